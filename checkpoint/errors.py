@@ -1,0 +1,66 @@
+"""Everything that floor 1 can refuse or fail at: one family, one sentence per class."""
+
+from __future__ import annotations
+
+
+class CheckpointError(Exception):
+    """Something about capturing, storing or restoring a process did not work.
+
+    The message says what was tried, on what, why not, and what to do about it.
+    """
+
+
+class ProbeError(CheckpointError):
+    """This machine or process cannot be looked into at all (no such process, not ours, already traced)."""
+
+
+class UnsupportedError(CheckpointError):
+    """The process holds something that cannot be preserved; it was not touched.
+
+    Attributes:
+        reasons: one sentence per thing found, each with what to do about it.
+    """
+
+    def __init__(self, message: str, reasons: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.reasons = reasons
+
+
+class CaptureError(CheckpointError):
+    """A capture was begun and not finished; the process runs on unharmed and nothing was forgotten."""
+
+
+class ProcessGoneError(CaptureError):
+    """The process ended while it was being looked at."""
+
+
+class RestoreError(CheckpointError):
+    """A restore was begun and not finished; nothing of it is left behind."""
+
+
+class MismatchError(RestoreError):
+    """This machine differs from the snapshot's in something the program depends on; nothing was started.
+
+    Attributes:
+        reasons: one sentence per difference, each with what to do about it.
+    """
+
+    def __init__(self, message: str, reasons: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.reasons = reasons
+
+
+class FormatError(CheckpointError):
+    """Bytes that are not a whole, unaltered snapshot of a version that we read."""
+
+
+class ChainError(CheckpointError):
+    """A delta does not continue the position it is offered to."""
+
+
+class StoreError(CheckpointError):
+    """The snapshot store could not do what was asked; what it already held is intact."""
+
+
+class MapsFormatError(CheckpointError):
+    """A line of /proc/PID/maps is not of the documented form."""

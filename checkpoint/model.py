@@ -1,0 +1,366 @@
+"""The values that floor 1 speaks in: a process at one instant, as frozen data.
+
+Read this file first. Nothing here opens, reads or asks; every type is immutable, so a value that was
+captured can be handed between threads, processes and machines without anybody changing it.
+
+Words: a *VMA* is one mapping ``[start, end)``; a *page* is ``page_size`` bytes; a *run* is consecutive pages.
+Addresses are absolute, in bytes. Instants are integer nanoseconds.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+Fact = int | str | bytes | bool | float | None | list["Fact"] | dict[str, "Fact"]
+"""One thing that a resource says about itself: whatever msgpack can carry."""
+
+
+class VmaKind(enum.StrEnum):
+    """What backs a mapping, which decides how it comes back."""
+
+    ANONYMOUS = "anonymous"
+    HEAP = "heap"
+    STACK = "stack"
+    FILE = "file"
+    VDSO = "vdso"
+    VVAR = "vvar"
+    VSYSCALL = "vsyscall"
+
+
+@dataclass(frozen=True, slots=True)
+class FileIdentity:
+    """How to tell that a file here is the file that the program had there.
+
+    Attributes:
+        path: absolute, as the program's mount namespace names it, without the kernel's " (deleted)".
+        size: bytes, at the capture.
+        mtime_ns: modification time; a hint only, never compared between machines.
+        build_id: the ELF build id, or b"" where there is none.
+        digest: blake3 of the whole content, 32 bytes, or b"" where it was not taken (large or unreadable).
+        deleted: no name leads to the file any more.
+    """
+
+    path: str
+    device: int = 0
+    inode: int = 0
+    mode: int = 0
+    size: int = 0
+    mtime_ns: int = 0
+    build_id: bytes = b""
+    digest: bytes = b""
+    deleted: bool = False
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class PageRun:
+    """Consecutive pages: ``[start, end)``, both multiples of the page size."""
+
+    start: int
+    end: int
+
+    @property
+    def size(self) -> int:
+        """Bytes covered."""
+        return self.end - self.start
+
+
+@dataclass(frozen=True, slots=True)
+class Vma:
+    """One mapping of the address space.
+
+    Attributes:
+        protection: bits of mmap(2): 1 read, 2 write, 4 execute.
+        shared: MAP_SHARED; otherwise writes are private.
+        offset: bytes into the file.
+        name: what /proc/PID/maps prints last: a path, "[heap]", "" …
+        file: identity of the backing file, for ``kind`` FILE.
+        flags: the two-letter codes of VmFlags in smaps that matter on restore ("gd" grows down, "dc" don't copy on
+            fork, "dd" don't dump, "wf" wipe on fork, "hg"/"nh" huge page advice, "lo" locked, "nr" no reserve,
+            "sr"/"rr" read advice, "mg" mergeable).
+    """
+
+    start: int
+    end: int
+    protection: int
+    shared: bool
+    kind: VmaKind
+    offset: int = 0
+    name: str = ""
+    file: FileIdentity | None = None
+    flags: tuple[str, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Bytes covered."""
+        return self.end - self.start
+
+
+@dataclass(frozen=True, slots=True)
+class SignalAction:
+    """What one signal does (rt_sigaction(2)): the kernel's own four words."""
+
+    signal: int
+    handler: int
+    flags: int
+    restorer: int
+    mask: int
+
+
+@dataclass(frozen=True, slots=True)
+class Rseq:
+    """A registered restartable-sequences area (rseq(2))."""
+
+    address: int
+    size: int
+    signature: int
+    flags: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ThreadState:
+    """One thread, as it stood when it was frozen.
+
+    Attributes:
+        registers: register sets by name as the kernel gives them ("prstatus", "xstate" …), see ``checkpoint.arch``.
+            They stand where the program must go on: an interrupted system call is already set to be made again.
+        signal_mask: blocked signals, bit 0 is signal 1.
+        pending: signals pending for this thread alone, each a whole siginfo (128 bytes).
+        altstack: (address, flags, size) of sigaltstack(2).
+        robust_list: (head address, length).
+        clear_tid: address given to set_tid_address(2), 0 if none.
+        policy, priority: of sched_setscheduler(2); ``affinity`` is the list of allowed processors.
+        interrupted: name of the system call that was interrupted and will be made again, "" if none.
+    """
+
+    tid: int
+    name: str
+    registers: Mapping[str, bytes]
+    signal_mask: int = 0
+    pending: tuple[bytes, ...] = ()
+    altstack: tuple[int, int, int] = (0, 2, 0)
+    robust_list: tuple[int, int] = (0, 0)
+    clear_tid: int = 0
+    rseq: Rseq | None = None
+    policy: int = 0
+    priority: int = 0
+    nice: int = 0
+    io_priority: int = 0
+    affinity: tuple[int, ...] = ()
+    timer_slack_ns: int = 50_000
+    interrupted: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class IntervalTimer:
+    """An alarm of setitimer(2); ``which`` is 0 real, 1 virtual, 2 profiling. All in microseconds; ``value`` is what was left."""
+
+    which: int
+    interval_us: int
+    value_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class PosixTimer:
+    """A timer of timer_create(2), with what was left of it.
+
+    Attributes:
+        notify: SIGEV_SIGNAL 0, SIGEV_NONE 1, SIGEV_THREAD_ID 4.
+        value: the sigev_value that the program chose.
+        overrun: expirations not yet told.
+    """
+
+    timer_id: int
+    clock: int
+    notify: int
+    signal: int
+    value: int
+    tid: int
+    interval_ns: int
+    value_ns: int
+    overrun: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Clocks:
+    """The machine's clocks as the *program* reads them (inside its time namespace), at the freeze."""
+
+    realtime_ns: int
+    monotonic_ns: int
+    boottime_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Credentials:
+    """User and group ids: (real, effective, saved, filesystem); capabilities as the five words of /proc/PID/status."""
+
+    uids: tuple[int, int, int, int]
+    gids: tuple[int, int, int, int]
+    groups: tuple[int, ...] = ()
+    capabilities: tuple[int, int, int, int, int] = (0, 0, 0, 0, 0)
+    no_new_privs: bool = False
+    securebits: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class MemoryLayout:
+    """The kernel's own marks in an address space (struct prctl_mm_map of prctl(2), without the exe)."""
+
+    start_code: int
+    end_code: int
+    start_data: int
+    end_data: int
+    start_brk: int
+    brk: int
+    start_stack: int
+    arg_start: int
+    arg_end: int
+    env_start: int
+    env_end: int
+    auxv: bytes = b""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessState:
+    """What belongs to the process as a whole.
+
+    Attributes:
+        pid: as the program itself sees it (innermost PID namespace).
+        ppid, pgid, sid: likewise; 0 where they lie outside its namespace.
+        limits: RLIMIT number → (soft, hard); -1 is infinity.
+        pending: signals pending for the process, each a whole siginfo (128 bytes).
+        isolated: it lives in PID and time namespaces of its own.
+    """
+
+    pid: int
+    ppid: int
+    pgid: int
+    sid: int
+    executable: FileIdentity
+    arguments: tuple[str, ...]
+    layout: MemoryLayout
+    working_directory: str
+    root_directory: str
+    umask: int
+    credentials: Credentials
+    personality: int = 0
+    limits: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    oom_score_adj: int = 0
+    dumpable: int = 1
+    keep_caps: bool = False
+    child_subreaper: bool = False
+    parent_death_signal: int = 0
+    thp_disabled: bool = False
+    signal_actions: tuple[SignalAction, ...] = ()
+    pending: tuple[bytes, ...] = ()
+    interval_timers: tuple[IntervalTimer, ...] = ()
+    posix_timers: tuple[PosixTimer, ...] = ()
+    isolated: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Resource:
+    """One thing that a process holds besides memory, described by its file in ``checkpoint.resources``.
+
+    Attributes:
+        kind: the file's name there: "files", "devices", "streams" …
+        name: what holds it: for descriptors the number, as "fd 7".
+        facts: documented in that file; unknown facts of a newer writer are refused, not ignored.
+    """
+
+    kind: str
+    name: str
+    facts: Mapping[str, Fact] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """Where a snapshot was taken.
+
+    Attributes:
+        architecture: as uname(2) says ("x86_64").
+        features: processor features that the program may have chosen code by (see ``checkpoint.arch``).
+        vdso_digest: blake3 of the vdso image, 32 bytes.
+        robot: name of the robot, "" for a one-shot capture.
+    """
+
+    architecture: str
+    page_size: int
+    kernel: str
+    boot_id: str
+    hostname: str
+    features: tuple[str, ...] = ()
+    xstate_mask: int = 0
+    vdso_digest: bytes = b""
+    robot: str = ""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Position:
+    """A point in a component's history. Equal numbers with unequal digests mean the histories diverged.
+
+    Attributes:
+        generation: incarnation; every restore opens a new one.
+        sequence: of the snapshot inside its generation, from 1.
+        digest: state digest, 16 bytes (see ``checkpoint.chain``).
+    """
+
+    generation: int
+    sequence: int
+    digest: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class OutputPiece:
+    """Bytes that the component wrote to one of its streams since the parent position.
+
+    Attributes:
+        stream: 1 standard output, 2 standard error.
+        offset: of the first byte in the whole stream, from its beginning.
+    """
+
+    stream: int
+    offset: int
+    content: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The immutable state of one component at one instant: a base (whole), or a delta since ``parent``.
+
+    A page that no snapshot of a chain holds is what a fresh mapping holds: zeros, or the file's content.
+
+    Attributes:
+        parent: None for a base.
+        page_sum: sum of the page digests of the *whole* state, 16 bytes (see ``checkpoint.pages``).
+        cleared: runs whose earlier pages are forgotten before ``contents`` is applied (fresh mappings, zeroed pages).
+        runs: the pages that this snapshot carries, in address order, disjoint.
+        contents: the bytes of ``runs``, concatenated in the same order; ``sum(run.size)`` bytes.
+        epoch: number of the primacy under which it was taken; 0 for a one-shot capture.
+        freeze_us: how long the program stood still for it.
+    """
+
+    component: str
+    engine: str
+    position: Position
+    parent: Position | None
+    machine: Machine
+    clocks: Clocks
+    process: ProcessState
+    threads: tuple[ThreadState, ...]
+    vmas: tuple[Vma, ...]
+    resources: tuple[Resource, ...] = ()
+    cleared: tuple[PageRun, ...] = ()
+    runs: tuple[PageRun, ...] = ()
+    contents: bytes | memoryview = b""
+    page_sum: bytes = b""
+    output: tuple[OutputPiece, ...] = ()
+    epoch: int = 0
+    freeze_us: int = 0
+    notes: tuple[str, ...] = ()
+
+    @property
+    def is_base(self) -> bool:
+        """Whether it stands alone."""
+        return self.parent is None
