@@ -1,0 +1,1 @@
+"""The daemon: beats, lanes, guards and keepers. It acts on what `failover.core` decides; nobody imports it."""

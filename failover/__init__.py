@@ -1,0 +1,1 @@
+"""Rules and faces: who runs what, and how people and programs ask."""

@@ -1,0 +1,217 @@
+"""The agent's control socket, from the outside: one request, then its replies.
+
+Wire: a unix stream socket, 0600. Every message is four bytes of length (big endian) and that many bytes of msgpack: from the client
+one `Request`, from the agent any number of `Update` and `Output`, and at last one `Result` or `Refused`. Closing the
+connection ends a request that goes on for ever (`status` with ``watch``, `logs` with ``follow``); it never ends the component.
+
+Verbs, their arguments and what ``Result.value`` holds (every argument has a default unless marked *must*):
+
+=============  =======================================================  ========================================================
+verb           arguments                                                result, updates
+=============  =======================================================  ========================================================
+``ping``                                                                ``robot team pid version insecure``
+``status``     ``watch`` false, ``every_ms`` 500                        see `STATUS`; with ``watch`` each picture is an Update
+``run``        ``argv`` *must*, ``name`` = argv[0]'s, ``env``, ``cwd``,  Update ``{"started": {name, pid, inner_pid, isolated,
+               ``umask`` 18, ``isolate`` true, ``wait`` true            notes}}``; with ``wait`` Output … and Result
+                                                                        ``{name, exit_status}`` (a wait status); else at once
+``protect``    ``pid`` *must*, ``name`` *must*                          ``{name, pid, notes}``
+``release``    ``name`` *must*                                          ``{name, pid}``; the program runs on, unprotected
+``stop``       ``name`` *must*, ``signal`` 15                           ``{name, exit_status}`` once it has ended
+``logs``       ``name`` *must*, ``follow`` false, ``offsets`` [0, 0]     Output …, Result ``{name, totals, exit_status}``
+``why``        ``name`` ""                                              ``{"story": [{at, robot, component, saw, did}, …]}``
+``handover``   ``name`` *must*, ``to`` ""                               ``{name, to, epoch, outage_ms}``
+``prefer``     ``name`` *must*, ``robot`` *must*                        ``{name, robot}``
+=============  =======================================================  ========================================================
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from failover.errors import AgentRefusedError, LostAgentError, NoAgentError
+
+STATUS: Final = """
+robot, team, role, pid, version, uptime_ms: of this agent
+insecure: links are neither authenticated nor encrypted
+realtime: the heart runs at real-time priority with its memory locked
+promise: one sentence: what holds if this robot dies now
+notes: [sentence, …]: what is missing or degraded on this robot
+peers: [{name, state, last_heard_ms, beats_lost, lane, rtt_us, notes}]
+    state: unknown | live | suspect | dead; lane: connected | connecting | refused | down
+components: [{name, role, primary, state, epoch, generation, sequence, engine, pid, inner_pid, isolated, standby, standby_sequence,
+    lag_ms, period_ms, freeze_us, freeze_us_max, snapshot_size, dirty_bytes, snapshots, restores, crashes, exit_status, reasons, notes}]
+    role: primary | standby | none; state: starting | running | frozen | held | restoring | ended | degraded | failed
+"""
+"""What ``status`` answers, field by field. A value that is not known is None."""
+
+MESSAGE_LIMIT: Final = 16 << 20
+"""Bytes of one message either way: a status of thousands of components fits, a runaway peer does not fill the memory."""
+
+LENGTH: Final = struct.Struct(">I")
+SOCKET_NAME: Final = "control.sock"
+SYSTEM_SOCKET: Final = Path("/run/failover") / SOCKET_NAME
+SOCKET_VARIABLE: Final = "FAILOVER_SOCKET"
+CONNECT_TIMEOUT_S: Final = 5.0
+
+
+class Request(msgspec.Struct, frozen=True):
+    """What the client wants."""
+
+    verb: str
+    arguments: dict[str, Any] = {}
+
+
+class Update(msgspec.Struct, frozen=True, tag="update"):
+    """Something to show while the answer is still being made."""
+
+    value: dict[str, Any]
+
+
+class Output(msgspec.Struct, frozen=True, tag="output"):
+    """Bytes that the component wrote; ``stream`` 1 or 2, ``offset`` of the first byte in the whole stream."""
+
+    stream: int
+    offset: int
+    content: bytes
+
+
+class Result(msgspec.Struct, frozen=True, tag="result"):
+    """The answer; nothing follows."""
+
+    value: dict[str, Any]
+
+
+class Refused(msgspec.Struct, frozen=True, tag="refused"):
+    """It cannot be done; nothing follows. See `failover.errors.AgentRefusedError`."""
+
+    kind: str
+    message: str
+    reasons: tuple[str, ...] = ()
+
+
+Reply = Update | Output | Result | Refused
+
+_encoder = msgspec.msgpack.Encoder()
+_reply_decoder: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
+
+
+def socket_path() -> Path:
+    """Where the agent listens: ``$FAILOVER_SOCKET``, else the user's own agent if its socket is there, else the system's."""
+    chosen = os.environ.get(SOCKET_VARIABLE)
+    if chosen:
+        return Path(chosen)
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    own = Path(runtime) / "failover" / SOCKET_NAME if runtime else None
+    return own if own is not None and own.exists() else SYSTEM_SOCKET
+
+
+class Control:
+    """One connection to one agent; one request at a time. A context manager, or call `close`."""
+
+    def __init__(self, link: socket.socket, path: Path) -> None:
+        self._link = link
+        self._path = path
+
+    @classmethod
+    def open(cls, path: Path | None = None) -> Control:
+        """Connect to the agent.
+
+        Raises:
+            NoAgentError: nobody listens there, or not for this user.
+        """
+        path = path or socket_path()
+        link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+        link.settimeout(CONNECT_TIMEOUT_S)
+        try:
+            link.connect(str(path))
+        except OSError as error:
+            link.close()
+            raise NoAgentError(_why_not(path, error)) from error
+        link.settimeout(None)
+        return cls(link, path)
+
+    def ask(self, verb: str, **arguments: Any) -> dict[str, Any]:
+        """Make a request and wait for its result, past any updates and output.
+
+        Raises:
+            AgentRefusedError: the agent says no.
+            LostAgentError: it went away before it answered.
+        """
+        for reply in self.stream(verb, **arguments):
+            if isinstance(reply, Result):
+                return reply.value
+        raise LostAgentError(f"the agent at {self._path} ended its answer to {verb} without a result; see its log")
+
+    def stream(self, verb: str, **arguments: Any) -> Iterator[Update | Output | Result]:
+        """Make a request and yield everything that comes back, the result last.
+
+        Raises:
+            AgentRefusedError, LostAgentError: as for `ask`.
+        """
+        self._send(_encoder.encode(Request(verb, arguments)))
+        while True:
+            reply = self._receive(verb)
+            if isinstance(reply, Refused):
+                raise AgentRefusedError(reply.message, reply.kind, reply.reasons)
+            yield reply
+            if isinstance(reply, Result):
+                return
+
+    def fileno(self) -> int:
+        """To wait for the next reply together with other things."""
+        return self._link.fileno()
+
+    def close(self) -> None:
+        """End the connection; a request that still goes on is dropped, the component is not."""
+        with contextlib.suppress(OSError):
+            self._link.close()
+
+    def __enter__(self) -> Control:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _send(self, body: bytes) -> None:
+        try:
+            self._link.sendall(LENGTH.pack(len(body)) + body)
+        except OSError as error:
+            raise LostAgentError(f"cannot send to the agent at {self._path}: {error.strerror}; is it still running?") from error
+
+    def _receive(self, verb: str) -> Reply:
+        (size,) = LENGTH.unpack(self._exactly(LENGTH.size, verb))
+        if size > MESSAGE_LIMIT:
+            raise LostAgentError(f"the agent at {self._path} announced a reply of {size} bytes, over {MESSAGE_LIMIT}; is it an agent?")
+        try:
+            return _reply_decoder.decode(self._exactly(size, verb))
+        except msgspec.MsgspecError as error:
+            raise LostAgentError(f"the agent at {self._path} answered {verb} in a way not understood: {error}; same version?") from error
+
+    def _exactly(self, size: int, verb: str) -> bytes:
+        parts = bytearray()
+        while len(parts) < size:
+            try:
+                part = self._link.recv(size - len(parts))
+            except OSError as error:
+                raise LostAgentError(f"lost the agent at {self._path} during {verb}: {error.strerror}") from error
+            if not part:
+                raise LostAgentError(f"the agent at {self._path} went away during {verb}; components run on, see failover status")
+            parts += part
+        return bytes(parts)
+
+
+def _why_not(path: Path, error: OSError) -> str:
+    cure = {
+        FileNotFoundError: f"no agent has been started there; start failover-agent, or set {SOCKET_VARIABLE}",
+        ConnectionRefusedError: "the socket is a left-over of an agent that ended; start failover-agent again",
+        PermissionError: "this user may not; use sudo, or join the group that owns the socket",
+    }.get(type(error), error.strerror or str(error))
+    return f"cannot reach the agent at {path}: {cure}"

@@ -1,0 +1,29 @@
+"""Everything that floor 2 can refuse or fail at: one family, one sentence per class."""
+
+from __future__ import annotations
+
+
+class FailoverError(Exception):
+    """Something about protecting a component did not work; the message says what, on what, why not and what to do."""
+
+
+class NoAgentError(FailoverError):
+    """No agent answers on its control socket."""
+
+
+class AgentRefusedError(FailoverError):
+    """The agent understood a request and says no.
+
+    Attributes:
+        kind: name of the error class on the agent's side ("UnsupportedError", "UnknownComponentError" …).
+        reasons: one sentence each, with what to do about it.
+    """
+
+    def __init__(self, message: str, kind: str = "", reasons: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.kind = kind
+        self.reasons = reasons
+
+
+class LostAgentError(FailoverError):
+    """The agent went away in the middle of an answer."""
