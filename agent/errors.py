@@ -1,0 +1,23 @@
+"""Everything that floor 3 can refuse or fail at: one family, one sentence per class."""
+
+from __future__ import annotations
+
+
+class AgentError(Exception):
+    """The daemon could not do something; the message says what, on what, why not and what to do."""
+
+
+class GuardError(AgentError):
+    """A guard refused a request, or could not carry it out; the component is as it was."""
+
+
+class GuardLostError(GuardError):
+    """The guard of a component does not answer: it ended, or closed the connection."""
+
+
+class KeeperLostError(AgentError):
+    """The keeper ended before it answered; the program runs on unharmed, a new keeper starts with a base."""
+
+
+class BallotError(AgentError):
+    """The record of what must not be forgotten cannot be read or written; nothing may be decided without it."""

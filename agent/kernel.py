@@ -1,0 +1,52 @@
+"""The few system calls that a guard needs and that Python does not offer.
+
+Sources: prctl(2), mlockall(2), fallocate(2).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from typing import Final
+
+PR_SET_CHILD_SUBREAPER: Final = 36
+MCL_CURRENT: Final = 1
+MCL_FUTURE: Final = 2
+FALLOC_FL_KEEP_SIZE: Final = 1
+FALLOC_FL_PUNCH_HOLE: Final = 2
+
+_libc = ctypes.CDLL(None, use_errno=True)
+_libc.fallocate.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_int64, ctypes.c_int64)
+
+
+def become_subreaper() -> None:
+    """Become the parent of every descendant whose own parent dies.
+
+    Raises:
+        OSError: the kernel says no (it has known this since 3.4).
+    """
+    _check(_libc.prctl(PR_SET_CHILD_SUBREAPER, ctypes.c_ulong(1), 0, 0, 0), "prctl(PR_SET_CHILD_SUBREAPER)")
+
+
+def lock_memory() -> None:
+    """Keep every page of this process in memory, also those that are still to come; children do not inherit it.
+
+    Raises:
+        OSError: RLIMIT_MEMLOCK is too small and CAP_IPC_LOCK is missing.
+    """
+    _check(_libc.mlockall(MCL_CURRENT | MCL_FUTURE), "mlockall")
+
+
+def punch_hole(descriptor: int, offset: int, size: int) -> None:
+    """Give the file's bytes [offset, offset + size) back to the disk; they read as zeros, the file keeps its size.
+
+    Raises:
+        OSError: EOPNOTSUPP where the filesystem cannot.
+    """
+    _check(_libc.fallocate(descriptor, FALLOC_FL_PUNCH_HOLE | FALLOC_FL_KEEP_SIZE, offset, size), "fallocate(PUNCH_HOLE)")
+
+
+def _check(result: int, what: str) -> None:
+    if result < 0:
+        number = ctypes.get_errno()
+        raise OSError(number, f"{what}: {os.strerror(number)}")
