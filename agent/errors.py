@@ -21,3 +21,25 @@ class KeeperLostError(AgentError):
 
 class BallotError(AgentError):
     """The record of what must not be forgotten cannot be read or written; nothing may be decided without it."""
+
+
+class ConfigError(AgentError):
+    """The configuration cannot be used; the message names the file and, where it can, the line."""
+
+
+class LaneError(AgentError):
+    """The bulk lane could not be opened, or a peer on it broke the rules."""
+
+
+class RefusedError(AgentError):
+    """A request on the control socket cannot be served.
+
+    Attributes:
+        kind: the class name told to the client.
+        reasons: one sentence each, with what to do about it.
+    """
+
+    def __init__(self, message: str, kind: str = "RefusedError", reasons: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.kind = kind
+        self.reasons = reasons

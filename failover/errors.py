@@ -27,3 +27,11 @@ class AgentRefusedError(FailoverError):
 
 class LostAgentError(FailoverError):
     """The agent went away in the middle of an answer."""
+
+
+class FileMistakeError(FailoverError):
+    """A file that a person wrote holds a mistake; the message names file, line and cure."""
+
+
+class TeamFileError(FailoverError):
+    """The team directory or a key in it cannot be used."""

@@ -1,7 +1,7 @@
 """The agent's control socket, from the outside: one request, then its replies.
 
-Wire: a unix stream socket, 0600. Every message is four bytes of length (big endian) and that many bytes of msgpack: from the client
-one `Request`, from the agent any number of `Update` and `Output`, and at last one `Result` or `Refused`. Closing the
+Wire: a unix stream socket, 0600. Every message is four bytes of length (big endian) and that many bytes of msgpack: from the
+client one `Request`, from the agent any number of `Update` and `Output`, and at last one `Result` or `Refused`. Closing the
 connection ends a request that goes on for ever (`status` with ``watch``, `logs` with ``follow``); it never ends the component.
 
 Verbs, their arguments and what ``Result.value`` holds (every argument has a default unless marked *must*):
@@ -46,8 +46,9 @@ promise: one sentence: what holds if this robot dies now
 notes: [sentence, …]: what is missing or degraded on this robot
 peers: [{name, state, last_heard_ms, beats_lost, lane, rtt_us, notes}]
     state: unknown | live | suspect | dead; lane: connected | connecting | refused | down
-components: [{name, role, primary, state, epoch, generation, sequence, engine, pid, inner_pid, isolated, standby, standby_sequence,
-    lag_ms, period_ms, freeze_us, freeze_us_max, snapshot_size, dirty_bytes, snapshots, restores, crashes, exit_status, reasons, notes}]
+components: [{name, role, primary, state, epoch, generation, sequence, engine, pid, inner_pid, isolated, standby,
+    standby_sequence, lag_ms, period_ms, freeze_us, freeze_us_max, snapshot_size, dirty_bytes, snapshots, restores, crashes,
+    exit_status, reasons, notes}]
     role: primary | standby | none; state: starting | running | frozen | held | restoring | ended | degraded | failed
 """
 """What ``status`` answers, field by field. A value that is not known is None."""
@@ -189,11 +190,11 @@ class Control:
     def _receive(self, verb: str) -> Reply:
         (size,) = LENGTH.unpack(self._exactly(LENGTH.size, verb))
         if size > MESSAGE_LIMIT:
-            raise LostAgentError(f"the agent at {self._path} announced a reply of {size} bytes, over {MESSAGE_LIMIT}; is it an agent?")
+            raise LostAgentError(f"{self._path} announced a reply of {size} bytes, over {MESSAGE_LIMIT}; is it an agent?")
         try:
             return _reply_decoder.decode(self._exactly(size, verb))
         except msgspec.MsgspecError as error:
-            raise LostAgentError(f"the agent at {self._path} answered {verb} in a way not understood: {error}; same version?") from error
+            raise LostAgentError(f"{self._path} answered {verb} in a way not understood: {error}; same version?") from error
 
     def _exactly(self, size: int, verb: str) -> bytes:
         parts = bytearray()

@@ -1,0 +1,142 @@
+"""What the agent must not forget: durable before anything that depends on it leaves the machine.
+
+One small file, ``ballot``: a line of JSON and a line with its digest. It is written aside, synced, renamed, and the
+directory synced, so a power cut leaves the old content or the new, never a mixture. Besides the core's own record it
+holds the boot counter, which tells this life of the agent from every earlier one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from agent.errors import BallotError
+
+FILE_NAME: Final = "ballot"
+VERSION: Final = 1
+SIZE_LIMIT: Final = 4 << 20
+"""Bytes; a record of ten thousand components is under a tenth of it."""
+
+
+class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The content of the file.
+
+    Attributes:
+        boot: lives of this agent so far; grows by one at each start.
+        core: what `failover.core` asked to keep, as it encoded it.
+    """
+
+    version: int
+    robot: str
+    boot: int
+    core: bytes = b""
+
+
+class Ballot:
+    """The file of one robot. One thread at a time."""
+
+    def __init__(self, directory: Path, robot: str) -> None:
+        self._directory = directory
+        self._path = directory / FILE_NAME
+        self._record = Record(VERSION, robot, 0)
+
+    @property
+    def record(self) -> Record:
+        """What is durable now."""
+        return self._record
+
+    def open(self) -> Record:
+        """Read what an earlier life left and begin a new one: the boot counter is raised, durably.
+
+        Raises:
+            BallotError: the file is unreadable, altered, or another robot's; or the directory cannot be written.
+        """
+        found = self._read()
+        if found is not None:
+            if found.robot != self._record.robot:
+                raise BallotError(
+                    f"cannot start as {self._record.robot}: {self._path} belongs to {found.robot}; give each robot a "
+                    "state_directory of its own, or the robot its old name"
+                )
+            self._record = found
+        self._write(msgspec.structs.replace(self._record, boot=self._record.boot + 1))
+        return self._record
+
+    def keep(self, core: bytes) -> None:
+        """Make the core's record durable. Returns when it would survive a power cut.
+
+        Raises:
+            BallotError: it could not be written; the old record stands.
+        """
+        if core != self._record.core:
+            self._write(msgspec.structs.replace(self._record, core=core))
+
+    def _read(self) -> Record | None:
+        try:
+            with self._path.open("rb") as file:
+                content = file.read(SIZE_LIMIT)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise BallotError(f"cannot read {self._path}: {error.strerror}; the agent needs it to know its epochs") from error
+        body, _, rest = content.partition(b"\n")
+        try:
+            if rest.strip().decode() != _digest(body):
+                raise BallotError(_altered(self._path, "its digest does not fit"))
+            record = msgspec.json.decode(body, type=Record)
+        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+            raise BallotError(_altered(self._path, str(error))) from error
+        if record.version != VERSION:
+            raise BallotError(f"cannot read {self._path}: it is of version {record.version}, this agent reads {VERSION}")
+        return record
+
+    def _write(self, record: Record) -> None:
+        body = msgspec.json.encode(record)
+        aside = self._path.with_suffix(".new")
+        try:
+            write_durably(aside, body + b"\n" + _digest(body).encode() + b"\n")
+            aside.rename(self._path)
+            sync_directory(self._directory)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                aside.unlink(missing_ok=True)
+            raise BallotError(
+                f"cannot keep an epoch in {self._path}: {error.strerror}; until then this robot gives no vote and takes nothing over"
+            ) from error
+        self._record = record
+
+
+def write_durably(path: Path, content: bytes) -> None:
+    """Write a new file, 0600, and wait until the disk has it."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+    try:
+        with open(descriptor, "wb", closefd=False) as file:
+            file.write(content)
+        os.fdatasync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def sync_directory(directory: Path) -> None:
+    """Wait until the disk has the directory's names, so that a rename survives a power cut."""
+    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _digest(body: bytes) -> str:
+    return hashlib.blake2b(body, digest_size=16).hexdigest()
+
+
+def _altered(path: Path, why: str) -> str:
+    return (
+        f"cannot trust {path}: {why}. It holds the epochs this robot promised to honour; restore it, or, if the team agrees that "
+        "this robot starts as new, remove the file and its snapshots"
+    )

@@ -1,0 +1,44 @@
+"""The agent's only clock, and its real-time rights. Instants are integer nanoseconds of CLOCK_MONOTONIC, this machine's own."""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import os
+import time
+from typing import Final
+
+MCL_CURRENT: Final = 1
+MCL_FUTURE: Final = 2
+HEART_PRIORITY: Final = 60
+"""SCHED_FIFO priority of the heart: just above the interrupt threads of a PREEMPT_RT kernel (50), below its watchdogs (99)."""
+
+
+def now_ns() -> int:
+    """The instant, for the core."""
+    return time.monotonic_ns()
+
+
+def wall_time_s() -> float:
+    """Calendar time, for a person's eyes only; nothing is decided by it."""
+    return time.time()
+
+
+def become_realtime() -> tuple[str, ...]:
+    """Run this process ahead of ordinary ones and keep its memory resident; what is not permitted comes back as sentences.
+
+    Source: sched(7), mlockall(2).
+    """
+    notes: list[str] = []
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(HEART_PRIORITY))
+    except OSError as error:
+        notes.append(
+            f"beats run at normal priority: SCHED_FIFO was refused ({error.strerror}); under load a live robot may be taken for "
+            "dead; give the agent CAP_SYS_NICE or a LimitRTPRIO, see systemd/failover-agent.service"
+        )
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(MCL_CURRENT | MCL_FUTURE) != 0:
+        why = os.strerror(ctypes.get_errno())
+        notes.append(f"the heart's memory can be swapped out: mlockall was refused ({why}); give the agent CAP_IPC_LOCK")
+    return tuple(notes)

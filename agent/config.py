@@ -1,0 +1,150 @@
+"""The agent's configuration: one TOML file, read once into frozen values.
+
+Every key and its default stand, commented, in ``systemd/agent.toml``; a test keeps the two equal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, Literal
+
+from agent.errors import ConfigError
+from failover.client import strict_toml
+from failover.client import team as team_directory
+from failover.client.team import Robot, Team
+from failover.errors import FailoverError
+
+MISSED_BEATS_TO_DEATH: Final = 3
+"""A lease shorter than this many beats would take one lost frame for a dead robot."""
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentConfig:
+    """What the operator wants for one component; ``[components."/lab/robot1/mapper"]``.
+
+    Attributes:
+        on_loss: takeover: the standby runs it; hold: the standby keeps its newest checkpoint until the primary is back.
+        on_crash: the program died, its robot lives: resume it here from the newest checkpoint, or leave it ended.
+        on_unsupported: it turned into something that cannot be captured: keep the last checkpoint, or stop protecting.
+        standby: the robot that keeps its snapshots; "" lets the team choose.
+        prefer: the robot that should run it; "" for wherever it is.
+        snapshot_period_ms: 0 for the agent's own.
+    """
+
+    on_loss: Literal["takeover", "hold"] = "takeover"
+    on_crash: Literal["resume", "leave"] = "resume"
+    on_unsupported: Literal["keep_last", "stop_protecting"] = "keep_last"
+    standby: str = ""
+    prefer: str = ""
+    snapshot_period_ms: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """The whole file. Times in milliseconds.
+
+    Attributes:
+        robot: this robot's name in the team file.
+        team_directory: see `failover.client.team`.
+        state_directory: what survives a power cut: ballot, snapshots, streams.
+        runtime_directory: sockets; gone after a reboot.
+        insecure: run without keys: anybody on the network can read memory and start programs.
+        group: unix group that may use the control socket besides its owner; "" for nobody.
+        beat_ms: period of beats to each peer.
+        lease_ms: how long a primary acts without being heard, and how long a standby stays loyal to a silent one.
+        rule: pair: of two voters the survivor takes over; majority: three or more voters.
+        when_alone: under the pair rule: run on, or freeze, when the other is silent.
+        snapshot_period_ms: between two snapshots of a component; grows by itself when link or standby is slower.
+        keep_chains: chains (a base and its deltas) kept for each component.
+        realtime: ask for SCHED_FIFO and locked memory.
+        link_mbit_s: cap on snapshot traffic; 0 for none.
+    """
+
+    robot: str
+    team_directory: str = "/etc/failover/team"
+    state_directory: str = "/var/lib/failover"
+    runtime_directory: str = "/run/failover"
+    insecure: bool = False
+    group: str = ""
+    beat_ms: int = 20
+    lease_ms: int = 200
+    rule: Literal["pair", "majority"] = "pair"
+    when_alone: Literal["run", "freeze"] = "run"
+    snapshot_period_ms: int = 100
+    keep_chains: int = 2
+    realtime: bool = True
+    link_mbit_s: int = 0
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    components: dict[str, ComponentConfig] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse values that contradict each other.
+
+        Raises:
+            ValueError: says which; the reader adds file and line.
+        """
+        if self.beat_ms < 1:
+            raise ValueError(f"beat_ms is {self.beat_ms}; it must be at least 1")
+        if self.lease_ms < MISSED_BEATS_TO_DEATH * self.beat_ms:
+            least = MISSED_BEATS_TO_DEATH * self.beat_ms
+            raise ValueError(
+                f"lease_ms is {self.lease_ms}: one lost beat would count as a death; with beat_ms {self.beat_ms} "
+                f"give at least {least}"
+            )
+        if self.snapshot_period_ms < 1 or self.keep_chains < 1:
+            raise ValueError("snapshot_period_ms and keep_chains must be at least 1")
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Everything an agent is started with: the file, the team, and this robot's secret key ("" when insecure)."""
+
+    config: Config
+    team: Team
+    secret_key: str
+
+    @property
+    def me(self) -> Robot:
+        """This robot's own entry."""
+        return self.team.robots[self.config.robot]
+
+    @property
+    def peers(self) -> Mapping[str, Robot]:
+        """Everybody else, by name."""
+        return {name: robot for name, robot in self.team.robots.items() if name != self.config.robot}
+
+    def component(self, name: str) -> ComponentConfig:
+        """What the operator wants for a component; the defaults where nothing was said."""
+        return self.config.components.get(name, ComponentConfig())
+
+
+def load(path: Path) -> Settings:
+    """Read the configuration, the team file and the key that it leads to.
+
+    Raises:
+        ConfigError: any of them is missing or mistaken; names file and, where it can, line.
+    """
+    try:
+        config = strict_toml.read(path, Config)
+        members = team_directory.read(Path(config.team_directory))
+        if config.robot not in members.robots:
+            known = ", ".join(sorted(members.robots)) or "nobody"
+            where = Path(config.team_directory) / team_directory.TEAM_FILE
+            raise ConfigError(f"{path}: robot {config.robot!r} is not in {where}, which knows {known}; see failover team enrol")
+        secret = "" if config.insecure else team_directory.read_secret_key(Path(config.team_directory), config.robot)
+    except FailoverError as error:
+        raise ConfigError(str(error)) from error
+    _check_keys(path, config, members)
+    return Settings(config, members, secret)
+
+
+def _check_keys(path: Path, config: Config, members: team.Team) -> None:
+    """With keys everybody has one: a single robot without would stay shut out for ever, unexplained."""
+    without = sorted(name for name, robot in members.robots.items() if not robot.public_key)
+    if without and not config.insecure:
+        raise ConfigError(
+            f"{path}: {', '.join(without)} in {config.team_directory} have no public key; enrol them with failover team enrol, "
+            "or set insecure = true on every robot"
+        )

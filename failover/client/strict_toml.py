@@ -1,0 +1,136 @@
+"""TOML files that a person writes: read into frozen dataclasses, and every mistake named with file, line and cure."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import re
+import tomllib
+import types
+import typing
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import msgspec
+
+from failover.errors import FileMistakeError
+
+T = TypeVar("T")
+SIZE_LIMIT: Final = 1 << 20
+"""Bytes; no configuration of ours comes near."""
+
+_MSGSPEC_PATH = re.compile(r" - at `\$(?P<path>[^`]*)`$")
+_KEY = re.compile(r"""^\s*(?:"(?P<quoted>[^"]+)"|'(?P<literal>[^']+)'|(?P<bare>[\w\-.]+))\s*=""")
+_TABLE = re.compile(r"^\s*\[\[?(?P<path>[^\]]+)\]\]?")
+_PART = re.compile(r"""\s*(?:"([^"]*)"|'([^']*)'|([\w-]+))\s*(?:\.|$)""")
+
+
+def read(path: Path, kind: type[T]) -> T:
+    """Read one file as ``kind``, a frozen dataclass whose fields are its keys.
+
+    Raises:
+        FileMistakeError: it is missing, no TOML, holds an unknown key or a value of the wrong kind, or refuses itself
+            (a ValueError from ``__post_init__``).
+    """
+    text = _text(path)
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise FileMistakeError(f"{path}: this is not TOML: {error}") from error
+    for keys, valid in _unknown(table, kind, ()):
+        raise FileMistakeError(_unknown_key(path, text, keys, valid))
+    try:
+        return msgspec.convert(table, kind)
+    except msgspec.ValidationError as error:
+        raise FileMistakeError(_wrong_value(path, text, str(error))) from error
+
+
+def _text(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return file.read(SIZE_LIMIT).decode()
+    except FileNotFoundError as error:
+        raise FileMistakeError(f"{path}: there is no such file; see the commented agent.toml for what belongs in it") from error
+    except OSError as error:
+        raise FileMistakeError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise FileMistakeError(f"{path}: is not UTF-8 text ({error.reason} at byte {error.start})") from error
+
+
+def _unknown(table: Mapping[str, Any], kind: Any, at: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], list[str]]]:
+    """Every key that no field answers to, with the keys that would have been valid there."""
+    hints = typing.get_type_hints(kind)
+    valid = [field.name for field in dataclasses.fields(kind)]
+    for key, value in table.items():
+        if key not in valid:
+            yield (*at, key), valid
+            continue
+        inner = _nested(hints[key])
+        if inner is not None and isinstance(value, dict):
+            named = typing.get_origin(_plain(hints[key])) is not None
+            for name, entry in value.items() if named else [("", value)]:
+                if isinstance(entry, dict):
+                    yield from _unknown(entry, inner, (*at, key, name) if named else (*at, key))
+
+
+def _plain(hint: Any) -> Any:
+    """The type without an "or None"."""
+    if isinstance(hint, types.UnionType):
+        return next(kind for kind in typing.get_args(hint) if kind is not type(None))
+    return hint
+
+
+def _nested(hint: Any) -> Any:
+    """The dataclass that a table, or every entry of a table of tables, must be; None for plain values."""
+    hint = _plain(hint)
+    if dataclasses.is_dataclass(hint):
+        return hint
+    arguments = typing.get_args(hint)
+    return arguments[-1] if arguments and dataclasses.is_dataclass(arguments[-1]) else None
+
+
+def _unknown_key(path: Path, text: str, keys: tuple[str, ...], valid: list[str]) -> str:
+    near = difflib.get_close_matches(keys[-1], valid, 1, 0.5)
+    cure = f"did you mean {near[0]!r}?" if near else "valid here: " + ", ".join(valid)
+    return f"{path}:{line_of(text, keys)}: unknown key {keys[-1]!r}; {cure}"
+
+
+def _wrong_value(path: Path, text: str, message: str) -> str:
+    found = _MSGSPEC_PATH.search(message)
+    keys = tuple(part for part in re.split(r"[.\[\]]+", found["path"]) if part and part != "...") if found else ()
+    said = message[: found.start()] if found else message
+    line = line_of(text, keys) if keys else 1
+    return f"{path}:{line}: {'.'.join(keys) + ': ' if keys else ''}{said}"
+
+
+def line_of(text: str, keys: tuple[str, ...]) -> int:
+    """The line on which a key stands, from 1; of its table if the key itself is not found.
+
+    Inner names that are not known exactly (msgspec says only "some entry") match any table.
+    """
+    table: tuple[str, ...] = ()
+    best = 1
+    for number, line in enumerate(text.splitlines(), 1):
+        header = _TABLE.match(line)
+        if header is not None:
+            table = _split(header["path"])
+            best = number if table == keys else best
+            if table == keys:
+                return number
+            continue
+        key = _KEY.match(line)
+        if key is None:
+            continue
+        name = key["quoted"] or key["literal"] or key["bare"]
+        if name == keys[-1] and _fits(table, keys[:-1]):
+            return number
+    return best
+
+
+def _fits(table: tuple[str, ...], wanted: tuple[str, ...]) -> bool:
+    return table == wanted or (len(table) > len(wanted) and table[: len(wanted)] == wanted)
+
+
+def _split(path: str) -> tuple[str, ...]:
+    return tuple(quoted or literal or bare for quoted, literal, bare in _PART.findall(path))

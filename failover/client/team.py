@@ -1,0 +1,177 @@
+"""The team directory: who belongs, where each robot listens, and by which key it is known.
+
+::
+
+    team.toml            the same on every robot; nothing secret in it
+    keys/ROBOT.secret    that robot's own secret key, 0600; only on that robot
+
+`failover team create` begins one, `enrol` adds a robot, and the operator carries team.toml to the others. Keys are CURVE
+keys (Curve25519, 32 bytes) written as 40 characters of Z85. Source: rfc.zeromq.org/spec/32.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final, Literal
+
+from failover.client import strict_toml
+from failover.errors import TeamFileError
+
+Role = Literal["robot", "server", "witness"]
+
+TEAM_FILE: Final = "team.toml"
+KEY_CHARACTERS: Final = 40
+DEFAULT_BEAT_PORT: Final = 7420
+DEFAULT_BULK_PORT: Final = 7421
+ROBOT_LIMIT: Final = 64
+"""Robots of one team: each beats to each, so the traffic grows with the square."""
+
+_NAME = re.compile(r"^[^\s/:\x00-\x1f\"\\.]{1,64}$")
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """One member.
+
+    Attributes:
+        role: robot runs components, server stores and votes, witness only votes.
+        beats: "host:port" for each of its links; beats go to all of them.
+        bulk: "host:port" on the wired link, for snapshots.
+        public_key: Z85, or "" in a team without keys.
+    """
+
+    beats: tuple[str, ...]
+    bulk: str
+    role: Role = "robot"
+    public_key: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Team:
+    """The members, by name."""
+
+    team: str
+    robots: dict[str, Robot] = field(default_factory=dict)
+
+
+def read(directory: Path) -> Team:
+    """Read the team file.
+
+    Raises:
+        FileMistakeError: it is missing or mistaken; names the line.
+        TeamFileError: its content makes no team.
+    """
+    path = directory / TEAM_FILE
+    team = strict_toml.read(path, Team)
+    if len(team.robots) > ROBOT_LIMIT:
+        raise TeamFileError(f"{path}: {len(team.robots)} robots are over the limit of {ROBOT_LIMIT}")
+    for name, robot in team.robots.items():
+        check_robot(str(path), name, robot)
+    return team
+
+
+def check_robot(where: str, name: str, robot: Robot) -> None:
+    """Refuse a name, an address or a key that could not work.
+
+    Raises:
+        TeamFileError: says which and why.
+    """
+    if not _NAME.match(name):
+        raise TeamFileError(f'{where}: {name!r} cannot name a robot: 1 to 64 characters without space, / : . " or \\')
+    if not robot.beats:
+        raise TeamFileError(f"{where}: robot {name} has no beat address; give at least one host:port")
+    for address in (*robot.beats, robot.bulk):
+        split_address(address, f"{where}: robot {name}")
+    if robot.public_key and len(robot.public_key) != KEY_CHARACTERS:
+        raise TeamFileError(f"{where}: the public key of {name} has {len(robot.public_key)} characters, not {KEY_CHARACTERS}")
+
+
+def split_address(address: str, where: str) -> tuple[str, int]:
+    """("host", port) of "host:port" or "[v6]:port".
+
+    Raises:
+        TeamFileError: it is neither.
+    """
+    host, separator, port = address.rpartition(":")
+    if not separator or not host or not port.isdigit() or not 0 < int(port) < 1 << 16:
+        raise TeamFileError(f"{where}: {address!r} is no address; write host:port")
+    return host.strip("[]"), int(port)
+
+
+def write(directory: Path, team: Team) -> None:
+    """Write the team file whole: aside, then renamed."""
+    directory.mkdir(parents=True, exist_ok=True)
+    aside = directory / (TEAM_FILE + ".new")
+    aside.write_text(_as_toml(team))
+    aside.replace(directory / TEAM_FILE)
+
+
+def enrol(team: Team, name: str, robot: Robot) -> Team:
+    """The team with one more robot, or with that robot's entry replaced."""
+    check_robot("the new robot", name, robot)
+    return replace(team, robots={**team.robots, name: robot})
+
+
+def secret_key_path(directory: Path, robot: str) -> Path:
+    """Where a robot keeps its own secret key."""
+    return directory / "keys" / f"{robot}.secret"
+
+
+def write_secret_key(directory: Path, robot: str, secret: str) -> Path:
+    """Keep a secret key, 0600; an existing one is never overwritten.
+
+    Raises:
+        TeamFileError: there is one already, or it cannot be written.
+    """
+    path = secret_key_path(directory, robot)
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    except FileExistsError as error:
+        raise TeamFileError(f"{path} exists; a robot keeps its key. Remove it if {robot} shall have a new one") from error
+    except OSError as error:
+        raise TeamFileError(f"cannot write {path}: {error.strerror}") from error
+    with open(descriptor, "w") as file:
+        file.write(secret + "\n")
+    return path
+
+
+def read_secret_key(directory: Path, robot: str) -> str:
+    """This robot's secret key.
+
+    Raises:
+        TeamFileError: it is missing, others may read it, or it is no key.
+    """
+    path = secret_key_path(directory, robot)
+    try:
+        mode = path.stat().st_mode
+        secret = path.read_text().strip()
+    except OSError as error:
+        raise TeamFileError(
+            f"cannot read this robot's key {path}: {error.strerror}; failover team enrol {robot} makes one, or run without keys "
+            "by insecure = true"
+        ) from error
+    if mode & 0o077:
+        raise TeamFileError(f"{path} is open to others (mode {mode & 0o777:o}); run: chmod 600 {path}")
+    if len(secret) != KEY_CHARACTERS:
+        raise TeamFileError(f"{path} holds {len(secret)} characters; a key has {KEY_CHARACTERS}")
+    return secret
+
+
+def forget_secret_key(directory: Path, robot: str) -> None:
+    """Remove a secret key that was carried to its robot."""
+    with contextlib.suppress(FileNotFoundError):
+        secret_key_path(directory, robot).unlink()
+
+
+def _as_toml(team: Team) -> str:
+    lines = ["# The team: the same file on every robot. Nothing in it is secret.", f'team = "{team.team}"']
+    for name, robot in sorted(team.robots.items()):
+        beats = ", ".join(f'"{address}"' for address in robot.beats)
+        lines += ["", f'[robots."{name}"]', f'role = "{robot.role}"', f"beats = [{beats}]", f'bulk = "{robot.bulk}"']
+        lines += [f'public_key = "{robot.public_key}"'] if robot.public_key else []
+    return "\n".join(lines) + "\n"
