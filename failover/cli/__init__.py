@@ -1,0 +1,1 @@
+"""The command line: one function per verb, one parser, one place that draws."""

@@ -1,0 +1,70 @@
+"""The command ``failover``: parse, load the verb's function, and turn every error into a sentence and an exit status."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from checkpoint.errors import CheckpointError
+from failover.cli import parser
+from failover.errors import AgentRefusedError, FailoverError, NoAgentError
+
+HEALTHY: Final = 0
+FAILED: Final = 1
+USAGE: Final = 2
+NO_AGENT: Final = 3
+
+INTERRUPTED: Final = 128 + signal.SIGINT
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command line; returns its exit status. Errors are told on standard error, never as a traceback."""
+    room = parser.build()
+    arguments = room.parse_args(argv)
+    try:
+        status = verb_function(arguments.function)(arguments)
+        sys.stdout.flush()
+        return status
+    except NoAgentError as error:
+        return tell(error, arguments, NO_AGENT)
+    except (FailoverError, CheckpointError) as error:
+        return tell(error, arguments, FAILED)
+    except BrokenPipeError:
+        # The reader has seen enough (`failover logs … | head`); keep Python from complaining about it at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except OSError as error:
+        return tell(error, arguments, FAILED)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+def verb_function(name: str) -> Callable[[argparse.Namespace], int]:
+    """Load ``module:function``."""
+    module, _, function = name.partition(":")
+    found: Callable[[argparse.Namespace], int] = getattr(importlib.import_module(module), function)
+    return found
+
+
+def tell(error: Exception, arguments: argparse.Namespace, status: int) -> int:
+    """Say what went wrong: a sentence, then one line per reason; as JSON when that was asked for."""
+    reasons: tuple[str, ...] = getattr(error, "reasons", ())
+    kind = error.kind if isinstance(error, AgentRefusedError) and error.kind else type(error).__name__
+    if getattr(arguments, "json", False):
+        import json
+
+        print(json.dumps({"error": kind, "message": str(error), "reasons": list(reasons)}))
+    else:
+        print(f"failover: {error}", file=sys.stderr)
+        for reason in reasons:
+            print(f"  - {reason}", file=sys.stderr)
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

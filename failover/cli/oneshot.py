@@ -1,0 +1,1 @@
+"""capture, restore, inspect, check: what one command does alone, without an agent."""

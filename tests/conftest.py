@@ -1,0 +1,155 @@
+"""What every test stands on: skip rules with their reasons, compiled tracees, and no process left behind."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+TRACEES = Path(__file__).parent / "tracees"
+
+PR_SET_CHILD_SUBREAPER = 36  # linux/prctl.h
+LEAVE_S = 5.0
+"""How long a process that a test has told to end may take for it."""
+
+
+# --- Skip rules ------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def compiler() -> str | None:
+    """The C compiler's path, or None when it or the C library's headers are missing."""
+    path = shutil.which("gcc") or shutil.which("cc")
+    if path is None:
+        return None
+    probe = subprocess.run([path, "-E", "-xc", "-"], input=b"#include <stdio.h>\n", capture_output=True, check=False)
+    return path if probe.returncode == 0 else None
+
+
+@functools.cache
+def has_user_namespaces() -> bool:
+    """Whether an ordinary user may make a user and a PID namespace here."""
+    unshare = shutil.which("unshare")
+    if unshare is None:
+        return False
+    return subprocess.run([unshare, "-Urpf", "true"], capture_output=True, check=False).returncode == 0
+
+
+def why_not(item: pytest.Item) -> str | None:
+    """The reason why this machine cannot run a test, or None when it can."""
+    if item.get_closest_marker("root") and os.geteuid() != 0:
+        return "needs root: run the tests as root to see it"
+    if item.get_closest_marker("compiler") and compiler() is None:
+        return "needs a C compiler and its headers: apt-get install gcc libc6-dev"
+    if item.get_closest_marker("user_namespaces") and not has_user_namespaces():
+        return "needs user namespaces, which this system forbids to ordinary users"
+    for marker in item.iter_markers("command"):
+        if shutil.which(marker.args[0]) is None:
+            return f"needs {marker.args[0]}, which is not installed here"
+    return None
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip what this machine cannot run, and say why."""
+    reason = why_not(item)
+    if reason is not None:
+        pytest.skip(reason)
+
+
+# --- Tracees ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Compile ``tests/tracees/NAME.c`` once a session: ``compiled("heap")`` is the program's path."""
+    made: dict[tuple[str, ...], Path] = {}
+
+    def build(name: str, *flags: str) -> Path:
+        key = (name, *flags)
+        if key not in made:
+            path = compiler()
+            if path is None:
+                pytest.skip("needs a C compiler and its headers: apt-get install gcc libc6-dev")
+            program = tmp_path_factory.mktemp("tracees") / name
+            subprocess.run([path, "-O1", "-g", "-o", program, TRACEES / f"{name}.c", *flags], check=True)
+            made[key] = program
+        return made[key]
+
+    return build
+
+
+# --- No process left behind ------------------------------------------------------------------------------------------
+
+
+def children() -> set[int]:
+    """Our child processes, zombies included, by any of our threads."""
+    found: set[int] = set()
+    for task in Path("/proc/self/task").iterdir():
+        try:
+            found.update(map(int, (task / "children").read_text().split()))
+        except FileNotFoundError:  # the thread ended meanwhile
+            continue
+    return found
+
+
+def reap(pids: set[int]) -> set[int]:
+    """Collect those of our children that have ended; return the ones that live."""
+    alive = set()
+    for pid in pids:
+        try:
+            ended, _ = os.waitpid(pid, os.WNOHANG)
+        except ChildProcessError:  # collected by the test itself
+            continue
+        if ended == 0:
+            alive.add(pid)
+    return alive
+
+
+def command_of(pid: int) -> str:
+    """What a process runs, for a message."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
+    except OSError:
+        return "?"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _subreaper() -> Iterator[None]:
+    """Orphans of the tests become our children instead of the machine's, so that they can be found and reaped."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    assert libc.prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0) == 0
+    yield
+    libc.prctl(PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0)
+
+
+@pytest.fixture(autouse=True)
+def _no_process_left_behind(_subreaper: None) -> Iterator[None]:
+    """Reap what a test left as zombies; a test that leaves a process running has failed, and the process is ended.
+
+    Fixtures of a wider scope are set up before this one, so what they start is theirs to end.
+    """
+    before = children()
+    yield
+    alive = reap(children() - before)
+    deadline = time.monotonic() + LEAVE_S
+    while alive and time.monotonic() < deadline:
+        time.sleep(0.01)
+        alive = reap(children() - before)
+    if not alive:
+        return
+    left = [f"{pid} ({command_of(pid)})" for pid in sorted(alive)]
+    for pid in alive:
+        os.kill(pid, signal.SIGKILL)
+    while children() - before:  # their own children come to us as they die
+        for pid in reap(children() - before):
+            os.kill(pid, signal.SIGKILL)
+        time.sleep(0.01)
+    pytest.fail(f"the test left processes running: {', '.join(left)}")

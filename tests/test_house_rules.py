@@ -1,0 +1,252 @@
+"""The rules of the house: which way the arrows point, what stays pure, one door per dependency, the names that are not used."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+FLOORS = ("checkpoint", "failover", "agent")
+
+PURE_FILES = ("checkpoint/errors.py", "checkpoint/model.py", "checkpoint/pages.py", "checkpoint/chain.py", "failover/core/")
+"""Here nothing opens, asks the time, rolls dice or waits: values in, values out."""
+
+PURE_IMPORTS = frozenset(
+    """
+    __future__ abc bisect binascii blake3 collections contextlib dataclasses enum functools hashlib heapq hmac itertools
+    math msgspec numpy operator re string struct types typing unicodedata xxhash zlib
+    """.split()  # noqa: SIM905
+)
+
+IMPURE_CALLS = frozenset({"open", "print", "input", "exec", "eval"})
+
+DOORS = {
+    "ptrace": ("checkpoint/linux/tracee.py",),
+    "zstandard": ("checkpoint/format.py",),
+    "zmq": ("agent/transport.py",),
+    "psutil": ("agent/processes.py",),
+    "rich": ("failover/cli/render.py",),
+    "shtab": ("failover/cli/completion.py",),
+}
+"""Each outside dependency that is not plain arithmetic enters through one file."""
+
+FORBIDDEN_WORDS = frozenset({"manager", "helper", "helpers", "util", "utils", "handler", "data", "info", "misc", "common"})
+
+REGISTRY_HOSTS = tuple(
+    f"{name}.{top}" for name, top in (("pypi", "org"), ("pythonhosted", "org"), ("deb", "debian"), ("npmjs", "org"))
+)
+
+
+def tracked_files() -> list[Path]:
+    """Every file of the project: what git tracks, or, outside a clone, what lies there."""
+    listed = subprocess.run(["git", "-C", ROOT, "ls-files", "-z"], capture_output=True, check=False)
+    if listed.returncode == 0:
+        return [ROOT / name for name in listed.stdout.decode().split("\0") if name and (ROOT / name).is_file()]
+    return [path for path in ROOT.rglob("*") if path.is_file() and ".venv" not in path.parts]
+
+
+def sources(*floors: str) -> list[Path]:
+    """The Python files of the given floors, whether tracked yet or not."""
+    return sorted(path for floor in floors for path in (ROOT / floor).rglob("*.py"))
+
+
+def name_of(path: Path) -> str:
+    """A file's path inside the project, as the rules name it."""
+    return path.relative_to(ROOT).as_posix()
+
+
+def package_of(path: Path) -> list[str]:
+    """The package that a relative import in this file starts from."""
+    return list(path.relative_to(ROOT).parent.parts)
+
+
+def imports(tree: ast.AST, package: list[str]) -> Iterator[tuple[int, str]]:
+    """Every import anywhere in a file, also inside functions and of names given as text: (line, dotted module)."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            start = package[: len(package) - node.level + 1] if node.level else []
+            module = ".".join([*start, *([node.module] if node.module else [])])
+            yield from ((node.lineno, f"{module}.{alias.name}" if module else alias.name) for alias in node.names)
+        elif isinstance(node, ast.Call) and called(node) in ("__import__", "import_module"):
+            first = node.args[0] if node.args else None
+            if isinstance(first, ast.Constant) and isinstance(first.value, str):
+                yield node.lineno, first.value
+
+
+def called(node: ast.Call) -> str:
+    """The last part of the name that a call calls, "" for anything fancier."""
+    return node.func.id if isinstance(node.func, ast.Name) else node.func.attr if isinstance(node.func, ast.Attribute) else ""
+
+
+def parsed(path: Path) -> ast.Module:
+    """A source file as a tree."""
+    return ast.parse(path.read_text(), str(path))
+
+
+# --- Arrows ----------------------------------------------------------------------------------------------------------
+
+
+def upward(path: Path, tree: ast.AST) -> list[str]:
+    """The imports of a file that point at a floor above its own."""
+    floor = FLOORS.index(path.relative_to(ROOT).parts[0])
+    above = FLOORS[floor + 1 :]
+    return [
+        f"{name_of(path)}:{line} imports {module}: arrows go agent → failover → checkpoint, never up"
+        for line, module in imports(tree, package_of(path))
+        if module.split(".")[0] in above
+    ]
+
+
+def test_every_arrow_points_down() -> None:
+    assert [wrong for path in sources(*FLOORS) for wrong in upward(path, parsed(path))] == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import agent",
+        "from agent import loop",
+        "def f():\n    import agent.loop",
+        "from ..agent import loop",
+        "import importlib\nimportlib.import_module('agent.loop')",
+        "if True:\n    from agent.loop import Loop",
+    ],
+)
+def test_an_arrow_that_points_up_is_seen_wherever_it_hides(text: str) -> None:
+    assert upward(ROOT / "failover" / "errors.py", ast.parse(text)) != [] or ".." in text
+    assert upward(ROOT / "failover" / "core" / "node.py", ast.parse(text.replace("..agent", "...agent"))) != []
+
+
+# --- Purity ----------------------------------------------------------------------------------------------------------
+
+
+def is_pure(path: Path) -> bool:
+    """Whether the house rules call a file pure."""
+    return name_of(path).startswith(PURE_FILES)
+
+
+def impurities(path: Path, tree: ast.AST) -> list[str]:
+    """What a pure file imports or calls that it should not."""
+    found = [
+        f"{name_of(path)}:{line} imports {module}"
+        for line, module in imports(tree, package_of(path))
+        if module.split(".")[0] not in PURE_IMPORTS and not is_pure_name(module)
+    ]
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)]
+    return found + [f"{name_of(path)}:{node.lineno} calls {called(node)}" for node in calls if called(node) in IMPURE_CALLS]
+
+
+def is_pure_name(module: str) -> bool:
+    """Whether a dotted name lies in a pure file or room, or in the error families."""
+    path = module.replace(".", "/")
+    return path.startswith(("failover/core", "failover/errors", *(pure.removesuffix(".py") for pure in PURE_FILES)))
+
+
+def test_the_pure_rooms_are_pure() -> None:
+    pure = [path for path in sources("checkpoint", "failover") if is_pure(path)]
+    assert [wrong for path in pure for wrong in impurities(path, parsed(path))] == []
+
+
+@pytest.mark.parametrize(
+    "text", ["import time", "def f():\n    import socket", "from random import choice", "open('x')", "import checkpoint.store"]
+)
+def test_an_impurity_is_seen(text: str) -> None:
+    assert impurities(ROOT / "failover" / "core" / "node.py", ast.parse(text)) != []
+
+
+# --- Doors -----------------------------------------------------------------------------------------------------------
+
+
+def test_each_dependency_enters_through_its_door() -> None:
+    wrong = [
+        f"{name_of(path)}:{line} imports {module}: its only door is {', '.join(doors)}"
+        for path in sources(*FLOORS)
+        for line, module in imports(parsed(path), package_of(path))
+        if (doors := DOORS.get(module.split(".")[0])) and name_of(path) not in doors
+    ]
+    assert wrong == []
+
+
+def test_the_keeper_alone_loads_the_gpl_library() -> None:
+    """python-ptrace must never be in a process of ours other than the keeper: no face may pull it in."""
+    modules = ", ".join(name_of(path).removesuffix(".py").replace("/", ".") for path in sources("failover", "agent"))
+    script = f"import sys\nimport {modules}\nprint([name for name in sys.modules if name.split('.')[0] == 'ptrace'])"
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert ran.stdout.strip() == "[]"
+
+
+# --- Names -----------------------------------------------------------------------------------------------------------
+
+
+def words(name: str) -> list[str]:
+    """A name's words: ``PageStore`` and ``page_store`` are both page, store."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower().strip("_").split("_")
+
+
+def unwelcome(name: str) -> bool:
+    """Whether a name says nothing: manager, helper, do_…"""
+    return bool(FORBIDDEN_WORDS.intersection(words(name))) or (words(name)[0] == "do" and len(words(name)) > 1)
+
+
+def test_no_name_that_says_nothing() -> None:
+    wrong = [name_of(path) for path in sources(*FLOORS) if unwelcome(path.stem)]
+    for path in sources(*FLOORS):
+        wrong += [
+            f"{name_of(path)}:{node.lineno} {node.name}"
+            for node in ast.walk(parsed(path))
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) and unwelcome(node.name)
+        ]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("name", ["PeerManager", "do_capture", "file_utils", "SignalHandler", "read_data"])
+def test_a_name_that_says_nothing_is_seen(name: str) -> None:
+    assert unwelcome(name)
+    assert not unwelcome("database_path")
+
+
+# --- Files and documents ---------------------------------------------------------------------------------------------
+
+
+def test_no_file_names_a_package_registry() -> None:
+    wrong = []
+    for path in tracked_files():
+        content = path.read_bytes()
+        wrong += [f"{name_of(path)} names {host}" for host in REGISTRY_HOSTS if host.encode() in content]
+    assert wrong == []
+
+
+def test_the_development_set_is_pinned_by_version_and_hash() -> None:
+    text = (ROOT / "requirements-dev.txt").read_text()
+    entries = re.split(r"\n(?=\S)", re.sub(r"(?m)^#.*\n", "", text).strip())
+    assert len(entries) > 20
+    for entry in entries:
+        assert re.match(r"[a-z0-9.\-]+==\S+ \\\n", entry), entry.splitlines()[0]
+        assert "--hash=sha256:" in entry
+
+
+def mentioned_verbs(text: str) -> set[str]:
+    """The verbs that a document tells the reader to type: ``failover VERB`` in code spans and code blocks."""
+    code = re.findall(r"```.*?```|`[^`\n]+`", text, flags=re.DOTALL)
+    return {verb for piece in code for verb in re.findall(r"(?:^|[\s`$(|])failover ([a-z][a-z-]*)\b", piece)}
+
+
+def test_documents_mention_only_verbs_that_exist() -> None:
+    from failover.cli.parser import verbs
+
+    known = set(verbs())
+    documents = [path for path in tracked_files() if path.suffix == ".md"]
+    unknown = {name_of(path): sorted(mentioned_verbs(path.read_text()) - known) for path in documents}
+    assert {name: verbs for name, verbs in unknown.items() if verbs} == {}
+
+
+def test_a_verb_that_does_not_exist_is_seen() -> None:
+    assert mentioned_verbs("type `failover fly 3` now") == {"fly"}
