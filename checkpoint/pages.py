@@ -1,0 +1,252 @@
+"""Sets of pages, zero pages and page sums: arithmetic over arrays, no system call.
+
+A *set of pages* here is a numpy array of shape ``(count, 2)`` and type uint64: extents ``[start, end)`` in address
+order that neither touch nor overlap. Every function below returns such arrays; ``extents`` makes one from anything.
+
+The *page sum* is the sum, in two lanes modulo 2⁶⁴, of the digests of all pages that a state holds. It does not depend on
+the order of the pages, so writing, adding or dropping a page changes it by that page's digest alone. It finds
+accidents and diverged histories; it is no guard against a stranger (the file's blake3 digests are).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import xxhash
+from numpy.typing import NDArray
+
+from checkpoint.model import PageRun, Vma
+
+Words = NDArray[np.uint64]
+"""Unsigned 64-bit words: addresses (count,), extents (count, 2) or lanes of digests (count, 2)."""
+
+Flags = NDArray[np.bool_]
+Buffer = bytes | bytearray | memoryview
+"""Bytes of pages, in address order."""
+
+DIGEST_SIZE = 16
+"""Bytes of one page digest, and of a page sum."""
+
+EMPTY_SUM = bytes(DIGEST_SIZE)
+"""The page sum of a state that holds no page."""
+
+_LANE = np.dtype("<u8")
+
+
+# Sets of pages
+
+
+def extents(runs: Iterable[PageRun | Vma]) -> Words:
+    """The set that runs or mappings cover, whatever their order and overlap."""
+    pairs = sorted((run.start, run.end) for run in runs if run.start < run.end)
+    ordered = np.array(pairs, dtype=np.uint64).reshape(-1, 2)
+    if not len(ordered):
+        return ordered
+    reach = np.maximum.accumulate(ordered[:, 1])
+    first = np.concatenate(([True], ordered[1:, 0] > reach[:-1]))
+    last = np.concatenate((first[1:], [True]))
+    return np.stack((ordered[first, 0], reach[last]), axis=1)
+
+
+def page_runs(pages: Words) -> tuple[PageRun, ...]:
+    """The same set as the model's values."""
+    return tuple(PageRun(start, end) for start, end in pages.tolist())
+
+
+def union(left: Words, right: Words) -> Words:
+    """Pages of either set."""
+    return _combined(left, right, np.logical_or)
+
+
+def intersection(left: Words, right: Words) -> Words:
+    """Pages of both sets."""
+    return _combined(left, right, np.logical_and)
+
+
+def difference(left: Words, right: Words) -> Words:
+    """Pages of ``left`` that are not in ``right``."""
+    return _combined(left, right, np.greater)
+
+
+def _combined(left: Words, right: Words, rule: Callable[[Flags, Flags], Flags]) -> Words:
+    """Walk over every boundary of both sets; an extent opens and closes where the rule's answer changes."""
+    points = np.unique(np.concatenate((left.ravel(), right.ravel())))
+    inside = rule(covered(left, points), covered(right, points))
+    before = np.concatenate(([False], inside[:-1]))
+    return np.stack((points[inside & ~before], points[~inside & before]), axis=1)
+
+
+def covered(pages: Words, addresses: Words) -> Flags:
+    """For each address whether it lies in the set."""
+    opened = np.searchsorted(pages[:, 0], addresses, side="right")
+    closed = np.searchsorted(pages[:, 1], addresses, side="right")
+    return opened > closed
+
+
+def total_size(pages: Words) -> int:
+    """Bytes that the set covers."""
+    return int((pages[:, 1] - pages[:, 0]).sum())
+
+
+def addresses_of(pages: Words, page_size: int) -> Words:
+    """The address of every page of the set, in order."""
+    counts = ((pages[:, 1] - pages[:, 0]) // np.uint64(page_size)).astype(np.int64)
+    firsts = np.repeat(pages[:, 0], counts)
+    index_in_run = np.arange(len(firsts)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return firsts + index_in_run.astype(np.uint64) * np.uint64(page_size)
+
+
+def extents_of_addresses(addresses: Words, page_size: int) -> Words:
+    """The set of the pages at these addresses, which are in order and all different."""
+    if not len(addresses):
+        return np.empty((0, 2), dtype=np.uint64)
+    step = np.uint64(page_size)
+    first = np.concatenate(([True], addresses[1:] - addresses[:-1] != step))
+    last = np.concatenate((first[1:], [True]))
+    return np.stack((addresses[first], addresses[last] + step), axis=1)
+
+
+# Contents of pages
+
+
+def zero_pages(contents: Buffer, page_size: int) -> Flags:
+    """For each page of the buffer whether all its bytes are zero."""
+    words = _rows(contents, page_size).view(np.uint64)
+    samples = words[:, :: max(1, words.shape[1] // 4)]
+    zero: Flags = np.logical_not(samples.any(axis=1))  # most pages are known not to be zero by four of their words
+    candidates = np.flatnonzero(zero)
+    zero[candidates] = np.logical_not(words[candidates].any(axis=1))
+    return zero
+
+
+def digest_pages(contents: Buffer, addresses: Words, page_size: int) -> Words:
+    """The digest of each page: two little-endian lanes of xxh3_128 with the page's address as the seed.
+
+    Args:
+        contents: ``len(addresses) × page_size`` bytes.
+
+    Returns:
+        Lanes of shape ``(count, 2)``.
+    """
+    rows = _rows(contents, page_size)
+    assert len(rows) == len(addresses), "one address for every page"
+    packed = b"".join(map(xxhash.xxh3_128_digest, rows, addresses.tolist()))
+    return np.frombuffer(packed, dtype=_LANE).astype(np.uint64, copy=False).reshape(-1, 2)
+
+
+def sum_of(lanes: Words) -> bytes:
+    """The page sum of the pages with these digests, 16 bytes."""
+    return _packed(lanes.sum(axis=0, dtype=np.uint64))
+
+
+def add_to_sum(page_sum: bytes, added: Words, removed: Words) -> bytes:
+    """The page sum after pages with the digests ``added`` came and those with ``removed`` went."""
+    lanes = np.frombuffer(page_sum, dtype=_LANE).astype(np.uint64)
+    return _packed(lanes + added.sum(axis=0, dtype=np.uint64) - removed.sum(axis=0, dtype=np.uint64))
+
+
+def _packed(lanes: Words) -> bytes:
+    return lanes.astype(_LANE).tobytes()
+
+
+def _rows(contents: Buffer, page_size: int) -> NDArray[np.uint8]:
+    """The buffer as one row a page, without copying."""
+    return np.frombuffer(contents, dtype=np.uint8).reshape(-1, page_size)
+
+
+# What a state holds at each page
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PageMap:
+    """Which pages a state holds, and two words about each (a digest, or where its content lies).
+
+    Attributes:
+        addresses: in order, all different.
+        words: shape ``(len(addresses), 2)``.
+    """
+
+    addresses: Words
+    words: Words
+
+    @classmethod
+    def empty(cls) -> PageMap:
+        """A state without pages."""
+        return cls(np.empty(0, dtype=np.uint64), np.empty((0, 2), dtype=np.uint64))
+
+    def without(self, kept: Words, forgotten: Words) -> tuple[PageMap, Words]:
+        """Drop the pages outside the set ``kept`` and those in ``forgotten``.
+
+        Returns:
+            What is left, and the words of the pages that went.
+        """
+        dropped = ~_covered_in_order(kept, self.addresses) | _covered_in_order(forgotten, self.addresses)
+        if not dropped.any():
+            return self, self.words[:0]
+        return PageMap(self.addresses[~dropped], self.words[~dropped]), self.words[dropped]
+
+    def overlaid(self, addresses: Words, words: Words) -> tuple[PageMap, Words]:
+        """Set pages, replacing or adding; ``addresses`` are in order and all different.
+
+        Returns:
+            The new map, and the words of the pages that were replaced.
+        """
+        places = np.searchsorted(self.addresses, addresses)
+        known = self.addresses[np.minimum(places, len(self.addresses) - 1)] == addresses if len(self.addresses) else places < 0
+        replaced = self.words[places[known]]
+        changed = self.words.copy()
+        changed[places[known]] = words[known]
+        if known.all():
+            return PageMap(self.addresses, changed), replaced
+        fresh = ~known
+        return (
+            PageMap(
+                np.insert(self.addresses, places[fresh], addresses[fresh]),
+                np.insert(changed, places[fresh], words[fresh], axis=0),
+            ),
+            replaced,
+        )
+
+
+def _covered_in_order(pages: Words, addresses: Words) -> Flags:
+    """Like ``covered``, for addresses in order: the work grows with the extents, not with the addresses."""
+    edges = np.zeros(len(addresses) + 1, dtype=np.int32)
+    np.add.at(edges, np.searchsorted(addresses, pages[:, 0]), 1)
+    np.subtract.at(edges, np.searchsorted(addresses, pages[:, 1]), 1)
+    inside: Flags = np.cumsum(edges[:-1]) > 0
+    return inside
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PageTable:
+    """The digest of every page of a state, and their sum. Immutable: ``apply`` answers with the next one.
+
+    Kept by the side that captures, to know the sum without hashing the whole, and by the side that checks a chain.
+
+    Attributes:
+        page_sum: as in ``Snapshot.page_sum``.
+    """
+
+    page_size: int
+    pages: PageMap
+    page_sum: bytes
+
+    @classmethod
+    def empty(cls, page_size: int) -> PageTable:
+        """The table of a state without pages."""
+        return cls(page_size, PageMap.empty(), EMPTY_SUM)
+
+    def apply(self, cleared: Iterable[PageRun], runs: Iterable[PageRun], contents: Buffer, vmas: Iterable[Vma]) -> PageTable:
+        """The table after a snapshot: drop what lies outside ``vmas`` or in ``cleared``, then set the pages of ``runs``.
+
+        Args:
+            contents: bytes of ``runs``, in address order.
+        """
+        addresses = addresses_of(extents(runs), self.page_size)
+        digests = digest_pages(contents, addresses, self.page_size)
+        kept, dropped = self.pages.without(extents(vmas), extents(cleared))
+        pages, replaced = kept.overlaid(addresses, digests)
+        page_sum = add_to_sum(self.page_sum, digests, np.concatenate((dropped, replaced)))
+        return PageTable(self.page_size, pages, page_sum)
