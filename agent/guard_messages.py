@@ -1,0 +1,181 @@
+"""What agent and guard say to each other (ARCHITECTURE.md, section 5). Arguments and environment are bytes: programs' are.
+
+Stream descriptors travel with `Started` and `VesselReady`, in this order: counters, read end 1, read end 2, log 1, log 2.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+
+class Message(msgspec.Struct, frozen=True, tag=True):
+    """The base of them all: a frozen struct, told apart by its class name."""
+
+
+class Start(Message):
+    """Start a program, and be its parent.
+
+    Attributes:
+        component: its name; remembered, so that a restarted agent learns whose guard this is.
+        environment: each ``NAME=value``.
+        isolate: in PID and time namespaces of its own.
+        log_directory: where `agent.streams.OutputLogs` are.
+        cgroup: a cgroup v2 directory to make the component's own cgroup in; "" for the guard's.
+    """
+
+    component: str
+    argv: tuple[bytes, ...]
+    environment: tuple[bytes, ...]
+    working_directory: bytes
+    umask: int
+    isolate: bool
+    log_directory: str
+    cgroup: str = ""
+
+
+class MakeVessel(Message):
+    """Make a vessel for a restore, and be its parent. With the keeper's pidfd: before `Commit`, its end is the vessel's end.
+
+    Attributes:
+        inner_pid: the PID that the program knows itself by; 0 for any.
+        monotonic_ns, boottime_ns: what the program's clocks must at least read now (its snapshot's, with the outage added).
+        totals: bytes that the program had written to its two streams.
+    """
+
+    component: str
+    inner_pid: int
+    isolate: bool
+    monotonic_ns: int
+    boottime_ns: int
+    totals: tuple[int, int]
+    log_directory: str
+    cgroup: str = ""
+
+
+class Watch(Message):
+    """Look after a process that is somebody else's child: its end is noticed, its exit status is not known."""
+
+    component: str
+    pid: int
+
+
+class Commit(Message):
+    """The vessel has become the component: from here on it outlives agent and keeper."""
+
+
+class Lease(Message):
+    """Freeze the component by yourself when CLOCK_MONOTONIC passes ``until_ns``; 0 for no lease. A later one thaws it again."""
+
+    until_ns: int
+
+
+class Freeze(Message):
+    """Hold the component still until `Thaw`."""
+
+
+class Thaw(Message):
+    """Let it go on; refused while its lease is over."""
+
+
+class Kill(Message):
+    """Send the program a signal; SIGKILL goes to whatever else it started, too."""
+
+    signal: int
+
+
+class Describe(Message):
+    """How does the component stand?"""
+
+
+class LetGo(Message):
+    """Protection ends, the program runs on: no lease any more; the guard keeps its streams and ends when it ends."""
+
+
+class Forget(Message):
+    """The exit status has been noted; the guard may end. Refused while the component lives."""
+
+
+class Started(Message):
+    """The program runs, or will as soon as it is scheduled."""
+
+    pid: int
+    inner_pid: int
+    isolated: bool
+    notes: tuple[str, ...] = ()
+
+
+class VesselReady(Message):
+    """The vessel waits for the keeper."""
+
+    pid: int
+    inner_pid: int
+    isolated: bool
+    notes: tuple[str, ...] = ()
+
+
+class Watching(Message):
+    """The process is there and is looked after."""
+
+    notes: tuple[str, ...] = ()
+
+
+class Done(Message):
+    """What was asked has been done."""
+
+
+class Described(Message):
+    """How the component stands.
+
+    Attributes:
+        state: none: nothing was started yet; vessel: not committed yet.
+        frozen_by: who holds it: "" nobody, "order" the agent, "lease" the guard.
+        exit_status: as wait(2) gives it; None before the end, and for a process that was not our child.
+        totals: bytes written to the two streams so far.
+        freezes_by: "cgroup" (invisible to the program) or "SIGSTOP".
+        blocked: why output is held back, "" if it is not.
+    """
+
+    component: str
+    state: Literal["none", "vessel", "running", "frozen", "ended"]
+    pid: int
+    inner_pid: int
+    isolated: bool
+    watched: bool
+    frozen_by: Literal["", "order", "lease"]
+    exit_status: int | None
+    totals: tuple[int, int]
+    lease_until_ns: int
+    log_directory: str
+    freezes_by: Literal["", "cgroup", "SIGSTOP"]
+    blocked: str
+    notes: tuple[str, ...]
+
+
+class Refused(Message):
+    """It was not done; the component is as it was."""
+
+    message: str
+
+
+class Exited(Message):
+    """The component ended; said to every agent that connects, until `Forget`.
+
+    Attributes:
+        status: as wait(2) gives it; None for a process that was not our child.
+        totals: bytes written to the two streams, complete.
+    """
+
+    status: int | None
+    totals: tuple[int, int]
+    notes: tuple[str, ...] = ()
+
+
+class FrozenByLease(Message):
+    """The lease ran out and the guard froze the component; an event."""
+
+
+Request = Start | MakeVessel | Watch | Commit | Lease | Freeze | Thaw | Kill | Describe | LetGo | Forget
+Reply = Started | VesselReady | Watching | Done | Described | Refused
+Event = Exited | FrozenByLease

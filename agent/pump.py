@@ -1,0 +1,163 @@
+"""Moves a program's output from its pipes into its logs, counting every byte, and never lets the program die of it.
+
+The counters are shared with the keeper, so that a snapshot's output is exact without asking anybody during a freeze
+(ARCHITECTURE.md, section 4). A byte is counted when it leaves the pipe and written afterwards, outside ``busy``: a slow disk never
+prolongs a freeze, and the keeper finds the bytes in the log after the thaw.
+
+The disk is full: the oldest half of the log is given back to it first. If that does not help, nothing is dropped: the pump tries again
+until there is room, the pipe fills, and the program waits inside its next write. It is not killed, and goes on without a gap.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import mmap
+import os
+import select
+import threading
+import time
+from typing import Final
+
+from agent.streams import KEEP_LIMIT, STREAMS, TRIM_STEP, OutputLogs
+
+READ_SIZE: Final = 256 << 10
+"""Bytes taken at once; the only output ever held in this process's memory."""
+
+PIPE_SIZE: Final = 256 << 10
+"""Asked of the kernel for each pipe; bounds what a snapshot carries unread. A smaller pipe works too."""
+
+COUNTERS_SIZE: Final = mmap.PAGESIZE
+RETRY_S: Final = 0.1
+"""Between two attempts to write to a disk that is full."""
+
+CUT_FLOOR: Final = TRIM_STEP
+"""Bytes of a log that are never given back for want of space: newer than any snapshot still being taken."""
+
+
+class Counters:
+    """Four u64 in a memfd that the keeper maps too: busy 1, count 1, busy 2, count 2. One writer: the pump's thread."""
+
+    def __init__(self, totals: tuple[int, int]) -> None:
+        self.descriptor = os.memfd_create("failover-streams", os.MFD_CLOEXEC)
+        os.ftruncate(self.descriptor, COUNTERS_SIZE)
+        self._mapping = mmap.mmap(self.descriptor, COUNTERS_SIZE)
+        self._words = memoryview(self._mapping).cast("Q")  # an item is stored by one eight-byte move, never in parts
+        self._words[1], self._words[3] = totals
+
+    def count(self, stream: int) -> int:
+        """Bytes of the stream that have left the pipe, since the component's first."""
+        return self._words[stream * 2 - 1]
+
+    def totals(self) -> tuple[int, int]:
+        """Both counts."""
+        return self._words[1], self._words[3]
+
+    def take(self, stream: int, pipe: int) -> bytes:
+        """Read from the pipe and count, as one act in the keeper's eyes.
+
+        Raises:
+            BlockingIOError: the pipe is empty.
+        """
+        busy = stream * 2 - 2
+        self._words[busy] = 1
+        try:
+            content = os.read(pipe, READ_SIZE)
+            self._words[busy + 1] += len(content)
+        finally:
+            self._words[busy] = 0
+        return content
+
+
+class Pump:
+    """Two pipes, two logs, one thread of its own: a disk that hangs must not keep the guard from its lease."""
+
+    def __init__(self, logs: OutputLogs, totals: tuple[int, int]) -> None:
+        self.logs = logs
+        self.counters = Counters(totals)
+        self.blocked = ""
+        """Why output is not being written now; "" while it is."""
+        self.read_ends: dict[int, int] = {}
+        self.write_ends: dict[int, int] = {}
+        for stream in STREAMS:
+            self.read_ends[stream], self.write_ends[stream] = _pipe()
+        self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._drained = threading.Event()
+        self._draining = False
+        self._thread = threading.Thread(target=self._run, name="pump", daemon=True)
+
+    def start(self) -> None:
+        """Begin to pump. Fork before this: afterwards the process has two threads."""
+        for descriptor in self.write_ends.values():
+            os.close(descriptor)
+        self.write_ends.clear()
+        self._thread.start()
+
+    def drain(self, patience_s: float) -> bool:
+        """The program has ended: wait until what it left in the pipes is in the logs; False if the disk took longer."""
+        self._draining = True
+        os.eventfd_write(self._wake, 1)
+        return self._drained.wait(patience_s)
+
+    def _run(self) -> None:
+        poll = select.poll()
+        poll.register(self._wake, select.POLLIN)
+        streams = {pipe: stream for stream, pipe in self.read_ends.items()}
+        for pipe in streams:
+            poll.register(pipe, select.POLLIN)
+        while True:
+            ready = [descriptor for descriptor, _ in poll.poll(0 if self._draining else None)]
+            if not ready and self._draining:
+                self._draining = False
+                self._drained.set()
+            for descriptor in ready:
+                if descriptor == self._wake:
+                    os.eventfd_read(self._wake)
+                elif not self._move(streams[descriptor], descriptor):
+                    poll.unregister(descriptor)  # every writer closed it: nothing will ever come again
+
+    def _move(self, stream: int, pipe: int) -> bool:
+        """Move one pipeful; False at the end of the stream."""
+        offset = self.counters.count(stream)
+        try:
+            content = self.counters.take(stream, pipe)
+        except BlockingIOError:
+            return True
+        self._store(stream, offset, memoryview(content))
+        return bool(content)
+
+    def _store(self, stream: int, offset: int, rest: memoryview) -> None:
+        while rest:
+            try:
+                written = self.logs.write(stream, offset, rest)
+            except OSError as error:
+                self.blocked = f"output of the program is held back: cannot write {self.logs.directory}: {error.strerror}"
+                self._make_room(stream, error)
+                continue
+            offset, rest = offset + written, rest[written:]
+        if self.blocked:
+            self.blocked = ""
+        if offset % TRIM_STEP < READ_SIZE:
+            self.logs.trim(stream, offset - KEEP_LIMIT)
+
+    def _make_room(self, stream: int, error: OSError) -> None:
+        """Give the older half of both logs back, if the disk is full and they are long enough; else wait a moment."""
+        gave = False
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            for each in STREAMS:
+                bounds = self.logs.bounds(each)
+                kept = bounds.size - bounds.start
+                gave |= kept > 2 * CUT_FLOOR and self.logs.trim(each, bounds.size - max(kept // 2, CUT_FLOOR))
+        if not gave:
+            time.sleep(RETRY_S)
+
+
+def _pipe() -> tuple[int, int]:
+    """A pipe whose read end never blocks; the write end does, so that a program waits and does not fail."""
+    read_end, write_end = os.pipe2(os.O_CLOEXEC)
+    os.set_blocking(read_end, False)
+    try:
+        fcntl.fcntl(read_end, fcntl.F_SETPIPE_SZ, PIPE_SIZE)
+    except OSError:  # the user's share of pipe memory is used up: the kernel's own size does as well
+        pass
+    return read_end, write_end

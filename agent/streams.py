@@ -1,0 +1,194 @@
+"""What a component wrote, as two log files in one directory: on its primary and, rebuilt from snapshots, on each standby.
+
+A byte's place in a log file is its place in the stream, from the component's very first byte; no restart or takeover renumbers it.
+Three numbers bound a stream: ``start <= committed <= size``.
+
+* Bytes before ``start`` were given back to the disk (a log keeps `KEEP_LIMIT` bytes); they read as zeros and are never served.
+* Bytes before ``committed`` belong to a checkpoint: every robot that has them has the same ones, and no takeover takes them back.
+* Bytes up to ``size`` were written by a program whose newest state is not acknowledged yet; a restore cuts them off.
+
+``start`` and ``committed`` stand in the file ``offsets`` (four little-endian u64: start 1, committed 1, start 2, committed 2). Neither
+needs to survive a power cut by itself: a restore gets its totals from the snapshot.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from agent import kernel
+from checkpoint.model import OutputPiece
+
+STREAMS: Final = (1, 2)
+"""Standard output and standard error, by the descriptor that the program knows them as."""
+
+LOG_NAMES: Final = {1: "stdout.log", 2: "stderr.log"}
+OFFSETS_NAME: Final = "offsets"
+
+KEEP_LIMIT: Final = 256 << 20
+"""Bytes of one stream that stay readable; older ones are given back to the disk, so that a flood cannot fill it."""
+
+TRIM_STEP: Final = 16 << 20
+"""Bytes given back at a time: one system call a step, and a multiple of every filesystem's block."""
+
+READ_LIMIT: Final = 1 << 20
+"""Most bytes that one `OutputLogs.read` returns."""
+
+START: Final = 0
+COMMITTED: Final = 1
+_OFFSET: Final = struct.Struct("<Q")
+FAR_AWAY: Final = 1 << 40
+"""An offset, a multiple of `TRIM_STEP`, to try out whether holes can be made."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """Where one stream begins, what of it is committed, and where it ends; all in bytes from the component's first."""
+
+    start: int
+    committed: int
+    size: int
+
+
+class OutputLogs:
+    """The two logs of one component on this robot, open for reading and writing.
+
+    Any number of processes may have them open: the guard appends, the agent commits and reads. On a standby only the agent writes.
+
+    Raises (all methods): OSError, from the filesystem.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        """Open the logs, making the directory (0700) and the files (0600) if they are not there."""
+        self.directory = directory
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._offsets = _open(directory / OFFSETS_NAME)
+        self._logs = {stream: _open(directory / LOG_NAMES[stream]) for stream in STREAMS}
+        self.trims = _can_trim(self._logs[1])
+        """Whether old bytes can be given back here; otherwise the logs grow until the disk is full."""
+
+    def close(self) -> None:
+        """Let the files go; what was written stays."""
+        for descriptor in (self._offsets, *self._logs.values()):
+            os.close(descriptor)
+
+    def descriptor(self, stream: int) -> int:
+        """The log's file descriptor; it stays this object's."""
+        return self._logs[stream]
+
+    def bounds(self, stream: int) -> Bounds:
+        """Where the stream stands now."""
+        size = os.fstat(self._logs[stream]).st_size
+        return Bounds(min(self._offset(stream, START), size), min(self._offset(stream, COMMITTED), size), size)
+
+    def totals(self) -> tuple[int, int]:
+        """Bytes in each log, committed or not."""
+        return self.bounds(1).size, self.bounds(2).size
+
+    def read(self, stream: int, offset: int, size: int = READ_LIMIT, *, committed: bool = True) -> OutputPiece:
+        """The stream's bytes from ``offset`` on, at most ``size``; fewer, or none, where the stream ends.
+
+        The piece says where it begins: later than asked where the beginning is no longer kept.
+
+        Args:
+            committed: only what no takeover can take back; otherwise also what the program wrote since.
+        """
+        while True:
+            bounds = self.bounds(stream)
+            begin = max(offset, bounds.start)
+            end = min(bounds.committed if committed else bounds.size, begin + min(size, READ_LIMIT))
+            content = os.pread(self._logs[stream], end - begin, begin) if end > begin else b""
+            if self._offset(stream, START) <= begin:  # otherwise it was given back while we read, and we may have read zeros
+                return OutputPiece(stream, begin, content)
+
+    def write(self, stream: int, offset: int, content: bytes | memoryview) -> int:
+        """Write at ``offset``; returns the bytes written, which may be fewer than given (write(2))."""
+        return os.pwrite(self._logs[stream], content, offset)
+
+    def apply(self, pieces: Iterable[OutputPiece]) -> None:
+        """Make the committed stream end as a snapshot says it does. Applying the same snapshot again changes nothing.
+
+        Pieces come from the snapshots of one chain, in its order. Whatever lay beyond a piece's end was written by a history that did
+        not survive and goes. Where the log ends before a piece begins, the stream's kept part starts with the piece.
+        """
+        for piece in pieces:
+            bounds = self.bounds(piece.stream)
+            if piece.offset > bounds.size:
+                self._set_offset(piece.stream, START, piece.offset)
+            _write_whole(self._logs[piece.stream], piece.content, piece.offset)
+            total = piece.offset + len(piece.content)
+            os.ftruncate(self._logs[piece.stream], total)
+            self._set_offset(piece.stream, COMMITTED, total)
+            self.trim(piece.stream, total - KEEP_LIMIT)
+
+    def commit(self, totals: tuple[int, int]) -> None:
+        """Say that a checkpoint holds the streams up to ``totals``. Never goes back: an older acknowledgement changes nothing."""
+        for stream, total in zip(STREAMS, totals, strict=True):
+            if total > self._offset(stream, COMMITTED):
+                self._set_offset(stream, COMMITTED, total)
+
+    def truncate(self, totals: tuple[int, int]) -> None:
+        """Make the streams end at ``totals``, all of it committed: what a program restored from there has written so far."""
+        for stream, total in zip(STREAMS, totals, strict=True):
+            if total > self.bounds(stream).size:
+                self._set_offset(stream, START, total)
+            os.ftruncate(self._logs[stream], total)
+            self._set_offset(stream, COMMITTED, total)
+
+    def trim(self, stream: int, start: int) -> bool:
+        """Give the bytes before ``start`` back to the disk, in whole steps; returns whether any were."""
+        old = self._offset(stream, START)
+        new = start - start % TRIM_STEP
+        if not self.trims or new <= old:
+            return False
+        self._set_offset(stream, START, new)  # first: nobody may be served the zeros
+        begin = old - old % TRIM_STEP
+        kernel.punch_hole(self._logs[stream], begin, new - begin)
+        return True
+
+    def _offset(self, stream: int, which: int) -> int:
+        content = os.pread(self._offsets, _OFFSET.size, _place(stream, which))
+        return int(_OFFSET.unpack(content)[0]) if len(content) == _OFFSET.size else 0
+
+    def _set_offset(self, stream: int, which: int, value: int) -> None:
+        os.pwrite(self._offsets, _OFFSET.pack(value), _place(stream, which))
+
+
+def total_of(pieces: Iterable[OutputPiece]) -> tuple[int, int]:
+    """Where the streams end after ``pieces``: the totals that a restore from their snapshot continues at."""
+    totals = {1: 0, 2: 0}
+    for piece in pieces:
+        totals[piece.stream] = max(totals[piece.stream], piece.offset + len(piece.content))
+    return totals[1], totals[2]
+
+
+def _place(stream: int, which: int) -> int:
+    return ((stream - 1) * 2 + which) * _OFFSET.size
+
+
+def _open(path: Path) -> int:
+    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+
+
+def _can_trim(descriptor: int) -> bool:
+    """Ask for a hole where no file ends."""
+    try:
+        kernel.punch_hole(descriptor, FAR_AWAY, TRIM_STEP)
+    except OSError as error:
+        if error.errno in (errno.EOPNOTSUPP, errno.ENOSYS):
+            return False
+        raise
+    return True
+
+
+def _write_whole(descriptor: int, content: bytes, offset: int) -> None:
+    """Write all of it, however many calls it takes."""
+    rest = memoryview(content)
+    while rest:
+        written = os.pwrite(descriptor, rest, offset)
+        rest, offset = rest[written:], offset + written
