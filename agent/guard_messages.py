@@ -14,7 +14,7 @@ class Message(msgspec.Struct, frozen=True, tag=True):
     """The base of them all: a frozen struct, told apart by its class name."""
 
 
-class Start(Message):
+class Start(Message, frozen=True):
     """Start a program, and be its parent.
 
     Attributes:
@@ -35,7 +35,7 @@ class Start(Message):
     cgroup: str = ""
 
 
-class MakeVessel(Message):
+class MakeVessel(Message, frozen=True):
     """Make a vessel for a restore, and be its parent. With the keeper's pidfd: before `Commit`, its end is the vessel's end.
 
     Attributes:
@@ -54,50 +54,50 @@ class MakeVessel(Message):
     cgroup: str = ""
 
 
-class Watch(Message):
+class Watch(Message, frozen=True):
     """Look after a process that is somebody else's child: its end is noticed, its exit status is not known."""
 
     component: str
     pid: int
 
 
-class Commit(Message):
+class Commit(Message, frozen=True):
     """The vessel has become the component: from here on it outlives agent and keeper."""
 
 
-class Lease(Message):
+class Lease(Message, frozen=True):
     """Freeze the component by yourself when CLOCK_MONOTONIC passes ``until_ns``; 0 for no lease. A later one thaws it again."""
 
     until_ns: int
 
 
-class Freeze(Message):
+class Freeze(Message, frozen=True):
     """Hold the component still until `Thaw`."""
 
 
-class Thaw(Message):
+class Thaw(Message, frozen=True):
     """Let it go on; refused while its lease is over."""
 
 
-class Kill(Message):
+class Kill(Message, frozen=True):
     """Send the program a signal; SIGKILL goes to whatever else it started, too."""
 
     signal: int
 
 
-class Describe(Message):
+class Describe(Message, frozen=True):
     """How does the component stand?"""
 
 
-class LetGo(Message):
+class LetGo(Message, frozen=True):
     """Protection ends, the program runs on: no lease any more; the guard keeps its streams and ends when it ends."""
 
 
-class Forget(Message):
+class Forget(Message, frozen=True):
     """The exit status has been noted; the guard may end. Refused while the component lives."""
 
 
-class Started(Message):
+class Started(Message, frozen=True):
     """The program runs, or will as soon as it is scheduled."""
 
     pid: int
@@ -106,7 +106,7 @@ class Started(Message):
     notes: tuple[str, ...] = ()
 
 
-class VesselReady(Message):
+class VesselReady(Message, frozen=True):
     """The vessel waits for the keeper."""
 
     pid: int
@@ -115,17 +115,17 @@ class VesselReady(Message):
     notes: tuple[str, ...] = ()
 
 
-class Watching(Message):
+class Watching(Message, frozen=True):
     """The process is there and is looked after."""
 
     notes: tuple[str, ...] = ()
 
 
-class Done(Message):
+class Done(Message, frozen=True):
     """What was asked has been done."""
 
 
-class Described(Message):
+class Described(Message, frozen=True):
     """How the component stands.
 
     Attributes:
@@ -153,13 +153,13 @@ class Described(Message):
     notes: tuple[str, ...]
 
 
-class Refused(Message):
+class Refused(Message, frozen=True):
     """It was not done; the component is as it was."""
 
     message: str
 
 
-class Exited(Message):
+class Exited(Message, frozen=True):
     """The component ended; said to every agent that connects, until `Forget`.
 
     Attributes:
@@ -172,7 +172,7 @@ class Exited(Message):
     notes: tuple[str, ...] = ()
 
 
-class FrozenByLease(Message):
+class FrozenByLease(Message, frozen=True):
     """The lease ran out and the guard froze the component; an event."""
 
 

@@ -1,11 +1,11 @@
 """Moves a program's output from its pipes into its logs, counting every byte, and never lets the program die of it.
 
 The counters are shared with the keeper, so that a snapshot's output is exact without asking anybody during a freeze
-(ARCHITECTURE.md, section 4). A byte is counted when it leaves the pipe and written afterwards, outside ``busy``: a slow disk never
-prolongs a freeze, and the keeper finds the bytes in the log after the thaw.
+(ARCHITECTURE.md, section 4). A byte is counted when it leaves the pipe and written afterwards, outside ``busy``: a slow disk
+never prolongs a freeze, and the keeper finds the bytes in the log after the thaw.
 
-The disk is full: the oldest half of the log is given back to it first. If that does not help, nothing is dropped: the pump tries again
-until there is room, the pipe fills, and the program waits inside its next write. It is not killed, and goes on without a gap.
+The disk is full: the oldest half of the log is given back to it first. If that does not help, nothing is dropped: the pump tries
+again until there is room, the pipe fills, and the program waits inside its next write. It is not killed, and goes on without a gap.
 """
 
 from __future__ import annotations

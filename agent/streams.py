@@ -1,14 +1,14 @@
 """What a component wrote, as two log files in one directory: on its primary and, rebuilt from snapshots, on each standby.
 
-A byte's place in a log file is its place in the stream, from the component's very first byte; no restart or takeover renumbers it.
+A byte's place in a log file is its place in the stream, from the component's first byte; no restart or takeover renumbers it.
 Three numbers bound a stream: ``start <= committed <= size``.
 
 * Bytes before ``start`` were given back to the disk (a log keeps `KEEP_LIMIT` bytes); they read as zeros and are never served.
 * Bytes before ``committed`` belong to a checkpoint: every robot that has them has the same ones, and no takeover takes them back.
 * Bytes up to ``size`` were written by a program whose newest state is not acknowledged yet; a restore cuts them off.
 
-``start`` and ``committed`` stand in the file ``offsets`` (four little-endian u64: start 1, committed 1, start 2, committed 2). Neither
-needs to survive a power cut by itself: a restore gets its totals from the snapshot.
+``start`` and ``committed`` stand in the file ``offsets`` (four little-endian u64: start 1, committed 1, start 2, committed 2).
+Neither needs to survive a power cut by itself: a restore gets its totals from the snapshot.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Bounds:
 class OutputLogs:
     """The two logs of one component on this robot, open for reading and writing.
 
-    Any number of processes may have them open: the guard appends, the agent commits and reads. On a standby only the agent writes.
+    Any number of processes may have them open: the guard appends, the agent commits and reads. On a standby the agent writes.
 
     Raises (all methods): OSError, from the filesystem.
     """
@@ -113,8 +113,8 @@ class OutputLogs:
     def apply(self, pieces: Iterable[OutputPiece]) -> None:
         """Make the committed stream end as a snapshot says it does. Applying the same snapshot again changes nothing.
 
-        Pieces come from the snapshots of one chain, in its order. Whatever lay beyond a piece's end was written by a history that did
-        not survive and goes. Where the log ends before a piece begins, the stream's kept part starts with the piece.
+        Pieces come from the snapshots of one chain, in its order. Whatever lay beyond a piece's end was written by a history
+        that did not survive and goes. Where the log ends before a piece begins, the stream's kept part starts with the piece.
         """
         for piece in pieces:
             bounds = self.bounds(piece.stream)
