@@ -1,0 +1,134 @@
+"""Another process's memory: read and written in long vectors, without stopping it."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from checkpoint.errors import CaptureError, ProcessGoneError
+from checkpoint.linux import abi
+
+Ranges = NDArray[np.uint64]
+"""Shape (n, 2): address and length in bytes, one row a range; exactly an array of struct iovec."""
+
+MAX_TRANSFER: Final = 1 << 30
+"""Bytes that we ask of one call; the kernel itself stops short of 2 GiB (MAX_RW_COUNT)."""
+
+
+def ranges_of(pairs: list[tuple[int, int]] | tuple[tuple[int, int], ...]) -> Ranges:
+    """Make an array of (address, length) rows."""
+    return np.array(pairs, dtype=np.uint64).reshape(len(pairs), 2)
+
+
+def address_of(buffer: bytearray | memoryview | NDArray[np.uint8]) -> int:
+    """Where a writable buffer lies in our own memory; the caller keeps it alive."""
+    if isinstance(buffer, np.ndarray):
+        return int(buffer.ctypes.data)
+    return ctypes.addressof(ctypes.c_char.from_buffer(buffer))
+
+
+class Memory:
+    """The address space of one process, named by its PID.
+
+    Reading and writing honour the page protections and need no stop. `poke` goes through ``/proc/PID/mem``, which
+    ignores them (a private copy of the page is made); it needs the right to trace.
+    """
+
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+        self._local = abi.IoVec()
+
+    def read(self, address: int, size: int) -> bytes:
+        """Read ``size`` bytes.
+
+        Raises:
+            ProcessGoneError: the process has ended.
+            CaptureError: some of it is not mapped or not readable.
+        """
+        buffer = bytearray(size)
+        if size:
+            self.read_into(ranges_of([(address, size)]), buffer)
+        return bytes(buffer)
+
+    def read_into(self, ranges: Ranges, buffer: bytearray | memoryview | NDArray[np.uint8]) -> None:
+        """Read all ranges, one after the other, into ``buffer`` (as many bytes as the lengths add up to).
+
+        Raises:
+            ProcessGoneError: the process has ended.
+            CaptureError: one of them is not mapped or not readable; what was read until then is in the buffer.
+        """
+        self._transfer(abi.process_vm_readv, "read", ranges, address_of(buffer))
+
+    def write_from(self, ranges: Ranges, buffer: bytearray | memoryview | NDArray[np.uint8]) -> None:
+        """Write ``buffer`` to the ranges, one after the other. The mappings must be writable."""
+        self._transfer(abi.process_vm_writev, "write", ranges, address_of(buffer))
+
+    def write(self, address: int, content: bytes) -> None:
+        """Write ``content`` to a writable mapping."""
+        if content:
+            self.write_from(ranges_of([(address, len(content))]), bytearray(content))
+
+    def poke(self, address: int, content: bytes) -> None:
+        """Write whatever the protection says, through ``/proc/PID/mem`` (FOLL_FORCE).
+
+        Raises:
+            ProcessGoneError: the process has ended.
+            CaptureError: it is not mapped, or the kernel forbids it (``proc_mem.force_override=never``).
+        """
+        try:
+            descriptor = os.open(f"/proc/{self.pid}/mem", os.O_WRONLY | os.O_CLOEXEC)
+        except OSError as error:
+            raise self._failure("write", address, error.errno or 0) from error
+        try:
+            written = os.pwrite(descriptor, content, address)
+        except OSError as error:
+            raise self._failure("write", address, error.errno or 0) from error
+        finally:
+            os.close(descriptor)
+        if written != len(content):
+            raise self._failure("write", address + written, errno.EFAULT)
+
+    def _transfer(self, call: object, verb: str, ranges: Ranges, local: int) -> None:
+        lengths = ranges[:, 1]
+        for first in range(0, len(ranges), abi.IOV_MAX):
+            group = np.ascontiguousarray(ranges[first : first + abi.IOV_MAX])
+            want = int(lengths[first : first + abi.IOV_MAX].sum())
+            if want > MAX_TRANSFER:
+                self._transfer_long(call, verb, group, local)
+            else:
+                self._transfer_group(call, verb, group, local, want)
+            local += want
+
+    def _transfer_long(self, call: object, verb: str, group: Ranges, local: int) -> None:
+        for address, length in group.tolist():
+            for offset in range(0, length, MAX_TRANSFER):
+                size = min(MAX_TRANSFER, length - offset)
+                self._transfer_group(call, verb, ranges_of([(address + offset, size)]), local + offset, size)
+            local += length
+
+    def _transfer_group(self, call: object, verb: str, group: Ranges, local: int, want: int) -> None:
+        self._local.base, self._local.length = local, want
+        remote = int(group.ctypes.data)
+        got = call(self.pid, ctypes.addressof(self._local), 1, remote, len(group), 0)  # type: ignore[operator]
+        if got != want:
+            failed = ctypes.get_errno() if got < 0 else errno.EFAULT
+            raise self._failure(verb, self._first_unread(group, max(got, 0)), failed)
+
+    @staticmethod
+    def _first_unread(group: Ranges, done: int) -> int:
+        for address, length in group.tolist():
+            if done < length:
+                return int(address + done)
+            done -= length
+        return 0
+
+    def _failure(self, verb: str, address: int, number: int) -> CaptureError:
+        if number in (errno.ESRCH, errno.ENOENT):
+            return ProcessGoneError(f"cannot {verb} memory of pid {self.pid}: it has ended")
+        advice = "give the keeper the right to trace it (CAP_SYS_PTRACE)" if number == errno.EPERM else "capture it again"
+        return CaptureError(f"cannot {verb} memory of pid {self.pid} at {address:#x}: {os.strerror(number)}; {advice}")

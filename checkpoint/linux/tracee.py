@@ -1,0 +1,235 @@
+"""One traced thread: stopped, looked at, changed, let go. The only door to python-ptrace.
+
+Every call on one `Tracee` must come from the thread that seized it: the kernel knows tracers by thread. A tracer that
+dies lets go of everything; a thread that was only stopped runs on.
+
+Source: ptrace(2).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import time
+from dataclasses import dataclass
+from typing import Final
+
+from ptrace.binding.func import ptrace as _ptrace
+from ptrace.error import PtraceError
+
+from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError
+from checkpoint.linux import abi
+from checkpoint.linux.memory import Memory
+from checkpoint.model import Rseq
+
+REGISTERS_SIZE: Final = 4096
+"""Bytes offered for the general registers: more than any processor has."""
+XSTATE_SIZE: Final = 16384
+"""Bytes offered for the extended state: AMX's 11,008 fit."""
+STOP_TIMEOUT_S: Final = 2.0
+"""How long a thread may take to stop: a disk that sleeps answers within this, a dead network file system does not."""
+SPIN_S: Final = 0.001
+"""How long we look without sleeping: a thread stops within 0.1 ms when nothing holds it."""
+PEEK_COUNT: Final = 64
+"""Pending signals asked for in one call."""
+PENDING_LIMIT: Final = 4096
+"""Pending signals that we carry; RLIMIT_SIGPENDING is far above only for floods of queued signals."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Why a thread stands still.
+
+    Attributes:
+        event: the PTRACE_EVENT_* number, 0 for a stop before the delivery of ``signal``.
+        signal: SIGTRAP for a plain interrupt, the stopping signal for a group stop, else the signal to be delivered.
+    """
+
+    event: int
+    signal: int
+
+    @property
+    def is_delivery(self) -> bool:
+        """Whether a signal was taken from the queue and waits to be handed back by `Tracee.cont`."""
+        return self.event == 0
+
+
+class Tracee:
+    """One thread of another process, from `seize` to `detach`."""
+
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+        self.memory = Memory(pid)
+        self._registers = ctypes.create_string_buffer(REGISTERS_SIZE)
+        self._xstate = ctypes.create_string_buffer(XSTATE_SIZE)
+        self._iov = abi.IoVec()
+        self._mask = ctypes.c_uint64()
+
+    def request(self, what: str, request: int, address: int = 0, value: int = 0) -> int:
+        """Make one raw ptrace(2) request.
+
+        Args:
+            what: the request in words, for the error message.
+
+        Raises:
+            ProcessGoneError: there is no such thread any more, or it is not stopped for us.
+            ProbeError: we have no right to trace it.
+            CaptureError: anything else.
+        """
+        try:
+            return int(_ptrace(request, self.pid, address, value))
+        except PtraceError as error:
+            raise self._failure(what, error.errno or 0) from error
+
+    def _failure(self, what: str, number: int) -> CheckpointError:
+        on = f"cannot {what} pid {self.pid}"
+        if number == errno.ESRCH:
+            return ProcessGoneError(f"{on}: it has ended, or is not stopped")
+        if number == errno.EPERM:
+            return ProbeError(
+                f"{on}: not permitted; it is traced already, belongs to another user, or kernel.yama.ptrace_scope forbids it: "
+                "give the keeper CAP_SYS_PTRACE, see systemd/failover-agent.service"
+            )
+        return CaptureError(f"{on}: {os.strerror(number)}; capture it again")
+
+    # Stopping and letting go
+
+    def seize(self, options: int = 0) -> None:
+        """Become its tracer without disturbing it.
+
+        Raises:
+            ProbeError: not permitted, or traced by somebody else.
+        """
+        self.request("seize", abi.PTRACE_SEIZE, 0, options)
+
+    def interrupt(self) -> None:
+        """Ask it to stop; `wait` tells when it has."""
+        self.request("interrupt", abi.PTRACE_INTERRUPT)
+
+    def freeze(self, timeout_s: float = STOP_TIMEOUT_S) -> Stop:
+        """Stop it and return once it stands; a signal on its way is delivered first.
+
+        Raises:
+            ProcessGoneError: it ended instead.
+            CaptureError: it did not stop in time; it stops as soon as it can, call `freeze` again or `release`.
+        """
+        self.interrupt()
+        while (stop := self.wait(timeout_s)).is_delivery:
+            self.cont(stop.signal)
+        return stop
+
+    def wait(self, timeout_s: float = STOP_TIMEOUT_S) -> Stop:
+        """Wait for its next stop.
+
+        Raises:
+            ProcessGoneError: it ended.
+            CaptureError: it did not stop in time.
+        """
+        began = time.perf_counter()
+        while True:
+            try:
+                pid, status = os.waitpid(self.pid, abi.WALL | os.WNOHANG)
+            except ChildProcessError as error:
+                raise ProcessGoneError(f"pid {self.pid} ended while it was being looked at") from error
+            if pid:
+                return self._stop_of(status)
+            waited = time.perf_counter() - began
+            if waited > timeout_s:
+                raise CaptureError(
+                    f"pid {self.pid} did not stop within {timeout_s:g} s: it waits inside the kernel for a device or "
+                    "a file system; capture it again when that answers"
+                )
+            if waited < SPIN_S:
+                os.sched_yield()
+            else:
+                time.sleep(0.0001)
+
+    def _stop_of(self, status: int) -> Stop:
+        if not os.WIFSTOPPED(status):
+            raise ProcessGoneError(f"pid {self.pid} ended while it was being looked at")
+        return Stop(event=status >> 16, signal=os.WSTOPSIG(status))
+
+    def cont(self, signal: int = 0) -> None:
+        """Let it run, still traced; ``signal`` is delivered first unless 0."""
+        self.request("continue", abi.PTRACE_CONT, 0, signal)
+
+    def detach(self, signal: int = 0) -> None:
+        """Let it go for good; it must be stopped."""
+        self.request("detach from", abi.PTRACE_DETACH, 0, signal)
+
+    # Registers
+
+    def registers(self) -> bytes:
+        """Read the general registers (NT_PRSTATUS)."""
+        return self._getregset("read registers of", abi.NT_PRSTATUS, self._registers)
+
+    def set_registers(self, content: bytes) -> None:
+        """Write the general registers."""
+        self._setregset("write registers of", abi.NT_PRSTATUS, content, self._registers)
+
+    def xstate(self) -> bytes:
+        """Read the FPU and vector registers in XSAVE's own form (NT_X86_XSTATE)."""
+        return self._getregset("read vector registers of", abi.NT_X86_XSTATE, self._xstate)
+
+    def set_xstate(self, content: bytes) -> None:
+        """Write the FPU and vector registers."""
+        self._setregset("write vector registers of", abi.NT_X86_XSTATE, content, self._xstate)
+
+    def _getregset(self, what: str, kind: int, buffer: ctypes.Array[ctypes.c_char]) -> bytes:
+        self._iov.base, self._iov.length = ctypes.addressof(buffer), len(buffer)
+        self.request(what, abi.PTRACE_GETREGSET, kind, ctypes.addressof(self._iov))
+        return buffer.raw[: self._iov.length]
+
+    def _setregset(self, what: str, kind: int, content: bytes, buffer: ctypes.Array[ctypes.c_char]) -> None:
+        ctypes.memmove(buffer, content, len(content))
+        self._iov.base, self._iov.length = ctypes.addressof(buffer), len(content)
+        self.request(what, abi.PTRACE_SETREGSET, kind, ctypes.addressof(self._iov))
+
+    # Signals
+
+    def signal_mask(self) -> int:
+        """Read the mask that is in force once the present system call is over (sigsuspend's own is temporary)."""
+        self.request("read the signal mask of", abi.PTRACE_GETSIGMASK, abi.SIGSET_SIZE, ctypes.addressof(self._mask))
+        return self._mask.value
+
+    def set_signal_mask(self, mask: int) -> None:
+        """Set the mask; a temporary one (sigsuspend, ppoll) is forgotten, its call must be made again."""
+        self._mask.value = mask
+        self.request("set the signal mask of", abi.PTRACE_SETSIGMASK, abi.SIGSET_SIZE, ctypes.addressof(self._mask))
+
+    def pending(self, *, shared: bool) -> tuple[bytes, ...]:
+        """Read the queued signals, each a whole siginfo, oldest first; they stay queued.
+
+        Args:
+            shared: those sent to the process; otherwise those sent to this very thread.
+
+        Raises:
+            CaptureError: more than `PENDING_LIMIT` are queued.
+        """
+        found: list[bytes] = []
+        buffer = ctypes.create_string_buffer(PEEK_COUNT * abi.SIGINFO_SIZE)
+        flags = abi.PTRACE_PEEKSIGINFO_SHARED if shared else 0
+        while len(found) <= PENDING_LIMIT:
+            order = abi.PeekSiginfo(len(found), flags, PEEK_COUNT)
+            count = self.request(
+                "read pending signals of", abi.PTRACE_PEEKSIGINFO, ctypes.addressof(order), ctypes.addressof(buffer)
+            )
+            raw = buffer.raw
+            found += [raw[i * abi.SIGINFO_SIZE : (i + 1) * abi.SIGINFO_SIZE] for i in range(count)]
+            if count < PEEK_COUNT:
+                return tuple(found)
+        raise CaptureError(f"pid {self.pid} has more than {PENDING_LIMIT} signals queued; capture it when it has taken them")
+
+    def rseq(self) -> Rseq | None:
+        """Read its restartable-sequences registration; None without one, or where the kernel cannot tell."""
+        found = abi.RseqConfiguration()
+        try:
+            _ptrace(abi.PTRACE_GET_RSEQ_CONFIGURATION, self.pid, ctypes.sizeof(found), ctypes.addressof(found))
+        except PtraceError as error:
+            if error.errno == errno.EIO:
+                return None
+            raise self._failure("read the rseq area of", error.errno or 0) from error
+        if not found.address:
+            return None
+        return Rseq(found.address, found.size, found.signature, found.flags)
