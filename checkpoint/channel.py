@@ -1,0 +1,291 @@
+"""Messages and descriptors between two processes of one robot, and the keeper's own vocabulary.
+
+A channel is one end of a ``SOCK_SEQPACKET`` unix socket pair. Every packet is one byte of form and then msgpack of a tagged
+struct (`INLINE`), or nothing, the struct lying in a memfd that travels as the first descriptor (`IN_MEMFD`; hidden here).
+Both ends belong to one user; what comes is still decoded strictly, and a wrong message is an error, never a guess.
+"""
+
+from __future__ import annotations
+
+import array
+import contextlib
+import mmap
+import os
+import socket
+from typing import Any, Final, Generic, TypeVar
+
+import msgspec
+
+from checkpoint.engine import Report
+from checkpoint.errors import CheckpointError
+from checkpoint.model import Position
+
+INLINE: Final = b"\x00"
+IN_MEMFD: Final = b"\x01"
+INLINE_LIMIT: Final = 64 << 10
+"""Bytes of a message that travel in the packet itself; a larger one would not fit a socket's default buffer."""
+DESCRIPTOR_LIMIT: Final = 250
+"""Descriptors in one message: SCM_MAX_FD is 253; a chain of more files is folded by its sender first."""
+
+M = TypeVar("M")
+
+
+class ChannelError(CheckpointError):
+    """The other end sent something that is no message, or cannot be sent to."""
+
+
+class ChannelClosedError(ChannelError):
+    """The other end has gone."""
+
+
+class Channel(Generic[M]):
+    """One end of a conversation.
+
+    Args:
+        end: a connected SOCK_SEQPACKET unix socket; the channel owns it.
+        incoming: the union of the message types that may arrive, e.g. ``Request``.
+    """
+
+    def __init__(self, end: socket.socket, incoming: Any) -> None:
+        self._socket = end
+        self._decoder: msgspec.msgpack.Decoder[M] = msgspec.msgpack.Decoder(incoming)
+        self._encoder = msgspec.msgpack.Encoder()
+
+    def fileno(self) -> int:
+        """For select and poll: readable means that `receive` returns at once."""
+        return self._socket.fileno()
+
+    def send(self, message: msgspec.Struct, descriptors: tuple[int, ...] = ()) -> None:
+        """Send one message; the descriptors are copied, ours stay open.
+
+        Raises:
+            ChannelClosedError: nobody is there any more.
+            ChannelError: the socket does not take it (full while non-blocking, or too many descriptors).
+        """
+        if len(descriptors) > DESCRIPTOR_LIMIT:
+            raise ChannelError(
+                f"cannot send {type(message).__name__} with {len(descriptors)} descriptors: {DESCRIPTOR_LIMIT} is the limit"
+            )
+        body = self._encoder.encode(message)
+        if len(body) <= INLINE_LIMIT:
+            self._send_packet(INLINE + body, descriptors)
+            return
+        memfd = memfd_holding(body, "message")
+        try:
+            self._send_packet(IN_MEMFD, (memfd, *descriptors))
+        finally:
+            os.close(memfd)
+
+    def _send_packet(self, packet: bytes, descriptors: tuple[int, ...]) -> None:
+        ancillary = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", descriptors))] if descriptors else []
+        try:
+            self._socket.sendmsg([packet], ancillary, socket.MSG_NOSIGNAL)
+        except (BrokenPipeError, ConnectionResetError) as error:
+            raise ChannelClosedError("cannot send: the other end of the local socket has gone") from error
+        except OSError as error:
+            raise ChannelError(f"cannot send on the local socket: {error.strerror}") from error
+
+    def receive(self) -> tuple[M, tuple[int, ...]]:
+        """Wait for one message (as long as the socket's timeout says): it, and its descriptors, now ours to close.
+
+        Raises:
+            ChannelClosedError: the other end has gone.
+            ChannelError: what came is no message; its descriptors were closed.
+            TimeoutError: the socket has a timeout and nothing came.
+        """
+        try:
+            packet, descriptors = self._receive_packet()
+        except ConnectionResetError as error:
+            raise ChannelClosedError("the other end of the local socket has gone") from error
+        if not packet:
+            close_all(descriptors)
+            raise ChannelClosedError("the other end of the local socket has gone")
+        try:
+            if packet[:1] == IN_MEMFD and descriptors:
+                body = content_of(descriptors[0])
+                os.close(descriptors[0])
+                descriptors = descriptors[1:]
+            else:
+                body = packet[1:]
+            return self._decoder.decode(body), descriptors
+        except (msgspec.DecodeError, OSError) as error:
+            close_all(descriptors)
+            raise ChannelError(f"the other end of the local socket sent something that is no message: {error}") from error
+
+    def _receive_packet(self) -> tuple[bytes, tuple[int, ...]]:
+        room = socket.CMSG_SPACE((DESCRIPTOR_LIMIT + 1) * array.array("i").itemsize)
+        packet, ancillary, flags, _ = self._socket.recvmsg(INLINE_LIMIT + 1, room, socket.MSG_CMSG_CLOEXEC)
+        found = array.array("i")
+        for level, kind, content in ancillary:
+            if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
+                found.frombytes(content[: len(content) - len(content) % found.itemsize])
+        if flags & (socket.MSG_TRUNC | socket.MSG_CTRUNC):
+            close_all(tuple(found))
+            raise ChannelError("the other end of the local socket sent a message that is too long")
+        return packet, tuple(found)
+
+    def close(self) -> None:
+        """Hang up."""
+        self._socket.close()
+
+
+def close_all(descriptors: tuple[int, ...]) -> None:
+    """Close descriptors that came with a message."""
+    for descriptor in descriptors:
+        with contextlib.suppress(OSError):
+            os.close(descriptor)
+
+
+def memfd_holding(content: bytes | memoryview, name: str) -> int:
+    """Make a sealed memory file; the caller owns the descriptor.
+
+    Sealed: neither end can change or cut what the other is reading.
+    """
+    import fcntl
+
+    descriptor = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    view = memoryview(content)
+    while view:
+        view = view[os.write(descriptor, view) :]
+    seals = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE | fcntl.F_SEAL_SEAL
+    fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, seals)
+    return descriptor
+
+
+def content_of(descriptor: int) -> bytes:
+    """Read the whole of a memory file or a regular file, wherever its offset stands."""
+    size = os.fstat(descriptor).st_size
+    if not size:
+        return b""
+    with mmap.mmap(descriptor, size, prot=mmap.PROT_READ) as view:
+        return view[:]
+
+
+def pair() -> tuple[socket.socket, socket.socket]:
+    """Make both ends of a channel's socket."""
+    return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
+
+
+# What a keeper is asked
+
+
+class Probe(msgspec.Struct, frozen=True, tag=True):
+    """Look at a process without touching it. Answer: `Probed`."""
+
+    pid: int
+
+
+class Protect(msgspec.Struct, frozen=True, tag=True):
+    """Begin to follow a process. Answer: `Protected`.
+
+    With descriptors, if ``streams``: the counters' memfd, two pipe read ends, two log files.
+    """
+
+    pid: int
+    component: str
+    streams: bool = False
+    robot: str = ""
+
+
+class Capture(msgspec.Struct, frozen=True, tag=True):
+    """Take a snapshot. Answer: `Captured` with a sealed memfd that holds it encoded."""
+
+    base: bool
+    generation: int
+    sequence: int
+    epoch: int = 0
+
+
+class Acknowledge(msgspec.Struct, frozen=True, tag=True):
+    """A standby holds everything up to here. No answer."""
+
+    position: Position
+
+
+class Restore(msgspec.Struct, frozen=True, tag=True):
+    """Turn the vessel ``pid`` into the program; with descriptors: the chain's files, oldest first. Answer: `Restored`.
+
+    Attributes:
+        streams: the last five descriptors are the streams, as with `Protect`.
+    """
+
+    pid: int
+    component: str
+    elapsed_ns: int = 0
+    accept_changed: tuple[str, ...] = ()
+    streams: bool = False
+    robot: str = ""
+
+
+class Resume(msgspec.Struct, frozen=True, tag=True):
+    """Let the restored program go on. Answer: `Resumed`; it is protected from now on."""
+
+
+class Release(msgspec.Struct, frozen=True, tag=True):
+    """Let go of the process; it runs on. Answer: `Released`."""
+
+
+# What a keeper answers
+
+
+class Probed(msgspec.Struct, frozen=True, tag=True):
+    """What a capture would preserve."""
+
+    report: Report
+
+
+class Protected(msgspec.Struct, frozen=True, tag=True):
+    """The process is followed."""
+
+    notes: tuple[str, ...] = ()
+
+
+class Captured(msgspec.Struct, frozen=True, tag=True):
+    """A snapshot was taken.
+
+    Attributes:
+        size: bytes of the encoded snapshot.
+        dirty_bytes: of the pages that it carries, before compression.
+    """
+
+    position: Position
+    parent: Position | None
+    size: int
+    freeze_us: int
+    dirty_bytes: int
+    notes: tuple[str, ...] = ()
+
+
+class Restored(msgspec.Struct, frozen=True, tag=True):
+    """The program stands in the vessel, still stopped."""
+
+    pid: int
+    position: Position
+    notes: tuple[str, ...] = ()
+
+
+class Resumed(msgspec.Struct, frozen=True, tag=True):
+    """The program goes on; ``notes`` as of `Protected`."""
+
+    notes: tuple[str, ...] = ()
+
+
+class Released(msgspec.Struct, frozen=True, tag=True):
+    """The process runs on by itself."""
+
+
+class Failed(msgspec.Struct, frozen=True, tag=True):
+    """It did not work.
+
+    Attributes:
+        error: name of a class in ``checkpoint.errors``.
+        reasons: of `UnsupportedError` and `MismatchError`: one sentence each.
+    """
+
+    error: str
+    message: str
+    reasons: tuple[str, ...] = ()
+
+
+Request = Probe | Protect | Capture | Acknowledge | Restore | Resume | Release
+Reply = Probed | Protected | Captured | Restored | Resumed | Released | Failed

@@ -1,0 +1,198 @@
+"""The contract of an engine: a way to capture a process and to bring it back.
+
+An engine finds out (`Engine.probe`), protects (`Engine.protect` opens a `Session`) and restores. Whoever uses one needs nothing
+from below this file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from checkpoint.errors import ProbeError
+from checkpoint.model import Position, Snapshot
+
+KEPT: Final = "kept"
+REFUSED: Final = "refused"
+NOTED: Final = "noted"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that a process holds.
+
+    Attributes:
+        kind: which file of ``checkpoint.resources`` speaks ("files", "unsupported" …), or "process", "memory", "tracking".
+        name: what holds it: "fd 7", "thread 413", "VMA 7f00-7f01".
+        verdict: `KEPT` (comes back as it was), `NOTED` (comes back, with the difference told in ``text``), `REFUSED`.
+        text: one sentence; for a refusal it says what to do about it.
+    """
+
+    kind: str
+    name: str
+    verdict: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What a capture of one process would preserve, found without touching it.
+
+    Attributes:
+        command: its arguments, joined by blanks.
+        resident_size: bytes of memory in use.
+        tracking: how its written pages would be found: "pagemap", "soft-dirty" or "digest".
+    """
+
+    pid: int
+    command: str
+    resident_size: int
+    tracking: str
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def supported(self) -> bool:
+        """Whether nothing stands against a capture."""
+        return not self.reasons
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why not, one sentence each."""
+        return tuple(finding.text for finding in self.findings if finding.verdict == REFUSED)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What will differ, one sentence each."""
+        return tuple(finding.text for finding in self.findings if finding.verdict == NOTED)
+
+
+@dataclass(frozen=True, slots=True)
+class Streams:
+    """The guard's end of a component's standard streams: descriptors of *this* process.
+
+    Attributes:
+        counters: memfd, little-endian u64 ``[busy1, count1, busy2, count2]`` (ARCHITECTURE §4).
+        outputs: read ends of the pipes (or the pseudo-terminal's masters) of standard output and standard error.
+        logs: the files that the guard appends what it has read to.
+    """
+
+    counters: int
+    outputs: tuple[int, int]
+    logs: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureOrder:
+    """What the next snapshot is to be.
+
+    Attributes:
+        base: whole, whatever was acknowledged; a delta is made only when this is False and a position was acknowledged.
+        generation, sequence: of the position that it gets.
+        robot: name of the robot, "" for a one-shot capture.
+    """
+
+    base: bool = True
+    generation: int = 1
+    sequence: int = 1
+    epoch: int = 0
+    robot: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class RestoreOptions:
+    """How a program is to come back.
+
+    Attributes:
+        elapsed_ns: time between the snapshot and now, as far as known; the program's clocks go on by this much.
+        accept_changed: paths of files that may differ from what the snapshot recorded (rule ``shared``).
+    """
+
+    elapsed_ns: int = 0
+    accept_changed: tuple[str, ...] = ()
+
+
+class Session(Protocol):
+    """One protected process. Every call comes from the thread that opened it."""
+
+    notes: tuple[str, ...]
+    """What is not as it could be: a fallback that was taken, something that will differ."""
+
+    def capture(self, order: CaptureOrder) -> Snapshot:
+        """Take one snapshot; the program runs on whatever happens.
+
+        Raises:
+            ProcessGoneError: it ended.
+            UnsupportedError: it has turned into something that cannot be captured.
+            CaptureError: this one did not work; nothing was forgotten, a later one may.
+        """
+        ...
+
+    def acknowledge(self, position: Position) -> None:
+        """A standby holds everything up to ``position``: what was written before it may be forgotten."""
+        ...
+
+    def close(self) -> None:
+        """Let go; the program runs on unchanged. Further calls do nothing."""
+        ...
+
+
+class Restored(Protocol):
+    """A program that was brought back and stands still until `resume`."""
+
+    pid: int
+    """As this process sees it."""
+    position: Position
+    """Of the snapshot that it stands at."""
+    notes: tuple[str, ...]
+
+    def resume(self) -> None:
+        """Let it go on."""
+        ...
+
+
+class Engine(Protocol):
+    """A way to capture and restore."""
+
+    name: str
+
+    def probe(self, pid: int) -> Report:
+        """Look at a process without touching it.
+
+        Raises:
+            ProbeError: it cannot be looked into at all.
+        """
+        ...
+
+    def protect(self, pid: int, component: str, streams: Streams | None) -> Session:
+        """Begin to follow a process.
+
+        Args:
+            streams: the guard's ends of its standard streams, if it lives under a guard; the session owns them from now on.
+
+        Raises:
+            ProbeError: it cannot be looked into at all.
+            UnsupportedError: it holds something that cannot be preserved; it was not touched.
+        """
+        ...
+
+    def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
+        """Turn a waiting vessel into the program of a base.
+
+        Raises:
+            MismatchError: this machine lacks something; nothing was started.
+            RestoreError: it did not work; the caller kills the vessel and nothing is left.
+        """
+        ...
+
+
+def engine_named(name: str) -> Engine:
+    """Look an engine up.
+
+    Raises:
+        ProbeError: there is none of that name.
+    """
+    if name != "ptrace":
+        raise ProbeError(f"no engine is called {name!r}: choose ptrace")
+    from checkpoint.engines.ptrace import PtraceEngine
+
+    return PtraceEngine()
