@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import ctypes
-import ctypes.util
 import os
 import time
 from typing import Final
 
-MCL_CURRENT: Final = 1
-MCL_FUTURE: Final = 2
+from agent import kernel
+
 HEART_PRIORITY: Final = 60
 """SCHED_FIFO priority of the heart: just above the interrupt threads of a PREEMPT_RT kernel (50), below its watchdogs (99)."""
 
@@ -37,8 +35,8 @@ def become_realtime() -> tuple[str, ...]:
             f"beats run at normal priority: SCHED_FIFO was refused ({error.strerror}); under load a live robot may be taken for "
             "dead; give the agent CAP_SYS_NICE or a LimitRTPRIO, see systemd/failover-agent.service"
         )
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.mlockall(MCL_CURRENT | MCL_FUTURE) != 0:
-        why = os.strerror(ctypes.get_errno())
-        notes.append(f"the heart's memory can be swapped out: mlockall was refused ({why}); give the agent CAP_IPC_LOCK")
+    try:
+        kernel.lock_memory()
+    except OSError as error:
+        notes.append(f"the heart's memory can be swapped out: {error.strerror}; give the agent CAP_IPC_LOCK")
     return tuple(notes)

@@ -140,7 +140,7 @@ def load(path: Path) -> Settings:
     return Settings(config, members, secret)
 
 
-def _check_keys(path: Path, config: Config, members: team.Team) -> None:
+def _check_keys(path: Path, config: Config, members: Team) -> None:
     """With keys everybody has one: a single robot without would stay shut out for ever, unexplained."""
     without = sorted(name for name, robot in members.robots.items() if not robot.public_key)
     if without and not config.insecure:

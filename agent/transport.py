@@ -1,0 +1,327 @@
+"""The bulk lane: ZeroMQ between agents, authenticated and encrypted by CURVE. The only ``zmq`` import.
+
+One ROUTER socket hears everybody; one DEALER socket speaks to each peer. A connection carries one direction's messages, in
+order. What is queued for a connection is gone when the connection is: the core says again what still matters.
+
+Who speaks is known by key, not by claim: the ZAP answer below admits only public keys of the team file and names their owner.
+Source: rfc.zeromq.org/spec/25 (CURVE), /27 (ZAP); zmq_setsockopt(3), zmq_socket_monitor(3).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import enum
+import logging
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import zmq
+import zmq.asyncio
+from zmq.utils import z85
+from zmq.utils.monitor import parse_monitor_message
+
+from agent.errors import LaneError
+from agent.lane_messages import CHUNK_SIZE, Chunk, Message, Word, decode, encode
+
+QUEUE_LIMIT: Final = 1_024
+"""Messages waiting for one peer, chunks not counted: a peer that takes none for so long has lost them anyway."""
+
+HIGH_WATER: Final = 6
+"""Messages inside ZeroMQ for one peer: what is in there can no longer be overtaken by a vote."""
+
+MESSAGE_LIMIT: Final = CHUNK_SIZE + (64 << 10)
+"""Bytes of one frame from a stranger; more closes the connection."""
+
+RECONNECT_FIRST_MS: Final = 50
+RECONNECT_MOST_MS: Final = 2_000
+"""ZeroMQ doubles the pause from first to most and adds a random part of its own."""
+
+RETRANSMIT_LIMIT_MS: Final = 3_000
+"""A connection whose bytes stay unacknowledged so long is dead (TCP_USER_TIMEOUT); the beats have known it much earlier."""
+
+HANDSHAKE_LIMIT_MS: Final = 5_000
+
+ZAP_ADDRESS: Final = "inproc://zeromq.zap.01"
+ZAP_DOMAIN: Final = b"failover"
+
+log = logging.getLogger("failover.lane")
+
+
+class LinkState(enum.StrEnum):
+    """How the connection *to* a peer stands."""
+
+    CONNECTING = "connecting"
+    CONNECTED = "connected"
+    REFUSED = "refused"
+    DOWN = "down"
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """This robot's pair and everybody's public keys by name; Z85. Empty strings: no encryption."""
+
+    public: str
+    secret: str
+    peers: Mapping[str, str]
+
+    @property
+    def present(self) -> bool:
+        """Whether the lane is authenticated and encrypted."""
+        return bool(self.secret)
+
+
+Receive = Callable[[str, Message, bytes], None]
+"""Called with (peer, message, the second frame or b"")."""
+
+Changed = Callable[[str, LinkState, str], None]
+"""Called with (peer, state, reason) when a connection changed."""
+
+
+def new_keys() -> tuple[str, str]:
+    """A fresh (public, secret) pair, Z85."""
+    public, secret = zmq.curve_keypair()
+    return public.decode(), secret.decode()
+
+
+def public_key_of(secret: str) -> str:
+    """The public half of a secret key.
+
+    Raises:
+        LaneError: it is no key.
+    """
+    try:
+        return zmq.curve_public(secret.encode()).decode()
+    except (zmq.ZMQError, ValueError) as error:
+        raise LaneError("this robot's secret key is not a CURVE key of 40 characters; failover team enrol makes one") from error
+
+
+class Link:
+    """The way to one peer: a DEALER socket, what waits for it, and how its connection stands."""
+
+    def __init__(self, context: zmq.asyncio.Context, me: str, peer: str, address: str, keys: Keys, changed: Changed) -> None:
+        self.peer = peer
+        self.state = LinkState.CONNECTING
+        self.reason = ""
+        self._changed = changed
+        self._words: deque[bytes] = deque(maxlen=QUEUE_LIMIT)
+        self._chunk: tuple[bytes, bytes, asyncio.Future[None]] | None = None
+        self._wake = asyncio.Event()
+        self._socket = context.socket(zmq.DEALER)
+        _limits(self._socket)
+        self._socket.setsockopt(zmq.IDENTITY, me.encode())
+        self._socket.setsockopt(zmq.IMMEDIATE, 1)
+        self._socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_FIRST_MS)
+        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MOST_MS)
+        self._socket.setsockopt(zmq.TCP_MAXRT, RETRANSMIT_LIMIT_MS)
+        if keys.present:
+            self._socket.curve_publickey = keys.public.encode()
+            self._socket.curve_secretkey = keys.secret.encode()
+            self._socket.curve_serverkey = keys.peers[peer].encode()
+        self._monitor = self._socket.get_monitor_socket()
+        self._socket.connect(f"tcp://{address}")
+        self._tasks = (asyncio.create_task(self._watch()), asyncio.create_task(self._send()))
+
+    def say(self, message: Message) -> None:
+        """Queue a small message; it overtakes chunks. Dropped where there is no connection."""
+        if self.state is LinkState.CONNECTED:
+            self._words.append(encode(message))
+            self._wake.set()
+
+    async def ship(self, chunk: Chunk, content: bytes) -> None:
+        """Send one chunk after all small messages; returns when ZeroMQ has taken it.
+
+        Raises:
+            LaneError: the connection is down, or went down meanwhile.
+        """
+        while self._chunk is not None and self.state is LinkState.CONNECTED:
+            with contextlib.suppress(LaneError):
+                await asyncio.shield(self._chunk[2])
+        if self.state is not LinkState.CONNECTED:
+            raise LaneError(f"the bulk lane to {self.peer} is down: {self.reason or self.state}")
+        done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._chunk = (encode(chunk), content, done)
+        self._wake.set()
+        await done
+
+    def refuse(self, reason: str) -> None:
+        """Talk no further with this peer until it connects anew: it broke the rules."""
+        self._enter(LinkState.REFUSED, reason)
+
+    async def close(self) -> None:
+        """Let the connection go; nothing lingers."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        self._socket.disable_monitor()
+        self._monitor.close(0)
+        self._socket.close(0)
+        self._fail_chunk("the agent ends")
+
+    async def _send(self) -> None:
+        """Whatever waits, small messages first, one at a time, so that little is committed to the socket's own queue."""
+        while True:
+            await self._wake.wait()
+            if self._words:
+                await self._socket.send(self._words.popleft())
+            elif self._chunk is not None:
+                head, content, done = self._chunk
+                await self._socket.send_multipart([head, content])
+                self._chunk = None if self._chunk and self._chunk[2] is done else self._chunk
+                if not done.done():
+                    done.set_result(None)
+            else:
+                self._wake.clear()
+
+    async def _watch(self) -> None:
+        """Follow the connection's events."""
+        while True:
+            event = parse_monitor_message(await self._monitor.recv_multipart())
+            kind = event["event"]
+            if kind == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                self._enter(LinkState.CONNECTED, "")
+            elif kind in (zmq.EVENT_HANDSHAKE_FAILED_AUTH, zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL):
+                self._enter(LinkState.REFUSED, _refusal(self.peer, kind))
+            elif kind == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL:
+                self._enter(LinkState.REFUSED, f"{self.peer} closed the connection during the handshake: wrong key, or no agent")
+            elif kind == zmq.EVENT_DISCONNECTED and self.state is not LinkState.REFUSED:
+                self._enter(LinkState.CONNECTING, "the connection was lost")
+            elif kind == zmq.EVENT_CLOSED and self.state is LinkState.CONNECTING:
+                self._enter(LinkState.CONNECTING, "nobody listens there")
+
+    def _enter(self, state: LinkState, reason: str) -> None:
+        if (state, reason) == (self.state, self.reason):
+            return
+        self.state, self.reason = state, reason
+        if state is not LinkState.CONNECTED:
+            self._words.clear()
+            self._fail_chunk(reason)
+        self._changed(self.peer, state, reason)
+
+    def _fail_chunk(self, reason: str) -> None:
+        waiting, self._chunk = self._chunk, None
+        if waiting is not None and not waiting[2].done():
+            waiting[2].set_exception(LaneError(f"the bulk lane to {self.peer} went down: {reason}"))
+
+
+class BulkLane:
+    """All connections of this robot. Lives in one asyncio loop."""
+
+    def __init__(self, me: str, bind: str, peers: Mapping[str, str], keys: Keys, receive: Receive, changed: Changed) -> None:
+        """
+        Args:
+            bind: "host:port" to listen at.
+            peers: "host:port" by name.
+        """
+        self._me = me
+        self._bind = bind
+        self._peers = peers
+        self._keys = keys
+        self._receive = receive
+        self._changed = changed
+        self._context = zmq.asyncio.Context()
+        self._tasks: list[asyncio.Task[None]] = []
+        self.links: dict[str, Link] = {}
+        self.strangers = 0
+
+    def open(self) -> None:
+        """Listen, and begin to connect to everybody.
+
+        Raises:
+            LaneError: the address cannot be had.
+        """
+        if self._keys.present:
+            gate = self._context.socket(zmq.REP)
+            gate.bind(ZAP_ADDRESS)
+            self._tasks.append(asyncio.create_task(self._admit(gate)))
+        router = self._context.socket(zmq.ROUTER)
+        _limits(router)
+        router.setsockopt(zmq.ROUTER_HANDOVER, 1)
+        if self._keys.present:
+            router.curve_server = True
+            router.curve_secretkey = self._keys.secret.encode()
+            router.zap_domain = ZAP_DOMAIN
+        try:
+            router.bind(f"tcp://{self._bind}")
+        except zmq.ZMQError as error:
+            router.close(0)
+            raise LaneError(
+                f"cannot listen for snapshots at {self._bind}: {error.strerror}; is another agent running, or is it not ours?"
+            ) from error
+        self._tasks.append(asyncio.create_task(self._hear(router)))
+        for peer, address in self._peers.items():
+            self.links[peer] = Link(self._context, self._me, peer, address, self._keys, self._changed)
+
+    def say(self, peer: str, message: Message) -> None:
+        """Queue a small message to a peer; dropped when it is not connected."""
+        self.links[peer].say(message)
+
+    async def ship(self, peer: str, chunk: Chunk, content: bytes) -> None:
+        """Send one chunk; see `Link.ship`."""
+        await self.links[peer].ship(chunk, content)
+
+    async def close(self) -> None:
+        """Close every socket and wait for the tasks."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.gather(*(link.close() for link in self.links.values()))
+        self._context.destroy(linger=0)
+
+    async def _hear(self, router: zmq.asyncio.Socket) -> None:
+        """Every message of every peer, in order; what is malformed or of a stranger is counted and dropped."""
+        try:
+            while True:
+                frames = await router.recv_multipart(copy=False)
+                peer = self._speaker(frames)
+                message = decode(frames[1].buffer) if peer and len(frames) in (2, 3) else None
+                if message is None:
+                    self.strangers += 1
+                    continue
+                self._receive(peer, message, frames[2].bytes if len(frames) == 3 else b"")
+        finally:
+            router.close(0)
+
+    def _speaker(self, frames: list[Any]) -> str:
+        """The peer whose message this is, by its key; "" for a stranger or a peer under another's name."""
+        claimed = bytes(frames[0].bytes).decode(errors="replace")
+        if claimed not in self._peers:
+            return ""
+        if self._keys.present and frames[1].get("User-Id") != claimed:
+            return ""
+        return claimed
+
+    async def _admit(self, gate: zmq.asyncio.Socket) -> None:
+        """Answer ZeroMQ's question who may connect: the owners of the team's keys, by name."""
+        owners = {z85.decode(key.encode()): name for name, key in self._keys.peers.items() if key}
+        try:
+            while True:
+                version, request, _domain, address, _identity, mechanism, *credentials = await gate.recv_multipart()
+                owner = owners.get(credentials[0]) if mechanism == b"CURVE" and len(credentials) == 1 else None
+                if owner is None:
+                    self.strangers += 1
+                    log.warning("refused a stranger's key from %s on the bulk lane", address.decode(errors="replace"))
+                status = (b"200", b"OK", owner.encode()) if owner else (b"400", b"not in the team", b"")
+                await gate.send_multipart([version, request, *status, b""])
+        finally:
+            gate.close(0)
+
+
+def _limits(socket: zmq.asyncio.Socket) -> None:
+    socket.setsockopt(zmq.LINGER, 0)
+    socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
+    socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
+    socket.setsockopt(zmq.MAXMSGSIZE, MESSAGE_LIMIT)
+    socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_LIMIT_MS)
+    socket.setsockopt(zmq.IPV6, 1)
+
+
+def _refusal(peer: str, kind: int) -> str:
+    if kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+        return f"{peer} does not know this robot's key: bring the same team.toml to every robot"
+    return f"the handshake with {peer} broke off: its key is not the one in team.toml, or one side runs without keys"
+
+
+__all__ = ["BulkLane", "Keys", "Link", "LinkState", "Word", "new_keys", "public_key_of"]
