@@ -1,0 +1,81 @@
+"""x86-64 machine code that a restore runs: what a vessel waits in, and the loop that makes many system calls at once.
+
+Data only, each with its assembly beside it. Sources: System V ABI (AMD64 supplement), elf(5), syscall(2).
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+LOAD_ADDRESS: Final = 0x400000
+"""Where the little programs below are mapped. A restore unmaps them before it maps the snapshot, so any place would do."""
+
+WAIT: Final = bytes.fromhex(
+    "b822000000"  # again:  mov  eax, 34        pause(2)
+    "0f05"  #               syscall
+    "ebf7"  #               jmp  again
+)
+"""Waits for ever. A vessel runs this until a restorer seizes it."""
+
+WATCH: Final = bytes.fromhex(
+    "48b80300000001000000"  #         mov  rax, {fd 3, POLLIN}
+    "50"  #                           push rax
+    "4889e7"  #               again:  mov  rdi, rsp
+    "be01000000"  #                   mov  esi, 1
+    "48c7c2ffffffff"  #               mov  rdx, -1
+    "b807000000"  #                   mov  eax, 7         poll(2)
+    "0f05"  #                         syscall
+    "83f801"  #                       cmp  eax, 1
+    "75e5"  #                         jne  again
+    "31ff"  #                         xor  edi, edi
+    "b8e7000000"  #                   mov  eax, 231       exit_group(2)
+    "0f05"  #                         syscall
+)
+"""Waits until descriptor 3 is readable (a pidfd: until its process has ended), then ends with status 0."""
+
+CALL_LOOP: Final = bytes.fromhex(
+    "4839eb"  #     next:  cmp  rbx, rbp       rbx: this call, rbp: end of the table
+    "7433"  #              je   stop
+    "488b03"  #            mov  rax, [rbx]
+    "488b7b08"  #          mov  rdi, [rbx+8]
+    "488b7310"  #          mov  rsi, [rbx+16]
+    "488b5318"  #          mov  rdx, [rbx+24]
+    "4c8b5320"  #          mov  r10, [rbx+32]
+    "4c8b4328"  #          mov  r8,  [rbx+40]
+    "4c8b4b30"  #          mov  r9,  [rbx+48]
+    "0f05"  #              syscall
+    "48894338"  #          mov  [rbx+56], rax
+    "483b4340"  #          cmp  rax, [rbx+64]  least result that is as expected
+    "7c0c"  #              jl   stop
+    "483b4348"  #          cmp  rax, [rbx+72]  greatest
+    "7f06"  #              jg   stop
+    "4883c350"  #          add  rbx, 80
+    "ebc8"  #              jmp  next
+    "cc"  #         stop:  int3
+)
+"""Makes the calls of a table in order and stops by a breakpoint: at its end, or at the first whose result was not expected.
+
+Needs no stack. Each call is ten little-endian words: number, six arguments, result, least, greatest (signed).
+"""
+
+CALL: Final = struct.Struct("<7Q3q")
+
+SYSCALL_INSTRUCTION: Final = b"\x0f\x05"
+
+
+def program(code: bytes) -> bytes:
+    """A static executable that runs ``code`` and nothing else: one segment, no libraries, a stack that cannot execute."""
+    header_size, segment_size = 64, 56
+    offset = header_size + 2 * segment_size
+    size = offset + len(code)
+    identity = b"\x7fELF" + bytes([2, 1, 1, 0]) + bytes(8)
+    executable, x86_64 = 2, 62
+    header = identity + struct.pack(
+        "<HHIQQQIHHHHHH", executable, x86_64, 1, LOAD_ADDRESS + offset, header_size, 0, 0, header_size, segment_size, 2, 64, 0, 0
+    )
+    load, read_execute = 1, 5
+    text = struct.pack("<IIQQQQQQ", load, read_execute, 0, LOAD_ADDRESS, LOAD_ADDRESS, size, size, 4096)
+    gnu_stack, read_write = 0x6474E551, 6
+    stack = struct.pack("<IIQQQQQQ", gnu_stack, read_write, 0, 0, 0, 0, 0, 16)
+    return header + text + stack + code

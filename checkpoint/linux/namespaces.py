@@ -1,0 +1,192 @@
+"""Namespaces of its own for one program: PIDs, clocks, mounts; inside a user namespace where we have no rights.
+
+Everything here is called in a short-lived child between its birth and the program's, never in a process that lives on.
+
+Sources: namespaces(7), user_namespaces(7), pid_namespaces(7), time_namespaces(7), clone(2), capabilities(7).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from checkpoint.model import Clocks
+
+CLONE_PARENT: Final = 0x00008000
+CLONE_NEWNS: Final = 0x00020000
+CLONE_NEWTIME: Final = 0x00000080
+CLONE_NEWUSER: Final = 0x10000000
+CLONE_NEWPID: Final = 0x20000000
+
+PR_SET_PDEATHSIG: Final = 1
+PR_CAP_AMBIENT: Final = 47
+PR_CAP_AMBIENT_RAISE: Final = 2
+PR_SET_PTRACER: Final = 0x59616D61
+
+CAP_CHECKPOINT_RESTORE: Final = 40
+
+_SYS_CLONE3: Final = 435
+_SYS_CLOSE_RANGE: Final = 436
+_CLOSE_RANGE_CLOEXEC: Final = 4
+_MS_NOSUID_NODEV_NOEXEC: Final = 2 | 4 | 8
+_MS_REC_SLAVE: Final = 16384 | (1 << 19)
+_CAPABILITY_VERSION_3: Final = 0x20080522
+_NS_PER_S: Final = 1_000_000_000
+
+# Holds the interpreter's lock across the call: in a child made by clone3 nobody else is there to hand it back.
+_libc = ctypes.PyDLL(None, use_errno=True)
+
+
+class _CloneArguments(ctypes.Structure):
+    """struct clone_args of clone(2), version 1 (80 bytes, Linux 5.5)."""
+
+    _fields_ = [
+        (name, ctypes.c_uint64)
+        for name in (
+            *("flags", "pidfd", "child_tid", "parent_tid", "exit_signal"),
+            *("stack", "stack_size", "tls", "set_tid", "set_tid_size"),
+        )
+    ]
+
+
+def sibling(pid: int = 0) -> int:
+    """Fork a child of our *parent*: 0 in the child, its PID here.
+
+    Args:
+        pid: the PID it must have in the PID namespace it is born into; 0: any.
+
+    Raises:
+        OSError: EEXIST when the PID is taken, EPERM when we may not choose.
+    """
+    wanted = (ctypes.c_int32 * 1)(pid)
+    arguments = _CloneArguments(flags=CLONE_PARENT)
+    if pid:
+        arguments.set_tid = ctypes.addressof(wanted)
+        arguments.set_tid_size = 1
+    return _checked(
+        _libc.syscall(ctypes.c_long(_SYS_CLONE3), ctypes.byref(arguments), ctypes.c_size_t(ctypes.sizeof(arguments))),
+        f"clone3(set_tid={pid})" if pid else "clone3",
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Entered:
+    """Which namespaces of its own the caller's next child will have.
+
+    Attributes:
+        notes: a sentence for each thing that was wanted and is not had.
+    """
+
+    pids: bool
+    clocks: bool
+    user: bool
+    notes: tuple[str, ...] = ()
+
+
+def enter(pids: bool, clocks: bool) -> Entered:
+    """Give the caller's children a PID namespace, a time namespace, or both, as far as this system lets us.
+
+    With PIDs come mounts of their own, so that a /proc that shows these PIDs can be mounted over ours.
+    """
+    notes: list[str] = []
+    attempts = [(pids, clocks)] + ([(True, False), (False, True)] if pids and clocks else [])
+    for with_pids, with_clocks in attempts:
+        if not (with_pids or with_clocks):
+            break
+        flags = (CLONE_NEWPID | CLONE_NEWNS if with_pids else 0) | (CLONE_NEWTIME if with_clocks else 0)
+        user, refusal = _unshare_as_permitted(flags)
+        if refusal is None:
+            if with_pids:
+                _checked(_libc.mount(None, b"/", None, ctypes.c_ulong(_MS_REC_SLAVE), None), "mount(/, MS_SLAVE)")
+            return Entered(with_pids, with_clocks, user, tuple(notes))
+        wanted = " and ".join(name for name, on in (("PIDs", with_pids), ("clocks", with_clocks)) if on)
+        notes.append(f"no namespace of its own for {wanted}: {refusal}")
+    return Entered(False, False, False, tuple(notes))
+
+
+def _unshare_as_permitted(flags: int) -> tuple[bool, str | None]:
+    """Unshare plainly, else inside a new user namespace: (whether a user namespace was made, why nothing could be done)."""
+    if _libc.unshare(flags) == 0:
+        return False, None
+    if ctypes.get_errno() != errno.EPERM:
+        return False, os.strerror(ctypes.get_errno())
+    uid, gid = os.geteuid(), os.getegid()
+    if _libc.unshare(flags | CLONE_NEWUSER) != 0:
+        return False, f"{os.strerror(ctypes.get_errno())}; allow user namespaces (sysctl user.max_user_namespaces) or run as root"
+    Path("/proc/self/uid_map").write_text(f"{uid} {uid} 1")
+    Path("/proc/self/setgroups").write_text("deny")
+    Path("/proc/self/gid_map").write_text(f"{gid} {gid} 1")
+    return True, None
+
+
+def set_clocks(clocks: Clocks, elapsed_ns: int) -> None:
+    """Make the children's monotonic and boot time go on from ``clocks`` plus what has elapsed since.
+
+    Call after ``enter`` and before the first child: the kernel fixes the offsets when a process comes in.
+
+    Args:
+        elapsed_ns: time since the reading; below zero counts as zero, so that the program's clocks never go back.
+
+    Raises:
+        OSError: the kernel refuses the offset (ERANGE: the clock would be negative or leave its range).
+    """
+    elapsed_ns = max(elapsed_ns, 0)
+    offsets = Path("/proc/self/timens_offsets")
+    now = {name: int(seconds) * _NS_PER_S + int(rest) for name, seconds, rest in map(str.split, offsets.read_text().splitlines())}
+    wanted = {"monotonic": (clocks.monotonic_ns, time.CLOCK_MONOTONIC), "boottime": (clocks.boottime_ns, time.CLOCK_BOOTTIME)}
+    lines = []
+    for name, (reading_ns, clock) in wanted.items():
+        seconds, rest = divmod(now[name] + reading_ns + elapsed_ns - time.clock_gettime_ns(clock), _NS_PER_S)
+        lines.append(f"{name} {seconds} {rest}\n")
+    offsets.write_text("".join(lines))
+
+
+def mount_proc() -> None:
+    """Mount a /proc that shows the caller's PID namespace over the one that is there.
+
+    Raises:
+        OSError: EPERM in a container whose own /proc is partly hidden.
+    """
+    _checked(_libc.mount(b"proc", b"/proc", b"proc", ctypes.c_ulong(_MS_NOSUID_NODEV_NOEXEC), None), "mount(/proc)")
+
+
+def keep_restore_right() -> None:
+    """Keep CAP_CHECKPOINT_RESTORE over the next execve, for a caller that has it by a user namespace without being its root.
+
+    Raises:
+        OSError: the caller has no such right to keep.
+    """
+    header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
+    sets = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable of capabilities 0-31, then of 32-63
+    _checked(_libc.capget(header, sets), "capget")
+    sets[5] |= 1 << (CAP_CHECKPOINT_RESTORE - 32)
+    _checked(_libc.capset(header, sets), "capset")
+    prctl(PR_CAP_AMBIENT, PR_CAP_AMBIENT_RAISE, CAP_CHECKPOINT_RESTORE)
+
+
+def prctl(option: int, *arguments: int) -> int:
+    """Make one call of prctl(2).
+
+    Raises:
+        OSError: as the man page lists them.
+    """
+    words = [ctypes.c_ulong(word) for word in (*arguments, 0, 0, 0, 0)[:4]]
+    return _checked(_libc.prctl(option, *words), f"prctl({option})")
+
+
+def close_others_on_exec(first: int) -> None:
+    """Have every descriptor from ``first`` on closed by the next execve."""
+    everything = ctypes.c_uint(0xFFFFFFFF)
+    _checked(_libc.syscall(_SYS_CLOSE_RANGE, ctypes.c_uint(first), everything, _CLOSE_RANGE_CLOEXEC), "close_range")
+
+
+def _checked(result: int, what: str) -> int:
+    if result < 0:
+        number = ctypes.get_errno()
+        raise OSError(number, f"{what}: {os.strerror(number)}")
+    return int(result)
