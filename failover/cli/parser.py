@@ -96,6 +96,78 @@ def _pid(room: argparse.ArgumentParser, optional: bool = False) -> None:
     room.add_argument("pid", metavar="PID", type=positive, nargs="?" if optional else None, help="the process")
 
 
+# --- Under an agent --------------------------------------------------------------------------------------------------
+
+
+def _run(room: argparse.ArgumentParser) -> None:
+    room.add_argument(
+        "--name", metavar="NAME", help="its name, a path such as /lab/robot1/mapper (default: made from the command)"
+    )
+    room.add_argument("--detach", action="store_true", help="print the name and return; see failover logs")
+    room.add_argument(
+        "--no-isolate", dest="isolate", action="store_false", help="keep it in this machine's PIDs and clocks (default: its own)"
+    )
+    room.add_argument("command", metavar="CMD", nargs="+", help="the program and its arguments, after --")
+    _agent(room)
+
+
+def _protect(room: argparse.ArgumentParser) -> None:
+    _pid(room)
+    room.add_argument("--name", metavar="NAME", help="its name (default: /pid/PID)")
+    _agent(room)
+
+
+def _named(room: argparse.ArgumentParser) -> None:
+    _name(room)
+    _agent(room)
+
+
+def _stop(room: argparse.ArgumentParser) -> None:
+    _name(room)
+    room.add_argument("--signal", metavar="N", type=signal_number, default=15, help="number or name (default: TERM)")
+    _agent(room)
+
+
+def _logs(room: argparse.ArgumentParser) -> None:
+    _name(room)
+    room.add_argument("-f", "--follow", action="store_true", help="go on until the program ends, or Ctrl-C")
+    room.add_argument("--stream", type=int, choices=(1, 2), help="standard output (1) or standard error (2) alone")
+    _agent(room)
+
+
+def _status(room: argparse.ArgumentParser) -> None:
+    room.add_argument("-w", "--watch", action="store_true", help="show it again and again, until Ctrl-C")
+    room.add_argument("--every-ms", metavar="MS", type=positive, default=500, help="with --watch (default: 500)")
+    _agent(room)
+
+
+def _why(room: argparse.ArgumentParser) -> None:
+    room.add_argument("name", metavar="NAME", nargs="?", help="one component alone")
+    _agent(room)
+
+
+def _handover(room: argparse.ArgumentParser) -> None:
+    _name(room)
+    room.add_argument("--to", metavar="ROBOT", help="where to (default: its standby)")
+    _agent(room)
+
+
+def _prefer(room: argparse.ArgumentParser) -> None:
+    _name(room)
+    room.add_argument("robot", metavar="ROBOT", help="the robot that should run it whenever it can")
+    _agent(room)
+
+
+def signal_number(text: str) -> int:
+    """A signal's number, from a number or a name with or without SIG."""
+    import signal
+
+    try:
+        return signal.Signals(int(text)) if text.isdecimal() else signal.Signals["SIG" + text.upper().removeprefix("SIG")]
+    except (ValueError, KeyError):
+        raise argparse.ArgumentTypeError(f"{text!r} is no signal; give a number or a name such as TERM") from None
+
+
 # --- One shot: no agent needed ---------------------------------------------------------------------------------------
 
 
@@ -137,6 +209,115 @@ def _completion(room: argparse.ArgumentParser) -> None:
 
 
 VERBS: Final = (
+    Verb(
+        "run",
+        "start a program under protection; its output and exit status become ours",
+        """
+        Start a program as a component of this robot. Snapshots of it go to its standby; when this robot dies, it goes on there.
+        Ctrl-C is passed on to the program. --json prints how it was started, and how it ended, on standard error.
+
+          failover run -- python3 mapper.py --map hall.yaml
+          failover run --name /lab/robot1/mapper --detach -- ./mapper
+        """,
+        _run,
+        "failover.cli.components:run",
+    ),
+    Verb(
+        "protect",
+        "protect a process that runs already",
+        """
+        Take a running process under protection. It keeps its standard streams; what cannot be preserved is refused by name,
+        and the process is not touched then (failover check PID shows the whole list).
+
+          failover protect 4711 --name /lab/robot1/mapper
+        """,
+        _protect,
+        "failover.cli.components:protect",
+    ),
+    Verb(
+        "release",
+        "let a component go: its program runs on, unprotected",
+        """
+        End protection. The program is not touched; its snapshots on the standby are no longer taken over.
+
+          failover release /lab/robot1/mapper
+        """,
+        _named,
+        "failover.cli.components:release",
+    ),
+    Verb(
+        "stop",
+        "end a component's program; no robot runs it again",
+        """
+        Send the program a signal and wait for its end, which is recorded on its standby too.
+
+          failover stop /lab/robot1/mapper
+          failover stop /lab/robot1/mapper --signal INT
+        """,
+        _stop,
+        "failover.cli.components:stop",
+    ),
+    Verb(
+        "status",
+        "the team as a tree: role, epoch, lag, freeze, standby, links, and what is promised now",
+        """
+        Show every robot, its components, how old their newest checkpoint is (lag), how long a snapshot stops them (freeze), and
+        in one sentence what holds if this robot dies now. Exit status 1 says that something is degraded.
+
+          failover status
+          failover status --watch
+          failover status --json | jq '.components[].lag_ms'
+        """,
+        _status,
+        "failover.cli.status:status",
+    ),
+    Verb(
+        "logs",
+        "what a component wrote, without gap or repetition, from any robot",
+        """
+        Show standard output and standard error of a component from its beginning.
+
+          failover logs /lab/robot1/mapper
+          failover logs --follow --stream 2 /lab/robot1/mapper
+        """,
+        _logs,
+        "failover.cli.components:logs",
+    ),
+    Verb(
+        "why",
+        "the story of the last decisions",
+        """
+        Tell what was seen, by whom, when, and what was done about it.
+
+          failover why
+          failover why /lab/robot1/mapper
+        """,
+        _why,
+        "failover.cli.status:why",
+    ),
+    Verb(
+        "handover",
+        "move a component to another robot, planned: nothing is lost",
+        """
+        The last changes are sent, then the other robot goes on where this one stopped.
+
+          failover handover /lab/robot1/mapper
+          failover handover /lab/robot1/mapper --to robot2
+        """,
+        _handover,
+        "failover.cli.components:handover",
+    ),
+    Verb(
+        "prefer",
+        "which robot should run a component",
+        """
+        The component goes there when that robot is able to run it.
+
+          failover prefer /lab/robot1/mapper robot1
+        """,
+        _prefer,
+        "failover.cli.components:prefer",
+    ),
     Verb(
         "check",
         "can this machine, or this process, be protected; and what to change",

@@ -1,0 +1,235 @@
+"""run, protect, release, stop, logs, handover, prefer: what is done with one component."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, Final
+
+from failover.cli import picture, render
+from failover.cli.agent import connect
+from failover.client.control import Control, Output, Result, Update
+from failover.errors import FailoverError, LostAgentError, NoAgentError
+
+RECONNECT_S: Final = 30.0
+"""How long ``failover run`` waits for its agent to come back: a restart takes a second, an upgrade some more."""
+
+RECONNECT_EVERY_S: Final = 0.2
+
+
+# --- run -------------------------------------------------------------------------------------------------------------
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Start a program under protection; its output and exit status become ours."""
+    wanted: dict[str, Any] = {"argv": arguments.command, "env": dict(os.environ), "cwd": os.getcwd(), "umask": _umask()}
+    wanted |= {"isolate": arguments.isolate, "wait": not arguments.detach}
+    if arguments.name:
+        wanted["name"] = arguments.name
+    follower = _Follower(arguments)
+    with connect(arguments) as agent:
+        if arguments.detach:
+            return _started(agent.ask("run", **wanted), arguments)
+        with follower.passing_signals_on():
+            return exit_like(follower.follow(agent, wanted))
+
+
+def _started(answer: dict[str, Any], arguments: argparse.Namespace) -> int:
+    started = answer.get("started", answer)
+    if arguments.json:
+        render.as_json(started)
+    else:
+        print(started["name"])
+        _notes(started)
+    return 0
+
+
+class _Follower:
+    """Shows one component's output until it ends, through restarts of the agent.
+
+    The component lives outside the agent, so an agent that goes away is waited for, and the output goes on where it stopped.
+    """
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        self._arguments = arguments
+        self._offsets = [0, 0]
+        self._name = ""
+
+    def follow(self, agent: Control, wanted: dict[str, Any]) -> int | None:
+        """Run and show; returns the wait status, None when it is not known."""
+        try:
+            return self._show(agent, "run", wanted)
+        except LostAgentError:
+            if not self._name:
+                raise
+        while True:
+            with self._reconnect() as agent:
+                try:
+                    return self._show(agent, "logs", {"name": self._name, "follow": True, "offsets": self._offsets})
+                except LostAgentError:
+                    continue
+
+    def _show(self, agent: Control, verb: str, wanted: dict[str, Any]) -> int | None:
+        for reply in agent.stream(verb, **wanted):
+            if isinstance(reply, Output):
+                write_output(reply)
+                self._offsets[reply.stream - 1] = reply.offset + len(reply.content)
+            elif isinstance(reply, Update):
+                self._begin(reply.value.get("started", {}))
+            else:
+                status: int | None = reply.value.get("exit_status")
+                return status
+        return None
+
+    def _begin(self, started: dict[str, Any]) -> None:
+        self._name = str(started.get("name", self._name))
+        if self._arguments.json:
+            print(render.json_text({"started": started}), file=sys.stderr, flush=True)
+        else:
+            _notes(started)
+
+    def _reconnect(self) -> Control:
+        deadline = time.monotonic() + RECONNECT_S
+        while True:
+            try:
+                return connect(self._arguments)
+            except NoAgentError as error:
+                if time.monotonic() > deadline:
+                    raise LostAgentError(
+                        f"the agent went away and did not come back within {RECONNECT_S:.0f} s; {self._name} runs on without it: "
+                        f"start failover-agent, then follow with: failover logs --follow {self._name}"
+                    ) from error
+                time.sleep(RECONNECT_EVERY_S)
+
+    @contextmanager
+    def passing_signals_on(self) -> Iterator[None]:
+        """Ctrl-C and termination are the program's business: pass them on instead of leaving it behind."""
+        before = {number: signal.signal(number, self._pass_on) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+        try:
+            yield
+        finally:
+            for number, action in before.items():
+                signal.signal(number, action)
+
+    def _pass_on(self, number: int, _frame: FrameType | None) -> None:
+        if not self._name:  # nothing runs yet
+            raise KeyboardInterrupt
+        # A thread of its own: the agent answers when the program has ended, and we are in the middle of showing its output.
+        threading.Thread(target=self._ask_to_stop, args=(number,), daemon=True).start()
+
+    def _ask_to_stop(self, number: int) -> None:
+        try:
+            with connect(self._arguments) as agent:
+                agent.ask("stop", name=self._name, signal=number)
+        except FailoverError as error:
+            print(f"failover: {error}", file=sys.stderr)
+
+
+def write_output(piece: Output) -> None:
+    """Pass a component's bytes on, unchanged, at once."""
+    stream = sys.stdout.buffer if piece.stream == 1 else sys.stderr.buffer
+    stream.write(piece.content)
+    stream.flush()
+
+
+def exit_like(wait_status: int | None) -> int:
+    """Our exit status for a program's wait status: its own, or 128 + the signal that ended it, as shells say it."""
+    if wait_status is None:
+        print("failover: the program has ended; how is not known", file=sys.stderr)
+        return 1
+    number = wait_status & 0x7F
+    return 128 + number if number else (wait_status >> 8) & 0xFF
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _notes(answer: dict[str, Any]) -> None:
+    for note in answer.get("notes") or ():
+        print(f"failover: note: {note}", file=sys.stderr)
+
+
+# --- The others: ask, and say what came of it ------------------------------------------------------------------------
+
+
+def protect(arguments: argparse.Namespace) -> int:
+    """Protect a process that runs already."""
+    name = arguments.name or f"/pid/{arguments.pid}"
+    with connect(arguments) as agent:
+        answer = agent.ask("protect", pid=arguments.pid, name=name)
+    return _tell(arguments, answer, f"pid {answer['pid']} is protected as {answer['name']}")
+
+
+def release(arguments: argparse.Namespace) -> int:
+    """Let a component go; its program runs on, unprotected."""
+    with connect(arguments) as agent:
+        answer = agent.ask("release", name=arguments.name)
+    return _tell(arguments, answer, f"{answer['name']} runs on as pid {answer['pid']}, unprotected")
+
+
+def stop(arguments: argparse.Namespace) -> int:
+    """End a component's program; no robot runs it again."""
+    with connect(arguments) as agent:
+        answer = agent.ask("stop", name=arguments.name, signal=arguments.signal)
+    status = answer.get("exit_status")
+    return _tell(arguments, answer, f"{answer['name']} has ended" + ("" if status is None else f": {picture.ending(status)}"))
+
+
+def logs(arguments: argparse.Namespace) -> int:
+    """Show what a component wrote, from whichever robot it wrote it."""
+    totals: dict[str, Any] = {}
+    with connect(arguments) as agent:
+        try:
+            for reply in agent.stream("logs", name=arguments.name, follow=arguments.follow):
+                if isinstance(reply, Output):
+                    _show_piece(arguments, reply)
+                elif isinstance(reply, Result):
+                    totals = reply.value
+        except KeyboardInterrupt:
+            return 0
+    if arguments.json:
+        render.as_json(totals)
+    return 0
+
+
+def _show_piece(arguments: argparse.Namespace, piece: Output) -> None:
+    if arguments.stream is not None and piece.stream != arguments.stream:
+        return
+    if arguments.json:
+        text = piece.content.decode(errors="surrogateescape")
+        render.as_json({"stream": piece.stream, "offset": piece.offset, "content": text})
+    else:
+        write_output(piece)
+
+
+def handover(arguments: argparse.Namespace) -> int:
+    """Move a component to another robot, planned: nothing is lost."""
+    with connect(arguments) as agent:
+        answer = agent.ask("handover", name=arguments.name, to=arguments.to or "")
+    return _tell(arguments, answer, f"{answer['name']} runs on {answer['to']} now; it stood still for {answer['outage_ms']} ms")
+
+
+def prefer(arguments: argparse.Namespace) -> int:
+    """Say which robot should run a component."""
+    with connect(arguments) as agent:
+        answer = agent.ask("prefer", name=arguments.name, robot=arguments.robot)
+    return _tell(arguments, answer, f"{answer['name']} prefers {answer['robot']}")
+
+
+def _tell(arguments: argparse.Namespace, answer: dict[str, Any], sentence: str) -> int:
+    if arguments.json:
+        render.as_json(answer)
+    else:
+        print(sentence)
+        _notes(answer)
+    return 0

@@ -1,0 +1,123 @@
+"""Drawing on a terminal or into a pipe (the only rich import, loaded when something is drawn in colour)."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import TYPE_CHECKING, Any, Final
+
+from failover.cli import picture
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+COLOURS: Final = {"good": "green", "warning": "yellow", "bad": "bold red", "quiet": "dim"}
+
+GAP: Final = "  "
+"""Between two columns of a plain table."""
+
+
+def is_terminal() -> bool:
+    """Whether standard output is looked at by a person."""
+    return sys.stdout.isatty()
+
+
+def json_text(value: Any) -> str:
+    """One JSON object on one line; bytes as hexadecimal."""
+    return json.dumps(
+        value, ensure_ascii=False, default=lambda odd: odd.hex() if isinstance(odd, bytes | bytearray) else str(odd)
+    )
+
+
+def as_json(value: Any) -> None:
+    """Print one JSON object on a line of its own, at once."""
+    print(json_text(value), flush=True)
+
+
+def plain_table(columns: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """Columns aligned by spaces; a column that is empty throughout is left out."""
+    cells = [tuple(columns), *(tuple(line) for line in lines)]
+    kept = [index for index in range(len(columns)) if any(line[index] for line in cells[1:])]
+    widths = {index: max(len(line[index]) for line in cells) for index in kept}
+    return "\n".join(GAP.join(line[index].ljust(widths[index]) for index in kept).rstrip() for line in cells)
+
+
+def table(columns: Sequence[str], lines: Sequence[Sequence[str]], title: str = "") -> None:
+    """Print a table: framed on a terminal, aligned elsewhere."""
+    if is_terminal():
+        _console().print(_rich_table(columns, [(line, "") for line in lines], title))
+        return
+    if title:
+        print(title)
+    print(plain_table(columns, lines))
+
+
+def tree(status: dict[str, Any]) -> None:
+    """Print the team once."""
+    if is_terminal():
+        _console().print(_rich_tree(status))
+    else:
+        print(plain_tree(status))
+
+
+def plain_tree(status: dict[str, Any]) -> str:
+    """The team as aligned text."""
+    lines = [plain_table(picture.COLUMNS, [row.cells for row in picture.rows(status)])]
+    if status.get("promise"):
+        lines.append(f"promise: {status['promise']}")
+    return "\n".join([*lines, *(f"note: {line}" for line in picture.remarks(status))])
+
+
+def live_tree() -> AbstractContextManager[Callable[[dict[str, Any]], None]]:
+    """A picture that is drawn again and again: in place on a terminal, one below the other elsewhere."""
+    if is_terminal():
+        return _LiveTree()
+    return nullcontext(lambda status: print(plain_tree(status), end="\n\n", flush=True))
+
+
+class _LiveTree:
+    """The team, redrawn in place."""
+
+    def __enter__(self) -> Callable[[dict[str, Any]], None]:
+        from rich.live import Live
+
+        self._live = Live(console=_console(), auto_refresh=False)
+        self._live.__enter__()
+        return lambda status: self._live.update(_rich_tree(status), refresh=True)
+
+    def __exit__(self, *reason: Any) -> None:
+        self._live.__exit__(*reason)
+
+
+def _console() -> Console:
+    from rich.console import Console
+
+    return Console(highlight=False)
+
+
+def _rich_tree(status: dict[str, Any]) -> Any:
+    from rich.console import Group
+    from rich.text import Text
+
+    lines = [(row.cells, COLOURS[row.mood]) for row in picture.rows(status)]
+    parts: list[Any] = [_rich_table(picture.COLUMNS, lines, f"team {status.get('team') or ''}".strip())]
+    if status.get("promise"):
+        parts.append(Text(f"promise: {status['promise']}", style="bold"))
+    return Group(*parts, *(Text(line, style="yellow") for line in picture.remarks(status)))
+
+
+def _rich_table(columns: Sequence[str], lines: Sequence[tuple[Sequence[str], str]], title: str = "") -> Table:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    kept = [index for index in range(len(columns)) if any(line[index] for line, _ in lines)]
+    drawn = Table(title=title or None, title_justify="left", box=box.ROUNDED, border_style="dim", header_style="bold")
+    for index in kept:
+        drawn.add_column(columns[index], no_wrap=index == 0)
+    for line, style in lines:
+        drawn.add_row(*(Text(line[index], style=style) for index in kept))
+    return drawn
