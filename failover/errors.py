@@ -35,3 +35,11 @@ class FileMistakeError(FailoverError):
 
 class TeamFileError(FailoverError):
     """The team directory or a key in it cannot be used."""
+
+
+class RulesError(FailoverError):
+    """A setting contradicts another one or leaves its range; the message names the setting and the cure."""
+
+
+class NameFormatError(FailoverError):
+    """A name of a robot, a team or a component is not of the documented form."""

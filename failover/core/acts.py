@@ -1,0 +1,251 @@
+"""What a node orders. ``Ready`` is obeyed in this order: persist → send → act; the acts in the order given.
+
+Every act carries the epoch under which it was decided; whoever carries it out drops it when it has seen a later one for
+that component, and returns the epoch with the event that answers it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from checkpoint.model import Position
+from failover.core.messages import Beat
+from failover.core.types import Ballot, ComponentSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Begin (or adopt) the program. → Started, ActFailed.
+
+    Attributes:
+        lease_until_ns: given to the guard before the program runs; 0 = no lease.
+    """
+
+    component: str
+    epoch: int
+    spec: ComponentSpec
+    lease_until_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Restore:
+    """Bring the program back from ``position``, which this robot's store holds. → Restored, ActFailed.
+
+    Whatever is left of the component on this robot (a crashed process, an old guard) is cleared away first.
+
+    Attributes:
+        lease_until_ns: given to the guard before the program runs; 0 = no lease.
+    """
+
+    component: str
+    epoch: int
+    position: Position
+    spec: ComponentSpec | None
+    lease_until_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    """Take a snapshot and keep it durably in this robot's store. → Captured, CaptureFailed. One at a time per component.
+
+    Attributes:
+        base: whole; otherwise a delta since the last position that was acknowledged to the keeper.
+        hold: leave the program frozen afterwards (the last delta of a handover); the act Thaw or Stop follows.
+    """
+
+    component: str
+    epoch: int
+    base: bool
+    generation: int
+    sequence: int
+    hold: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Ship:
+    """Send the snapshot at ``position`` over the bulk lane. → ShipEnded.
+
+    Attributes:
+        parent: the standby's present position; None for a base.
+        whole: the store's chain up to ``position`` folded into one base (a checkpoint that is given back).
+    """
+
+    component: str
+    epoch: int
+    position: Position
+    parent: Position | None
+    to: str
+    spec: ComponentSpec
+    whole: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class CancelShip:
+    """Give up the transfer of ``position``; a delta that nobody waits for any more. No answer."""
+
+    component: str
+    epoch: int
+    position: Position
+    to: str
+
+
+@dataclass(frozen=True, slots=True)
+class Acknowledge:
+    """Tell the keeper that ``position`` is a checkpoint: the next delta counts from here. No answer."""
+
+    component: str
+    epoch: int
+    position: Position
+
+
+@dataclass(frozen=True, slots=True)
+class Admit:
+    """From now on snapshots of this component are taken from ``sender`` at ``epoch`` or later ("": from nobody). No answer."""
+
+    component: str
+    epoch: int
+    sender: str
+
+
+@dataclass(frozen=True, slots=True)
+class Freeze:
+    """Stop every thread of the component. No answer; the guard does it by itself when the lease has run out."""
+
+    component: str
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class Thaw:
+    """Let it go on; ``lease_until_ns`` is given to the guard first (0 = no lease). No answer."""
+
+    component: str
+    epoch: int
+    lease_until_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class SetLease:
+    """The guard freezes the component when its clock passes ``until_ns``; 0 = no lease. No answer."""
+
+    component: str
+    epoch: int
+    until_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class KeepAside:
+    """Keep the state of a copy that lost as a snapshot of its own, for inspection, before the act Stop that follows. No answer.
+
+    The snapshots of ``generations`` leave the chain and are never resumed from by themselves.
+    """
+
+    component: str
+    epoch: int
+    generations: tuple[int, ...]
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """End the program: with ``signal`` as the operator asked. → Exited."""
+
+    component: str
+    epoch: int
+    signal: int
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Kill this robot's copy at once and clear it away; there may be none. → Stopped. Its exit is nobody's result."""
+
+    component: str
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class LetGo:
+    """Detach keeper and guard; the program runs on unprotected. No answer."""
+
+    component: str
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class Prune:
+    """Snapshots that are not needed to restore ``oldest`` or a later position may go."""
+
+    component: str
+    epoch: int
+    oldest: Position
+
+
+@dataclass(frozen=True, slots=True)
+class Drop:
+    """Forget every snapshot of the component on this robot."""
+
+    component: str
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReportExit:
+    """The end of the component is a record: tell whoever waits for it (``failover run``).
+
+    Attributes:
+        status: waitpid's.
+        acknowledged: the standby knows it too; False when this robot is alone.
+        failed: it did not end by itself: ``reason`` says why nobody runs it any more.
+    """
+
+    component: str
+    epoch: int
+    status: int
+    acknowledged: bool
+    failed: bool = False
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The reply to an operator's command; ``sentence`` says what was done, or why not and what to do about it."""
+
+    request: int
+    ok: bool
+    sentence: str
+
+
+Act = (
+    Start
+    | Restore
+    | Capture
+    | Ship
+    | CancelShip
+    | Acknowledge
+    | Admit
+    | Freeze
+    | Thaw
+    | SetLease
+    | KeepAside
+    | End
+    | Stop
+    | LetGo
+    | Prune
+    | Drop
+    | ReportExit
+    | Answer
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """The obligations after one step, in the order in which they are met.
+
+    Attributes:
+        persist: the whole ballot, to be made durable before anything else; None when it has not changed.
+        send: beats, each for every peer over every link.
+    """
+
+    persist: Ballot | None = None
+    send: tuple[Beat, ...] = ()
+    act: tuple[Act, ...] = ()

@@ -1,0 +1,32 @@
+"""The ballot as bytes, for the agent to make durable."""
+
+from __future__ import annotations
+
+import msgspec
+
+from failover.core.types import Ballot
+from failover.errors import RulesError
+
+_encoder = msgspec.json.Encoder()
+_decoder: msgspec.json.Decoder[Ballot] = msgspec.json.Decoder(Ballot)
+
+
+def encode(ballot: Ballot) -> bytes:
+    """JSON, so that a person in trouble can read it."""
+    return _encoder.encode(ballot)
+
+
+def decode(body: bytes) -> Ballot:
+    """What ``encode`` gave; b"" is the ballot of a robot that never voted.
+
+    Raises:
+        RulesError: anything else.
+    """
+    if not body:
+        return Ballot()
+    try:
+        return _decoder.decode(body)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise RulesError(
+            f"cannot read the ballot: {error}; restore it, or start this robot as new with an empty state"
+        ) from error

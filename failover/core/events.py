@@ -1,0 +1,205 @@
+"""What can happen to a node. Events about a component carry the epoch of the act that caused them; older ones are dropped."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from checkpoint.model import Position
+from failover.core.messages import Beat
+from failover.core.types import ComponentSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """The instant that ``next_deadline_ns`` asked for has come (or nothing else has happened)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """A beat that passed ``wire.Receiver``: whole, authentic, of our team and version, not seen before.
+
+    Attributes:
+        link: name of the link it came over.
+    """
+
+    beat: Beat
+    link: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Started:
+    """The act Start is done: the program runs (or, adopted, has been running) and its keeper is ready."""
+
+    component: str
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class Captured:
+    """The act Capture is done. The snapshot is durable in this robot's own store and can be shipped and restored from.
+
+    Attributes:
+        dirty_size: bytes of pages carried; ``size``: bytes of the encoded snapshot.
+    """
+
+    component: str
+    epoch: int
+    position: Position
+    parent: Position | None
+    size: int = 0
+    freeze_us: int = 0
+    dirty_size: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureFailed:
+    """The act Capture came to nothing; the program runs on and nothing was forgotten.
+
+    Attributes:
+        unsupported: the program holds something that cannot be preserved (checkpoint.errors.UnsupportedError).
+        needs_base: the keeper lost its place (a new keeper): only a base can follow.
+    """
+
+    component: str
+    epoch: int
+    message: str
+    unsupported: bool = False
+    needs_base: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ShipEnded:
+    """The transfer ordered by the act Ship has ended: ``ok`` when the last byte was taken by the other side.
+
+    The acknowledgement itself comes with the standby's beats.
+    """
+
+    component: str
+    epoch: int
+    position: Position
+    to: str
+    ok: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Stored:
+    """On the standby: a snapshot that was admitted is verified, fits the chain, and is durable in this robot's store."""
+
+    component: str
+    epoch: int
+    position: Position
+    sender: str
+    spec: ComponentSpec
+
+
+@dataclass(frozen=True, slots=True)
+class StoreFailed:
+    """On the standby: a snapshot did not fit, or could not be written. What the store already held is intact.
+
+    Attributes:
+        needs_base: its parent is not our newest position, or our chain is damaged.
+    """
+
+    component: str
+    epoch: int
+    sender: str
+    message: str
+    needs_base: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Restored:
+    """The act Restore is done: the program runs from ``position``."""
+
+    component: str
+    epoch: int
+    position: Position
+
+
+@dataclass(frozen=True, slots=True)
+class ActFailed:
+    """Start or Restore came to nothing and left nothing behind. ``message`` says what to do about it."""
+
+    component: str
+    epoch: int
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class Stopped:
+    """The act Stop is done: no process of this component is left on this robot (asked or not, its keeper and guard are gone)."""
+
+    component: str
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class Exited:
+    """The program ended by itself. ``status`` is waitpid(2)'s: low seven bits the signal (0: none), next byte the exit code."""
+
+    component: str
+    epoch: int
+    status: int
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Operator: start this program here (or, with ``spec.launch.pid``, protect it where it runs). Answered by the act Answer."""
+
+    request: int
+    spec: ComponentSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Release:
+    """Operator: let the program run on without protection, and forget its checkpoints everywhere."""
+
+    request: int
+    component: str
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Operator: end the program with ``signal``; its end is a record like any other."""
+
+    request: int
+    component: str
+    signal: int = 15
+
+
+@dataclass(frozen=True, slots=True)
+class Handover:
+    """Operator: move the component to robot ``to`` ("" for its standby)."""
+
+    request: int
+    component: str
+    to: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Prefer:
+    """Operator: robot ``robot`` runs the component whenever it can ("" for no preference)."""
+
+    request: int
+    component: str
+    robot: str
+
+
+Command = Run | Release | Stop | Handover | Prefer
+
+Event = (
+    Tick
+    | Received
+    | Started
+    | Captured
+    | CaptureFailed
+    | ShipEnded
+    | Stored
+    | StoreFailed
+    | Restored
+    | ActFailed
+    | Stopped
+    | Exited
+    | Command
+)

@@ -1,0 +1,352 @@
+"""The words of the rules: what a component is, what a robot remembers, what it shows. Frozen values only.
+
+Instants are integer nanoseconds of this machine's own clock (suffix ``_ns``); two machines' clocks are never compared.
+What happens to a node is in ``events.py``, what it orders in ``acts.py``, what robots tell each other in ``messages.py``.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+
+from checkpoint.model import Position
+from failover.errors import RulesError
+
+MS = 1_000_000
+"""Nanoseconds in a millisecond."""
+
+
+class OnLoss(enum.StrEnum):
+    """What the standby does when the primary's robot is lost."""
+
+    TAKEOVER = "takeover"
+    HOLD = "hold"
+
+
+class OnCrash(enum.StrEnum):
+    """What happens when the program dies by a signal while its robot lives."""
+
+    RESTORE = "restore"
+    STOP = "stop"
+
+
+class WhenAlone(enum.StrEnum):
+    """What a primary does when it hears nobody: go on (available), or stand still (safe)."""
+
+    RUN = "run"
+    FREEZE = "freeze"
+
+
+class OnUnsupported(enum.StrEnum):
+    """What becomes of the protection when the program turns into something that cannot be captured."""
+
+    KEEP_LAST = "keep_last"
+    STOP_PROTECTING = "stop_protecting"
+
+
+class State(enum.StrEnum):
+    """Where one component stands on one robot. The arrows between them are the table in ``election.py``."""
+
+    ABSENT = "absent"
+    CLAIMING = "claiming"
+    STARTING = "starting"
+    PRIMARY = "primary"
+    FROZEN = "frozen"
+    HANDING_OVER = "handing over"
+    RECOVERING = "recovering"
+    TAKING_OVER = "taking over"
+    STOPPING = "stopping"
+    STANDBY = "standby"
+    FINISHED = "finished"
+    FAILED = "failed"
+    RELEASED = "released"
+
+
+HOLDING = frozenset(
+    {
+        State.CLAIMING,
+        State.STARTING,
+        State.PRIMARY,
+        State.FROZEN,
+        State.HANDING_OVER,
+        State.RECOVERING,
+        State.TAKING_OVER,
+    }
+)
+"""The states in which a robot says: the primacy of this epoch is mine."""
+
+ENDED = frozenset({State.FINISHED, State.FAILED, State.RELEASED})
+"""The states that are a record: nobody runs the component until an operator says so."""
+
+
+class Protection(enum.StrEnum):
+    """How well a primary's component is protected right now."""
+
+    NONE = "none"
+    PROTECTED = "protected"
+    DEGRADED = "degraded"
+    STOPPED = "stopped"
+
+
+@dataclass(frozen=True, slots=True)
+class Launch:
+    """How a program begins. The rules carry it and never look inside.
+
+    Attributes:
+        argv: empty for a program that was taken under protection by its pid.
+        environment: (name, value) pairs.
+        pid: of a running program to protect (``failover protect``), 0 otherwise; means something on its home robot only.
+        isolate: PID and time namespaces of its own.
+    """
+
+    argv: tuple[str, ...] = ()
+    environment: tuple[tuple[str, str], ...] = ()
+    directory: str = "/"
+    umask: int = 0o022
+    pid: int = 0
+    isolate: bool = True
+    engine: str = "ptrace"
+    terminal: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """The operator's choices for one component.
+
+    Attributes:
+        period_ms: between two captures while a standby keeps up.
+        crash_limit: resumptions from the newest checkpoint inside ``crash_window_ms``; the next one goes one checkpoint back,
+            the one after that is not made: the component has failed.
+        prefer: robot that should run it whenever it can; "" leaves it where it runs.
+        standby: robot that should protect it; "" lets the primary choose.
+    """
+
+    period_ms: int = 100
+    on_loss: OnLoss = OnLoss.TAKEOVER
+    on_crash: OnCrash = OnCrash.RESTORE
+    crash_limit: int = 3
+    crash_window_ms: int = 60_000
+    when_alone: WhenAlone = WhenAlone.RUN
+    on_unsupported: OnUnsupported = OnUnsupported.KEEP_LAST
+    prefer: str = ""
+    standby: str = ""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.period_ms <= 3_600_000:
+            raise RulesError(f"period_ms = {self.period_ms}: a capture period lies between 1 ms and an hour")
+        if not 0 <= self.crash_limit <= 100:
+            raise RulesError(f"crash_limit = {self.crash_limit}: choose between 0 and 100")
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentSpec:
+    """One supervised program: its name, where it belongs, how it begins, and by which rules it lives.
+
+    Attributes:
+        name: a path such as ``/lab/robot1/mapper``, see ``names.py``.
+        home: robot where it was started.
+    """
+
+    name: str
+    home: str = ""
+    launch: Launch = field(default_factory=Launch)
+    rules: Rules = field(default_factory=Rules)
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """What one robot's node is told at birth.
+
+    Attributes:
+        robot: own name.
+        peers: the other robots of the team that vote or protect.
+        components: to be run from the start wherever nobody runs them yet (the same list may stand on every robot).
+        beat_ms: between two beats.
+        lease_ms: how long a primary may act without being heard; also the silence after which a primary may be replaced,
+            stretched by the margin.
+        margin_ms_min, margin_percent: the standby waits longer than the lease by the larger of the two (drift, freeze time).
+        alone_period_ms: between captures kept on this robot only, while there is no standby.
+        retry_ms: before another try of a capture that failed, or of a standby that did not answer.
+        handover_ms: a planned move that takes longer is called off.
+        ship_ms: a snapshot that is still on its way after that is given up.
+        restore_ms: a restore or start that says nothing for that long has failed.
+    """
+
+    robot: str
+    peers: tuple[str, ...] = ()
+    components: tuple[ComponentSpec, ...] = ()
+    beat_ms: int = 20
+    lease_ms: int = 150
+    margin_ms_min: int = 20
+    margin_percent: int = 10
+    alone_period_ms: int = 1_000
+    retry_ms: int = 1_000
+    handover_ms: int = 10_000
+    ship_ms: int = 120_000
+    restore_ms: int = 60_000
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.beat_ms <= 10_000:
+            raise RulesError(f"beat_ms = {self.beat_ms}: beats lie between 1 ms and 10 s apart")
+        if self.lease_ms < BEATS_IN_LEASE_MIN * self.beat_ms:
+            raise RulesError(
+                f"lease_ms = {self.lease_ms} with beat_ms = {self.beat_ms}: a lease shorter than {BEATS_IN_LEASE_MIN} beats "
+                f"would end with one lost packet; set lease_ms to {BEATS_IN_LEASE_MIN * self.beat_ms} or more"
+            )
+        if self.margin_percent < 2 or self.margin_ms_min < 1:
+            raise RulesError("margin_percent must be at least 2 and margin_ms_min at least 1: clocks drift, freezing takes time")
+        if self.robot in self.peers:
+            raise RulesError(f"robot {self.robot!r} is listed among its own peers; remove it there")
+        if len(self.peers) > PEERS_MAX:
+            raise RulesError(f"{len(self.peers)} peers: at most {PEERS_MAX} robots share a team")
+
+    @property
+    def beat_ns(self) -> int:
+        """Between two beats."""
+        return self.beat_ms * MS
+
+    @property
+    def lease_ns(self) -> int:
+        """How long a primary may act after a beat that was heard."""
+        return self.lease_ms * MS
+
+    @property
+    def loyalty_ns(self) -> int:
+        """Silence after which a peer counts as dead: the lease and the margin."""
+        return self.lease_ns + max(self.margin_ms_min * MS, self.lease_ns * self.margin_percent // 100)
+
+
+BEATS_IN_LEASE_MIN = 4
+"""Three beats may be lost in a row before anybody acts on it."""
+
+PEERS_MAX = 63
+"""Robots besides oneself; their echoes must fit a frame."""
+
+COMPONENTS_MAX = 1_024
+"""Components that one node follows; a peer that announces more is not believed."""
+
+HISTORY_MAX = 8
+"""Restorable positions that are remembered per component."""
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """What one robot must not forget about one component.
+
+    Attributes:
+        epoch: the highest that was seen or claimed; only grows.
+        primary: robot whose primacy of ``epoch`` this robot accepts: itself, a peer, or "" (nobody's).
+        state: PRIMARY while this robot holds the primacy, STANDBY, ABSENT, or one of the records FINISHED, FAILED, RELEASED.
+        entrusted: robots that may take over if they stop hearing this primary; while there are any, this robot acts on leases.
+        trusted: the primary of ``epoch`` has entrusted this robot.
+        lost: generations of this robot's own that lost against another primary; never resumed from.
+        status: exit status (waitpid's) of a finished component.
+        reason: why it failed.
+    """
+
+    name: str
+    epoch: int = 0
+    primary: str = ""
+    state: State = State.ABSENT
+    entrusted: tuple[str, ...] = ()
+    trusted: bool = False
+    lost: tuple[int, ...] = ()
+    status: int = 0
+    reason: str = ""
+    spec: ComponentSpec | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Ballot:
+    """All that a robot's rules must not forget: durable before any message that depends on it leaves."""
+
+    records: tuple[Record, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """Restorable positions that this robot's own store holds of one component, oldest first (at most ``HISTORY_MAX`` count)."""
+
+    component: str
+    positions: tuple[Position, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A component whose guard was found alive when the agent started.
+
+    Attributes:
+        epoch: under which it was started or last restored, as the guard remembers.
+        running: its program is there (perhaps frozen by its guard); False once it has ended.
+        status: waitpid's status, when it has ended.
+    """
+
+    component: str
+    epoch: int
+    running: bool
+    status: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class PeerView:
+    """One peer as this robot sees it: ``state`` is alive, suspect, dead or unheard; ``silent_ns`` since its last beat."""
+
+    robot: str
+    state: str
+    boot: int
+    silent_ns: int
+    hears_us: bool
+    load: int
+    links: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentView:
+    """One component as this robot sees it, for ``failover status``.
+
+    Attributes:
+        primary, standby: robots; "" where there is none that we know of.
+        lag_ns: age of the newest checkpoint, -1 if there is none or this robot cannot know.
+        positions: newest acknowledged position first.
+        notes: sentences: why it is degraded, waiting or failed.
+        lease_until_ns: of this robot's clock; 0 acts without a lease.
+    """
+
+    name: str
+    state: State
+    epoch: int
+    primary: str
+    standby: str
+    protection: Protection
+    lag_ns: int
+    freeze_us: int
+    positions: tuple[Position, ...]
+    promise: str
+    notes: tuple[str, ...] = ()
+    status: int = 0
+    lease_until_ns: int = 0
+    period_ms: int = 0
+    home: str = ""
+    prefer: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class StatusView:
+    """Everything ``failover status`` shows, seen from one robot. ``healthy`` is False when anything failed or is degraded."""
+
+    robot: str
+    boot: int
+    rule: str
+    promise: str
+    healthy: bool
+    peers: tuple[PeerView, ...]
+    components: tuple[ComponentView, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """One line of the journal: what was decided about which component ("" for the robot), when by this robot's clock, and why."""
+
+    at_ns: int
+    component: str
+    sentence: str
