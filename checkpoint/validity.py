@@ -1,0 +1,123 @@
+"""What must hold in every snapshot: checked before one is written and before a decoded one is used."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import pairwise
+
+import numpy as np
+
+from checkpoint import pages
+from checkpoint.errors import FormatError
+from checkpoint.model import OutputPiece, PageRun, Position, Snapshot, Vma
+from checkpoint.state import STATE_DIGEST_SIZE
+
+MIN_PAGE_SIZE = 4096
+MAX_PAGE_SIZE = 1 << 16
+"""Page sizes of the kernels that we know: 4, 16 and 64 KiB."""
+
+ADDRESS_END = (1 << 64) - MAX_PAGE_SIZE
+"""Nothing is mapped from here on: the end of a run must itself be an address."""
+
+MAX_NUMBER = (1 << 63) - 1
+"""Largest generation, sequence or epoch."""
+
+STREAMS = (1, 2)
+"""Standard output and standard error."""
+
+
+def check_snapshot(snapshot: Snapshot, contents_size: int | None = None) -> None:
+    """Refuse a snapshot that does not hold together.
+
+    Args:
+        contents_size: bytes of contents, where they are not in ``snapshot.contents`` yet.
+
+    Raises:
+        FormatError: names the first thing that cannot be.
+    """
+    page_size = snapshot.machine.page_size
+    if page_size not in range(MIN_PAGE_SIZE, MAX_PAGE_SIZE + 1) or page_size & (page_size - 1):
+        raise FormatError(f"machine: page size {page_size} is not a power of two from {MIN_PAGE_SIZE} to {MAX_PAGE_SIZE}")
+    _check_numbers(snapshot)
+    _check_extents(snapshot.vmas, page_size, "vmas")
+    _check_extents(snapshot.cleared, page_size, "cleared runs")
+    _check_extents(snapshot.runs, page_size, "runs")
+    _check_runs_mapped(snapshot.runs, snapshot.vmas)
+    _check_contents(snapshot, len(memoryview(snapshot.contents).cast("B")) if contents_size is None else contents_size)
+    _check_threads(snapshot)
+    _check_output(snapshot.output)
+
+
+def _check_numbers(snapshot: Snapshot) -> None:
+    _check_position(snapshot.position, "position")
+    if snapshot.parent is not None:
+        _check_position(snapshot.parent, "parent")
+        parent, position = snapshot.parent, snapshot.position
+        if (parent.generation, parent.sequence) >= (position.generation, position.sequence):
+            raise FormatError(f"parent {place(parent)} is not before position {place(position)}")
+    if len(snapshot.page_sum) != pages.DIGEST_SIZE:
+        raise FormatError(f"page sum: {len(snapshot.page_sum)} bytes where {pages.DIGEST_SIZE} belong")
+    for name, number in (("epoch", snapshot.epoch), ("freeze_us", snapshot.freeze_us)):
+        if not 0 <= number <= MAX_NUMBER:
+            raise FormatError(f"{name}: {number} is not from 0 to {MAX_NUMBER}")
+
+
+def _check_position(position: Position, name: str) -> None:
+    if not (0 <= position.generation <= MAX_NUMBER and 0 <= position.sequence <= MAX_NUMBER):
+        raise FormatError(f"{name}: {place(position)} is not of numbers from 0 to {MAX_NUMBER}")
+    if len(position.digest) != STATE_DIGEST_SIZE:
+        raise FormatError(f"{name}: a digest of {len(position.digest)} bytes where {STATE_DIGEST_SIZE} belong")
+
+
+def place(position: Position) -> str:
+    """A position in words, for messages: ``3.17``."""
+    return f"{position.generation}.{position.sequence}"
+
+
+def _check_extents(items: Iterable[PageRun | Vma], page_size: int, name: str) -> None:
+    """Aligned, not empty, in address order, without overlap."""
+    pairs = [(item.start, item.end) for item in items]
+    outside = [pair for pair in pairs if not 0 <= pair[0] < pair[1] <= ADDRESS_END]
+    if outside:
+        raise FormatError(f"{name}: {outside[0][0]:#x}-{outside[0][1]:#x} is empty or beyond the address space")
+    bounds = np.array(pairs, dtype=np.uint64).reshape(-1, 2)
+    unaligned = np.flatnonzero((bounds & np.uint64(page_size - 1)).any(axis=1))
+    if len(unaligned):
+        raise FormatError(f"{name}: {_span(bounds, unaligned[0])} is not of whole pages of {page_size} bytes")
+    early = np.flatnonzero(bounds[1:, 0] < bounds[:-1, 1])
+    if len(early):
+        raise FormatError(f"{name}: {_span(bounds, early[0] + 1)} overlaps or comes before {_span(bounds, early[0])}")
+
+
+def _span(bounds: pages.Words, index: np.intp) -> str:
+    return f"{int(bounds[index, 0]):#x}-{int(bounds[index, 1]):#x}"
+
+
+def _check_runs_mapped(runs: tuple[PageRun, ...], vmas: tuple[Vma, ...]) -> None:
+    stray = pages.difference(pages.extents(runs), pages.extents(vmas))
+    if len(stray):
+        raise FormatError(f"runs: {_span(stray, np.intp(0))} lies in no mapping")
+
+
+def _check_contents(snapshot: Snapshot, contents_size: int) -> None:
+    needed = sum(run.size for run in snapshot.runs)
+    if needed != contents_size:
+        raise FormatError(f"contents: {contents_size} bytes where the runs need {needed}")
+
+
+def _check_threads(snapshot: Snapshot) -> None:
+    tids = [thread.tid for thread in snapshot.threads]
+    if len(set(tids)) != len(tids):
+        raise FormatError("threads: two have the same id")
+
+
+def _check_output(output: tuple[OutputPiece, ...]) -> None:
+    """Streams that exist, pieces of one stream in order and without overlap."""
+    for piece in output:
+        if piece.stream not in STREAMS or not 0 <= piece.offset <= MAX_NUMBER:
+            raise FormatError(f"output: stream {piece.stream} at offset {piece.offset} cannot be")
+    for stream in STREAMS:
+        ours = [piece for piece in output if piece.stream == stream]
+        for earlier, later in pairwise(ours):
+            if later.offset < earlier.offset + len(earlier.content):
+                raise FormatError(f"output: pieces of stream {stream} overlap at offset {later.offset}")
