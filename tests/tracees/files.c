@@ -1,0 +1,207 @@
+/* Open files of one kind, named by the second argument: number, offset, flags, sharing and content. */
+#include "tracee.h"
+
+#include <dirent.h>
+
+#define TEXT "0123456789abcdefghijklmnopqrstuvwxyz\n"
+
+static int make(const char *name, int flags) {
+    int file = open(name, O_RDWR | O_CREAT | O_TRUNC, 0640);
+    if (file < 0 || write(file, TEXT, 37) != 37) cannot("make %s", name);
+    close(file);
+    file = open(name, flags);
+    if (file < 0) cannot("open %s", name);
+    return file;
+}
+
+static void expect_read(int file, const char *wanted) {
+    char found[40] = "";
+    int size = read(file, found, strlen(wanted));
+    EXPECT(size == (int)strlen(wanted) && !memcmp(found, wanted, size), "fd %d: read %d bytes '%s', not '%s'", file, size,
+           found, wanted);
+}
+
+static void expect_flags(int file, int status, int descriptor) {
+    EXPECT_EQUAL("status flags", fcntl(file, F_GETFL), status);
+    EXPECT_EQUAL("descriptor flags", fcntl(file, F_GETFD), descriptor);
+}
+
+static void read_offset(const char *go) {
+    int file = make("in", O_RDONLY), status = fcntl(file, F_GETFL);
+    lseek(file, 7, SEEK_SET);
+    ready(), wait_for_go(go);
+    EXPECT_EQUAL("offset", lseek(file, 0, SEEK_CUR), 7);
+    expect_read(file, "789ab");
+    expect_flags(file, status, 0);
+}
+
+static void write_offset(const char *go) {
+    int file = make("out", O_WRONLY), status = fcntl(file, F_GETFL);
+    lseek(file, 3, SEEK_SET);
+    ready(), wait_for_go(go);
+    if (write(file, "XYZ", 3) != 3) differs("cannot write: %s", strerror(errno));
+    expect_flags(file, status, 0);
+    file = open("out", O_RDONLY);
+    expect_read(file, "012XYZ678");
+}
+
+static void append(const char *go) {
+    int file = make("log", O_WRONLY | O_APPEND), status = fcntl(file, F_GETFL);
+    ready(), wait_for_go(go);
+    lseek(file, 0, SEEK_SET);
+    if (write(file, "end", 3) != 3) differs("cannot append: %s", strerror(errno));
+    expect_flags(file, status, 0);
+    file = open("log", O_RDONLY);
+    expect_read(file, TEXT "end");
+}
+
+static void odd_flags(const char *go) {
+    int file = make("odd", O_RDWR | O_NONBLOCK | O_SYNC | O_NOATIME | O_CLOEXEC), status = fcntl(file, F_GETFL);
+    ready(), wait_for_go(go);
+    expect_flags(file, status, FD_CLOEXEC);
+}
+
+static void shared_offset(const char *go) {
+    int file = make("in", O_RDONLY), twin = dup(file), other = open("in", O_RDONLY), far = dup2(file, 700);
+    lseek(file, 5, SEEK_SET), lseek(other, 20, SEEK_SET);
+    ready(), wait_for_go(go);
+    expect_read(file, "56"), expect_read(twin, "78"), expect_read(far, "9a");
+    expect_read(other, "kl");
+}
+
+static void holes(const char *go) {
+    int first = make("a", O_RDONLY), second = make("b", O_RDONLY), third = make("c", O_RDONLY);
+    dup3(second, 200, O_CLOEXEC), dup2(third, 1000);
+    close(first), close(second);
+    int open_before = 0, open_after = 0;
+    for (int file = 0; file < 1100; file++) open_before += fcntl(file, F_GETFD) != -1;
+    ready(), wait_for_go(go);
+    for (int file = 0; file < 1100; file++) open_after += fcntl(file, F_GETFD) != -1;
+    EXPECT_EQUAL("open descriptors", open_after, open_before);
+    EXPECT(fcntl(first, F_GETFD) == -1 && fcntl(second, F_GETFD) == -1, "a hole is filled");
+    EXPECT_EQUAL("flags of 200", fcntl(200, F_GETFD), FD_CLOEXEC);
+    EXPECT_EQUAL("flags of 1000", fcntl(1000, F_GETFD), 0);
+    EXPECT_EQUAL("the next free number", dup(0), first);
+}
+
+static void deleted(const char *go) {
+    int file = make("doomed", O_RDWR), twin = dup(file);
+    struct stat before, after;
+    unlink("doomed");
+    lseek(file, 10, SEEK_SET);
+    fstat(file, &before);
+    ready(), wait_for_go(go);
+    expect_read(file, "abc"), expect_read(twin, "def");
+    if (pwrite(file, "ZZ", 2, 0) != 2) differs("cannot write: %s", strerror(errno));
+    lseek(file, 0, SEEK_SET);
+    expect_read(file, "ZZ2345");
+    fstat(file, &after);
+    EXPECT_EQUAL("size", after.st_size, before.st_size);
+    EXPECT_EQUAL("names", after.st_nlink, 0);
+    EXPECT_EQUAL("mode", after.st_mode, before.st_mode);
+    EXPECT(access("doomed", F_OK) != 0, "the file has a name again");
+}
+
+static void deleted_read_only(const char *go) {
+    int file = make("doomed", O_RDONLY), status = fcntl(file, F_GETFL);
+    unlink("doomed");
+    ready(), wait_for_go(go);
+    expect_read(file, "012");
+    expect_flags(file, status, 0);
+    EXPECT(write(file, "x", 1) == -1 && errno == EBADF, "a read-only descriptor takes writes");
+}
+
+static void devices(const char *go) {
+    static const char *const paths[] = {"/dev/null", "/dev/zero", "/dev/full", "/dev/urandom", "/dev/random"};
+    int files[5];
+    char byte;
+    for (int index = 0; index < 5; index++)
+        if ((files[index] = open(paths[index], index == 4 ? O_RDONLY : O_RDWR)) < 0) cannot("open %s", paths[index]);
+    ready(), wait_for_go(go);
+    EXPECT(read(files[0], &byte, 1) == 0 && write(files[0], "x", 1) == 1, "/dev/null is something else");
+    EXPECT(read(files[1], &byte, 1) == 1 && byte == 0, "/dev/zero is something else");
+    EXPECT(write(files[2], "x", 1) == -1 && errno == ENOSPC, "/dev/full is something else");
+    uint64_t random[2] = {0, 0};
+    EXPECT(read(files[3], random, 16) == 16 && random[0] != random[1], "/dev/urandom is something else");
+    EXPECT(read(files[4], random, 8) == 8, "/dev/random is something else");
+}
+
+static void directory(const char *go) {
+    mkdir("some", 0700);
+    char name[40];
+    for (int index = 0; index < 9; index++) {
+        snprintf(name, sizeof name, "some/%d", index);
+        close(open(name, O_CREAT | O_WRONLY, 0600));
+    }
+    int file = open("some", O_RDONLY | O_DIRECTORY | O_CLOEXEC);
+    ready(), wait_for_go(go);
+    EXPECT(faccessat(file, "3", F_OK, 0) == 0, "the directory is another one");
+    DIR *entries = fdopendir(file);
+    int seen = 0;
+    while (entries && readdir(entries)) seen++;
+    EXPECT_EQUAL("entries", seen, 11);
+}
+
+static void path_only(const char *go) {
+    close(make("target", O_RDONLY));
+    int file = open("target", O_PATH), status = fcntl(file, F_GETFL);
+    ready(), wait_for_go(go);
+    char path[40];
+    expect_flags(file, status, 0);
+    snprintf(path, sizeof path, "/proc/self/fd/%d", file);
+    expect_read(open(path, O_RDONLY), "0123");
+}
+
+static void beyond_end(const char *go) {
+    int file = make("out", O_RDWR);
+    lseek(file, 100000, SEEK_SET);
+    ready(), wait_for_go(go);
+    EXPECT_EQUAL("offset", lseek(file, 0, SEEK_CUR), 100000);
+    struct stat about;
+    fstat(file, &about);
+    EXPECT_EQUAL("size", about.st_size, 37);
+    if (write(file, "x", 1) != 1) differs("cannot write");
+    fstat(file, &about);
+    EXPECT_EQUAL("size after the write", about.st_size, 100001);
+}
+
+static void memory_file(const char *go) {
+    int file = memfd_create("scratch", MFD_CLOEXEC);
+    if (file < 0 || write(file, TEXT, 37) != 37) cannot("make a memory file");
+    lseek(file, 4, SEEK_SET);
+    ready(), wait_for_go(go);
+    expect_read(file, "4567");
+}
+
+static void odd_name(const char *go) {
+    int file = make("with space\nand line (deleted)", O_RDONLY);
+    lseek(file, 2, SEEK_SET);
+    ready(), wait_for_go(go);
+    expect_read(file, "234");
+}
+
+static void owner_signal(const char *go) {
+    int file = make("owned", O_RDONLY);
+    fcntl(file, F_SETOWN, getpid());
+    fcntl(file, F_SETSIG, SIGUSR2);
+    ready(), wait_for_go(go);
+    EXPECT_EQUAL("owner", fcntl(file, F_GETOWN), getpid());
+    EXPECT_EQUAL("signal", fcntl(file, F_GETSIG), SIGUSR2);
+}
+
+int main(int count, char **arguments) {
+    static const struct {
+        const char *name;
+        void (*act)(const char *go);
+    } kinds[] = {{"read_offset", read_offset}, {"write_offset", write_offset}, {"append", append},
+                 {"odd_flags", odd_flags},     {"shared_offset", shared_offset}, {"holes", holes},
+                 {"deleted", deleted},         {"deleted_read_only", deleted_read_only}, {"devices", devices},
+                 {"directory", directory},     {"path_only", path_only}, {"beyond_end", beyond_end},
+                 {"memory_file", memory_file}, {"odd_name", odd_name}, {"owner_signal", owner_signal}};
+    for (size_t index = 0; index < sizeof kinds / sizeof *kinds; index++)
+        if (count > 2 && !strcmp(arguments[2], kinds[index].name)) {
+            kinds[index].act(arguments[1]);
+            return finish();
+        }
+    cannot("find the kind");
+}

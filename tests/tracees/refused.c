@@ -1,0 +1,347 @@
+/* Holds one thing that a snapshot cannot carry, named by the second argument, and must go on as if nobody had looked.
+ *
+ * Prints "ready", or "cannot: …" with status 77 where this machine does not have the thing.
+ */
+#include "tracee.h"
+
+#include <linux/aio_abi.h>
+#include <linux/bpf.h>
+#include <linux/filter.h>
+#include <linux/io_uring.h>
+#include <linux/perf_event.h>
+#include <linux/seccomp.h>
+#include <linux/userfaultfd.h>
+#include <mqueue.h>
+#include <netinet/in.h>
+#include <pthread.h>
+#include <pty.h>
+#include <sys/epoll.h>
+#include <sys/eventfd.h>
+#include <sys/fanotify.h>
+#include <sys/file.h>
+#include <sys/inotify.h>
+#include <sys/ioctl.h>
+#include <sys/pidfd.h>
+#include <sys/prctl.h>
+#include <sys/ptrace.h>
+#include <sys/shm.h>
+#include <sys/signalfd.h>
+#include <sys/socket.h>
+#include <sys/timerfd.h>
+#include <sys/un.h>
+
+static const char *go;
+static int opened; /* what a kind that is a descriptor leaves here is looked at again at the end */
+static pid_t child;
+
+static void keep(int file, const char *what) {
+    if (file < 0) cannot("open %s", what);
+    opened = file;
+}
+
+static void *nap_along(void *unused) {
+    (void)unused;
+    wait_for_go(go);
+    return NULL;
+}
+
+static pthread_t thread;
+static void take_thread(void) {
+    if (pthread_create(&thread, NULL, nap_along, NULL)) cannot("start a thread");
+}
+
+static void take_child(void) {
+    child = fork();
+    if (child) return;
+    while (!is_told(go)) usleep(2000);
+    _exit(0);
+}
+
+static void take_zombie_child(void) {
+    siginfo_t about;
+    child = fork();
+    if (child == 0) _exit(0);
+    waitid(P_PID, child, &about, WEXITED | WNOWAIT);
+}
+
+static void take_shared_files_child(void) {
+    child = syscall(SYS_clone, CLONE_FILES | SIGCHLD, 0, 0, 0, 0);
+    if (child) return;
+    while (!is_told(go)) usleep(2000);
+    _exit(0);
+}
+
+static void take_pipe(void) {
+    int ends[2];
+    if (pipe(ends)) cannot("make a pipe");
+    keep(ends[1], "a pipe");
+}
+
+static void take_fifo(void) {
+    mkfifo("fifo", 0600);
+    keep(open("fifo", O_RDWR), "a fifo");
+}
+
+static void take_unix_socket(void) {
+    int ends[2];
+    if (socketpair(AF_UNIX, SOCK_STREAM, 0, ends)) cannot("make sockets");
+    keep(ends[0], "a socket");
+}
+
+static void take_tcp_socket(void) {
+    keep(socket(AF_INET, SOCK_STREAM, 0), "a socket");
+    struct sockaddr_in address = {.sin_family = AF_INET, .sin_addr = {htonl(INADDR_LOOPBACK)}};
+    if (bind(opened, (struct sockaddr *)&address, sizeof address) || listen(opened, 1)) cannot("listen");
+}
+
+static void take_udp_socket(void) { keep(socket(AF_INET6, SOCK_DGRAM, 0), "a socket"); }
+static void take_netlink_socket(void) { keep(socket(AF_NETLINK, SOCK_RAW, 0), "a socket"); }
+static void take_epoll(void) { keep(epoll_create1(0), "epoll"); }
+static void take_eventfd(void) { keep(eventfd(3, 0), "an eventfd"); }
+static void take_timerfd(void) { keep(timerfd_create(CLOCK_MONOTONIC, 0), "a timerfd"); }
+
+static void take_signalfd(void) {
+    sigset_t set;
+    sigemptyset(&set);
+    sigaddset(&set, SIGHUP);
+    keep(signalfd(-1, &set, 0), "a signalfd");
+}
+
+static void take_inotify(void) {
+    keep(inotify_init(), "inotify");
+    inotify_add_watch(opened, ".", IN_CREATE);
+}
+
+static void take_fanotify(void) { keep(fanotify_init(FAN_CLASS_NOTIF, O_RDONLY), "fanotify"); }
+
+static void take_io_uring(void) {
+    struct io_uring_params parameters = {0};
+    keep(syscall(SYS_io_uring_setup, 8, &parameters), "io_uring");
+}
+
+static void take_io_uring_mapped(void) {
+    struct io_uring_params parameters = {0};
+    int ring = syscall(SYS_io_uring_setup, 8, &parameters);
+    if (ring < 0) cannot("open io_uring");
+    if (mmap(NULL, PAGE, PROT_READ | PROT_WRITE, MAP_SHARED, ring, IORING_OFF_SQ_RING) == MAP_FAILED) cannot("map it");
+    close(ring);
+}
+
+static void take_aio(void) {
+    aio_context_t context = 0;
+    if (syscall(SYS_io_setup, 4, &context)) cannot("set up asynchronous i/o");
+}
+
+static void take_userfaultfd(void) {
+    struct uffdio_api api = {.api = UFFD_API};
+    keep(syscall(SYS_userfaultfd, O_CLOEXEC), "userfaultfd");
+    ioctl(opened, UFFDIO_API, &api);
+}
+
+static void take_userfaultfd_registered(void) {
+    take_userfaultfd();
+    struct uffdio_register range = {.range = {(uintptr_t)map_pages(4, PROT_READ | PROT_WRITE, 0), 4 * PAGE},
+                                    .mode = UFFDIO_REGISTER_MODE_MISSING};
+    if (ioctl(opened, UFFDIO_REGISTER, &range)) cannot("register memory");
+}
+
+static void take_pseudo_terminal(void) {
+    int other;
+    if (openpty(&opened, &other, NULL, NULL, NULL)) cannot("open a pseudo-terminal");
+}
+
+static void take_seccomp(void) {
+    struct sock_filter allow[] = {BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW)};
+    struct sock_fprog program = {1, allow};
+    prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0);
+    if (prctl(PR_SET_SECCOMP, SECCOMP_MODE_FILTER, &program)) cannot("install a filter");
+}
+
+static void take_huge_pages(void) {
+    char *place = mmap(NULL, 2 << 20, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_HUGETLB, -1, 0);
+    if (place == MAP_FAILED) cannot("map a huge page");
+    place[0] = 1;
+}
+
+static void take_lock(void) {
+    keep(open("locked", O_RDWR | O_CREAT, 0600), "a file");
+    if (flock(opened, LOCK_EX)) cannot("lock");
+}
+
+static void take_record_lock(void) {
+    keep(open("locked", O_RDWR | O_CREAT, 0600), "a file");
+    if (fcntl(opened, F_SETLK, &(struct flock){.l_type = F_WRLCK, .l_len = 10})) cannot("lock");
+}
+
+static void take_description_lock(void) {
+    keep(open("locked", O_RDWR | O_CREAT, 0600), "a file");
+    if (fcntl(opened, F_OFD_SETLK, &(struct flock){.l_type = F_RDLCK, .l_len = 10})) cannot("lock");
+}
+
+static void take_lease(void) {
+    keep(open("leased", O_RDONLY | O_CREAT, 0600), "a file");
+    if (fcntl(opened, F_SETLEASE, F_RDLCK)) cannot("take a lease");
+}
+
+static void take_kernel_log(void) { keep(open("/dev/kmsg", O_RDONLY), "/dev/kmsg"); }
+static void take_tun(void) { keep(open("/dev/net/tun", O_RDWR), "/dev/net/tun"); }
+static void take_fuse(void) { keep(open("/dev/fuse", O_RDWR), "/dev/fuse"); }
+static void take_terminal_multiplexer(void) { keep(open("/dev/ptmx", O_RDWR | O_NOCTTY), "/dev/ptmx"); }
+
+static void take_device_memory(void) {
+    int memory = open("/dev/mem", O_RDONLY);
+    if (memory < 0 || mmap(NULL, PAGE, PROT_READ, MAP_SHARED, memory, 0) == MAP_FAILED) cannot("map /dev/mem");
+    close(memory);
+}
+
+static void take_system_v_memory(void) {
+    int segment = shmget(IPC_PRIVATE, 4 * PAGE, IPC_CREAT | 0600);
+    void *place = segment < 0 ? (void *)-1 : shmat(segment, NULL, 0);
+    if (segment >= 0) shmctl(segment, IPC_RMID, NULL);
+    if (place == (void *)-1) cannot("attach shared memory");
+}
+
+static void take_message_queue(void) {
+    struct mq_attr attributes = {.mq_maxmsg = 2, .mq_msgsize = 8};
+    keep(mq_open("/failover-tracee", O_RDWR | O_CREAT, 0600, &attributes), "a message queue");
+    mq_unlink("/failover-tracee");
+}
+
+static void take_bpf_map(void) {
+    union bpf_attr attributes = {.map_type = BPF_MAP_TYPE_ARRAY, .key_size = 4, .value_size = 4, .max_entries = 1};
+    keep(syscall(SYS_bpf, BPF_MAP_CREATE, &attributes, sizeof attributes), "a BPF map");
+}
+
+static void take_perf_event(void) {
+    struct perf_event_attr event = {.type = PERF_TYPE_SOFTWARE, .size = sizeof event, .config = PERF_COUNT_SW_TASK_CLOCK};
+    keep(syscall(SYS_perf_event_open, &event, 0, -1, -1, 0), "a performance event");
+}
+
+static void take_pidfd(void) { keep(pidfd_open(getpid(), 0), "a pidfd"); }
+static void take_namespace(void) { keep(open("/proc/self/ns/net", O_RDONLY), "a namespace"); }
+static void take_proc_file(void) { keep(open("/proc/self/maps", O_RDONLY), "a file of /proc"); }
+static void take_proc_directory(void) { keep(open("/proc/self", O_RDONLY | O_DIRECTORY), "a directory of /proc"); }
+
+static void take_secret_memory(void) {
+    int file = syscall(SYS_memfd_secret, 0);
+    if (file < 0 || ftruncate(file, PAGE)) cannot("make secret memory");
+    char *place = mmap(NULL, PAGE, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
+    if (place == MAP_FAILED) cannot("map secret memory");
+    place[0] = 1;
+    close(file);
+}
+
+static void take_memory_file(void) {
+    keep(memfd_create("scratch", 0), "a memory file");
+    if (ftruncate(opened, PAGE) || mmap(NULL, PAGE, PROT_READ | PROT_WRITE, MAP_SHARED, opened, 0) == MAP_FAILED)
+        cannot("map a memory file");
+}
+
+static void take_protection_key(void) {
+    int key = pkey_alloc(0, 0);
+    if (key < 0 || pkey_mprotect(map_pages(1, PROT_READ | PROT_WRITE, 0), PAGE, PROT_READ | PROT_WRITE, key))
+        cannot("use a protection key");
+}
+
+static void take_deleted_directory(void) {
+    if (mkdir("gone", 0700) || chdir("gone") || rmdir("../gone")) cannot("delete the working directory");
+}
+
+static void take_root(void) {
+    mkdir("jail", 0700);
+    if (chroot("jail")) cannot("change the root");
+    go = "go"; /* the working directory stays outside */
+}
+
+static void take_traced_child(void) {
+    child = fork();
+    if (child == 0) {
+        ptrace(PTRACE_TRACEME, 0, 0, 0);
+        raise(SIGSTOP);
+        _exit(0);
+    }
+    waitpid(child, NULL, 0);
+}
+
+static void take_own_namespace(void) {
+    if (unshare(CLONE_NEWUTS)) cannot("make a namespace");
+}
+
+
+static void take_directory_notice(void) {
+    keep(open(".", O_RDONLY | O_DIRECTORY), "the directory");
+    signal(SIGIO, SIG_IGN);
+    if (fcntl(opened, F_NOTIFY, DN_CREATE | DN_MULTISHOT)) cannot("ask for notices");
+}
+
+static const struct kind {
+    const char *name;
+    void (*take)(void);
+} kinds[] = {{"nothing", NULL},
+             {"thread", take_thread},
+             {"child", take_child},
+             {"zombie_child", take_zombie_child},
+             {"shared_files_child", take_shared_files_child},
+             {"traced_child", take_traced_child},
+             {"pipe", take_pipe},
+             {"fifo", take_fifo},
+             {"unix_socket", take_unix_socket},
+             {"tcp_socket", take_tcp_socket},
+             {"udp_socket", take_udp_socket},
+             {"netlink_socket", take_netlink_socket},
+             {"epoll", take_epoll},
+             {"eventfd", take_eventfd},
+             {"timerfd", take_timerfd},
+             {"signalfd", take_signalfd},
+             {"inotify", take_inotify},
+             {"fanotify", take_fanotify},
+             {"io_uring", take_io_uring},
+             {"io_uring_mapped", take_io_uring_mapped},
+             {"aio", take_aio},
+             {"userfaultfd", take_userfaultfd},
+             {"userfaultfd_registered", take_userfaultfd_registered},
+             {"pseudo_terminal", take_pseudo_terminal},
+             {"seccomp", take_seccomp},
+             {"huge_pages", take_huge_pages},
+             {"lock", take_lock},
+             {"record_lock", take_record_lock},
+             {"description_lock", take_description_lock},
+             {"lease", take_lease},
+             {"kernel_log", take_kernel_log},
+             {"tun", take_tun},
+             {"fuse", take_fuse},
+             {"terminal_multiplexer", take_terminal_multiplexer},
+             {"device_memory", take_device_memory},
+             {"system_v_memory", take_system_v_memory},
+             {"message_queue", take_message_queue},
+             {"bpf_map", take_bpf_map},
+             {"perf_event", take_perf_event},
+             {"pidfd", take_pidfd},
+             {"namespace", take_namespace},
+             {"proc_file", take_proc_file},
+             {"proc_directory", take_proc_directory},
+             {"secret_memory", take_secret_memory},
+             {"memory_file", take_memory_file},
+             {"protection_key", take_protection_key},
+             {"deleted_directory", take_deleted_directory},
+             {"root", take_root},
+             {"own_namespace", take_own_namespace},
+             {"directory_notice", take_directory_notice}};
+
+int main(int count, char **arguments) {
+    go = arguments[1];
+    signal(SIGCHLD, SIG_DFL);
+    for (size_t index = 0; index < sizeof kinds / sizeof *kinds; index++) {
+        if (count < 3 || strcmp(arguments[2], kinds[index].name)) continue;
+        if (kinds[index].take) kinds[index].take();
+        ready();
+        wait_for_go(go);
+        EXPECT(!opened || fcntl(opened, F_GETFD) != -1, "the descriptor is gone");
+        if (child) {
+            ptrace(PTRACE_DETACH, child, 0, SIGCONT);
+            EXPECT(waitpid(child, NULL, 0) == child, "the child is gone");
+        }
+        return finish();
+    }
+    cannot("find the kind");
+}
