@@ -9,6 +9,8 @@ from typing import Literal
 
 import msgspec
 
+from checkpoint.model import Clocks
+
 
 class Message(msgspec.Struct, frozen=True, tag=True):
     """The base of them all: a frozen struct, told apart by its class name."""
@@ -40,15 +42,15 @@ class MakeVessel(Message, frozen=True):
 
     Attributes:
         inner_pid: the PID that the program knows itself by; 0 for any.
-        monotonic_ns, boottime_ns: what the program's clocks must at least read now (its snapshot's, with the outage added).
+        clocks: as the program read them when its snapshot was taken, ``elapsed_ns`` ago.
         totals: bytes that the program had written to its two streams.
     """
 
     component: str
     inner_pid: int
     isolate: bool
-    monotonic_ns: int
-    boottime_ns: int
+    clocks: Clocks
+    elapsed_ns: int
     totals: tuple[int, int]
     log_directory: str
     cgroup: str = ""

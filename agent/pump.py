@@ -5,7 +5,7 @@ The counters are shared with the keeper, so that a snapshot's output is exact wi
 never prolongs a freeze, and the keeper finds the bytes in the log after the thaw.
 
 The disk is full: the oldest half of the log is given back to it first. If that does not help, nothing is dropped: the pump tries
-again until there is room, the pipe fills, and the program waits inside its next write. It is not killed, and goes on without a gap.
+again until there is room, the pipe fills, and the program waits inside its next write: not killed, and later without a gap.
 """
 
 from __future__ import annotations

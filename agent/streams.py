@@ -118,13 +118,11 @@ class OutputLogs:
         """
         for piece in pieces:
             bounds = self.bounds(piece.stream)
-            if piece.offset > bounds.size:
-                self._set_offset(piece.stream, START, piece.offset)
+            gap = piece.offset > bounds.size
+            start = piece.offset if gap else min(bounds.start, piece.offset)
             _write_whole(self._logs[piece.stream], piece.content, piece.offset)
-            total = piece.offset + len(piece.content)
-            os.ftruncate(self._logs[piece.stream], total)
-            self._set_offset(piece.stream, COMMITTED, total)
-            self.trim(piece.stream, total - KEEP_LIMIT)
+            self._end_at(piece.stream, piece.offset + len(piece.content), start)
+            self.trim(piece.stream, piece.offset + len(piece.content) - KEEP_LIMIT)
 
     def commit(self, totals: tuple[int, int]) -> None:
         """Say that a checkpoint holds the streams up to ``totals``. Never goes back: an older acknowledgement changes nothing."""
@@ -135,10 +133,8 @@ class OutputLogs:
     def truncate(self, totals: tuple[int, int]) -> None:
         """Make the streams end at ``totals``, all of it committed: what a program restored from there has written so far."""
         for stream, total in zip(STREAMS, totals, strict=True):
-            if total > self.bounds(stream).size:
-                self._set_offset(stream, START, total)
-            os.ftruncate(self._logs[stream], total)
-            self._set_offset(stream, COMMITTED, total)
+            bounds = self.bounds(stream)
+            self._end_at(stream, total, total if total > bounds.size else bounds.start)
 
     def trim(self, stream: int, start: int) -> bool:
         """Give the bytes before ``start`` back to the disk, in whole steps; returns whether any were."""
@@ -150,6 +146,12 @@ class OutputLogs:
         begin = old - old % TRIM_STEP
         kernel.punch_hole(self._logs[stream], begin, new - begin)
         return True
+
+    def _end_at(self, stream: int, total: int, start: int) -> None:
+        """The stream ends at ``total``, committed, and its kept part begins at ``start``, or where it ends."""
+        os.ftruncate(self._logs[stream], total)
+        self._set_offset(stream, START, min(start, total))
+        self._set_offset(stream, COMMITTED, total)
 
     def _offset(self, stream: int, which: int) -> int:
         content = os.pread(self._offsets, _OFFSET.size, _place(stream, which))

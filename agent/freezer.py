@@ -1,0 +1,254 @@
+"""Holding a component still without a tracer: a ptrace stop ends when its tracer dies, so a lease must not rest on one.
+
+Two ways, one contract. A cgroup of version 2 holds whatever is in it, also what the program started, and the program cannot
+notice; where we may not make one, SIGSTOP does, sent to every descendant until no new one appears. A program can notice that one:
+its parent sees a stop, and a SIGCONT follows.
+
+Sources: cgroup-v2.rst of the kernel ("cgroup.freeze", "cgroup.kill"), signal(7), proc_pid_stat(5).
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Final, Literal, Protocol
+
+SETTLE_S: Final = 1.0
+"""How long a freeze may take to reach every thread; one that waits for a disk is only held when the disk answers."""
+
+SETTLE_STEP_S: Final = 0.001
+STANDING: Final = frozenset("TZX")
+"""States of /proc/PID/stat in which a process runs nothing, whoever lives or dies."""
+HELD: Final = STANDING | {"t"}
+"""The same, with a tracer that holds it now: once SIGSTOP is pending, it stands also when that tracer dies."""
+
+
+class Freezer(Protocol):
+    """Something that can hold a component still. All methods raise OSError only for what should not happen."""
+
+    kind: Literal["cgroup", "SIGSTOP"]
+
+    def birthplace(self) -> AbstractContextManager[None]:
+        """What this process starts within the body is born inside."""
+
+    def add(self, pid: int) -> None:
+        """Take a process that is there already, and what it starts from now on."""
+
+    def freeze(self) -> bool:
+        """Hold everything; True once every thread stands, False if one does not yet (it will as soon as it leaves the kernel)."""
+
+    def thaw(self) -> None:
+        """Let everything go on."""
+
+    def kill(self) -> None:
+        """SIGKILL to everything, frozen or not."""
+
+    def close(self) -> None:
+        """Give back what was made; everything in it has ended."""
+
+
+class CgroupFreezer:
+    """A cgroup v2 directory made for one component."""
+
+    kind: Literal["cgroup", "SIGSTOP"] = "cgroup"
+
+    def __init__(self, directory: Path) -> None:
+        """Make the cgroup.
+
+        Raises:
+            OSError: the place is not delegated to us, or is no cgroup v2 with a freezer.
+        """
+        directory.mkdir()
+        self._directory = directory
+        try:
+            self._write("cgroup.freeze", "0")
+        except OSError:
+            directory.rmdir()
+            raise
+
+    @contextmanager
+    def birthplace(self) -> Iterator[None]:
+        """Go in, and back out: there is no instant at which a newborn process is outside."""
+        home = own_cgroup()
+        assert home is not None
+        self._write("cgroup.procs", "0")
+        try:
+            yield
+        finally:
+            (home / "cgroup.procs").write_text("0", encoding="ascii")
+
+    def add(self, pid: int) -> None:
+        """Move the process in; one that was born here is here already."""
+        self._write("cgroup.procs", str(pid))
+
+    def freeze(self) -> bool:
+        """Freeze, and wait for the kernel's word that it is so."""
+        self._write("cgroup.freeze", "1")
+        deadline = time.monotonic() + SETTLE_S
+        with open(self._directory / "cgroup.events", encoding="ascii") as events:
+            changed = select.poll()
+            changed.register(events, select.POLLPRI)
+            while "frozen 1" not in events.read():
+                rest = deadline - time.monotonic()
+                if rest <= 0:
+                    return False
+                changed.poll(rest * 1000)
+                events.seek(0)
+        return True
+
+    def thaw(self) -> None:
+        """Thaw."""
+        self._write("cgroup.freeze", "0")
+
+    def kill(self) -> None:
+        """Kill all at once (Linux 5.14), else one by one."""
+        try:
+            self._write("cgroup.kill", "1")
+        except FileNotFoundError:
+            for pid in (self._directory / "cgroup.procs").read_text(encoding="ascii").split():
+                _send(int(pid), signal.SIGKILL)
+
+    def close(self) -> None:
+        """Remove the cgroup, once its last process has been reaped."""
+        deadline = time.monotonic() + SETTLE_S
+        while True:
+            try:
+                self._directory.rmdir()
+            except FileNotFoundError:
+                return
+            except OSError:
+                if time.monotonic() > deadline:
+                    return  # an unkillable process; the next guard of that name makes another directory
+                time.sleep(SETTLE_STEP_S)
+            else:
+                return
+
+    def _write(self, name: str, text: str) -> None:
+        with open(self._directory / name, "w", encoding="ascii") as file:
+            file.write(text)
+
+
+class SignalFreezer:
+    """SIGSTOP and SIGCONT to a process and its descendants."""
+
+    kind: Literal["cgroup", "SIGSTOP"] = "SIGSTOP"
+
+    def __init__(self) -> None:
+        self._roots: list[int] = []
+        self._stopped: set[int] = set()
+
+    @contextmanager
+    def birthplace(self) -> Iterator[None]:
+        """There is no place to be: whoever is born is added."""
+        yield
+
+    def add(self, pid: int) -> None:
+        """Remember the process."""
+        self._roots.append(pid)
+
+    def freeze(self) -> bool:
+        """Stop all; again until no new one appears and none runs."""
+        deadline = time.monotonic() + SETTLE_S
+        while True:
+            states = {pid: _state(pid) for pid in self._everybody()}
+            running = {pid for pid, state in states.items() if state not in STANDING} - self._stopped
+            if not running and set(states.values()) <= HELD:
+                return True
+            for pid in running:
+                _send(pid, signal.SIGSTOP)
+            self._stopped |= running
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(SETTLE_STEP_S)
+
+    def thaw(self) -> None:
+        """Continue those that we stopped; what stood before by itself stays as it was."""
+        for pid in sorted(self._stopped, reverse=True):
+            _send(pid, signal.SIGCONT)
+        self._stopped.clear()
+
+    def kill(self) -> None:
+        """Kill all; parents first, so that none starts another."""
+        for pid in self._everybody():
+            _send(pid, signal.SIGKILL)
+
+    def close(self) -> None:
+        """Nothing was made."""
+
+    def _everybody(self) -> list[int]:
+        """The processes and their descendants, parents before children."""
+        children = _children()
+        found: list[int] = []
+        waiting = list(self._roots)
+        while waiting:
+            pid = waiting.pop(0)
+            if pid not in found and _state(pid) != "":
+                found.append(pid)
+                waiting += children.get(pid, [])
+        return found
+
+
+def own_cgroup() -> Path | None:
+    """The cgroup v2 directory that this process is in; None where no such filesystem is mounted."""
+    mounts = Path("/proc/self/mountinfo").read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+    points = [line.split()[4] for line in mounts if " - cgroup2 " in line]
+    lines = Path("/proc/self/cgroup").read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+    paths = [line.removeprefix("0::") for line in lines if line.startswith("0::")]
+    return Path(points[0]) / paths[0].lstrip("/") if points and paths else None
+
+
+def choose(place: str, name: str) -> tuple[Freezer, tuple[str, ...]]:
+    """The best freezer that we may have, with a sentence if it is the lesser one.
+
+    Args:
+        place: the cgroup v2 directory to make ours in; "" for this process's own.
+        name: of our directory there.
+    """
+    parent = Path(place) if place else own_cgroup()
+    if parent is None:
+        reason = "no cgroup v2 filesystem is mounted"
+    else:
+        try:
+            return CgroupFreezer(parent / name), ()
+        except OSError as error:
+            reason = (
+                f"cannot make a cgroup in {parent}: {error.strerror}; delegate one to the agent's user (Delegate=yes in a unit)"
+            )
+    return SignalFreezer(), (f"it is frozen by SIGSTOP, which it can notice: {reason}",)
+
+
+def _children() -> dict[int, list[int]]:
+    """Every process's children, by one pass over /proc."""
+    table: dict[int, list[int]] = {}
+    for entry in os.listdir("/proc"):
+        if entry.isdigit():
+            fields = _stat(int(entry))
+            if len(fields) > 1:
+                table.setdefault(int(fields[1]), []).append(int(entry))
+    return table
+
+
+def _state(pid: int) -> str:
+    """The state letter of a process; "" if it is gone."""
+    return (_stat(pid) or [""])[0]
+
+
+def _stat(pid: int) -> list[str]:
+    """What follows the name in /proc/PID/stat: state, parent …; nothing if the process is gone."""
+    try:
+        with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:
+            return file.read().rpartition(")")[2].split()
+    except (FileNotFoundError, ProcessLookupError):
+        return []
+
+
+def _send(pid: int, number: int) -> None:
+    try:
+        os.kill(pid, number)
+    except ProcessLookupError:
+        pass

@@ -1,0 +1,373 @@
+"""The guard of one component: ``python -m agent.guard SOCKET_PATH``. Parent of the program, and nobody's child for long.
+
+It owns what must not die with an agent: the program's exit status, the other ends of its output, and the lease that freezes it
+when nobody renews it. It imports little, locks its memory, and does no tracing and no networking, so that little can end it. If
+it ends all the same, the program ends with it (PR_SET_PDEATHSIG): a program without a lease must not run.
+
+It listens on SOCKET_PATH (0600) for one agent at a time; a new one takes the place of the old. It ends
+
+* when the agent says `Forget` after the program's end;
+* when the program ends that was let go (`LetGo`); at once, if it is somebody else's child;
+* when the agent is lost before anything was started, or before a restore was committed;
+* when no agent ever came, after `FIRST_CALL_S`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import socket
+import struct
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+import msgspec
+
+from agent import kernel
+from agent.guard_messages import (
+    Commit,
+    Describe,
+    Described,
+    Done,
+    Forget,
+    Freeze,
+    FrozenByLease,
+    Kill,
+    Lease,
+    LetGo,
+    MakeVessel,
+    Refused,
+    Request,
+    Start,
+    Started,
+    Thaw,
+    VesselReady,
+    Watch,
+    Watching,
+)
+from agent.ward import Ward, WardError
+from checkpoint.channel import Channel, ChannelError, close_all
+from checkpoint.errors import CheckpointError
+
+FIRST_CALL_S: Final = 30.0
+SEND_TIMEOUT_S: Final = 1.0
+"""An agent that does not read for so long is treated as lost; a lease must not wait for it."""
+
+REALTIME_PRIORITY: Final = 1
+NS_PER_MS: Final = 1_000_000
+_PEER: Final = struct.Struct("3i")
+
+
+class Guard:
+    """The loop and what it was told. One thread; the pump of `Ward` is the only other one."""
+
+    def __init__(self, listener: socket.socket, notes: tuple[str, ...]) -> None:
+        self._listener = listener
+        self._notes = notes
+        self._agent: Channel[Any] | None = None
+        self._ward: Ward | None = None
+        self._keeper: int | None = None
+        self._over = False
+        self._ends_with_ward = False
+        self._started_at = time.monotonic()
+        self._children_ended = _wake_on_children()
+        self._answers: dict[type, Callable[[Any, tuple[int, ...]], None]] = {
+            Start: self._start,
+            MakeVessel: self._make_vessel,
+            Watch: self._watch,
+            Commit: self._commit,
+            Lease: self._lease,
+            Freeze: lambda _, __: self._act(lambda ward: ward.freeze()),
+            Thaw: lambda _, __: self._act(lambda ward: ward.thaw()),
+            Kill: lambda request, _: self._act(lambda ward: ward.kill(request.signal)),
+            Describe: lambda _, __: self._reply(self._description()),
+            LetGo: self._let_go,
+            Forget: self._forget,
+        }
+
+    def run(self) -> None:
+        """Serve until there is nothing left to guard."""
+        while not self._over:
+            ready = self._wait()
+            if self._ward is not None and self._ward.lapse(time.monotonic_ns()):  # first: a lease waits for nobody
+                self._tell(FrozenByLease())
+            for act in ready:
+                act()
+            if self._agent is None and self._ward is None and time.monotonic() > self._started_at + FIRST_CALL_S:
+                self._over = True
+        if self._ward is not None:
+            self._ward.close()
+
+    def _wait(self) -> list[Callable[[], None]]:
+        """Sleep until something is to be done, or a deadline passes; returns what is to be done."""
+        watched: dict[int, Callable[[], None]] = {
+            self._listener.fileno(): self._accept,
+            self._children_ended.fileno(): self._reap,
+        }
+        if self._agent is not None:
+            watched[self._agent.fileno()] = self._receive
+        if self._keeper is not None:
+            watched[self._keeper] = self._lose_keeper
+        if self._ward is not None and self._ward.pidfd is not None and self._ward.exited is None:
+            watched[self._ward.pidfd] = self._watched_end
+        poll = select.poll()
+        for descriptor in watched:
+            poll.register(descriptor, select.POLLIN)
+        return [watched[descriptor] for descriptor, _ in poll.poll(self._patience_ms())]
+
+    def _patience_ms(self) -> float | None:
+        if self._ward is None:
+            return FIRST_CALL_S * 1000 if self._agent is None else None
+        deadline_ns = self._ward.deadline_ns()
+        return None if deadline_ns is None else max(deadline_ns - time.monotonic_ns(), 0) / NS_PER_MS
+
+    # --- the agent ---
+
+    def _accept(self) -> None:
+        """A new agent takes the old one's place; a stranger is turned away."""
+        end, _ = self._listener.accept()
+        _, uid, _ = _PEER.unpack(end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
+        if uid not in (0, os.geteuid()):
+            end.close()
+            return
+        if self._agent is not None:
+            self._lose_agent()
+        if self._over:
+            end.close()
+            return
+        end.settimeout(SEND_TIMEOUT_S)
+        self._agent = Channel(end, Request)
+        if self._ward is not None and self._ward.exited is not None:
+            self._tell(self._ward.exited)
+
+    def _receive(self) -> None:
+        assert self._agent is not None
+        try:
+            request, descriptors = self._agent.receive()
+        except (ChannelError, TimeoutError):
+            self._lose_agent()
+            return
+        try:
+            self._answers[type(request)](request, descriptors)
+        except (WardError, OSError, CheckpointError) as error:
+            self._reply(Refused(_sentence(request, error)))
+        finally:
+            close_all(tuple(descriptor for descriptor in descriptors if descriptor != self._keeper))
+
+    def _lose_agent(self) -> None:
+        """The agent has gone: what was unfinished is undone, what runs goes on."""
+        assert self._agent is not None
+        self._agent.close()
+        self._agent = None
+        if self._ward is None:
+            self._over = True
+        else:
+            self._undo_unfinished(self._ward)
+
+    def _lose_keeper(self) -> None:
+        """The pidfd of the keeper says that it has ended in the middle of a restore."""
+        self._drop_keeper()
+        if self._ward is not None:
+            self._undo_unfinished(self._ward)
+
+    def _undo_unfinished(self, ward: Ward) -> None:
+        if not ward.committed:
+            ward.abandon()
+            self._ends_with_ward = self._agent is None  # nobody is left to be told
+
+    def _drop_keeper(self) -> None:
+        if self._keeper is not None:
+            os.close(self._keeper)
+            self._keeper = None
+
+    def _reply(self, message: msgspec.Struct, descriptors: tuple[int, ...] = ()) -> None:
+        self._tell(message, descriptors)
+
+    def _tell(self, message: msgspec.Struct, descriptors: tuple[int, ...] = ()) -> None:
+        """Send to the agent, if there is one that listens."""
+        if self._agent is None:
+            return
+        try:
+            self._agent.send(message, descriptors)
+        except ChannelError:
+            self._lose_agent()
+
+    # --- what it is asked ---
+
+    def _start(self, request: Start, _: tuple[int, ...]) -> None:
+        self._check_free()
+        self._ward = ward = Ward.start(request)
+        born = ward.born
+        self._reply(Started(born.pid, born.inner_pid, born.isolated, self._all_notes()), ward.descriptors())
+
+    def _make_vessel(self, request: MakeVessel, descriptors: tuple[int, ...]) -> None:
+        self._check_free()
+        self._ward = ward = Ward.make_vessel(request)
+        self._keeper = descriptors[0] if descriptors else None
+        born = ward.born
+        self._reply(VesselReady(born.pid, born.inner_pid, born.isolated, self._all_notes()), ward.descriptors())
+
+    def _watch(self, request: Watch, _: tuple[int, ...]) -> None:
+        self._check_free()
+        self._ward = Ward.watch(request)
+        self._reply(Watching(self._all_notes()))
+
+    def _commit(self, _: Commit, __: tuple[int, ...]) -> None:
+        self._guarded().commit()
+        self._drop_keeper()
+        self._reply(Done())
+
+    def _lease(self, request: Lease, _: tuple[int, ...]) -> None:
+        self._guarded().set_lease(request.until_ns)
+        self._reply(Done())
+
+    def _let_go(self, _: LetGo, __: tuple[int, ...]) -> None:
+        ward = self._guarded()
+        ward.set_lease(0)
+        if ward.frozen_by:
+            ward.thaw()
+        ward.let_go = self._ends_with_ward = True
+        self._over = ward.pidfd is not None or ward.exited is not None
+        self._reply(Done())
+
+    def _forget(self, _: Forget, __: tuple[int, ...]) -> None:
+        if self._ward is not None and self._ward.exited is None:
+            raise WardError("the program still runs; stop it or let it go first")
+        self._reply(Done())
+        self._over = True
+
+    def _act(self, act: Callable[[Ward], None]) -> None:
+        act(self._guarded())
+        self._reply(Done())
+
+    def _guarded(self) -> Ward:
+        if self._ward is None:
+            raise WardError("nothing was started yet")
+        return self._ward
+
+    def _check_free(self) -> None:
+        if self._ward is not None:
+            raise WardError(f"this guard already looks after pid {self._ward.born.pid}; a guard has one program in its life")
+
+    def _all_notes(self) -> tuple[str, ...]:
+        return (*(self._ward.notes if self._ward else ()), *self._notes)
+
+    def _description(self) -> Described:
+        if self._ward is not None:
+            return self._ward.describe(self._notes)
+        return Described("", "none", 0, 0, False, False, "", None, (0, 0), 0, "", "", "", self._notes)
+
+    # --- ends ---
+
+    def _reap(self) -> None:
+        while _drain(self._children_ended):
+            pass
+        if self._ward is not None and self._ward.reap():
+            self._announce_end()
+
+    def _watched_end(self) -> None:
+        assert self._ward is not None
+        self._ward.watched_end()
+        self._announce_end()
+
+    def _announce_end(self) -> None:
+        assert self._ward is not None and self._ward.exited is not None
+        self._drop_keeper()
+        self._tell(self._ward.exited)
+        self._over |= self._ends_with_ward
+
+
+def main(arguments: list[str]) -> int:
+    """Become a guard; returns its exit status."""
+    if len(arguments) != 1:
+        print("usage: python -m agent.guard SOCKET_PATH   (started by failover-agent, not by hand)", file=sys.stderr)
+        return 2
+    path = arguments[0]
+    try:
+        listener = _listen(path)
+    except OSError as error:
+        print(f"guard: cannot listen on {path}: {error.strerror}", file=sys.stderr)
+        return 1
+    try:
+        Guard(listener, _settle()).run()
+    finally:
+        os.unlink(path)
+    return 0
+
+
+def _listen(path: str) -> socket.socket:
+    """Listen at a path that nobody else listens at; 0600 from its first instant."""
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
+    before = os.umask(0o177)
+    try:
+        listener.bind(path)
+    finally:
+        os.umask(before)
+    listener.listen()
+    return listener
+
+
+def _settle() -> tuple[str, ...]:
+    """Make this process hard to disturb; returns a sentence for each thing that the system did not permit."""
+    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: None)  # it ends when its program has ended, however the system shuts down
+    kernel.become_subreaper()
+    with contextlib.suppress(PermissionError):  # it leads a session already: whoever started it saw to that
+        os.setsid()
+    notes = []
+    try:
+        kernel.lock_memory()
+    except OSError as error:
+        notes.append(f"the guard's memory is not locked, so its lease may be late when memory is short: {error.strerror}")
+    try:
+        parameter = os.sched_param(REALTIME_PRIORITY)
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, parameter)
+    except OSError as error:
+        notes.append(f"the guard has no real-time priority, so its lease may be late on a busy machine: {error.strerror}")
+    return tuple(notes)
+
+
+def _wake_on_children() -> socket.socket:
+    """A socket that becomes readable when a child has ended."""
+    inside, outside = socket.socketpair()
+    inside.setblocking(False)
+    outside.setblocking(False)
+    signal.signal(signal.SIGCHLD, lambda *_: None)
+    signal.set_wakeup_fd(outside.detach(), warn_on_full_buffer=False)
+    return inside
+
+
+def _drain(end: socket.socket) -> bytes:
+    try:
+        return end.recv(256)
+    except BlockingIOError:
+        return b""
+
+
+def _sentence(request: msgspec.Struct, error: Exception) -> str:
+    """What was tried and why not."""
+    if not isinstance(error, OSError):
+        return str(error)
+    where = f" ({error.filename})" if error.filename else ""
+    return f"cannot {_attempt(request)}: {error.strerror or error}{where}"
+
+
+def _attempt(request: msgspec.Struct) -> str:
+    """What a request wants, in words."""
+    match request:
+        case Start(argv=argv):
+            return f"start {os.fsdecode(argv[0]) if argv else 'a program without a name'}"
+        case MakeVessel(component=component):
+            return f"make a vessel for {component}"
+        case Watch(pid=pid):
+            return f"look after pid {pid}"
+        case _:
+            return f"{type(request).__name__.lower()} the component"
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,291 @@
+"""The program that a guard looks after: its birth, what holds it still, its lease, and its end.
+
+====================  ==================================================================================================
+state                 arrows out of it
+====================  ==================================================================================================
+``vessel``            `commit` → running; `abandon` (agent or keeper lost) → ended
+``running``           `freeze` or a lease that runs out → frozen; it ends → ended
+``frozen``            `thaw`, or a new lease after the old one froze it → running; SIGKILL → ended
+``ended``             none: the status is kept until it is forgotten
+====================  ==================================================================================================
+
+Invariant: while a lease is over, a committed program is frozen, whatever anybody asks for.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final, Literal
+
+from agent import freezer as freezing
+from agent.freezer import Freezer
+from agent.guard_messages import Described, Exited, MakeVessel, Start, Watch
+from agent.pump import Pump
+from agent.streams import STREAMS, OutputLogs
+from checkpoint.linux.vessel import Birth, Born, spawn_program, spawn_vessel
+
+DRAIN_S: Final = 2.0
+"""How long the end of a program waits for its last output to be written; a full disk must not hide the end."""
+
+NO_TRIM: Final = "its logs grow without bound: their filesystem cannot give the beginning of a file back"
+WATCHED: Final = "it was started by somebody else: its exit status will not be known, its output is not kept"
+
+
+class WardError(Exception):
+    """What was asked does not fit the state; says why and what to do."""
+
+
+@dataclass(slots=True)
+class Ward:
+    """One program, alive or ended. Made by `start`, `make_vessel` or `watch`."""
+
+    component: str
+    born: Born
+    freezer: Freezer
+    log_directory: str = ""
+    pump: Pump | None = None
+    pidfd: int | None = None
+    committed: bool = True
+    let_go: bool = False
+    frozen_by: Literal["", "order", "lease"] = ""
+    lease_until_ns: int = 0
+    exited: Exited | None = None
+    notes: list[str] = field(default_factory=list)
+
+    # --- birth ---
+
+    @classmethod
+    def start(cls, order: Start) -> Ward:
+        """Start a program.
+
+        Raises:
+            OSError: it cannot be executed, or its logs cannot be written; nothing is left of it.
+        """
+        argv = [os.fsdecode(argument) for argument in order.argv]
+        environment = dict(os.fsdecode(item).split("=", 1) for item in order.environment if b"=" in item)
+        directory = os.fsdecode(order.working_directory)
+
+        def give_birth(birth: Birth) -> Born:
+            return spawn_program(argv, environment, directory, order.umask, birth)
+
+        return cls._bear(order, (0, 0), Birth(isolate=order.isolate), give_birth)
+
+    @classmethod
+    def make_vessel(cls, order: MakeVessel) -> Ward:
+        """Make a vessel for a restore; uncommitted.
+
+        Raises:
+            RestoreError, OSError: it could not be made; nothing is left of it.
+        """
+        birth = Birth(order.inner_pid, order.isolate, order.clocks, order.elapsed_ns)
+        ward = cls._bear(order, order.totals, birth, spawn_vessel)
+        ward.committed = False
+        return ward
+
+    @classmethod
+    def watch(cls, order: Watch) -> Ward:
+        """Look after somebody else's child.
+
+        Raises:
+            ProcessLookupError: there is no such process.
+        """
+        pidfd = os.pidfd_open(order.pid)
+        hold = freezing.SignalFreezer()
+        hold.add(order.pid)
+        notes = [WATCHED, "it is frozen by SIGSTOP, which it can notice: it keeps the cgroup that it was started in"]
+        return cls(order.component, Born(order.pid, _inner_pid(order.pid)), hold, pidfd=pidfd, notes=notes)
+
+    @classmethod
+    def _bear(cls, order: Start | MakeVessel, totals: tuple[int, int], birth: Birth, act: Callable[[Birth], Born]) -> Ward:
+        """Logs, pipes and a freezer first; the process last, into all of them."""
+        logs = OutputLogs(Path(order.log_directory))
+        logs.truncate(totals)
+        pump = Pump(logs, totals)
+        hold, notes = freezing.choose(order.cgroup, f"failover-{os.getpid()}")
+        try:
+            with open(os.devnull, "rb") as nothing, hold.birthplace():
+                ends = pump.write_ends
+                born = act(replace(birth, stdio=(nothing.fileno(), ends[1], ends[2])))
+        except BaseException:
+            hold.close()
+            raise
+        hold.add(born.pid)
+        pump.start()
+        said = [*notes, *born.notes, *([] if logs.trims else [NO_TRIM])]
+        return cls(order.component, born, hold, order.log_directory, pump, notes=said)
+
+    def descriptors(self) -> tuple[int, ...]:
+        """What the keeper needs of the streams: counters, two read ends, two logs. They stay ours."""
+        if self.pump is None:
+            return ()
+        reads = [self.pump.read_ends[stream] for stream in STREAMS]
+        logs = [self.pump.logs.descriptor(stream) for stream in STREAMS]
+        return (self.pump.counters.descriptor, *reads, *logs)
+
+    # --- holding still ---
+
+    def commit(self) -> None:
+        """The vessel is the component now.
+
+        Raises:
+            WardError: it has ended in the meantime.
+        """
+        self._check_alive("commit to it")
+        self.committed = True
+        self.lapse(time.monotonic_ns())
+
+    def freeze(self, by: Literal["order", "lease"] = "order") -> None:
+        """Hold it; a thread that is deep in the kernel stands as soon as it leaves it.
+
+        Raises:
+            WardError: it has ended.
+        """
+        self._check_alive("freeze it")
+        self.freezer.freeze()
+        self.frozen_by = by
+
+    def thaw(self) -> None:
+        """Let it go on.
+
+        Raises:
+            WardError: it has ended, or its lease is over.
+        """
+        self._check_alive("thaw it")
+        if self._lease_is_over(time.monotonic_ns()):
+            raise WardError("cannot thaw it: its lease is over, another robot may run it; give it a new lease first")
+        self.freezer.thaw()
+        self.frozen_by = ""
+
+    def set_lease(self, until_ns: int) -> None:
+        """Take a new lease; what the old one froze goes on. What was frozen by order stays so."""
+        self.lease_until_ns = until_ns
+        if self.frozen_by == "lease" and self.exited is None and not self._lease_is_over(time.monotonic_ns()):
+            self.thaw()
+
+    def lapse(self, now_ns: int) -> bool:
+        """Freeze it if its lease is over by now; returns whether this did it."""
+        held = not self.committed or self.frozen_by == "lease"
+        if held or self.exited is not None or not self._lease_is_over(now_ns):
+            return False
+        self.freeze("lease")
+        return True
+
+    def deadline_ns(self) -> int | None:
+        """When `lapse` has something to do, on CLOCK_MONOTONIC."""
+        pending = self.lease_until_ns and self.committed and not self.frozen_by and self.exited is None
+        return self.lease_until_ns if pending else None
+
+    def _lease_is_over(self, now_ns: int) -> bool:
+        return 0 < self.lease_until_ns <= now_ns
+
+    # --- the end ---
+
+    def kill(self, number: int) -> None:
+        """Send a signal; SIGKILL goes to everything that it started, too. To what has ended, nothing happens."""
+        if self.exited is not None:
+            return
+        try:
+            if self.pidfd is not None:
+                signal.pidfd_send_signal(self.pidfd, number)
+            elif number == signal.SIGKILL:
+                self.freezer.kill()
+            else:
+                os.kill(self.born.pid, number)
+        except ProcessLookupError:
+            pass
+
+    def abandon(self) -> None:
+        """Agent or keeper are gone before the vessel became the component: nothing of it stays."""
+        self.committed = True
+        self.notes.append("the restore was not finished: agent or keeper ended before it was committed")
+        self.kill(signal.SIGKILL)
+
+    def reap(self) -> bool:
+        """Take the status of whatever has ended, orphans too; True if the program has just ended."""
+        just_ended = False
+        while (reaped := _reap_one()) is not None:
+            pid, status = reaped
+            if pid == self.born.pid and self.pidfd is None:
+                self._end(status)
+                just_ended = True
+        return just_ended
+
+    def watched_end(self) -> None:
+        """The pidfd of somebody else's child says that it has ended."""
+        self._end(None)
+
+    def _end(self, status: int | None) -> None:
+        """Its leftovers end with it, unless it was let go; then its last output is written, then the end is known."""
+        if not self.let_go and self.pidfd is None:
+            self.freezer.kill()
+        if self.pump is not None and not self.pump.drain(DRAIN_S):
+            self.notes.append("its last output may be incomplete: " + (self.pump.blocked or "something else still writes to it"))
+        self.frozen_by = ""
+        self.exited = Exited(status, self.totals(), tuple(self.notes))
+
+    def close(self) -> None:
+        """Give back what was made outside this process."""
+        self.freezer.close()
+
+    # --- telling ---
+
+    def totals(self) -> tuple[int, int]:
+        """Bytes taken from the two streams so far."""
+        return self.pump.counters.totals() if self.pump is not None else (0, 0)
+
+    def state(self) -> Literal["vessel", "running", "frozen", "ended"]:
+        """The state of the table above."""
+        if self.exited is not None:
+            return "ended"
+        if not self.committed:
+            return "vessel"
+        return "frozen" if self.frozen_by else "running"
+
+    def describe(self, more_notes: tuple[str, ...]) -> Described:
+        """All of it, for `Described`."""
+        return Described(
+            component=self.component,
+            state=self.state(),
+            pid=self.born.pid,
+            inner_pid=self.born.inner_pid,
+            isolated=self.born.isolated,
+            watched=self.pidfd is not None,
+            frozen_by=self.frozen_by,
+            exit_status=self.exited.status if self.exited else None,
+            totals=self.totals(),
+            lease_until_ns=self.lease_until_ns,
+            log_directory=self.log_directory,
+            freezes_by=self.freezer.kind,
+            blocked=self.pump.blocked if self.pump is not None else "",
+            notes=(*self.notes, *more_notes),
+        )
+
+    def _check_alive(self, what: str) -> None:
+        if self.exited is not None:
+            raise WardError(f"cannot {what}: the program has ended; ask for its status, then forget it")
+
+
+def _reap_one() -> tuple[int, int] | None:
+    """One child that has ended, as (PID, status); None when there is none now."""
+    try:
+        pid, status = os.waitpid(-1, os.WNOHANG)
+    except ChildProcessError:
+        return None
+    return (pid, status) if pid else None
+
+
+def _inner_pid(pid: int) -> int:
+    """The PID that the process knows itself by: the innermost of NSpid in /proc/PID/status."""
+    try:
+        with open(f"/proc/{pid}/status", encoding="utf-8", errors="replace") as file:
+            for line in file:
+                if line.startswith("NSpid:"):
+                    return int(line.split()[-1])
+    except (FileNotFoundError, ProcessLookupError):
+        pass
+    return pid
