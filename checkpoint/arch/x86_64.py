@@ -1,0 +1,251 @@
+"""x86-64 as data: registers, system call numbers, and the machine code that a borrowed page is filled with.
+
+Sections: registers · system calls · interrupted system calls · code of a borrowed page. A second processor is a second file with
+the same names in the same order, see ``checkpoint.arch``.
+
+Sources: struct user_regs_struct of sys/user.h; arch/x86/entry/syscalls/syscall_64.tbl; Intel SDM volume 2.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+NAME: Final = "x86_64"
+
+# Registers
+
+REGISTER_NAMES: Final = (
+    *("r15", "r14", "r13", "r12", "rbp", "rbx", "r11", "r10", "r9", "r8", "rax", "rcx", "rdx", "rsi", "rdi"),
+    *("orig_rax", "rip", "cs", "eflags", "rsp", "ss", "fs_base", "gs_base", "ds", "es", "fs", "gs"),
+)
+"""Order of NT_PRSTATUS: 64-bit words, little-endian."""
+_REGISTERS: Final = struct.Struct(f"<{len(REGISTER_NAMES)}Q")
+CODE_SEGMENT_64: Final = 0x33
+"""``cs`` of a 64-bit program; 0x23 is a 32-bit one."""
+
+Registers = dict[str, int]
+"""General registers by name, unsigned."""
+
+
+def decode_registers(content: bytes) -> Registers:
+    """Read NT_PRSTATUS."""
+    return dict(zip(REGISTER_NAMES, _REGISTERS.unpack(content), strict=True))
+
+
+def encode_registers(registers: Mapping[str, int]) -> bytes:
+    """Write NT_PRSTATUS."""
+    return _REGISTERS.pack(*(registers[name] & _WORD for name in REGISTER_NAMES))
+
+
+_WORD: Final = (1 << 64) - 1
+INSTRUCTION_POINTER: Final = "rip"
+STACK_POINTER: Final = "rsp"
+RESULT: Final = "rax"
+CALL_NUMBER: Final = "orig_rax"
+"""Number of the system call that the thread stands in; -1 outside of one."""
+ARGUMENTS: Final = ("rdi", "rsi", "rdx", "r10", "r8", "r9")
+
+# System calls
+
+SYSCALL: Final = b"\x0f\x05"
+SYSCALLS: Final[Mapping[str, int]] = {
+    "read": 0, "write": 1, "open": 2, "close": 3, "poll": 7, "mmap": 9, "mprotect": 10, "munmap": 11, "brk": 12,
+    "rt_sigaction": 13, "rt_sigprocmask": 14, "select": 23, "madvise": 28, "pause": 34, "nanosleep": 35, "getitimer": 36,
+    "semop": 65, "sigaltstack": 131, "rt_sigtimedwait": 128, "rt_sigsuspend": 130, "prctl": 157, "futex": 202,
+    "io_getevents": 208, "restart_syscall": 219, "semtimedop": 220, "timer_gettime": 224, "timer_getoverrun": 225, "clock_gettime": 228,
+    "clock_nanosleep": 230, "epoll_wait": 232, "pselect6": 270, "ppoll": 271, "get_robust_list": 274, "epoll_pwait": 281,
+    "userfaultfd": 323, "io_uring_enter": 426, "epoll_pwait2": 441,
+}  # fmt: skip
+"""Numbers by name: those that we make or tell of."""
+SYSCALL_NAMES: Final[Mapping[int, str]] = {number: name for name, number in SYSCALLS.items()}
+
+# Interrupted system calls
+
+RESTARTABLE: Final = frozenset((-512, -513, -514))
+"""ERESTARTSYS, ERESTARTNOINTR, ERESTARTNOHAND: what a stopped call returns when it is simply to be made again."""
+RESTART_BLOCK: Final = -516
+"""ERESTART_RESTARTBLOCK: to be gone on with by restart_syscall(2), from what the kernel remembers."""
+REMAINING_TIME: Final[Mapping[str, tuple[int, int]]] = {"nanosleep": (0, 1), "clock_nanosleep": (2, 3)}
+"""Which argument points to the time asked for, and which to where the kernel has written what remains of it."""
+ENDLESS_TIMEOUT: Final[Mapping[str, tuple[int, int] | None]] = {
+    "semop": None,
+    "rt_sigtimedwait": (2, 0),
+    "semtimedop": (3, 0),
+    "epoll_wait": (3, 0xFFFFFFFF),
+    "epoll_pwait": (3, 0xFFFFFFFF),
+    "epoll_pwait2": (3, 0),
+}
+"""Calls that return EINTR merely because of a stop, and the argument (index, value) that makes them wait for ever."""
+RESTART_BLOCK_USERS: Final = ("clock_nanosleep", "nanosleep", "poll", "futex")
+
+
+def call_number_before(code: bytes) -> int | None:
+    """Find the system call number that the instructions before a ``syscall`` have loaded.
+
+    Args:
+        code: the bytes that end with the ``syscall`` instruction.
+
+    Returns:
+        The immediate of the last ``mov eax, imm32``, if there is one.
+    """
+    place = code.rfind(b"\xb8", 0, len(code) - len(SYSCALL) - 4)
+    return None if place < 0 else int(struct.unpack_from("<I", code, place + 1)[0])
+
+
+# Code of a borrowed page (see ``checkpoint.linux.remote``)
+
+_MOVE_IMMEDIATE: Final = {"rax": 0, "rcx": 1, "rdx": 2, "rbx": 3, "rsp": 4, "rbp": 5, "rsi": 6, "rdi": 7} | {
+    f"r{number}": number for number in range(8, 16)
+}
+"""Register numbers of the instruction encoding; 8 and above need a REX bit."""
+CLOBBERED: Final = ("rax", "rdi", "rsi", "rdx", "r10", "r8", "r9", "rcx", "r11")
+"""What the calls change: ours to give back, in this order in the table."""
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """One system call to be made inside the tracee; its result goes to the next word of the table's results."""
+
+    name: str
+    arguments: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TablePlaces:
+    """Addresses inside the borrowed table that the code reads and writes."""
+
+    state: int
+    ended: int
+    done: int
+    serial: int
+    mask: int
+    timeout: int
+    empty_set: int
+    resume: int
+    registers: int
+    results: int
+
+
+class _Code:
+    """Straight-line machine code that is put together for one address; no instruction in it changes a flag or the stack."""
+
+    def __init__(self, address: int) -> None:
+        self._address = address
+        self.content = bytearray()
+
+    def set(self, register: str, value: int) -> None:
+        """``mov register, value``."""
+        number = _MOVE_IMMEDIATE[register]
+        value &= _WORD
+        if value >> 32:
+            self.content += bytes((0x48 | number >> 3, 0xB8 + (number & 7))) + struct.pack("<Q", value)
+        else:
+            self.content += (b"\x41" if number > 7 else b"") + bytes((0xB8 + (number & 7),)) + struct.pack("<I", value)
+
+    def load(self, register: str, address: int) -> None:
+        """``mov register, [rip + …]``."""
+        self._relative(0x8B, register, address)
+
+    def store(self, register: str, address: int) -> None:
+        """``mov [rip + …], register``."""
+        self._relative(0x89, register, address)
+
+    def store_value(self, value: int, address: int) -> None:
+        """``mov qword [rip + …], value``."""
+        displacement = address - (self._address + len(self.content) + 11)
+        self.content += b"\x48\xc7\x05" + struct.pack("<ii", displacement, value)
+
+    def move(self, target: str, source: str) -> None:
+        """``mov target, source``."""
+        high, low = _MOVE_IMMEDIATE[source], _MOVE_IMMEDIATE[target]
+        self.content += bytes((0x48 | (high >> 3) << 2 | low >> 3, 0x89, 0xC0 | (high & 7) << 3 | low & 7))
+
+    def call(self, number: int, arguments: Sequence[int]) -> None:
+        """Make a system call."""
+        for register, value in zip(ARGUMENTS, arguments, strict=False):
+            self.set(register, value)
+        self.set("rax", number)
+        self.content += SYSCALL
+
+    def jump_through(self, address: int) -> None:
+        """``notrack jmp [rip + …]``: allowed where indirect branches are tracked."""
+        displacement = address - (self._address + len(self.content) + 7)
+        self.content += b"\x3e\xff\x25" + struct.pack("<i", displacement)
+
+    def _relative(self, opcode: int, register: str, address: int) -> None:
+        number = _MOVE_IMMEDIATE[register]
+        displacement = address - (self._address + len(self.content) + 7)
+        self.content += bytes((0x48 | (number >> 3) << 2, opcode, (number & 7) << 3 | 5)) + struct.pack("<i", displacement)
+
+
+def batch_code(address: int, calls: Sequence[Call], places: TablePlaces) -> bytes:
+    """The batch: every call once, then wait for the tracer, then (nobody came) give everything back and go on.
+
+    Args:
+        address: where it will lie.
+    """
+    code = _Code(address)
+    for index, call in enumerate(calls):
+        code.call(SYSCALLS[call.name], call.arguments)
+        code.store("rax", places.results + 8 * index)
+    code.load("rax", places.serial)
+    code.store("rax", places.done)
+    code.call(SYSCALLS["rt_sigtimedwait"], (places.empty_set, 0, places.timeout, 8))
+    code.call(SYSCALLS["rt_sigprocmask"], (2, places.mask, 0, 8))
+    code.store_value(places.ended, places.state)
+    for index, register in enumerate(CLOBBERED):
+        code.load(register, places.registers + 8 * index)
+    code.jump_through(places.resume)
+    return bytes(code.content)
+
+
+ENTRY_REGISTERS: Final = ("r12", "r13", "r14")
+"""Where the entry keeps its results, and gives them back: the code pages, the table pages, the userfaultfd."""
+
+
+@dataclass(frozen=True, slots=True)
+class EntryCalls:
+    """What the first entry does, in this order: map the code pages, map the table pages, advise, open a userfaultfd."""
+
+    code_pages: Call
+    table_pages: Call
+    advice: Call
+    faults: Call
+
+
+def entry_code(address: int, calls: EntryCalls, registers: Registers, mask: int) -> bytes:
+    """The first entry, for a place where nothing of ours is mapped yet: constants only, nothing stored.
+
+    It waits with three results in `ENTRY_REGISTERS`, where a tracer sees them. If none comes it closes the descriptor, gives
+    everything back and goes on.
+
+    Args:
+        registers: what the program goes on with; ``rip`` is where.
+        mask: the program's signal mask.
+    """
+    code = _Code(address + ENTRY_CODE_OFFSET)
+    code.call(SYSCALLS[calls.code_pages.name], calls.code_pages.arguments)
+    code.move("r12", "rax")
+    code.call(SYSCALLS[calls.table_pages.name], calls.table_pages.arguments)
+    code.move("r13", "rax")
+    code.call(SYSCALLS[calls.advice.name], calls.advice.arguments)
+    code.call(SYSCALLS[calls.faults.name], calls.faults.arguments)
+    code.move("r14", "rax")
+    code.call(SYSCALLS["rt_sigtimedwait"], (address + 16, 0, address, 8))
+    code.move("rdi", "r14")
+    code.set("rax", SYSCALLS["close"])
+    code.content += SYSCALL
+    code.call(SYSCALLS["rt_sigprocmask"], (2, address + 24, 0, 8))
+    for register in (*ENTRY_REGISTERS, *CLOBBERED):
+        code.set(register, registers[register])
+    code.jump_through(address + 32)
+    return struct.pack("<QQQQQ", 0, ENTRY_TIMEOUT_NS, 0, mask, registers["rip"]) + bytes(code.content)
+
+
+ENTRY_CODE_OFFSET: Final = 40
+"""Where the instructions of `entry_code` begin, after its constants."""
+ENTRY_TIMEOUT_NS: Final = 100_000_000
+"""How long a program whose tracer died waits before it goes on by itself."""
