@@ -8,6 +8,8 @@ from __future__ import annotations
 import struct
 from typing import Final
 
+from checkpoint.arch import x86_64
+
 LOAD_ADDRESS: Final = 0x400000
 """Where the little programs below are mapped. A restore unmaps them before it maps the snapshot, so any place would do."""
 
@@ -61,7 +63,92 @@ Needs no stack. Each call is ten little-endian words: number, six arguments, res
 
 CALL: Final = struct.Struct("<7Q3q")
 
-SYSCALL_INSTRUCTION: Final = b"\x0f\x05"
+SYSTEM_CALLS: Final = {
+    "arch_prctl": 158,
+    "capset": 126,
+    "chdir": 80,
+    "clone3": 435,
+    "close": 3,
+    "dup3": 292,
+    "execve": 59,
+    "exit_group": 231,
+    "fallocate": 285,
+    "fchmod": 91,
+    "fchown": 93,
+    "fcntl": 72,
+    "ftruncate": 77,
+    "ioprio_set": 251,
+    "linkat": 265,
+    "lseek": 8,
+    "madvise": 28,
+    "memfd_create": 319,
+    "mlock2": 325,
+    "mmap": 9,
+    "mprotect": 10,
+    "mremap": 25,
+    "munmap": 11,
+    "openat": 257,
+    "personality": 135,
+    "pipe2": 293,
+    "prctl": 157,
+    "prlimit64": 302,
+    "pwrite64": 18,
+    "rseq": 334,
+    "rt_sigaction": 13,
+    "rt_sigqueueinfo": 129,
+    "rt_tgsigqueueinfo": 297,
+    "sched_setaffinity": 203,
+    "sched_setattr": 314,
+    "sched_setscheduler": 144,
+    "set_robust_list": 273,
+    "set_tid_address": 218,
+    "setfsgid": 123,
+    "setfsuid": 122,
+    "setgroups": 116,
+    "setitimer": 38,
+    "setpgid": 109,
+    "setpriority": 141,
+    "setresgid": 119,
+    "setresuid": 117,
+    "setsid": 112,
+    "sigaltstack": 131,
+    "timer_create": 222,
+    "timer_delete": 226,
+    "timer_settime": 223,
+    "umask": 95,
+    "unlinkat": 263,
+    "write": 1,
+}
+"""Numbers of the system calls that a restore makes inside a vessel (asm/unistd_64.h)."""
+
+_NO_CALL: Final = -1
+"""As `x86_64.CALL_NUMBER`: the thread is not in a system call, so the kernel has none to restart."""
+
+
+def with_registers(registers: bytes, **values: int) -> bytes:
+    """A copy of NT_PRSTATUS with some registers changed; the thread is not in a system call any more."""
+    return x86_64.encode_registers(x86_64.decode_registers(registers) | {x86_64.CALL_NUMBER: _NO_CALL, **values})
+
+
+def at_call(registers: bytes, instruction: int, number: int, arguments: tuple[int, ...]) -> bytes:
+    """Registers that make one system call with the syscall instruction at an address."""
+    return with_registers(registers, rip=instruction, rax=number, **dict(zip(x86_64.ARGUMENTS, arguments, strict=False)))
+
+
+def call_result(registers: bytes) -> int:
+    """What a system call returned: a negative error number, or its value."""
+    value = x86_64.decode_registers(registers)[x86_64.RESULT]
+    return value - (1 << 64) if value >> 63 else value
+
+
+def at_table(registers: bytes, loop: int, first: int, end: int) -> bytes:
+    """Registers that make the calls of a table by a `CALL_LOOP` at an address."""
+    return with_registers(registers, rip=loop, rbx=first, rbp=end)
+
+
+def stopped_call(registers: bytes) -> int:
+    """Address of the call at which `CALL_LOOP` stopped; the end of the table when all went well."""
+    return x86_64.decode_registers(registers)["rbx"]
 
 
 def program(code: bytes) -> bytes:

@@ -1,0 +1,167 @@
+"""The program's address space inside a vessel: cleared, mapped, filled, settled.
+
+Four steps, because the pages are written from outside in between: `clear` and `map_program` go into the first table of calls,
+`fill` writes every page that the snapshot carries, `settle` (second table) takes away the write permission that filling
+needed and gives the advice back.
+
+Sources: mmap(2), mremap(2), madvise(2), process_vm_writev(2).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from itertools import groupby
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from checkpoint.linux import abi
+from checkpoint.linux.call_table import CallTable
+from checkpoint.linux.memory import Memory
+from checkpoint.model import PageRun, Snapshot, Vma, VmaKind
+
+MREMAP_MAYMOVE_FIXED: Final = 1 | 2
+MAP_LOCKED_ON_FAULT: Final = 1
+
+KERNEL_KINDS: Final = frozenset({VmaKind.VDSO, VmaKind.VVAR, VmaKind.VSYSCALL})
+"""Mappings that the kernel made: moved, never mapped."""
+
+ADVICE: Final = {"sr": 2, "rr": 1, "dc": 10, "mg": 12, "hg": 14, "nh": 15, "dd": 16, "wf": 18}
+"""madvise(2) by the letters of VmFlags: sequential, random, don't fork, mergeable, huge, not huge, don't dump, wipe on fork."""
+
+NAMED_ANONYMOUS: Final = "[anon:"
+PR_SET_VMA: Final = 0x53564D41
+
+
+def clear(table: CallTable, vessel: Iterable[Vma]) -> None:
+    """Unmap everything that the vessel came with, but the kernel's own pages."""
+    for vma in vessel:
+        if vma.kind not in KERNEL_KINDS:
+            table.call(f"unmap {vma.start:#x} of the vessel", "munmap", vma.start, vma.size)
+
+
+def kernel_pages(vmas: Iterable[Vma]) -> list[Vma]:
+    """The vdso and its data, in address order; vsyscall has one address everywhere."""
+    return [vma for vma in vmas if vma.kind in (VmaKind.VDSO, VmaKind.VVAR)]
+
+
+def move_kernel_pages(table: CallTable, vessel: Sequence[Vma], program: Sequence[Vma], refuge: int) -> None:
+    """Move the vdso and its data to where the program has them.
+
+    Args:
+        refuge: an address with room for all of them in a hole; they go there first, so that old and new places may overlap.
+    """
+    moves = [(ours.start, theirs.start, ours.size) for ours, theirs in zip(vessel, program, strict=True)]
+    places = []
+    for start, _, size in moves:
+        _move(table, start, refuge, size)
+        places.append(refuge)
+        refuge += size
+    for place, (_, target, size) in zip(places, moves, strict=True):
+        _move(table, place, target, size)
+
+
+def _move(table: CallTable, start: int, target: int, size: int) -> None:
+    table.call(f"move the vdso to {target:#x}", "mremap", start, size, size, MREMAP_MAYMOVE_FIXED, target, least=target, most=target)
+
+
+def map_program(table: CallTable, vmas: Iterable[Vma], runs: Sequence[PageRun]) -> None:
+    """Map everything that the program had; what will be filled is writable for now."""
+    carried = Carried(runs)
+    mapped = [vma for vma in vmas if vma.kind not in KERNEL_KINDS]
+    files = [vma for vma in mapped if is_file_mapping(vma)]
+    for (path, writable), group in groupby(sorted(files, key=_file_order), key=_file_order):
+        descriptor = table.open(path, (os.O_RDWR if writable else os.O_RDONLY) | os.O_CLOEXEC)
+        for vma in group:
+            _map(table, vma, _first_protection(vma, carried), descriptor)
+        table.close(descriptor)
+    for piece in joined_shared(vma for vma in mapped if not is_file_mapping(vma)):
+        _map(table, piece, _first_protection(piece, carried), -1)
+
+
+def is_file_mapping(vma: Vma) -> bool:
+    """Whether it is mapped from a file that has a name; others are rebuilt from their pages alone."""
+    return vma.kind is VmaKind.FILE and vma.file is not None and not vma.file.deleted
+
+
+def _file_order(vma: Vma) -> tuple[str, bool]:
+    assert vma.file is not None
+    return vma.file.path, vma.shared and bool(vma.protection & abi.PROT_WRITE)
+
+
+def joined_shared(vmas: Iterable[Vma]) -> list[Vma]:
+    """Give neighbouring pieces of one shared object back their unity: they were split by mprotect or madvise, and share pages.
+
+    `settle` splits them again by giving each its protection.
+    """
+    pieces: list[Vma] = []
+    for vma in vmas:
+        last = pieces[-1] if pieces else None
+        if last and vma.shared and last.shared and last.end == vma.start and last.offset + last.size == vma.offset and vma.offset:
+            pieces[-1] = Vma(last.start, vma.end, last.protection, True, last.kind, last.offset, last.name, last.file, last.flags)
+        else:
+            pieces.append(vma)
+    return pieces
+
+
+def _map(table: CallTable, vma: Vma, protection: int, descriptor: int) -> None:
+    flags = abi.MAP_FIXED | (abi.MAP_SHARED if vma.shared else abi.MAP_PRIVATE)
+    offset = vma.offset if descriptor >= 0 else 0
+    if descriptor < 0:
+        flags |= abi.MAP_ANONYMOUS
+    if "gd" in vma.flags:
+        flags |= abi.MAP_GROWSDOWN | abi.MAP_STACK
+    if "nr" in vma.flags:
+        flags |= abi.MAP_NORESERVE
+    what = f"map {vma.size >> 10} KiB at {vma.start:#x} ({vma.name or 'anonymous'})"
+    arguments = (vma.start, vma.size, protection, flags, descriptor, offset)
+    table.call(what, "mmap", *arguments, least=vma.start, most=vma.start)
+
+
+def _first_protection(vma: Vma, carried: Carried) -> int:
+    return vma.protection | (abi.PROT_READ | abi.PROT_WRITE if carried.within(vma) else 0)
+
+
+class Carried:
+    """Which mappings the snapshot carries pages for."""
+
+    def __init__(self, runs: Sequence[PageRun]) -> None:
+        self._starts: NDArray[np.uint64] = np.fromiter((run.start for run in runs), np.uint64, len(runs))
+        self._ends: NDArray[np.uint64] = np.fromiter((run.end for run in runs), np.uint64, len(runs))
+
+    def within(self, vma: Vma) -> bool:
+        """Whether a page of this mapping is carried."""
+        index = int(np.searchsorted(self._ends, np.uint64(vma.start), side="right"))
+        return index < len(self._starts) and int(self._starts[index]) < vma.end
+
+
+def fill(memory: Memory, snapshot: Snapshot) -> None:
+    """Write every page that the snapshot carries."""
+    if not snapshot.runs:
+        return
+    ranges = np.empty((len(snapshot.runs), 2), np.uint64)
+    ranges[:, 0] = np.fromiter((run.start for run in snapshot.runs), np.uint64, len(snapshot.runs))
+    ranges[:, 1] = np.fromiter((run.size for run in snapshot.runs), np.uint64, len(snapshot.runs))
+    memory.write_from(ranges, np.frombuffer(snapshot.contents, np.uint8))
+
+
+def settle(table: CallTable, vmas: Iterable[Vma], runs: Sequence[PageRun]) -> None:
+    """Give every mapping its own protection, advice, name and lock."""
+    carried = Carried(runs)
+    for vma in vmas:
+        if vma.kind in KERNEL_KINDS:
+            continue
+        if vma.shared or _first_protection(vma, carried) != vma.protection:
+            table.call(f"protect {vma.start:#x}", "mprotect", vma.start, vma.size, vma.protection)
+        for letters in vma.flags:
+            if letters in ADVICE:
+                lost = f"memory at {vma.start:#x} loses its advice {letters!r}"
+                table.attempt(lost, "madvise", vma.start, vma.size, ADVICE[letters])
+        if "lo" in vma.flags:
+            on_fault = MAP_LOCKED_ON_FAULT if "lf" in vma.flags else 0
+            table.attempt(f"memory at {vma.start:#x} is not locked", "mlock2", vma.start, vma.size, on_fault)
+        if vma.name.startswith(NAMED_ANONYMOUS):
+            name = table.place_path(vma.name.removeprefix(NAMED_ANONYMOUS).removesuffix("]"))
+            table.attempt("", "prctl", PR_SET_VMA, 0, vma.start, vma.size, name)
