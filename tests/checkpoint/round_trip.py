@@ -1,0 +1,209 @@
+"""Take a real program through capture, death and restore, inside the calling process: what the tracee tests stand on.
+
+A `Program` writes its output to files in a directory of its own, reads nothing, and is our child, before and after. Everything
+that a snapshot goes through on its way to another robot happens to it here too: it is encoded, decoded and folded.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from checkpoint import chain, format
+from checkpoint.engine import CaptureOrder, RestoreOptions, Session, engine_named
+from checkpoint.linux.vessel import Birth, Born, discard, spawn_program, spawn_vessel
+from checkpoint.model import Snapshot
+
+ENGINE = engine_named("ptrace")
+PATIENCE_S = 60.0
+"""How long anything awaited here may take; generous, because the machine may be busy with other tests."""
+
+CANNOT = 77
+"""Exit status of a tracee that this machine does not let set its stage."""
+
+
+class EndedError(AssertionError):
+    """A program ended although something was still expected of it."""
+
+
+@dataclass
+class Program:
+    """A running program, fresh or restored.
+
+    Attributes:
+        directory: its working directory, with its output in ``out`` and ``err``.
+        status: how it ended, as `os.waitstatus_to_exitcode` says; None while it is not reaped.
+    """
+
+    born: Born
+    directory: Path
+    status: int | None = None
+
+    @property
+    def pid(self) -> int:
+        """As this process sees it."""
+        return self.born.pid
+
+    @property
+    def output(self) -> str:
+        """All that it has written to its standard output so far."""
+        return (self.directory / "out").read_text()
+
+    @property
+    def complaints(self) -> str:
+        """All that it has written to its standard error so far."""
+        return (self.directory / "err").read_text()
+
+    def poll(self) -> int | None:
+        """Its exit code if it has ended, negative for a signal."""
+        if self.status is None:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            if pid:
+                self.status = os.waitstatus_to_exitcode(status)
+        return self.status
+
+    def wait_until(self, condition: Callable[[], bool], what: str) -> None:
+        """Wait for something that the program brings about while it lives."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not condition():
+            if self.poll() is not None and not condition():
+                raise EndedError(f"ended with {self.status} before {what}:\n{self.output[-2000:]}{self.complaints[-2000:]}")
+            if time.monotonic() > deadline:
+                raise AssertionError(f"did not see {what} in {PATIENCE_S:.0f} s:\n{self.output[-2000:]}{self.complaints[-2000:]}")
+            time.sleep(0.002)
+
+    def wait_for_line(self, line: str) -> None:
+        """Wait for one whole line of standard output."""
+        self.wait_until(lambda: f"{line}\n" in self.output, f"the line {line!r}")
+
+    def wait_for_output(self, size: int) -> None:
+        """Wait until standard output holds more than ``size`` bytes."""
+        self.wait_until(lambda: (self.directory / "out").stat().st_size > size, f"more than {size} bytes of output")
+
+    def tell(self) -> None:
+        """Make the go file that a tracee waits for."""
+        (self.directory / "go").touch()
+
+    def finish(self) -> int:
+        """Wait for its end by itself; the exit code."""
+        with contextlib.suppress(EndedError):
+            self.wait_until(lambda: self.poll() is not None, "its end")
+        self._reap_first_process()
+        assert self.status is not None
+        return self.status
+
+    def kill(self) -> None:
+        """End it as a power cut does, and reap it."""
+        if self.status is None:
+            os.kill(self.pid, signal.SIGKILL)
+            self.status = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+        self._reap_first_process()
+
+    def _reap_first_process(self) -> None:
+        if self.born.init_pid:
+            with contextlib.suppress(ChildProcessError):  # reaped already
+                os.waitpid(self.born.init_pid, 0)
+
+
+def start(argv: Sequence[str | Path], directory: Path, *, env: Mapping[str, str] | None = None, isolate: bool = False) -> Program:
+    """Start a program afresh in ``directory``, under its full path, with standard input from /dev/null."""
+    with _stdio(directory) as stdio:
+        birth = Birth(isolate=isolate, stdio=stdio, die_with_parent=False)
+        words = [str(word) for word in argv]
+        return Program(spawn_program(words, dict(os.environ if env is None else env), directory, 0o022, birth), directory)
+
+
+def start_tracee(program: Path, directory: Path, *arguments: str) -> Program:
+    """Start a tracee and wait until it is ready; skips the test where the tracee says that it cannot."""
+    tracee = start([program, directory / "go", *arguments], directory)
+    try:
+        tracee.wait_for_line("ready")
+    except EndedError:
+        if tracee.status == CANNOT:
+            pytest.skip(tracee.output.strip())
+        raise
+    except BaseException:
+        tracee.kill()
+        raise
+    return tracee
+
+
+def expect_ok(tracee: Program) -> None:
+    """Let a tracee that was told finish, and show what it found to differ."""
+    status = tracee.finish()
+    assert (status, tracee.output.splitlines()[-1:]) == (0, ["ok"]), f"status {status}\n{tracee.output}{tracee.complaints}"
+
+
+@contextlib.contextmanager
+def ended(program: Program) -> Iterator[Program]:
+    """Kill a program at the end of the body if it has not ended by then."""
+    try:
+        yield program
+    finally:
+        program.kill()
+
+
+@contextlib.contextmanager
+def protected(program: Program, component: str = "/test/tracee") -> Iterator[Session]:
+    """Hold a program under protection for the body."""
+    session = ENGINE.protect(program.pid, component, None)
+    try:
+        yield session
+    finally:
+        session.close()
+
+
+def transported(snapshot: Snapshot) -> Snapshot:
+    """The same snapshot after its way through bytes."""
+    return format.decode(format.encode_bytes(snapshot))
+
+
+def captured(program: Program) -> Snapshot:
+    """One base; the program runs on."""
+    with protected(program) as session:
+        return transported(session.capture(CaptureOrder()))
+
+
+def captured_and_killed(program: Program) -> Snapshot:
+    """One base, then the power cut. What the program wrote in between must be undone by the restore."""
+    with protected(program) as session:
+        snapshot = transported(session.capture(CaptureOrder()))
+        program.kill()
+    return snapshot
+
+
+def restored(
+    state: Snapshot | Sequence[Snapshot], directory: Path, *, keep_pid: bool = True, accept_changed: tuple[str, ...] = ()
+) -> Program:
+    """Bring a base, or a base with its deltas, back as a child of ours and let it run."""
+    snapshots = [state] if isinstance(state, Snapshot) else list(state)
+    whole = chain.fold(snapshots) if len(snapshots) > 1 else snapshots[0]
+    elapsed_ns = max(time.time_ns() - whole.clocks.realtime_ns, 0)
+    with _stdio(directory) as stdio:
+        born = spawn_vessel(Birth(inner_pid=whole.process.pid if keep_pid else 0, stdio=stdio))
+    try:
+        program = ENGINE.restore(born.pid, whole, RestoreOptions(elapsed_ns=elapsed_ns, accept_changed=accept_changed))
+        program.resume()
+    except BaseException:
+        discard(born)
+        raise
+    return Program(born, directory)
+
+
+@contextlib.contextmanager
+def _stdio(directory: Path) -> Iterator[tuple[int, int, int]]:
+    """Standard input from nowhere, standard output and error into files of the directory."""
+    null = os.open("/dev/null", os.O_RDONLY)
+    streams = [os.open(directory / name, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644) for name in ("out", "err")]
+    try:
+        yield null, streams[0], streams[1]
+    finally:
+        for descriptor in (null, *streams):
+            os.close(descriptor)

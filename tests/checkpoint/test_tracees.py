@@ -1,0 +1,207 @@
+"""What a restore must preserve, one tiny program for each thing: see ``tests/tracees``.
+
+Every tracee is captured, runs on for a moment, is killed, comes back and is told to look: it prints what differs. A few are
+also looked at after a capture alone: whoever is captured must never notice.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.checkpoint.round_trip import Program, captured, captured_and_killed, ended, expect_ok, restored, start_tracee
+
+pytestmark = [pytest.mark.compiler, pytest.mark.root]
+
+Compiled = Callable[..., Path]
+
+BY_FILE, BY_SIGNAL, BY_ITSELF = "file", "signal", "itself"
+
+
+@dataclass(frozen=True)
+class Case:
+    """One tracee with its arguments.
+
+    Attributes:
+        told: how it learns that it is to look: a file, SIGUSR1, or by itself when a time is over.
+    """
+
+    program: str
+    arguments: tuple[str, ...] = ()
+    told: str = BY_FILE
+
+    def __str__(self) -> str:
+        return "-".join((self.program, *self.arguments))
+
+    def tell(self, tracee: Program) -> None:
+        """Tell a running tracee to look."""
+        if self.told == BY_FILE:
+            tracee.tell()
+        elif self.told == BY_SIGNAL:
+            os.kill(tracee.pid, signal.SIGUSR1)
+
+
+def cases(program: str, names: str = "", told: str = BY_FILE) -> list[Case]:
+    """One case for each name, or the one without arguments."""
+    return [Case(program, (name,), told) for name in names.split()] if names else [Case(program, (), told)]
+
+
+MEMORY = [
+    *cases("mappings"),
+    *cases("file_private"),
+    *cases("file_shared"),
+    *cases("shared_anonymous"),
+    *cases("advice"),
+    *cases("heap"),
+    *cases("stack"),
+    *cases("guard_pages"),
+    *cases("guard_pages", "advised"),
+    *cases("bss"),
+    *cases("sparse"),
+    *cases("many_mappings"),
+    *cases("deleted_mapping"),
+]
+
+REGISTERS = [
+    *cases("registers", told=BY_SIGNAL),
+    *cases("avx", told=BY_SIGNAL),
+    *cases("avx512", told=BY_SIGNAL),
+    *cases("rseq_loop", told=BY_SIGNAL),
+    *cases("segments"),
+    *cases("thread_addresses"),
+    *cases("tight_loop", "60", told=BY_ITSELF),
+]
+
+SIGNALS = [
+    *cases("signal_actions"),
+    *cases("signal_pending"),
+    *cases("altstack"),
+    *cases("sigsuspend", told=BY_SIGNAL),
+    *cases("sigsuspend", "pause", told=BY_SIGNAL),
+    *cases("sigwait", told=BY_SIGNAL),
+    *cases("sigwait", "timed", told=BY_ITSELF),
+]
+
+TIME = [
+    *cases("interval_timers"),
+    *cases("timer_left"),
+    *cases("posix_timers"),
+    *cases("timer_overrun"),
+    *cases("clocks"),
+]
+
+SLEEPS = cases(
+    "sleeps",
+    "nanosleep nanosleep_no_rest clock_relative clock_boottime absolute_monotonic absolute_realtime poll poll_file ppoll "
+    "select pselect futex futex_bitset futex_realtime",
+    told=BY_ITSELF,
+)
+
+PORTRAITS = cases(
+    "portrait",
+    "plain name umask nice limits personality dumpable parent_death_signal subreaper huge_pages_off timer_slack affinity "
+    "batch idle realtime io_priority io_priority_best no_tsc mdwe memory_merge store_bypass mce_kill directory oom "
+    "coredump_filter arguments user setuid groups effective fsuid capabilities securebits keep_caps no_new_privs",
+)
+
+FILES = cases(
+    "files",
+    "read_offset write_offset append odd_flags shared_offset holes deleted deleted_read_only devices directory path_only "
+    "beyond_end odd_name owner_signal",
+)
+
+PRESERVED = [*MEMORY, *REGISTERS, *SIGNALS, *TIME, *PORTRAITS, *FILES]
+
+
+@pytest.mark.parametrize("case", PRESERVED, ids=str)
+def test_a_restored_program_finds_everything_as_it_was(case: Case, compiled: Compiled, tmp_path: Path) -> None:
+    tracee = start_tracee(compiled(case.program, "-O2"), tmp_path, *case.arguments)
+    with ended(tracee):
+        snapshot = captured_and_killed(tracee)
+    with ended(restored(snapshot, tmp_path)) as tracee:
+        case.tell(tracee)
+        expect_ok(tracee)
+
+
+@pytest.mark.parametrize("case", [*REGISTERS, *SIGNALS, *TIME, *cases("portrait", "plain")], ids=str)
+def test_a_captured_program_notices_nothing(case: Case, compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled(case.program, "-O2"), tmp_path, *case.arguments)) as tracee:
+        for _ in range(3):
+            captured(tracee)
+        case.tell(tracee)
+        expect_ok(tracee)
+
+
+def test_blocking_calls_end_only_when_their_time_is_over(compiled: Compiled, tmp_path: Path) -> None:
+    """All at once, because each takes its time: captured, killed and brought back while they wait."""
+    program = compiled("sleeps", "-O2")
+    waiting = {}
+    for case in SLEEPS:
+        directory = tmp_path / case.arguments[0]
+        directory.mkdir()
+        waiting[case] = start_tracee(program, directory, *case.arguments)
+    back = {case: restored(captured_and_killed(tracee), tracee.directory) for case, tracee in waiting.items()}
+    complaints = [f"{case}: {found}" for case, tracee in back.items() if (found := _complaint(tracee))]
+    assert not complaints, "\n".join(complaints)
+
+
+def test_blocking_calls_do_not_notice_a_capture(compiled: Compiled, tmp_path: Path) -> None:
+    program = compiled("sleeps", "-O2")
+    waiting = {}
+    for case in SLEEPS:
+        directory = tmp_path / case.arguments[0]
+        directory.mkdir()
+        waiting[case] = start_tracee(program, directory, *case.arguments)
+    for tracee in waiting.values():
+        captured(tracee)
+    complaints = [f"{case}: {found}" for case, tracee in waiting.items() if (found := _complaint(tracee))]
+    assert not complaints, "\n".join(complaints)
+
+
+def _complaint(tracee: Program) -> str:
+    try:
+        expect_ok(tracee)
+    except AssertionError as error:
+        return str(error).splitlines()[0] + " " + " ".join(tracee.output.split("\n"))
+    finally:
+        tracee.kill()
+    return ""
+
+
+@pytest.mark.parametrize(
+    "case", [*cases("heap"), *cases("signal_pending"), *cases("portrait", "limits"), *cases("files", "deleted")], ids=str
+)
+def test_three_restores_in_a_row_lose_nothing(case: Case, compiled: Compiled, tmp_path: Path) -> None:
+    tracee = start_tracee(compiled(case.program, "-O2"), tmp_path, *case.arguments)
+    for _ in range(3):
+        with ended(tracee):
+            snapshot = captured_and_killed(tracee)
+        tracee = restored(snapshot, tmp_path)
+    with ended(tracee):
+        case.tell(tracee)
+        expect_ok(tracee)
+
+
+@pytest.mark.parametrize("case", [*cases("mappings"), *cases("files", "append"), *cases("posix_timers")], ids=str)
+def test_a_new_pid_is_no_loss_to_a_program_that_does_not_hold_its_own(case: Case, compiled: Compiled, tmp_path: Path) -> None:
+    tracee = start_tracee(compiled(case.program, "-O2"), tmp_path, *case.arguments)
+    with ended(tracee):
+        snapshot = captured_and_killed(tracee)
+    with ended(restored(snapshot, tmp_path, keep_pid=False)) as tracee:
+        assert tracee.pid != snapshot.process.pid
+        case.tell(tracee)
+        expect_ok(tracee)
+
+
+def test_the_pid_is_kept_where_it_is_free(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("heap", "-O2"), tmp_path)) as tracee:
+        snapshot = captured_and_killed(tracee)
+    with ended(restored(snapshot, tmp_path)) as back:
+        assert back.pid == tracee.pid == snapshot.process.pid
+        back.tell()
+        expect_ok(back)
