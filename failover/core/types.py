@@ -168,6 +168,7 @@ class Config:
         alone_period_ms: between captures kept on this robot only, while there is no standby.
         retry_ms: before another try of a capture that failed, or of a standby that did not answer.
         handover_ms: a planned move that takes longer is called off.
+        grace_ms: after its own start a robot waits that long for peers that it has not heard yet (keys are handed over first).
         ship_ms: a snapshot that is still on its way after that is given up.
         restore_ms: a restore or start that says nothing for that long has failed.
     """
@@ -182,6 +183,7 @@ class Config:
     alone_period_ms: int = 1_000
     retry_ms: int = 1_000
     handover_ms: int = 10_000
+    grace_ms: int = 3_000
     ship_ms: int = 120_000
     restore_ms: int = 60_000
 
@@ -214,6 +216,11 @@ class Config:
     def loyalty_ns(self) -> int:
         """Silence after which a peer counts as dead: the lease and the margin."""
         return self.lease_ns + max(self.margin_ms_min * MS, self.lease_ns * self.margin_percent // 100)
+
+    @property
+    def grace_ns(self) -> int:
+        """How long a peer that was never heard in this life may be on its way; never less than the loyalty."""
+        return max(self.grace_ms * MS, self.loyalty_ns)
 
 
 BEATS_IN_LEASE_MIN = 4

@@ -1,0 +1,148 @@
+"""Who lives, who hears whom, and for how long a beat that was heard lets its sender act.
+
+A peer is *suspect* when beats are missing and *dead* when it was silent on all links for longer than any lease that it may still act on.
+Invariants: a peer's counter and boot only grow; a lease is counted from the asking (the instant our beat left), never from the answer;
+lateness of our own loop makes peers look silent and is taken back before anybody is judged.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+from failover.core.messages import Beat, Entry
+from failover.core.types import COMPONENTS_MAX, Config, PeerView
+
+ASKED_MAX = 512
+"""Beats of ours whose instant of leaving is remembered; ten seconds of them at 20 ms."""
+
+SUSPECT_BEATS = 3
+"""Beats that may be missing before a peer is called suspect."""
+
+
+@dataclass(slots=True)
+class _Known:
+    entry: Entry
+    counter: int
+
+
+@dataclass(slots=True)
+class Peer:
+    """What one peer has told us.
+
+    Attributes:
+        heard_ns: instant of its last beat (before the first: of our own birth).
+        echoed: counter of the newest beat of our present life that it has heard; 0 for none.
+        settled: see ``messages.Beat``.
+    """
+
+    robot: str
+    heard_ns: int
+    boot: int = 0
+    counter: int = 0
+    echoed: int = 0
+    settled: int = 0
+    total: int = 0
+    load: int = 0
+    links: dict[str, int] = field(default_factory=dict)
+    entries: dict[str, _Known] = field(default_factory=dict)
+
+    def entry(self, component: str) -> Entry | None:
+        """What it says about a component, if that is fresh enough to act on."""
+        known = self.entries.get(component)
+        return known.entry if known and known.counter >= self.settled else None
+
+    @property
+    def complete(self) -> bool:
+        """Every entry that it has is known and fresh: what is missing here is missing there."""
+        return self.boot > 0 and sum(known.counter >= self.settled for known in self.entries.values()) >= self.total
+
+    def take(self, beat: Beat, own: tuple[str, int], link: str, now_ns: int) -> tuple[Entry, ...]:
+        """Note a beat; returns the entries that are news. ``own``: our name and boot count."""
+        if beat.boot < self.boot:
+            return ()
+        if beat.boot > self.boot:
+            self.boot, self.counter, self.echoed, self.settled = beat.boot, 0, 0, 0
+            self.entries.clear()
+        self.heard_ns = max(self.heard_ns, now_ns)
+        self.links[link] = now_ns
+        self._echoes(beat, own)
+        if beat.counter > self.counter:
+            self.counter, self.settled, self.total, self.load = beat.counter, beat.settled, beat.total, beat.load
+        return tuple(entry for entry in beat.entries if self._news(entry, beat.counter))
+
+    def _echoes(self, beat: Beat, own: tuple[str, int]) -> None:
+        for echo in beat.echoes:
+            if (echo.robot, echo.boot) == own:
+                self.echoed = max(self.echoed, echo.counter)
+
+    def _news(self, entry: Entry, counter: int) -> bool:
+        known = self.entries.get(entry.name)
+        if known is None and len(self.entries) >= COMPONENTS_MAX:
+            return False
+        if known is not None and known.counter >= counter:
+            return False
+        self.entries[entry.name] = _Known(entry, counter)
+        return True
+
+
+class Membership:
+    """The team, as one robot hears it."""
+
+    def __init__(self, config: Config, boot: int, now_ns: int) -> None:
+        self._config = config
+        self._own = (config.robot, boot)
+        self._asked: deque[tuple[int, int]] = deque(maxlen=ASKED_MAX)
+        self.peers = {robot: Peer(robot, now_ns) for robot in config.peers}
+
+    def hear(self, beat: Beat, link: str, now_ns: int) -> tuple[Entry, ...]:
+        """Take in a beat; returns its entries that are news. A stranger's beat is none."""
+        peer = self.peers.get(beat.sender)
+        return peer.take(beat, self._own, link, now_ns) if peer else ()
+
+    def asked(self, counter: int, now_ns: int) -> None:
+        """Remember when our own beat left."""
+        self._asked.append((counter, now_ns))
+
+    def forgive(self, late_ns: int, now_ns: int) -> None:
+        """Our own loop slept too long by ``late_ns``: what peers said meanwhile may still wait to be read."""
+        for peer in self.peers.values():
+            peer.heard_ns = min(peer.heard_ns + late_ns, now_ns)
+
+    def loyal_until_ns(self, robot: str) -> int:
+        """Until when this robot must not be replaced, as far as we know now."""
+        peer = self.peers[robot]
+        return peer.heard_ns + (self._config.loyalty_ns if peer.boot else self._config.grace_ns)
+
+    def dead(self, robot: str, now_ns: int) -> bool:
+        """Silent for longer than any lease that it may still act on. A robot that is no peer at all is dead to us."""
+        return robot not in self.peers or now_ns >= self.loyal_until_ns(robot)
+
+    def alive(self, robot: str, now_ns: int) -> bool:
+        """Heard in this life of ours, and not silent for too long."""
+        return robot in self.peers and self.peers[robot].boot > 0 and not self.dead(robot, now_ns)
+
+    def living(self, now_ns: int) -> tuple[Peer, ...]:
+        """The peers that are alive."""
+        return tuple(peer for peer in self.peers.values() if self.alive(peer.robot, now_ns))
+
+    def lease_ns(self, robot: str) -> int:
+        """Until when this peer's hearing us lets us act: the newest beat of ours that it echoed, and a lease."""
+        echoed = self.peers[robot].echoed if robot in self.peers else 0
+        return next((at + self._config.lease_ns for counter, at in reversed(self._asked) if counter <= echoed), 0)
+
+    def views(self, now_ns: int) -> tuple[PeerView, ...]:
+        """For the status."""
+        return tuple(self._view(peer, now_ns) for peer in self.peers.values())
+
+    def _view(self, peer: Peer, now_ns: int) -> PeerView:
+        silent_ns = now_ns - peer.heard_ns
+        if self.dead(peer.robot, now_ns):
+            state = "dead" if peer.boot else "unheard"
+        elif not peer.boot:
+            state = "unheard"
+        else:
+            state = "suspect" if silent_ns > SUSPECT_BEATS * self._config.beat_ns else "alive"
+        heard = tuple(link for link, at in sorted(peer.links.items()) if now_ns - at < self._config.loyalty_ns)
+        hears_us = self.lease_ns(peer.robot) > now_ns
+        return PeerView(peer.robot, state, peer.boot, silent_ns, hears_us, peer.load, heard)
