@@ -1,1 +1,171 @@
-"""capture, restore, inspect, check: what one command does alone, without an agent."""
+"""capture, restore, check: what one command does alone, without an agent. (`inspect` is in `inspection`.)"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from checkpoint import channel, format
+from checkpoint.channel import Capture, Captured, Protect, Protected, Release, Released, Restore, Restored, Resume, Resumed
+from checkpoint.errors import CheckpointError
+from checkpoint.linux import vessel
+from checkpoint.linux.vessel import Birth, Born
+from checkpoint.model import Snapshot
+from failover.cli import picture, render
+from failover.cli.components import exit_like
+from failover.cli.keeper import Keeper
+from failover.errors import FailoverError
+
+# --- capture ---------------------------------------------------------------------------------------------------------
+
+
+def capture(arguments: argparse.Namespace) -> int:
+    """Write one snapshot of a process to a file, and end the process unless it is to run on."""
+    target = Path(arguments.output)
+    if target.exists() and not arguments.force:
+        raise FailoverError(f"cannot write {target}: it exists; give another name, or --force to replace it")
+    with Keeper.spawn() as keeper:
+        protected, _ = keeper.ask(Protect(arguments.pid, f"/pid/{arguments.pid}"), Protected)
+        held = not arguments.leave_running
+        captured, (content,) = keeper.ask(Capture(base=True, generation=1, sequence=1, hold=held), Captured)
+        try:
+            _write_whole(target, content)
+        finally:
+            os.close(content)
+        if held:
+            os.kill(arguments.pid, signal.SIGKILL)
+        with contextlib.suppress(CheckpointError):  # it was killed a moment ago: nothing is left to let go of
+            keeper.ask(Release(), Released)
+    return _tell_capture(arguments, captured, protected.notes + captured.notes)
+
+
+def _tell_capture(arguments: argparse.Namespace, captured: Captured, notes: tuple[str, ...]) -> int:
+    facts = {"pid": arguments.pid, "file": arguments.output, "size": captured.size, "freeze_us": captured.freeze_us}
+    if arguments.json:
+        render.as_json(facts | {"dirty_bytes": captured.dirty_bytes, "running": arguments.leave_running, "notes": notes})
+        return 0
+    fate = "runs on" if arguments.leave_running else "was ended"
+    freeze = picture.microseconds(captured.freeze_us)
+    print(f"{arguments.output}: {picture.size(captured.size)}; pid {arguments.pid} stood still for {freeze} and {fate}")
+    _print_notes(notes)
+    return 0
+
+
+def _write_whole(target: Path, content: int) -> None:
+    """Write a snapshot aside, have the disk confirm it, then give it its name: 0600, for memory is secret."""
+    aside = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        descriptor = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        try:
+            size = os.fstat(content).st_size
+            sent = 0
+            while sent < size:
+                sent += os.sendfile(descriptor, content, sent, size - sent)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        aside.replace(target)
+        directory = os.open(target.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(directory)
+        finally:
+            os.close(directory)
+    except OSError as error:
+        raise FailoverError(f"cannot write {target}: {error.strerror}; the program was not ended") from error
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+# --- restore ---------------------------------------------------------------------------------------------------------
+
+
+def restore(arguments: argparse.Namespace) -> int:
+    """Start the program of a snapshot where it stood; print its PID and return, or stay until it ends."""
+    try:
+        file = os.open(arguments.file, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError as error:
+        raise FailoverError(f"cannot read {arguments.file}: {error.strerror}") from error
+    outline = format.read_outline(file)
+    elapsed_ns = vessel.elapsed_since(outline.clocks)
+    with Keeper.spawn() as keeper, _born(birth_of(outline, elapsed_ns, own_session=not arguments.wait)) as born:
+        restored, _ = keeper.ask(Restore(born.pid, outline.component, elapsed_ns=elapsed_ns), Restored, (file,))
+        resumed, _ = keeper.ask(Resume(), Resumed)
+        keeper.ask(Release(), Released)
+    _tell_restore(arguments, restored.pid, born.notes + restored.notes + resumed.notes)
+    return _wait_for(born) if arguments.wait else 0
+
+
+def birth_of(outline: Snapshot, elapsed_ns: int, own_session: bool) -> Birth:
+    """How the vessel for a snapshot must be born.
+
+    On the boot that it was captured on, a program that lived in the machine's own PIDs and clocks finds them as they were.
+    """
+    isolated = outline.process.isolated
+    here = Path("/proc/sys/kernel/random/boot_id").read_text().strip() == outline.machine.boot_id
+    clocks = None if here and not isolated else outline.clocks
+    return Birth(outline.process.pid, isolated, clocks, elapsed_ns, own_session=own_session)
+
+
+@contextmanager
+def _born(birth: Birth) -> Iterator[Born]:
+    """A vessel for the body; if the body fails nothing of it is left."""
+    born = vessel.spawn_vessel(birth)
+    try:
+        yield born
+    except BaseException:
+        vessel.discard(born)
+        raise
+
+
+def _tell_restore(arguments: argparse.Namespace, pid: int, notes: tuple[str, ...]) -> None:
+    if arguments.json:
+        render.as_json({"pid": pid, "file": arguments.file, "notes": notes})
+        return
+    print(pid, flush=True)
+    _print_notes(notes)
+
+
+def _wait_for(born: Born) -> int:
+    """Stay until the program ends. Ctrl-C goes to the program, which shares our terminal, and is its business alone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGQUIT, signal.SIG_IGN)
+    _, status = os.waitpid(born.pid, 0)
+    if born.init_pid:
+        os.waitpid(born.init_pid, 0)
+    return exit_like(status)
+
+
+def _print_notes(notes: tuple[str, ...]) -> None:
+    for note in notes:
+        print(f"failover: note: {note}", file=sys.stderr)
+
+
+# --- check -----------------------------------------------------------------------------------------------------------
+
+
+def check(arguments: argparse.Namespace) -> int:
+    """Say whether a process, or this machine, can be protected, and what to change."""
+    if arguments.pid is None:
+        from failover.cli import machine
+
+        return machine.check(arguments)
+    with Keeper.spawn() as keeper:
+        report = keeper.ask(channel.Probe(arguments.pid), channel.Probed)[0].report
+    if arguments.json:
+        import msgspec
+
+        render.as_json(msgspec.to_builtins(report) | {"supported": report.supported})
+        return 0 if report.supported else 1
+    print(f"pid {report.pid}: {report.command}")
+    print(f"{picture.size(report.resident_size)} in memory; written pages are found by {report.tracking}")
+    render.table(("verdict", "what", "which", "why"), [(f.verdict, f.kind, f.name, f.text) for f in report.findings])
+    print(
+        "it can be captured" if report.supported else f"it cannot be captured: {len(report.reasons)} reasons, see refused above"
+    )
+    return 0 if report.supported else 1

@@ -367,7 +367,7 @@ VERBS: Final = (
           failover inspect --json mapper.snapshot | jq .position
         """,
         _inspect,
-        "failover.cli.oneshot:inspect",
+        "failover.cli.inspection:inspect",
     ),
     Verb(
         "completion",

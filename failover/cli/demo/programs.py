@@ -1,0 +1,100 @@
+"""The programs of the demo: ordinary ones that nobody prepared, whose output depends on nothing but themselves."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+LINES: Final = 400
+PAUSE_S: Final = 0.015
+"""Between two lines of the Python program: together with the arithmetic some ten seconds."""
+
+PI: Final = f'''\
+"""Ten digits of pi a line, by Gibbons' unbounded spigot, and a running digest over all of them so far."""
+
+import hashlib
+import time
+
+
+def digits():
+    q, r, t, k, n, l = 1, 0, 1, 1, 3, 3
+    while True:
+        if 4 * q + r - t < n * t:
+            yield n
+            q, r, n = 10 * q, 10 * (r - n * t), 10 * (3 * q + r) // t - 10 * n
+        else:
+            q, r, t, k, n, l = q * k, (2 * q + r) * l, t * l, k + 1, (q * (7 * k + 2) + r * l) // (t * l), l + 2
+
+
+source = digits()
+digest = hashlib.sha256()
+for line in range(1, {LINES} + 1):
+    ten = "".join(str(next(source)) for _ in range(10))
+    digest.update(ten.encode())
+    print(f"pi {{line * 10:5}}  {{ten}}  {{digest.hexdigest()[:16]}}", flush=True)
+    time.sleep({PAUSE_S})
+'''
+
+POINTS: Final = 400
+
+BC: Final = f"""\
+# The logistic map in its chaotic range: one wrong digit anywhere changes everything that follows.
+scale = 50
+x = 0.4
+for (i = 1; i <= {POINTS}; i++) {{
+  for (j = 0; j < 6000; j++) x = 3.99 * x * (1 - x)
+  print "chaos ", i, "  ", x, "\n"
+}}
+quit
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """One program to protect.
+
+    Attributes:
+        name: of the component.
+        title: how the demo speaks of it.
+        argv: what to execute.
+        directory: where to execute it; its files lie there.
+    """
+
+    name: str
+    title: str
+    argv: tuple[str, ...]
+    directory: Path
+
+    def undisturbed(self, environment: dict[str, str], priority: int = 10) -> subprocess.Popen[bytes]:
+        """Start it as anybody would, politely, its output going to a file: see `reference`."""
+        with self.reference.open("wb") as output:
+            return subprocess.Popen(
+                ["nice", "-n", str(priority), *self.argv],
+                cwd=self.directory,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    @property
+    def reference(self) -> Path:
+        """Where the undisturbed run writes."""
+        return self.directory / f"{self.title}.undisturbed"
+
+
+def write(directory: Path) -> tuple[Program, ...]:
+    """Write the programs' files; returns those that this machine can run."""
+    python = getattr(sys, "_base_executable", None) or sys.executable
+    (directory / "pi.py").write_text(PI)
+    found = [Program("/demo/pi", "pi", (python, "pi.py"), directory)]
+    bc = shutil.which("bc")
+    if bc is not None:
+        (directory / "chaos.bc").write_text(BC)
+        found.append(Program("/demo/chaos", "chaos", (bc, "-q", "chaos.bc"), directory))
+    return tuple(found)

@@ -1,0 +1,89 @@
+"""A keeper of our own for one command: the tracer's process, spawned, asked, and gone when we are.
+
+The one-shot verbs go through the same program that the agent uses, so that python-ptrace is never in this process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+from typing import TypeVar
+
+import msgspec
+
+from checkpoint import channel, errors
+from checkpoint.channel import Channel, ChannelClosedError, Failed, Reply
+from checkpoint.errors import CheckpointError, MismatchError, UnsupportedError
+
+LEAVE_S = 10.0
+"""How long a keeper that was hung up on may take to let go of its tracee."""
+
+A = TypeVar("A", bound=msgspec.Struct)
+
+
+class Keeper:
+    """One keeper process and our end of its channel. A context manager; leaving it lets go of the tracee."""
+
+    def __init__(self, process: subprocess.Popen[bytes], link: Channel[Reply]) -> None:
+        self._process = process
+        self._link = link
+
+    @classmethod
+    def spawn(cls) -> Keeper:
+        """Start one."""
+        ours, theirs = channel.pair()
+        with theirs:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "checkpoint", "keeper", str(theirs.fileno())],
+                pass_fds=(theirs.fileno(),),
+                stdin=subprocess.DEVNULL,
+            )
+        return cls(process, Channel(ours, Reply))
+
+    def ask(self, request: msgspec.Struct, wanted: type[A], descriptors: tuple[int, ...] = ()) -> tuple[A, tuple[int, ...]]:
+        """Send one request and wait for its answer: it, and the descriptors that came with it, now ours.
+
+        Raises:
+            CheckpointError: of the class that the keeper names, or that it went away.
+        """
+        try:
+            self._link.send(request, descriptors)
+            answer, found = self._link.receive()
+        except ChannelClosedError as error:
+            raise CheckpointError(
+                f"the keeper (the tracer's process) ended during {type(request).__name__}; the program is unharmed; try again"
+            ) from error
+        if isinstance(answer, Failed):
+            channel.close_all(found)
+            raise as_error(answer)
+        if not isinstance(answer, wanted):
+            channel.close_all(found)
+            raise CheckpointError(f"the keeper answered {type(request).__name__} with {type(answer).__name__}; same version?")
+        return answer, found
+
+    def close(self) -> None:
+        """Hang up, and wait until it has let go."""
+        self._link.close()
+        try:
+            self._process.wait(LEAVE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def __enter__(self) -> Keeper:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(ChannelClosedError):
+            self.close()
+
+
+def as_error(failed: Failed) -> CheckpointError:
+    """The error that a keeper told of, as it was raised there."""
+    kind = getattr(errors, failed.error, CheckpointError)
+    if kind in (UnsupportedError, MismatchError):
+        return kind(failed.message, failed.reasons)  # type: ignore[no-any-return]
+    return (
+        kind(failed.message) if isinstance(kind, type) and issubclass(kind, CheckpointError) else CheckpointError(failed.message)
+    )
