@@ -83,7 +83,7 @@ def as_error(failed: Failed) -> CheckpointError:
     """The error that a keeper told of, as it was raised there."""
     kind = getattr(errors, failed.error, CheckpointError)
     if kind in (UnsupportedError, MismatchError):
-        return kind(failed.message, failed.reasons)  # type: ignore[no-any-return]
+        return kind(failed.message, failed.reasons)
     return (
         kind(failed.message) if isinstance(kind, type) and issubclass(kind, CheckpointError) else CheckpointError(failed.message)
     )

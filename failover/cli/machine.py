@@ -1,0 +1,131 @@
+"""check without a PID: what this machine offers to a protected program, what it lacks, and what to change."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import resource
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from checkpoint.channel import Probe, Probed
+from checkpoint.errors import CheckpointError
+from checkpoint.linux import vessel
+from checkpoint.linux.vessel import Birth
+from failover.cli import render
+from failover.cli.keeper import Keeper
+
+SUPPORTED = ("x86_64",)
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """One thing looked at: ``missing`` means that nothing works without it, ``lesser`` that something works less well."""
+
+    verdict: Literal["good", "lesser", "missing"]
+    what: str
+    text: str
+
+
+def check(arguments: argparse.Namespace) -> int:
+    """Show what this machine offers; 1 when something is missing that nothing works without."""
+    offers = [
+        _architecture(),
+        *_looking_into(),
+        _isolation(),
+        _chosen_pids(),
+        _real_time(),
+        _memory_lock(),
+        _watchdog(),
+        _network(),
+    ]
+    able = all(offer.verdict != "missing" for offer in offers)
+    if arguments.json:
+        render.as_json({"able": able, "offers": [{"verdict": o.verdict, "what": o.what, "text": o.text} for o in offers]})
+    else:
+        render.table(("", "what", "finding"), [(offer.verdict, offer.what, offer.text) for offer in offers])
+        print("this machine can protect programs" if able else "this machine cannot protect programs: see what is missing above")
+    return 0 if able else 1
+
+
+def _architecture() -> Offer:
+    machine, kernel = platform.machine(), platform.release()
+    if machine not in SUPPORTED:
+        return Offer("missing", "processor", f"{machine} is not supported yet, only {', '.join(SUPPORTED)}")
+    return Offer("good", "processor", f"{machine}, Linux {kernel}")
+
+
+def _looking_into() -> list[Offer]:
+    """Start a stand-in and let a keeper look at it."""
+    try:
+        born = vessel.spawn_vessel(Birth())
+    except CheckpointError as error:
+        return [Offer("missing", "restoring", str(error))]
+    try:
+        with Keeper.spawn() as keeper:
+            report = keeper.ask(Probe(born.pid), Probed)[0].report
+    except CheckpointError as error:
+        return [Offer("missing", "looking into programs", str(error))]
+    finally:
+        vessel.discard(born)
+    return [Offer("good", "looking into programs", _ptrace_scope()), _tracking(report.tracking)]
+
+
+def _ptrace_scope() -> str:
+    try:
+        scope = Path("/proc/sys/kernel/yama/ptrace_scope").read_text().strip()
+    except OSError:
+        return "allowed (no Yama on this kernel)"
+    return f"allowed; kernel.yama.ptrace_scope is {scope}" + ("" if scope == "0" else ", so protect PID needs CAP_SYS_PTRACE")
+
+
+def _tracking(tracking: str) -> Offer:
+    if tracking == "digest":
+        return Offer(
+            "lesser", "written pages", "found by comparing digests: every snapshot reads the whole memory; use Linux 6.7 or later"
+        )
+    return Offer("good", "written pages", f"found by {tracking}")
+
+
+def _isolation() -> Offer:
+    born = vessel.spawn_vessel(Birth(isolate=True))
+    vessel.discard(born)
+    if born.isolated:
+        return Offer("good", "PIDs of its own", "a program gets a PID namespace, so its PID is free everywhere")
+    return Offer("lesser", "PIDs of its own", "; ".join(born.notes) or "not available")
+
+
+def _chosen_pids() -> Offer:
+    if os.geteuid() == 0:
+        return Offer("good", "the old PID", "can be chosen on restore")
+    text = "outside a namespace of its own a restored program gets a new PID; CAP_CHECKPOINT_RESTORE lets this user choose"
+    return Offer("lesser", "the old PID", text)
+
+
+def _real_time() -> Offer:
+    if os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_RTPRIO)[1] > 0:
+        return Offer("good", "real-time priority", "the agent's heart can have it")
+    text = "not for this user: a busy machine may look dead; set LimitRTPRIO=, see systemd/failover-agent.service"
+    return Offer("lesser", "real-time priority", text)
+
+
+def _memory_lock() -> Offer:
+    limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
+    if os.geteuid() == 0 or limit == resource.RLIM_INFINITY:
+        return Offer("good", "locked memory", "the agent's heart is never swapped out")
+    return Offer("lesser", "locked memory", f"limited to {limit >> 20} MiB for this user; set LimitMEMLOCK=infinity")
+
+
+def _watchdog() -> Offer:
+    if Path("/dev/watchdog").exists():
+        return Offer("good", "hardware watchdog", "there; systemd's RuntimeWatchdogSec= resets a hung machine")
+    return Offer("lesser", "hardware watchdog", "none: a robot whose kernel hangs halfway is not reset")
+
+
+def _network() -> Offer:
+    if shutil.which("ip") or Path("/usr/sbin/ip").exists():
+        return Offer("good", "ip", "there")
+    return Offer("lesser", "ip", "iproute2 is not installed: the demo uses loopback ports instead of networks")
