@@ -53,11 +53,12 @@ ARGUMENTS: Final = ("rdi", "rsi", "rdx", "r10", "r8", "r9")
 SYSCALL: Final = b"\x0f\x05"
 SYSCALLS: Final[Mapping[str, int]] = {
     "read": 0, "write": 1, "open": 2, "close": 3, "poll": 7, "mmap": 9, "mprotect": 10, "munmap": 11, "brk": 12,
-    "rt_sigaction": 13, "rt_sigprocmask": 14, "select": 23, "madvise": 28, "pause": 34, "nanosleep": 35, "getitimer": 36,
-    "semop": 65, "sigaltstack": 131, "rt_sigtimedwait": 128, "rt_sigsuspend": 130, "prctl": 157, "futex": 202,
-    "io_getevents": 208, "restart_syscall": 219, "semtimedop": 220, "timer_gettime": 224, "timer_getoverrun": 225, "clock_gettime": 228,
-    "clock_nanosleep": 230, "epoll_wait": 232, "pselect6": 270, "ppoll": 271, "get_robust_list": 274, "epoll_pwait": 281,
-    "userfaultfd": 323, "io_uring_enter": 426, "epoll_pwait2": 441,
+    "rt_sigaction": 13, "rt_sigprocmask": 14, "select": 23, "madvise": 28, "pause": 34, "nanosleep": 35,
+    "getitimer": 36, "semop": 65, "sigaltstack": 131, "rt_sigtimedwait": 128, "rt_sigsuspend": 130, "prctl": 157,
+    "futex": 202, "io_getevents": 208, "restart_syscall": 219, "semtimedop": 220, "timer_gettime": 224,
+    "timer_getoverrun": 225, "clock_gettime": 228, "clock_nanosleep": 230, "epoll_wait": 232, "pselect6": 270,
+    "ppoll": 271, "get_robust_list": 274, "epoll_pwait": 281, "userfaultfd": 323, "io_uring_enter": 426,
+    "epoll_pwait2": 441,
 }  # fmt: skip
 """Numbers by name: those that we make or tell of."""
 SYSCALL_NAMES: Final[Mapping[int, str]] = {number: name for name, number in SYSCALLS.items()}

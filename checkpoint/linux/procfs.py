@@ -1,0 +1,438 @@
+"""What /proc says about one process: read once, parsed into frozen values.
+
+Every reader raises `ProcessGoneError` when the process has ended and `ProbeError` when we may not look.
+
+Source: proc(5) and the pages it is split into (proc_pid_maps(5), proc_pid_status(5) …).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from checkpoint.errors import MapsFormatError, ProbeError, ProcessGoneError
+from checkpoint.linux import abi
+
+DELETED: Final = " (deleted)"
+READ_SIZE: Final = 1 << 20
+
+
+def read_bytes(pid: int, name: str) -> bytes:
+    """Read ``/proc/PID/name`` whole.
+
+    Raises:
+        ProcessGoneError: no such process.
+        ProbeError: not permitted, or this kernel has no such file.
+    """
+    path = f"/proc/{pid}/{name}"
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            return _read_whole(descriptor)
+        finally:
+            os.close(descriptor)
+    except (FileNotFoundError, ProcessLookupError) as error:
+        if os.path.exists(f"/proc/{pid}"):
+            raise ProbeError(f"cannot read {path}: this kernel does not offer it") from error
+        raise ProcessGoneError(f"cannot read {path}: there is no process {pid}") from error
+    except PermissionError as error:
+        raise ProbeError(
+            f"cannot read {path}: not permitted; run as the same user or with CAP_SYS_PTRACE, see systemd/failover-agent.service"
+        ) from error
+
+
+def _read_whole(descriptor: int) -> bytes:
+    pieces = []
+    while piece := os.read(descriptor, READ_SIZE):
+        pieces.append(piece)
+    return b"".join(pieces)
+
+
+def read_text(pid: int, name: str) -> str:
+    """Read ``/proc/PID/name`` as text; bytes that are no UTF-8 survive as surrogates, like file names do."""
+    return os.fsdecode(read_bytes(pid, name))
+
+
+def read_link(pid: int, name: str) -> str:
+    """Where the link ``/proc/PID/name`` leads, in the kernel's words."""
+    try:
+        return os.readlink(f"/proc/{pid}/{name}")
+    except (FileNotFoundError, ProcessLookupError) as error:
+        raise ProcessGoneError(f"cannot read the link /proc/{pid}/{name}: it is not there (any more)") from error
+    except PermissionError as error:
+        raise ProbeError(
+            f"cannot read the link /proc/{pid}/{name}: not permitted; run as the same user or with CAP_SYS_PTRACE"
+        ) from error
+
+
+# Mappings
+
+
+@dataclass(frozen=True, slots=True)
+class MapsLine:
+    """One line of /proc/PID/maps."""
+
+    start: int
+    end: int
+    protection: int
+    shared: bool
+    offset: int
+    device: int
+    inode: int
+    name: str
+
+    @property
+    def size(self) -> int:
+        """Bytes covered."""
+        return self.end - self.start
+
+    @property
+    def has_file(self) -> bool:
+        """Whether a file stands behind it (shared anonymous memory has one without a path)."""
+        return self.inode != 0
+
+
+_MAPS_LINE: Final = re.compile(
+    r"([0-9a-f]+)-([0-9a-f]+) ([r-])([w-])([x-])([ps]) ([0-9a-f]+) ([0-9a-f]+):([0-9a-f]+) ([0-9]+) *(.*)", re.DOTALL
+)
+
+
+def parse_maps_line(line: str) -> MapsLine:
+    """Read one line.
+
+    Raises:
+        MapsFormatError: it is not of the documented form.
+    """
+    match = _MAPS_LINE.fullmatch(line)
+    if match is None:
+        raise MapsFormatError(f"cannot read this line of /proc/PID/maps: {line!r}")
+    start, end, read, write, execute, sharing, offset, major, minor, inode, name = match.groups()
+    protection = abi.PROT_READ * (read == "r") | abi.PROT_WRITE * (write == "w") | abi.PROT_EXEC * (execute == "x")
+    return MapsLine(
+        start=int(start, 16),
+        end=int(end, 16),
+        protection=protection,
+        shared=sharing == "s",
+        offset=int(offset, 16),
+        device=os.makedev(int(major, 16), int(minor, 16)),
+        inode=int(inode),
+        name=name.replace("\\012", "\n"),
+    )
+
+
+def parse_maps(text: str) -> tuple[MapsLine, ...]:
+    """Read the mappings of one process, in address order.
+
+    Raises:
+        MapsFormatError: a line is not of the documented form; names the line.
+
+    Source: proc_pid_maps(5).
+    """
+    return tuple(map(parse_maps_line, text.splitlines()))
+
+
+class MapsReader:
+    """Reads one process's maps again and again; lines that did not change are not parsed again."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._text = b""
+        self._lines: dict[bytes, MapsLine] = {}
+        self.lines: tuple[MapsLine, ...] = ()
+
+    def refresh(self) -> bool:
+        """Read the maps; answers whether anything changed. ``lines`` then holds what is there."""
+        text = read_bytes(self._pid, "maps")
+        if text == self._text:
+            return False
+        known = self._lines
+        fresh = {}
+        for line in text.splitlines():
+            fresh[line] = known.get(line) or parse_maps_line(os.fsdecode(line))
+        self._text, self._lines, self.lines = text, fresh, tuple(fresh.values())
+        return True
+
+
+_SMAPS_HEAD: Final = re.compile(r"([0-9a-f]+)-([0-9a-f]+) [r-][w-][x-][ps] ")
+
+
+def parse_vm_flags(text: str) -> dict[int, tuple[str, ...]]:
+    """Read the VmFlags of /proc/PID/smaps: start of the mapping → its two-letter codes."""
+    flags: dict[int, tuple[str, ...]] = {}
+    start = 0
+    for line in text.splitlines():
+        if line.startswith("VmFlags:"):
+            flags[start] = tuple(line.split()[1:])
+        elif match := _SMAPS_HEAD.match(line):
+            start = int(match[1], 16)
+    return flags
+
+
+# The process
+
+
+def parse_fields(text: str) -> dict[str, str]:
+    """Read "Key:\tvalue" lines, as of /proc/PID/status and fdinfo; the first of several lines of one key counts."""
+    fields: dict[str, str] = {}
+    for line in text.splitlines():
+        key, colon, value = line.partition(":")
+        if colon:
+            fields.setdefault(key, value.strip())
+    return fields
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """/proc/PID/status, as far as we use it.
+
+    Attributes:
+        state: one letter: R, S, D, T, t, Z, X.
+        pids, pgids, sids: from our namespace inwards.
+        capabilities: inheritable, permitted, effective, bounding, ambient.
+    """
+
+    name: str
+    state: str
+    umask: int
+    tgid: int
+    ppid: int
+    tracer: int
+    uids: tuple[int, int, int, int]
+    gids: tuple[int, int, int, int]
+    groups: tuple[int, ...]
+    pids: tuple[int, ...]
+    pgids: tuple[int, ...]
+    sids: tuple[int, ...]
+    resident_size: int
+    threads: int
+    caught: int
+    ignored: int
+    capabilities: tuple[int, int, int, int, int]
+    no_new_privs: bool
+    seccomp: int
+
+
+def parse_status(text: str) -> Status:
+    """Read /proc/PID/status.
+
+    Source: proc_pid_status(5).
+    """
+    fields = parse_fields(text)
+
+    def numbers(key: str, base: int = 10) -> tuple[int, ...]:
+        return tuple(int(word, base) for word in fields.get(key, "").split())
+
+    return Status(
+        name=fields.get("Name", ""),
+        state=fields.get("State", "?")[:1],
+        umask=int(fields.get("Umask", "0"), 8),
+        tgid=int(fields["Tgid"]),
+        ppid=int(fields["PPid"]),
+        tracer=int(fields["TracerPid"]),
+        uids=_four(numbers("Uid")),
+        gids=_four(numbers("Gid")),
+        groups=numbers("Groups"),
+        pids=numbers("NSpid") or (int(fields["Pid"]),),
+        pgids=numbers("NSpgid"),
+        sids=numbers("NSsid"),
+        resident_size=int((fields.get("VmRSS") or "0 kB").split()[0]) * 1024,
+        threads=int(fields.get("Threads", "1")),
+        caught=int(fields.get("SigCgt", "0"), 16),
+        ignored=int(fields.get("SigIgn", "0"), 16),
+        capabilities=_five(tuple(int(fields.get(f"Cap{which}", "0"), 16) for which in ("Inh", "Prm", "Eff", "Bnd", "Amb"))),
+        no_new_privs=fields.get("NoNewPrivs") == "1",
+        seccomp=int(fields.get("Seccomp", "0")),
+    )
+
+
+def _four(words: tuple[int, ...]) -> tuple[int, int, int, int]:
+    first, second, third, fourth = words
+    return first, second, third, fourth
+
+
+def _five(words: tuple[int, ...]) -> tuple[int, int, int, int, int]:
+    first, second, third, fourth, fifth = words
+    return first, second, third, fourth, fifth
+
+
+def status(pid: int) -> Status:
+    """Read and parse /proc/PID/status."""
+    return parse_status(read_text(pid, "status"))
+
+
+@dataclass(frozen=True, slots=True)
+class Stat:
+    """/proc/PID/stat, as far as we use it. Addresses are 0 where we may not see them."""
+
+    nice: int
+    priority: int
+    policy: int
+    start_time: int
+    flags: int
+    start_code: int
+    end_code: int
+    start_stack: int
+    start_data: int
+    end_data: int
+    start_brk: int
+    arg_start: int
+    arg_end: int
+    env_start: int
+    env_end: int
+
+
+PF_KTHREAD: Final = 0x00200000
+
+
+def parse_stat(text: str) -> Stat:
+    """Read /proc/PID/stat; the name in parentheses may hold anything.
+
+    Source: proc_pid_stat(5); its fields are numbered from 1, the third one follows the name.
+    """
+    words = text[text.rindex(")") + 2 :].split()
+
+    def field(number: int) -> int:
+        return int(words[number - 3])
+
+    return Stat(
+        nice=field(19),
+        priority=field(40),
+        policy=field(41),
+        start_time=field(22),
+        flags=field(9),
+        start_code=field(26),
+        end_code=field(27),
+        start_stack=field(28),
+        start_data=field(45),
+        end_data=field(46),
+        start_brk=field(47),
+        arg_start=field(48),
+        arg_end=field(49),
+        env_start=field(50),
+        env_end=field(51),
+    )
+
+
+def stat(pid: int) -> Stat:
+    """Read and parse /proc/PID/stat."""
+    return parse_stat(read_text(pid, "stat"))
+
+
+# Descriptors
+
+
+@dataclass(frozen=True, slots=True)
+class Descriptor:
+    """One open descriptor.
+
+    Attributes:
+        target: where /proc/PID/fd/N leads, in the kernel's words: a path, "pipe:[123]", "anon_inode:[eventpoll]" …
+        offset, flags: of fdinfo; flags hold O_CLOEXEC too.
+        mode, device, rdev, inode, size, mtime_ns: of fstat(2).
+        fields: everything that fdinfo says.
+    """
+
+    number: int
+    target: str
+    offset: int
+    flags: int
+    mode: int
+    device: int
+    rdev: int
+    inode: int
+    size: int
+    mtime_ns: int
+    links: int
+    fields: Mapping[str, str]
+
+    @property
+    def name(self) -> str:
+        """What reports call it."""
+        return f"fd {self.number}"
+
+
+def descriptors(pid: int) -> tuple[Descriptor, ...]:
+    """Every open descriptor, in order of number."""
+    try:
+        numbers = sorted(map(int, os.listdir(f"/proc/{pid}/fd")))
+    except (FileNotFoundError, ProcessLookupError) as error:
+        raise ProcessGoneError(f"cannot list descriptors: there is no process {pid}") from error
+    except PermissionError as error:
+        raise ProbeError(
+            f"cannot list descriptors of pid {pid}: not permitted; run as the same user or with CAP_SYS_PTRACE"
+        ) from error
+    return tuple(found for number in numbers if (found := descriptor(pid, number)) is not None)
+
+
+def descriptor(pid: int, number: int) -> Descriptor | None:
+    """One open descriptor; None when it was closed meanwhile."""
+    path = f"/proc/{pid}/fd/{number}"
+    try:
+        target = os.readlink(path)
+        about = os.stat(path)
+        fields = parse_fields(os.fsdecode(read_bytes(pid, f"fdinfo/{number}")))
+    except (FileNotFoundError, ProbeError):
+        return None
+    return Descriptor(
+        number=number,
+        target=target,
+        offset=int(fields.get("pos", "0")),
+        flags=int(fields.get("flags", "0"), 8),
+        mode=about.st_mode,
+        device=about.st_dev,
+        rdev=about.st_rdev,
+        inode=about.st_ino,
+        size=about.st_size,
+        mtime_ns=about.st_mtime_ns,
+        links=about.st_nlink,
+        fields=fields,
+    )
+
+
+# POSIX timers
+
+
+@dataclass(frozen=True, slots=True)
+class TimerLine:
+    """One timer of /proc/PID/timers; ``notify`` as of SIGEV_*, ``tid`` only with SIGEV_THREAD_ID."""
+
+    timer_id: int
+    signal: int
+    value: int
+    notify: int
+    tid: int
+    clock: int
+
+
+_NOTIFY: Final[Mapping[str, int]] = {"signal": 0, "none": 1, "thread": 2}
+SIGEV_THREAD_ID: Final = 4
+
+
+def parse_timers(text: str) -> tuple[TimerLine, ...]:
+    """Read /proc/PID/timers.
+
+    Source: fs/proc/base.c, show_timer(): "ID:", "signal: N/hex-value", "notify: word/(pid|tid).N", "ClockID:".
+    """
+    return tuple(_timers_of(text))
+
+
+def _timers_of(text: str) -> Iterator[TimerLine]:
+    for block in re.split(r"(?m)^(?=ID:)", text):
+        fields = parse_fields(block)
+        if "ID" not in fields:
+            continue
+        signal, _, value = fields["signal"].partition("/")
+        word, _, target = fields["notify"].partition("/")
+        kind, _, number = target.partition(".")
+        to_thread = kind == "tid"
+        yield TimerLine(
+            timer_id=int(fields["ID"]),
+            signal=int(signal),
+            value=int(value, 16),
+            notify=_NOTIFY[word] | (SIGEV_THREAD_ID if to_thread else 0),
+            tid=int(number) if to_thread else 0,
+            clock=int(fields["ClockID"]),
+        )
