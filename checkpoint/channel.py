@@ -188,12 +188,17 @@ class Protect(msgspec.Struct, frozen=True, tag=True):
 
 
 class Capture(msgspec.Struct, frozen=True, tag=True):
-    """Take a snapshot. Answer: `Captured` with a sealed memfd that holds it encoded."""
+    """Take a snapshot. Answer: `Captured` with a sealed memfd that holds it encoded.
+
+    Attributes:
+        hold: leave the program standing still afterwards, until `Release`: who ends it now ends it in exactly this state.
+    """
 
     base: bool
     generation: int
     sequence: int
     epoch: int = 0
+    hold: bool = False
 
 
 class Acknowledge(msgspec.Struct, frozen=True, tag=True):
