@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.memory import Memory
+from checkpoint.linux.procfs import MapsLine
 from checkpoint.model import PageRun, Snapshot, Vma, VmaKind
 
 MREMAP_MAYMOVE_FIXED: Final = 1 | 2
@@ -28,6 +29,9 @@ MAP_LOCKED_ON_FAULT: Final = 1
 KERNEL_KINDS: Final = frozenset({VmaKind.VDSO, VmaKind.VVAR, VmaKind.VSYSCALL})
 """Mappings that the kernel made: moved, never mapped."""
 
+KERNEL_NAMES: Final = ("[vdso]", "[vvar", "[vsyscall]")
+VSYSCALL: Final = "[vsyscall]"
+
 ADVICE: Final = {"sr": 2, "rr": 1, "dc": 10, "mg": 12, "hg": 14, "nh": 15, "dd": 16, "wf": 18}
 """madvise(2) by the letters of VmFlags: sequential, random, don't fork, mergeable, huge, not huge, don't dump, wipe on fork."""
 
@@ -35,19 +39,24 @@ NAMED_ANONYMOUS: Final = "[anon:"
 PR_SET_VMA: Final = 0x53564D41
 
 
-def clear(table: CallTable, vessel: Iterable[Vma]) -> None:
+def clear(table: CallTable, vessel: Iterable[MapsLine]) -> None:
     """Unmap everything that the vessel came with, but the kernel's own pages."""
-    for vma in vessel:
-        if vma.kind not in KERNEL_KINDS:
-            table.call(f"unmap {vma.start:#x} of the vessel", "munmap", vma.start, vma.size)
+    for line in vessel:
+        if not line.name.startswith(KERNEL_NAMES):
+            table.call(f"unmap {line.start:#x} of the vessel", "munmap", line.start, line.size)
 
 
-def kernel_pages(vmas: Iterable[Vma]) -> list[Vma]:
-    """The vdso and its data, in address order; vsyscall has one address everywhere."""
+def kernel_pages(vessel: Iterable[MapsLine]) -> list[MapsLine]:
+    """The vessel's vdso and its data, in address order, the vdso last; vsyscall has one address everywhere."""
+    return [line for line in vessel if line.name.startswith(KERNEL_NAMES) and line.name != VSYSCALL]
+
+
+def kernel_pages_of(vmas: Iterable[Vma]) -> list[Vma]:
+    """The same of the program."""
     return [vma for vma in vmas if vma.kind in (VmaKind.VDSO, VmaKind.VVAR)]
 
 
-def move_kernel_pages(table: CallTable, vessel: Sequence[Vma], program: Sequence[Vma], refuge: int) -> None:
+def move_kernel_pages(table: CallTable, vessel: Sequence[MapsLine], program: Sequence[Vma], refuge: int) -> None:
     """Move the vdso and its data to where the program has them.
 
     Args:
@@ -64,7 +73,9 @@ def move_kernel_pages(table: CallTable, vessel: Sequence[Vma], program: Sequence
 
 
 def _move(table: CallTable, start: int, target: int, size: int) -> None:
-    table.call(f"move the vdso to {target:#x}", "mremap", start, size, size, MREMAP_MAYMOVE_FIXED, target, least=target, most=target)
+    table.call(
+        f"move the vdso to {target:#x}", "mremap", start, size, size, MREMAP_MAYMOVE_FIXED, target, least=target, most=target
+    )
 
 
 def map_program(table: CallTable, vmas: Iterable[Vma], runs: Sequence[PageRun]) -> None:

@@ -1,0 +1,256 @@
+"""Turn a waiting vessel into the program of a base.
+
+::
+
+    checks                       this machine has what the snapshot needs (`restore_checks`); nothing is touched before
+    seize, stand in a hole       the vessel is ours and dies with us; loop and tables lie where neither it nor the program has anything
+    first table                  its own mappings go, the vdso moves, everything the program had is mapped
+    pages                        written from outside
+    second table                 protections, files, marks, signals, timers, rights
+    registers                    SIGTRAP's action, the area unmapped by the vdso's own syscall instruction, then the program's own
+
+Until `Restored.resume` the program stands still and dies with its tracer (PTRACE_O_EXITKILL): an unfinished restore leaves nothing.
+
+Source: ptrace(2), prctl(2), vdso(7); kernel/sys.c for PR_SET_MM_MAP.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import resource
+import signal
+from dataclasses import dataclass
+from typing import Final
+
+from checkpoint.arch import x86_64, x86_64_stub
+from checkpoint.engine import RestoreOptions
+from checkpoint.engines import restore_checks, restore_memory, restore_process
+from checkpoint.engines.restore_process import Vessel
+from checkpoint.errors import CheckpointError, RestoreError
+from checkpoint.linux import abi, call_table, procfs
+from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
+from checkpoint.linux.tracee import Stop, Tracee
+from checkpoint.model import Credentials, Position, Snapshot, Vma
+from checkpoint.resources.rebuild import rebuild_all
+
+PTRACE_O_TRACESYSGOOD: Final = 1
+PTRACE_EVENT_EXEC: Final = 4
+OPTIONS: Final = abi.PTRACE_O_EXITKILL | PTRACE_O_TRACESYSGOOD | abi.PTRACE_O_TRACEEXEC
+
+REFUGE_SIZE: Final = 1 << 20
+"""Bytes beside the area where vdso and its data stay while their old and new places are cleared."""
+
+PR_TIMER_CREATE_RESTORE_IDS_GET: Final = 2
+
+
+@dataclass(slots=True)
+class RestoredProgram:
+    """A program that was brought back; see ``checkpoint.engine.Restored``.
+
+    Attributes:
+        tracee: it stands still for us until `resume`, or until a session takes it over.
+    """
+
+    tracee: Tracee
+    position: Position
+    notes: tuple[str, ...]
+
+    @property
+    def pid(self) -> int:
+        """As this process sees it."""
+        return self.tracee.pid
+
+    def resume(self) -> None:
+        """Let it go on, without us."""
+        self.tracee.request("let go of", abi.PTRACE_SETOPTIONS, 0, 0)
+        self.tracee.detach()
+
+
+def restore(vessel_pid: int, state: Snapshot, options: RestoreOptions) -> RestoredProgram:
+    """See ``checkpoint.engine.Engine.restore``."""
+    if not state.is_base:
+        raise RestoreError("cannot restore a delta by itself: fold its chain first")
+    restore_checks.require(state, options)
+    try:
+        return _Restore(vessel_pid, state, options).run()
+    except RestoreError:
+        raise
+    except CheckpointError as error:
+        raise RestoreError(f"cannot restore {state.component} into pid {vessel_pid}: {error}") from error
+
+
+class _Restore:
+    """One restore, from the seizing of the vessel to the program's own registers."""
+
+    def __init__(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> None:
+        self._state = state
+        self._options = options
+        self._thread = state.threads[0]
+        self._tracee = Tracee(vessel_pid)
+        self._notes: list[str] = []
+
+    def run(self) -> RestoredProgram:
+        tracee = self._tracee
+        tracee.seize(OPTIONS)
+        tracee.freeze()
+        tracee.set_signal_mask(abi.ALL_SIGNALS & ~(1 << (signal.SIGTRAP - 1)))
+        vessel = look_at_vessel(tracee.pid)
+        if not vessel.may_choose_executable:
+            self._execute_program()
+        self._xstate_size = len(tracee.xstate())
+        self._start_registers = tracee.registers()
+        mappings = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
+        self._build_and_run(vessel, mappings)
+        self._become_program()
+        return RestoredProgram(tracee, self._state.position, tuple(self._notes))
+
+    def _build_and_run(self, vessel: Vessel, mappings: tuple[procfs.MapsLine, ...]) -> None:
+        state, tracee = self._state, self._tracee
+        taken = [(line.start, line.end) for line in mappings] + [(vma.start, vma.end) for vma in state.vmas]
+        base = call_table.find_hole(taken, AREA_SIZE + REFUGE_SIZE)
+        kernel_pages = restore_memory.kernel_pages(mappings)
+        first = self._mappings_table(CallTable(base), vessel, mappings, base + AREA_SIZE)
+        second = self._state_table(CallTable(base, descriptors=set(first.descriptors)), vessel)
+        size = max(first.end, second.end) - base
+        if size > AREA_SIZE:
+            raise RestoreError(
+                f"cannot restore: its {len(state.vmas)} mappings need {size >> 20} MiB of calls; the limit is 64 MiB"
+            )
+        self._area_size = size
+        stub = Stub(tracee, base)
+        stub.install(self._syscall_instruction(kernel_pages[-1]), size)
+        self._notes += stub.run(first)
+        restore_memory.fill(tracee.memory, state)
+        self._notes += stub.run(second)
+        self._stub = stub
+        _write_oom_score(tracee.pid, state.process.oom_score_adj, self._notes)
+
+    def _mappings_table(self, table: CallTable, vessel: Vessel, mappings: tuple[procfs.MapsLine, ...], refuge: int) -> CallTable:
+        vmas, runs = self._state.vmas, self._state.runs
+        restore_process.raise_limits(table, vessel)
+        restore_memory.clear(table, mappings)
+        ours, theirs = restore_memory.kernel_pages(mappings), restore_memory.kernel_pages_of(vmas)
+        restore_memory.move_kernel_pages(table, ours, theirs, refuge)
+        restore_memory.map_program(table, vmas, runs)
+        return table
+
+    def _state_table(self, table: CallTable, vessel: Vessel) -> CallTable:
+        process, thread, elapsed_ns = self._state.process, self._thread, self._options.elapsed_ns
+        restore_memory.settle(table, self._state.vmas, self._state.runs)
+        self._notes += rebuild_all(table, self._state, self._options)
+        restore_process.memory_layout(table, process, with_executable=vessel.may_choose_executable)
+        restore_process.signal_actions(table, process.signal_actions)
+        restore_process.thread_marks(table, thread)
+        restore_process.surroundings(table, process)
+        restore_process.scheduling(table, thread, vessel)
+        self._notes += restore_process.limits(table, process, vessel)
+        self._notes += restore_process.rights(table, process, vessel)
+        restore_process.pending_signals(table, process, thread, vessel.inner_pid)
+        restore_process.posix_timers(
+            table, process.posix_timers, vessel.inner_pid, elapsed_ns, chosen_ids=_timer_numbers_can_be_chosen()
+        )
+        restore_process.interval_timers(table, process.interval_timers, elapsed_ns)
+        restore_process.last_marks(table, process)
+        return table
+
+    def _become_program(self) -> None:
+        """SIGTRAP's action, our area gone, then the program's own registers and mask."""
+        tracee, state = self._tracee, self._state
+        vdso = restore_memory.kernel_pages_of(state.vmas)[-1]
+        instruction = self._syscall_instruction(vdso)
+        action = restore_process.trap_action(state.process.signal_actions)
+        tracee.memory.write(self._stub.base + abi.PAGE_SIZE, restore_process.packed_action(action))
+        arguments = (signal.SIGTRAP, self._stub.base + abi.PAGE_SIZE, 0, abi.SIGSET_SIZE)
+        self._single(instruction, "rt_sigaction", *arguments)
+        self._single(instruction, "munmap", self._stub.base, -(-self._area_size // abi.PAGE_SIZE) * abi.PAGE_SIZE)
+        self._restore_rseq_section()
+        tracee.set_xstate(self._thread.registers["xstate"][: self._xstate_size].ljust(self._xstate_size, b"\0"))
+        tracee.set_registers(x86_64_stub.with_registers(self._thread.registers["prstatus"]))
+        tracee.set_signal_mask(self._thread.signal_mask)
+
+    def _restore_rseq_section(self) -> None:
+        """Registering cleared the pointer to the critical section that the thread may stand in; the kernel aborts it on return."""
+        rseq = self._thread.rseq
+        if rseq is None:
+            return
+        pointer = content_at(self._state, rseq.address + RSEQ_SECTION_OFFSET, 8)
+        if pointer is not None and any(pointer):
+            self._tracee.memory.write(rseq.address + RSEQ_SECTION_OFFSET, pointer)
+
+    def _execute_program(self) -> None:
+        """Have the vessel execute the program's own file, so that /proc/PID/exe is right without a right to set it."""
+        tracee, path = self._tracee, self._state.process.executable.path
+        mappings = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
+        instruction = self._syscall_instruction(restore_memory.kernel_pages(mappings)[-1])
+        stack = next(line for line in mappings if line.name == "[stack]")
+        content = os.fsencode(path) + b"\0"
+        place = stack.start + abi.PAGE_SIZE
+        arguments = place + -(-len(content) // 16) * 16
+        tracee.memory.write(place, content)
+        tracee.memory.write(arguments, place.to_bytes(8, "little") + bytes(16))
+        call = (x86_64_stub.SYSTEM_CALLS["execve"], (place, arguments, arguments + 8))
+        tracee.set_registers(x86_64_stub.at_call(tracee.registers(), instruction, *call))
+        self._step()  # into the call
+        if self._step().event != PTRACE_EVENT_EXEC:
+            reason = os.strerror(-x86_64_stub.call_result(tracee.registers()))
+            raise RestoreError(f"cannot execute {path} in the vessel: {reason}")
+        self._step()  # out of the call, into a program that has not run yet
+
+    def _step(self) -> Stop:
+        self._tracee.request("step", abi.PTRACE_SYSCALL)
+        return self._tracee.wait(call_table.RUN_TIMEOUT_S)
+
+    def _syscall_instruction(self, vdso: procfs.MapsLine | Vma) -> int:
+        image = self._tracee.memory.read(vdso.start, vdso.size)
+        offset = image.find(x86_64.SYSCALL)
+        if offset < 0:
+            raise RestoreError("cannot restore: this kernel's vdso has no syscall instruction to leave by")
+        return vdso.start + offset
+
+    def _single(self, instruction: int, name: str, *arguments: int) -> None:
+        number = x86_64_stub.SYSTEM_CALLS[name]
+        result = call_table.single_call(self._tracee, self._start_registers, instruction, number, *arguments)
+        if result < 0:
+            raise RestoreError(f"cannot {name} as the last step of a restore: {os.strerror(-result)}")
+
+
+RSEQ_SECTION_OFFSET: Final = 8
+"""Offset of rseq_cs in struct rseq (linux/rseq.h)."""
+
+
+def content_at(state: Snapshot, address: int, size: int) -> bytes | None:
+    """Bytes of the program's memory, as far as the snapshot carries the page; None when it does not."""
+    position = 0
+    for run in state.runs:
+        if run.start <= address and address + size <= run.end:
+            offset = position + address - run.start
+            return bytes(memoryview(state.contents)[offset : offset + size])
+        position += run.size
+    return None
+
+
+def look_at_vessel(pid: int) -> Vessel:
+    """What a vessel is and may do."""
+    status = procfs.status(pid)
+    credentials = Credentials(status.uids, status.gids, status.groups, status.capabilities)
+    return Vessel(pid, status.pids[-1], credentials, frozenset(os.sched_getaffinity(pid)), _hard_limits(pid))
+
+
+def _hard_limits(pid: int) -> dict[int, int]:
+    return {number: resource.prlimit(pid, number)[1] for number in range(16)}
+
+
+def _write_oom_score(pid: int, score: int, notes: list[str]) -> None:
+    try:
+        with open(f"/proc/{pid}/oom_score_adj", "r+", encoding="ascii") as file:
+            if int(file.read()) != score:
+                file.seek(0)
+                file.write(str(score))
+    except PermissionError:
+        notes.append(f"oom_score_adj {score} is not kept: lowering it needs CAP_SYS_RESOURCE")
+
+
+def _timer_numbers_can_be_chosen() -> bool:
+    """Whether the kernel lets timer numbers be chosen (Linux 6.15); asking changes nothing."""
+    return ctypes.CDLL(None).prctl(restore_process.PR_TIMER_CREATE_RESTORE_IDS, PR_TIMER_CREATE_RESTORE_IDS_GET, 0, 0, 0) >= 0

@@ -1,0 +1,336 @@
+"""What belongs to the process besides memory and files, put back by system calls inside the vessel.
+
+Each function adds its calls to a table; `ptrace_restore` says in which order. What the vessel has no right to do becomes a note,
+except where the program would go wrong without it.
+
+Sources: prctl(2), rt_sigaction(2), timer_create(2), sched(7), credentials(7), capabilities(7), rseq(2).
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from checkpoint.linux import abi
+from checkpoint.linux.call_table import CallTable
+from checkpoint.model import Credentials, IntervalTimer, PosixTimer, ProcessState, SignalAction, ThreadState
+
+_NO_FILE: Final = 0xFFFFFFFF
+_MM_MAP: Final = struct.Struct("<12Q2I")
+_SIGTRAP: Final = 5
+_UNCHANGEABLE: Final = (9, 19)
+"""SIGKILL and SIGSTOP."""
+
+SS_ONSTACK: Final = 1
+
+PR_TIMER_CREATE_RESTORE_IDS: Final = 77
+TIMER_ID_LIMIT: Final = 1024
+"""Largest timer number that is reached by creating and deleting timers, on kernels that cannot be told the number."""
+
+_NS_PER_US: Final = 1000
+_US_PER_S: Final = 1_000_000
+_NS_PER_S: Final = 1_000_000_000
+
+_CPU_TIME_CLOCKS: Final = (2, 3)
+"""CLOCK_PROCESS_CPUTIME_ID and CLOCK_THREAD_CPUTIME_ID; a negative clock counts some process's CPU time too."""
+
+RLIM_INFINITY: Final = (1 << 64) - 1
+RAISED_LIMITS: Final = (1, 2, 7, 8, 9)
+"""RLIMIT_FSIZE, RLIMIT_DATA, RLIMIT_NOFILE, RLIMIT_MEMLOCK, RLIMIT_AS: those that a restore itself may meet."""
+
+CAP_SETGID: Final = 6
+CAP_SETUID: Final = 7
+CAP_SETPCAP: Final = 8
+CAP_SYS_ADMIN: Final = 21
+CAP_SYS_RESOURCE: Final = 24
+CAP_CHECKPOINT_RESTORE: Final = 40
+
+PR_CAPBSET_DROP: Final = 24
+PR_CAP_AMBIENT: Final = 47
+PR_CAP_AMBIENT_RAISE: Final = 2
+PR_CAP_AMBIENT_CLEAR_ALL: Final = 4
+_CAPABILITY_VERSION_3: Final = 0x20080522
+
+
+@dataclass(frozen=True, slots=True)
+class Vessel:
+    """What the vessel is before it becomes the program.
+
+    Attributes:
+        inner_pid: its PID as it sees it itself.
+        credentials: who it runs as.
+        affinity: processors that it may use.
+        hard_limits: by RLIMIT number; -1 is infinity.
+    """
+
+    pid: int
+    inner_pid: int
+    credentials: Credentials
+    affinity: frozenset[int]
+    hard_limits: Mapping[int, int]
+
+    def may(self, capability: int) -> bool:
+        """Whether a capability is in force."""
+        return bool(self.credentials.capabilities[2] >> capability & 1)
+
+    @property
+    def may_choose_executable(self) -> bool:
+        """Whether it may say what /proc/PID/exe shows."""
+        return self.may(CAP_CHECKPOINT_RESTORE) or self.may(CAP_SYS_ADMIN)
+
+
+# --- The address space's marks ---------------------------------------------------------------------------------------
+
+
+def memory_layout(table: CallTable, process: ProcessState, *, with_executable: bool) -> None:
+    """Set the marks of heap, stack, arguments, environment and auxiliary vector, and what /proc/PID/exe shows."""
+    layout = process.layout
+    executable = table.open(process.executable.path, os.O_RDONLY | os.O_CLOEXEC) if with_executable else _NO_FILE
+    packed = _MM_MAP.pack(
+        *(
+            layout.start_code,
+            layout.end_code,
+            layout.start_data,
+            layout.end_data,
+            layout.start_brk,
+            layout.brk,
+            layout.start_stack,
+        ),
+        *(layout.arg_start, layout.arg_end, layout.env_start, layout.env_end),
+        *(table.place(layout.auxv) if layout.auxv else 0, len(layout.auxv), executable),
+    )
+    what = f"set the marks of the address space (prctl PR_SET_MM_MAP, executable {process.executable.path})"
+    table.call(what, "prctl", abi.PR_SET_MM, abi.PR_SET_MM_MAP, table.place(packed), len(packed), 0)
+    if with_executable:
+        table.close(executable)
+
+
+# --- Signals ---------------------------------------------------------------------------------------------------------
+
+
+def signal_actions(table: CallTable, actions: Iterable[SignalAction]) -> None:
+    """Set what every signal does, but SIGTRAP: the table's own end resets that one, see `signal_action`."""
+    for action in actions:
+        if action.signal not in (*_UNCHANGEABLE, _SIGTRAP):
+            what = f"set the action of signal {action.signal}"
+            table.call(what, "rt_sigaction", action.signal, table.place(packed_action(action)), 0, abi.SIGSET_SIZE)
+
+
+def packed_action(action: SignalAction) -> bytes:
+    """The kernel's struct sigaction."""
+    return struct.pack("<4Q", action.handler, action.flags, action.restorer, action.mask)
+
+
+def trap_action(actions: Iterable[SignalAction]) -> SignalAction:
+    """What SIGTRAP did in the program."""
+    return next((action for action in actions if action.signal == _SIGTRAP), SignalAction(_SIGTRAP, 0, 0, 0, 0))
+
+
+def pending_signals(table: CallTable, process: ProcessState, thread: ThreadState, inner_pid: int) -> None:
+    """Queue what was pending: every signal is blocked in the vessel, so they wait for the program."""
+    for siginfo in process.pending:
+        number = struct.unpack_from("<i", siginfo)[0]
+        table.call(f"queue signal {number}", "rt_sigqueueinfo", inner_pid, number, table.place(siginfo))
+    for siginfo in thread.pending:
+        number = struct.unpack_from("<i", siginfo)[0]
+        table.call(f"queue signal {number}", "rt_tgsigqueueinfo", inner_pid, inner_pid, number, table.place(siginfo))
+
+
+# --- The thread ------------------------------------------------------------------------------------------------------
+
+
+def thread_marks(table: CallTable, thread: ThreadState) -> None:
+    """Alternate stack, robust list, the address cleared at its end, restartable sequences, name."""
+    address, flags, size = thread.altstack
+    stack = struct.pack("<QiiQ", address, flags & ~SS_ONSTACK, 0, size)
+    table.call("set the alternate signal stack", "sigaltstack", table.place(stack), 0)
+    if thread.robust_list[0]:
+        table.call("set the robust list", "set_robust_list", *thread.robust_list)
+    table.call("set the address that is cleared at the end", "set_tid_address", thread.clear_tid)
+    if thread.rseq is not None:
+        rseq = thread.rseq
+        table.call("register restartable sequences", "rseq", rseq.address, rseq.size, rseq.flags, rseq.signature)
+    table.call("set the name", "prctl", abi.PR_SET_NAME, table.place(os.fsencode(thread.name) + b"\0"))
+
+
+def scheduling(table: CallTable, thread: ThreadState, vessel: Vessel) -> None:
+    """Priority, policy, processors, I/O priority, timer slack."""
+    table.attempt(f"nice {thread.nice} is not kept", "setpriority", 0, 0, thread.nice)
+    if thread.policy:
+        priority = table.place(struct.pack("<i", thread.priority))
+        table.attempt(f"scheduling policy {thread.policy} is not kept", "sched_setscheduler", 0, thread.policy, priority)
+    allowed = vessel.affinity & set(thread.affinity)
+    if allowed and allowed != vessel.affinity:
+        mask = sum(1 << processor for processor in allowed).to_bytes(max(allowed) // 64 * 8 + 8, "little")
+        table.attempt("the choice of processors is not kept", "sched_setaffinity", 0, len(mask), table.place(mask))
+    if thread.io_priority:
+        table.attempt("the I/O priority is not kept", "ioprio_set", 1, 0, thread.io_priority)
+    table.attempt("the timer slack is not kept", "prctl", abi.PR_SET_TIMERSLACK, thread.timer_slack_ns)
+
+
+# --- Timers ----------------------------------------------------------------------------------------------------------
+
+
+def interval_timers(table: CallTable, timers: Iterable[IntervalTimer], elapsed_ns: int) -> None:
+    """Arm the alarms of setitimer(2) again. Real time went on meanwhile; the program's CPU time did not."""
+    for timer in timers:
+        value_us = timer.value_us
+        if timer.which == 0 and value_us:
+            value_us = max(value_us - elapsed_ns // _NS_PER_US, 1)
+        packed = struct.pack("<4q", *divmod(timer.interval_us, _US_PER_S), *divmod(value_us, _US_PER_S))
+        table.call(f"arm interval timer {timer.which}", "setitimer", timer.which, table.place(packed), 0)
+
+
+def posix_timers(table: CallTable, timers: tuple[PosixTimer, ...], inner_pid: int, elapsed_ns: int, *, chosen_ids: bool) -> None:
+    """Make the timers of timer_create(2) again, with the numbers that they had, and arm them.
+
+    Args:
+        chosen_ids: the kernel lets us say the number (Linux 6.15); otherwise numbers are counted up to and the rest deleted.
+    """
+    if not timers:
+        return
+    if chosen_ids:
+        table.call("choose timer numbers", "prctl", PR_TIMER_CREATE_RESTORE_IDS, 1)
+    next_id = 0
+    for timer in sorted(timers, key=lambda timer: timer.timer_id):
+        while not chosen_ids and next_id < timer.timer_id:
+            _create_timer(table, PosixTimer(next_id, 1, 1, 0, 0, 0, 0, 0), inner_pid)
+            table.call(f"delete timer {next_id}", "timer_delete", next_id)
+            next_id += 1
+        _create_timer(table, timer, inner_pid)
+        next_id = timer.timer_id + 1
+    if chosen_ids:
+        table.call("stop choosing timer numbers", "prctl", PR_TIMER_CREATE_RESTORE_IDS, 0)
+    for timer in timers:
+        if timer.value_ns:
+            packed = struct.pack("<4q", *divmod(timer.interval_ns, _NS_PER_S), *divmod(_left_of(timer, elapsed_ns), _NS_PER_S))
+            table.call(f"arm timer {timer.timer_id}", "timer_settime", timer.timer_id, 0, table.place(packed), 0)
+
+
+def _create_timer(table: CallTable, timer: PosixTimer, inner_pid: int) -> None:
+    event = struct.pack("<Qiii", timer.value & RLIM_INFINITY, timer.signal, timer.notify, inner_pid).ljust(64, b"\0")
+    number = table.place(struct.pack("<i", timer.timer_id))
+    table.call(f"create timer {timer.timer_id}", "timer_create", timer.clock, table.place(event), number)
+
+
+def _left_of(timer: PosixTimer, elapsed_ns: int) -> int:
+    if timer.clock in _CPU_TIME_CLOCKS or timer.clock < 0:
+        return timer.value_ns
+    return max(timer.value_ns - elapsed_ns, 1)
+
+
+# --- Limits and the rest of the process --------------------------------------------------------------------------------
+
+
+def surroundings(table: CallTable, process: ProcessState) -> None:
+    """Working directory, umask, execution domain, session, and the process's own switches."""
+    table.call(f"enter the working directory {process.working_directory}", "chdir", table.place_path(process.working_directory))
+    table.call("set the umask", "umask", process.umask)
+    table.call("set the execution domain", "personality", process.personality)
+    if process.sid == process.pid:
+        table.attempt("", "setsid")
+    elif process.pgid == process.pid:
+        table.attempt("", "setpgid", 0, 0)
+    if process.child_subreaper:
+        table.call("become a subreaper", "prctl", abi.PR_SET_CHILD_SUBREAPER, 1)
+    if process.thp_disabled:
+        table.call("switch huge pages off", "prctl", abi.PR_SET_THP_DISABLE, 1)
+
+
+def raise_limits(table: CallTable, vessel: Vessel) -> None:
+    """Lift the limits that a restore itself would meet, as far as they go; `limits` sets the program's own."""
+    for number in RAISED_LIMITS:
+        hard = vessel.hard_limits[number]
+        packed = struct.pack("<2Q", hard & RLIM_INFINITY, hard & RLIM_INFINITY)
+        table.attempt("", "prlimit64", 0, number, table.place(packed), 0)
+
+
+def limits(table: CallTable, process: ProcessState, vessel: Vessel) -> tuple[str, ...]:
+    """Set the program's limits: notes for those that had to be lowered to what the vessel may have."""
+    notes = []
+    for number, (soft, hard) in sorted(process.limits.items()):
+        ceiling = vessel.hard_limits.get(number, -1) & RLIM_INFINITY
+        wanted_soft, wanted_hard = soft & RLIM_INFINITY, hard & RLIM_INFINITY
+        if wanted_hard > ceiling and not vessel.may(CAP_SYS_RESOURCE):
+            notes.append(f"limit {number} is {ceiling} here, it was {wanted_hard}")
+            wanted_soft, wanted_hard = min(wanted_soft, ceiling), ceiling
+        packed = table.place(struct.pack("<2Q", wanted_soft, wanted_hard))
+        table.attempt(f"limit {number} is not kept", "prlimit64", 0, number, packed, 0)
+    return tuple(notes)
+
+
+# --- Rights ----------------------------------------------------------------------------------------------------------
+
+
+def rights(table: CallTable, process: ProcessState, vessel: Vessel) -> tuple[str, ...]:
+    """Become the user that the program ran as, with its capabilities: notes for what the vessel has no right to become.
+
+    Everything that needs rights must stand before this in the table.
+    """
+    theirs, ours = process.credentials, vessel.credentials
+    notes: list[str] = []
+    same_user = (theirs.uids, theirs.gids, set(theirs.groups)) == (ours.uids, ours.gids, set(ours.groups))
+    if not same_user and vessel.may(CAP_SETUID) and vessel.may(CAP_SETGID):
+        _bounding_set(table, theirs, vessel)
+        _become_user(table, theirs)
+    elif not same_user:
+        notes.append(f"runs as uid {ours.uids[1]} gid {ours.gids[1]}; it was uid {theirs.uids[1]} gid {theirs.gids[1]}")
+    else:
+        _bounding_set(table, theirs, vessel)
+    notes += _capabilities(table, theirs, ours)
+    if theirs.no_new_privs:
+        table.call("forbid new privileges", "prctl", abi.PR_SET_NO_NEW_PRIVS, 1)
+    if theirs.securebits:
+        table.attempt("securebits are not kept", "prctl", abi.PR_SET_SECUREBITS, theirs.securebits)
+    elif not same_user:
+        table.attempt("", "prctl", abi.PR_SET_KEEPCAPS, int(process.keep_caps))
+    return tuple(notes)
+
+
+def _bounding_set(table: CallTable, theirs: Credentials, vessel: Vessel) -> None:
+    lacking = vessel.credentials.capabilities[3] & ~theirs.capabilities[3]
+    if not vessel.may(CAP_SETPCAP):
+        return
+    for capability in range(64):
+        if lacking >> capability & 1:
+            table.attempt("", "prctl", PR_CAPBSET_DROP, capability)
+
+
+def _become_user(table: CallTable, theirs: Credentials) -> None:
+    table.call("keep capabilities over the change of user", "prctl", abi.PR_SET_KEEPCAPS, 1)
+    groups = table.place(struct.pack(f"<{len(theirs.groups)}I", *theirs.groups))
+    table.call("set the groups", "setgroups", len(theirs.groups), groups)
+    table.call(f"become gid {theirs.gids[1]}", "setresgid", *theirs.gids[:3])
+    table.call(f"become uid {theirs.uids[1]}", "setresuid", *theirs.uids[:3])
+    if theirs.gids[3] != theirs.gids[1]:
+        table.call("set the filesystem's gid", "setfsgid", theirs.gids[3])
+    if theirs.uids[3] != theirs.uids[1]:
+        table.call("set the filesystem's uid", "setfsuid", theirs.uids[3])
+
+
+def _capabilities(table: CallTable, theirs: Credentials, ours: Credentials) -> list[str]:
+    inheritable, permitted, effective, _, ambient = theirs.capabilities
+    have = ours.capabilities[1]
+    if theirs.capabilities == ours.capabilities and theirs.uids == ours.uids:
+        return []
+    table.attempt("", "prctl", PR_CAP_AMBIENT, PR_CAP_AMBIENT_CLEAR_ALL)
+    header = table.place(struct.pack("<Ii", _CAPABILITY_VERSION_3, 0))
+    sets = (effective & have, permitted & have, inheritable & (have | ours.capabilities[0]))
+    low, high = [word & 0xFFFFFFFF for word in sets], [word >> 32 for word in sets]
+    table.call("set the capabilities", "capset", header, table.place(struct.pack("<6I", *low, *high)))
+    for capability in range(64):
+        if ambient >> capability & 1:
+            table.attempt("an ambient capability is not kept", "prctl", PR_CAP_AMBIENT, PR_CAP_AMBIENT_RAISE, capability)
+    if permitted & ~have:
+        return [f"capabilities {permitted & ~have:#x} of the program are not kept: we do not have them"]
+    return []
+
+
+def last_marks(table: CallTable, process: ProcessState) -> None:
+    """What a change of user undoes, so it comes last: dumpable, and the signal at the parent's death (ours until now)."""
+    if process.dumpable in (0, 1):
+        table.call("set dumpable", "prctl", abi.PR_SET_DUMPABLE, process.dumpable)
+    table.call("set the signal at the parent's death", "prctl", abi.PR_SET_PDEATHSIG, process.parent_death_signal)
