@@ -135,15 +135,20 @@ class SetLease:
 
 @dataclass(frozen=True, slots=True)
 class KeepAside:
-    """Keep the state of a copy that lost as a snapshot of its own, for inspection, before the act Stop that follows. No answer.
+    """Keep the state of a copy that lost as a snapshot of its own, for inspection, before the act Stop that follows. No answer."""
 
-    The snapshots of ``generations`` leave the chain and are never resumed from by themselves.
-    """
+    component: str
+    epoch: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Forget:
+    """The snapshots of ``generations`` lost against the present primary: they leave the chain (aside, if they are kept)."""
 
     component: str
     epoch: int
     generations: tuple[int, ...]
-    reason: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,6 +232,7 @@ Act = (
     | Thaw
     | SetLease
     | KeepAside
+    | Forget
     | End
     | Stop
     | LetGo

@@ -1,8 +1,8 @@
 """What the rules of one robot tell those of another, as msgspec structs. The bytes are in ``PROTOCOL.md``.
 
-Beats carry state, never news: a lost beat is repaired by the next, so there is nothing to repeat and nothing to time out. A claim,
-a vote, a standby's acknowledgement and its wish for a base are fields of beats. Snapshots travel on the bulk lane, whose messages
-are the agent's own (``agent/lane_messages.py``).
+Two lanes. *Beats* carry state, never news: a lost beat is repaired by the next, so there is nothing to repeat and nothing to time
+out. A claim, a vote, a standby's acknowledgement and its wish for a base are fields of beats. The *bulk lane* carries snapshots, in
+chunks, under credit.
 """
 
 from __future__ import annotations
@@ -10,9 +10,10 @@ from __future__ import annotations
 import msgspec
 
 from checkpoint.model import Position
+from failover.core.types import ComponentSpec
 
 VERSION = 1
-"""Of the beat; a frame of another version is refused by name."""
+"""Of both lanes; a peer of another version is refused by name."""
 
 
 class Echo(msgspec.Struct, frozen=True, array_like=True):
@@ -79,3 +80,93 @@ class Beat(msgspec.Struct, frozen=True, array_like=True):
     total: int = 0
     echoes: tuple[Echo, ...] = ()
     entries: tuple[Entry, ...] = ()
+
+
+# The bulk lane: connection-oriented, authenticated and encrypted by the transport; in order while a connection lives.
+
+CHUNK_SIZE_MAX = 256 * 1024
+"""Bytes of a snapshot per chunk: at 1 Gbit/s a small message behind one waits 2 ms."""
+
+WINDOW_CHUNKS = 8
+"""Chunks that may be on their way without credit for more."""
+
+SNAPSHOT_SIZE_MAX = 1 << 38
+"""Bytes that an encoded snapshot may claim to have; the disk decides earlier."""
+
+
+class Hello(msgspec.Struct, frozen=True, tag="hello"):
+    """First message of each side on every new connection. Another version or team is answered by Goodbye.
+
+    Attributes:
+        boot: start count of the sender's agent.
+        beat_key: random bytes of this life; the sender's beats to this receiver are sealed with it from now on.
+    """
+
+    version: int
+    team: str
+    robot: str
+    boot: int
+    beat_key: bytes = b""
+
+
+class Goodbye(msgspec.Struct, frozen=True, tag="goodbye"):
+    """The connection ends; ``reason`` is a sentence."""
+
+    reason: str
+
+
+class Offer(msgspec.Struct, frozen=True, tag="offer"):
+    """A snapshot is ready for you. Answered by Credit or Refuse.
+
+    Attributes:
+        transfer: chosen by the sender, never used twice in one life of it.
+        size: bytes of the encoded snapshot (``checkpoint/FORMAT.md``); ``digest``: blake3 of them, 32 bytes.
+        parent: what it continues; None for a base.
+    """
+
+    transfer: int
+    component: str
+    epoch: int
+    position: Position
+    parent: Position | None
+    size: int
+    digest: bytes
+    spec: ComponentSpec
+
+
+class Credit(msgspec.Struct, frozen=True, tag="credit"):
+    """Bytes [0, ``until``) of the transfer may be sent."""
+
+    transfer: int
+    until: int
+
+
+class Chunk(msgspec.Struct, frozen=True, tag="chunk"):
+    """Bytes of a snapshot, in order, without gaps; the one that reaches ``Offer.size`` is the last."""
+
+    transfer: int
+    offset: int
+    content: bytes
+
+
+class Taken(msgspec.Struct, frozen=True, tag="taken"):
+    """All bytes arrived and their digest is right. (That they are stored is said by the beat.)"""
+
+    transfer: int
+
+
+class Refuse(msgspec.Struct, frozen=True, tag="refuse"):
+    """The offer, or the rest of it, is not wanted: stale epoch, wrong parent, no room. ``needs_base``: only a base would help."""
+
+    transfer: int
+    reason: str
+    needs_base: bool = False
+
+
+class Cancel(msgspec.Struct, frozen=True, tag="cancel"):
+    """The sender gives up this transfer; what had arrived of it is forgotten."""
+
+    transfer: int
+
+
+Bulk = Hello | Goodbye | Offer | Credit | Chunk | Taken | Refuse | Cancel

@@ -1,7 +1,7 @@
 """A beat ⇄ one authenticated datagram. ``PROTOCOL.md`` has the byte table.
 
-What arrives is a stranger's until its code is checked, so nothing here raises for what arrives: ``Receiver.open`` returns the beat, or
-a ``Refused`` that says why.
+What arrives is a stranger's until its code is checked, so nothing here raises for what arrives: ``Receiver.open`` returns the
+beat, or a ``Refused`` that says why. The bulk lane's messages are plain msgpack; their transport authenticates them.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from hashlib import blake2b
 
 import msgspec
 
-from failover.core.messages import VERSION, Beat, Entry
+from failover.core.messages import VERSION, Beat, Bulk, Entry
 from failover.core.types import PEERS_MAX
+from failover.errors import FailoverError
 
 FRAME_SIZE_MAX = 1_200
 """Bytes: passes every path of the Internet in one piece (RFC 9000, section 14.1)."""
@@ -40,6 +41,7 @@ BODY_SIZE_MAX = FRAME_SIZE_MAX - _BODY
 
 _encoder = msgspec.msgpack.Encoder()
 _decoder: msgspec.msgpack.Decoder[Beat] = msgspec.msgpack.Decoder(Beat)
+_bulk_decoder: msgspec.msgpack.Decoder[Bulk] = msgspec.msgpack.Decoder(Bulk)
 
 
 class Reason(enum.StrEnum):
@@ -70,6 +72,19 @@ def seal(beat: Beat, team: str, key: bytes) -> bytes:
     body = _encoder.encode(beat)
     assert len(body) <= BODY_SIZE_MAX, f"a beat of {len(body)} bytes does not fit a frame"
     return header + _code(key, header, body) + body
+
+
+def encode_bulk(message: Bulk) -> bytes:
+    """The message's bytes."""
+    return _encoder.encode(message)
+
+
+def decode_bulk(body: bytes | memoryview) -> Bulk | None:
+    """The message, or None for bytes that are none. Never raises."""
+    try:
+        return _bulk_decoder.decode(body)
+    except (msgspec.MsgspecError, ValueError, RecursionError, FailoverError):
+        return None
 
 
 def key_number(key: bytes) -> int:
