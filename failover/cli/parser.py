@@ -204,11 +204,30 @@ def _check(room: argparse.ArgumentParser) -> None:
     _json(room)
 
 
+def _demo(room: argparse.ArgumentParser) -> None:
+    room.add_argument("--picture", metavar="FILE", help="write what was shown to FILE as an SVG picture too")
+    _json(room)
+
+
 def _completion(room: argparse.ArgumentParser) -> None:
     room.add_argument("shell", choices=("bash", "zsh", "tcsh"), help="the shell to complete for")
 
 
 VERBS: Final = (
+    Verb(
+        "demo",
+        "two robots on this machine, real programs, a power cut: the programs go on",
+        """
+        Start two agents on this machine, run ordinary programs under protection on the first, cut its power, and see them go on
+        at the second. Exit status 0 only if their whole output equals an undisturbed run, byte for byte. Takes under a minute
+        and removes everything it made. Root gives each robot a network of its own.
+
+          failover demo
+          failover demo --json | jq .programs[0].outage_ms
+        """,
+        _demo,
+        "failover.cli.demo.play:demo",
+    ),
     Verb(
         "run",
         "start a program under protection; its output and exit status become ours",

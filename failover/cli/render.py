@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 COLOURS: Final = {"good": "green", "warning": "yellow", "bad": "bold red", "quiet": "dim"}
 
+PICTURE_WIDTH: Final = 108
+"""Columns of a terminal that is saved as a picture."""
+
 GAP: Final = "  "
 """Between two columns of a plain table."""
 
@@ -90,6 +93,49 @@ class _LiveTree:
 
     def __exit__(self, *reason: Any) -> None:
         self._live.__exit__(*reason)
+
+
+class LiveBoard:
+    """A table and a progress bar that are redrawn in place, with lines of text that scroll above them. For terminals."""
+
+    def __enter__(self) -> LiveBoard:
+        from rich.live import Live
+
+        self._live = Live(console=_console(), auto_refresh=False, transient=True)
+        self._live.__enter__()
+        return self
+
+    def __exit__(self, *reason: Any) -> None:
+        self._live.__exit__(*reason)
+
+    def say(self, text: str) -> None:
+        """Let a line scroll by above the table."""
+        self._live.console.print(text, markup=False)
+
+    def draw(self, columns: Sequence[str], lines: Sequence[Sequence[str]], share: float, caption: str) -> None:
+        """Redraw; ``share`` is the part of the whole that is done, 0 to 1."""
+        from rich.console import Group
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+
+        bar = Table.grid(padding=(0, 1))
+        bar.add_row(ProgressBar(total=1.0, completed=min(share, 1.0), width=40), f"{min(share, 1.0):4.0%}", caption)
+        self._live.update(Group(_rich_table(columns, [(line, "") for line in lines]), bar), refresh=True)
+
+
+def save_picture(path: str, command: str, lines: Sequence[str], columns: Sequence[str], cells: Sequence[Sequence[str]]) -> None:
+    """Write what a terminal showed, some lines and a table, as an SVG picture."""
+    import io
+
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(record=True, file=io.StringIO(), width=PICTURE_WIDTH, force_terminal=True, highlight=False)
+    console.print(Text(f"$ {command}", style="bold"))
+    for line in lines:
+        console.print(Text(line))
+    console.print(_rich_table(columns, [(line, "") for line in cells]))
+    console.save_svg(path, title=command)
 
 
 def _console() -> Console:

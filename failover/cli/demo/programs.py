@@ -13,6 +13,8 @@ LINES: Final = 400
 PAUSE_S: Final = 0.015
 """Between two lines of the Python program: together with the arithmetic some ten seconds."""
 
+PI_LINE_SIZE: Final = 39
+
 PI: Final = f'''\
 """Ten digits of pi a line, by Gibbons' unbounded spigot, and a running digest over all of them so far."""
 
@@ -40,6 +42,8 @@ for line in range(1, {LINES} + 1):
 '''
 
 POINTS: Final = 400
+POINT_SIZE: Final = 63
+"""Bytes of a line, on the average."""
 
 BC: Final = f"""\
 # The logistic map in its chaotic range: one wrong digit anywhere changes everything that follows.
@@ -62,12 +66,14 @@ class Program:
         title: how the demo speaks of it.
         argv: what to execute.
         directory: where to execute it; its files lie there.
+        expected_size: bytes that it writes in all, near enough for a progress bar.
     """
 
     name: str
     title: str
     argv: tuple[str, ...]
     directory: Path
+    expected_size: int
 
     def undisturbed(self, environment: dict[str, str], priority: int = 10) -> subprocess.Popen[bytes]:
         """Start it as anybody would, politely, its output going to a file: see `reference`."""
@@ -92,9 +98,9 @@ def write(directory: Path) -> tuple[Program, ...]:
     """Write the programs' files; returns those that this machine can run."""
     python = getattr(sys, "_base_executable", None) or sys.executable
     (directory / "pi.py").write_text(PI)
-    found = [Program("/demo/pi", "pi", (python, "pi.py"), directory)]
+    found = [Program("/demo/pi", "pi", (python, "pi.py"), directory, LINES * PI_LINE_SIZE)]
     bc = shutil.which("bc")
     if bc is not None:
         (directory / "chaos.bc").write_text(BC)
-        found.append(Program("/demo/chaos", "chaos", (bc, "-q", "chaos.bc"), directory))
+        found.append(Program("/demo/chaos", "chaos", (bc, "-q", "chaos.bc"), directory, POINTS * POINT_SIZE))
     return tuple(found)

@@ -1,0 +1,383 @@
+"""The demo's acts, in order: set the stage, protect, look on, cut the power, look on, compare."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import statistics
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final, NoReturn
+
+from failover.cli import picture, render
+from failover.cli.demo import programs, robots
+from failover.cli.demo.programs import Program
+from failover.cli.demo.robots import RobotMachine, Stage
+from failover.cli.demo.watch import Watcher, whole_output
+from failover.client.control import Control
+from failover.errors import FailoverError
+
+SNAPSHOTS_BEFORE: Final = 15
+"""Snapshots of each program that have arrived at the standby before the power is cut."""
+
+SECONDS_BEFORE: Final = 3.0
+"""Time to look on before the power is cut."""
+
+TAKEOVER_S: Final = 20.0
+END_S: Final = 60.0
+"""Bounds, far above what is usual, after which the demo says that it failed."""
+
+DRAW_S: Final = 0.1
+COLUMNS: Final = ("program", "runs on", "state", "snapshots", "lag", "freeze", "output", "newest line")
+RESULT_COLUMNS: Final = ("program", "outage", "lag at the cut", "freeze median", "freeze max", "output", "equal")
+
+
+@dataclass(slots=True)
+class Act:
+    """One program in the play, and what was seen of it.
+
+    Attributes:
+        freezes_us: freeze time of each snapshot, by sequence.
+        lag_ms: age of the newest checkpoint when last seen before the cut.
+        running_ns: when the standby was first seen to run it, on our clock.
+        outage_ms: from the cut to the first output after that.
+    """
+
+    program: Program
+    reference: subprocess.Popen[bytes]
+    before: Watcher
+    after: Watcher
+    freezes_us: dict[int, int] = field(default_factory=dict)
+    lag_ms: float | None = None
+    snapshots: int = 0
+    running_ns: int | None = None
+    outage_ms: float | None = None
+    equal: bool = False
+    size: int = 0
+    exit_status: int | None = None
+
+
+def demo(arguments: argparse.Namespace) -> int:
+    """Show a program outliving its robot; 0 only if its whole output equals an undisturbed run, byte for byte."""
+    live = render.is_terminal() and not arguments.json
+    screen = _LiveScreen() if live else _PlainScreen(quiet=arguments.json)
+    with _ending_well():
+        directory = Path(tempfile.mkdtemp(prefix="failover-demo-"))
+        with screen, Stage(directory, robots.means()) as stage:
+            play = Play(stage, screen)
+            try:
+                play.perform()
+            finally:
+                play.end_references()
+    return _conclude(arguments, play, screen)
+
+
+@contextmanager
+def _ending_well() -> Iterator[None]:
+    """Have every way of being told to end unwind the stack, so that whatever was started is ended."""
+
+    def unwind(_number: int, _frame: FrameType | None) -> NoReturn:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, unwind) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, action in before.items():
+            signal.signal(number, action)
+
+
+# --- The screen ------------------------------------------------------------------------------------------------------
+
+
+class _PlainScreen:
+    """Lines, each with the time since the beginning. ``transcript`` keeps them."""
+
+    def __init__(self, quiet: bool = False) -> None:
+        self.transcript: list[str] = []
+        self._quiet = quiet
+        self._began = time.monotonic()
+
+    def __enter__(self) -> _PlainScreen:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+    def say(self, text: str) -> None:
+        """Tell one thing that happened."""
+        line = f"{time.monotonic() - self._began:6.2f} s  {text}"
+        self.transcript.append(line)
+        self.show_line(line)
+
+    def show_line(self, line: str) -> None:
+        """Put a line where the person looks."""
+        if not self._quiet:
+            print(line, flush=True)
+
+    def draw(self, lines: Sequence[Sequence[str]], share: float, caption: str) -> None:
+        """Nothing: what matters is said."""
+
+
+class _LiveScreen(_PlainScreen):
+    """A table redrawn in place, with the lines scrolling above it."""
+
+    def __enter__(self) -> _LiveScreen:
+        self._board = render.LiveBoard().__enter__()
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        self._board.__exit__(*reason)
+
+    def show_line(self, line: str) -> None:
+        self._board.say(line)
+
+    def draw(self, lines: Sequence[Sequence[str]], share: float, caption: str) -> None:
+        self._board.draw(COLUMNS, lines, share, caption)
+
+
+# --- The play --------------------------------------------------------------------------------------------------------
+
+
+class Play:
+    """The acts on one stage. `perform` is the whole; afterwards ``acts`` holds what was seen."""
+
+    def __init__(self, stage: Stage, screen: _PlainScreen) -> None:
+        self._stage = stage
+        self._screen = screen
+        self._caption = ""
+        self._told: dict[str, int] = {}
+        self.acts: list[Act] = []
+
+    def perform(self) -> None:
+        """All of it, in order.
+
+        Raises:
+            FailoverError: something did not come about; says what, with the standby's own words.
+        """
+        self._stage.start()
+        self._screen.say(f"{self._primary.name} and {self._standby.name} are up: {self._stage.means.sentence()}")
+        self._protect()
+        self._look_on()
+        cut_ns = self._cut()
+        self._await_takeover(cut_ns)
+        self._await_end()
+        self._compare()
+
+    @property
+    def _primary(self) -> RobotMachine:
+        return self._stage.robots[0]
+
+    @property
+    def _standby(self) -> RobotMachine:
+        return self._stage.robots[1]
+
+    def _protect(self) -> None:
+        self._await("the robots to see each other", self._see_each_other)
+        environment = {"PATH": os.environ.get("PATH", os.defpath), "LANG": "C.UTF-8", "HOME": str(self._stage.directory)}
+        work = self._stage.directory / "work"
+        work.mkdir()
+        for program in programs.write(work):
+            wanted: dict[str, Any] = {"argv": program.argv, "name": program.name, "cwd": str(program.directory)}
+            with Control.open(self._primary.socket) as link:
+                answer = link.ask("run", **wanted, env=environment, umask=0o022, isolate=True, wait=False)
+            started = answer.get("started", answer)
+            before, after = (Watcher(program.name, robot.socket) for robot in self._stage.robots)
+            self.acts.append(Act(program, program.undisturbed(environment), before, after))
+            before.start()
+            after.start()
+            command = " ".join([Path(program.argv[0]).name, *program.argv[1:]])
+            self._screen.say(f"{command} runs on {self._primary.name} as pid {started.get('inner_pid') or started.get('pid')}")
+
+    def _see_each_other(self) -> bool:
+        return all(peer["state"] == "live" for robot in self._stage.robots for peer in robot.status()["peers"])
+
+    def _look_on(self) -> None:
+        self._caption = "protected; snapshots arrive at the standby"
+        until = time.monotonic() + SECONDS_BEFORE
+        self._await(
+            f"{SNAPSHOTS_BEFORE} snapshots of each program to arrive at {self._standby.name}",
+            lambda: self._sample() and time.monotonic() > until and all(act.snapshots >= SNAPSHOTS_BEFORE for act in self.acts),
+        )
+
+    def _sample(self) -> bool:
+        """Note what the primary's agent knows of each program."""
+        found = {component["name"]: component for component in self._primary.status()["components"]}
+        for act in self.acts:
+            component = found.get(act.program.name)
+            if component is None:
+                continue
+            if component["state"] in picture.BAD_STATES:
+                raise FailoverError(f"{act.program.name} is {component['state']}: {'; '.join(component.get('reasons') or ['?'])}")
+            act.lag_ms = component.get("lag_ms")
+            act.snapshots = component.get("standby_sequence") or 0
+            if component.get("freeze_us") is not None:
+                act.freezes_us[component.get("sequence") or 0] = component["freeze_us"]
+            self._tell_arrival(act, component)
+        self._draw(found, self._primary.name)
+        return True
+
+    def _tell_arrival(self, act: Act, component: dict[str, Any]) -> None:
+        """Every tenth snapshot is worth a line; the table shows them all."""
+        if act.snapshots and act.snapshots >= self._told.get(act.program.name, 0):
+            self._told[act.program.name] = act.snapshots - act.snapshots % 10 + 10
+            size, freeze = picture.size(component.get("snapshot_size")), picture.microseconds(component.get("freeze_us"))
+            lag = picture.milliseconds(component.get("lag_ms"))
+            what = f"snapshot {act.snapshots} of {act.program.title} has arrived at {self._standby.name}"
+            self._screen.say(f"{what}: {size}, freeze {freeze}, lag {lag}")
+
+    def _cut(self) -> int:
+        """The power cut; returns its instant on our clock."""
+        cut_ns = time.monotonic_ns()
+        count = self._primary.cut_power()
+        self._screen.say(f"power cut: all {count} processes of {self._primary.name} frozen, then killed at once")
+        for act in self.acts:
+            act.before.stop()
+        return cut_ns
+
+    def _await_takeover(self, cut_ns: int) -> None:
+        self._caption = "the power is cut"
+        self._await(
+            f"{self._standby.name} to go on with every program", lambda: self._see_takeover(cut_ns), robots.POLL_S, TAKEOVER_S
+        )
+
+    def _see_takeover(self, cut_ns: int) -> bool:
+        found = {component["name"]: component for component in self._standby.status()["components"]}
+        for act in self.acts:
+            component = found.get(act.program.name, {})
+            if act.running_ns is None and component.get("role") == "primary" and component.get("state") in ("running", "ended"):
+                act.running_ns = time.monotonic_ns()
+            arrived = act.after.first_after(act.running_ns) if act.running_ns is not None else None
+            if act.outage_ms is None and arrived is not None:
+                act.outage_ms = (arrived - cut_ns) / 1e6
+                self._screen.say(
+                    f"{act.program.title} goes on at {self._standby.name}: next output {act.outage_ms:.0f} ms after the cut"
+                )
+        return all(act.outage_ms is not None for act in self.acts)
+
+    def _await_end(self) -> None:
+        self._caption = f"going on at {self._standby.name}"
+        self._await("the programs to end", self._see_end, DRAW_S, END_S)
+
+    def _see_end(self) -> bool:
+        found = {component["name"]: component for component in self._standby.status()["components"]}
+        self._draw(found, self._standby.name)
+        for act in self.acts:
+            component = found.get(act.program.name, {})
+            if component.get("state") == "failed":
+                raise FailoverError(
+                    f"{act.program.name} failed at {self._standby.name}: {'; '.join(component.get('reasons') or ['?'])}"
+                )
+        return all(found.get(act.program.name, {}).get("state") == "ended" for act in self.acts)
+
+    def _compare(self) -> None:
+        for act in self.acts:
+            act.reference.wait()
+            expected = act.program.reference.read_bytes()
+            output, act.exit_status = whole_output(self._standby.socket, act.program.name)
+            act.size = len(output)
+            act.equal = output == expected and act.exit_status == act.reference.returncode == 0
+            verdict = "equal, byte for byte, to an undisturbed run" if act.equal else difference(output, expected, act)
+            ending = "–" if act.exit_status is None else picture.ending(act.exit_status)
+            self._screen.say(f"{act.program.title} has ended ({ending}); its {act.size} bytes of output are {verdict}")
+
+    def end_references(self) -> None:
+        """Whatever happens, no undisturbed run goes on without us, and nobody watches any more."""
+        for act in self.acts:
+            act.before.stop()
+            act.after.stop()
+            if act.reference.poll() is None:
+                act.reference.kill()
+            act.reference.wait()
+
+    def _await(self, what: str, condition: Callable[[], bool], every_s: float = DRAW_S / 2, limit_s: float = TAKEOVER_S) -> None:
+        deadline = time.monotonic() + limit_s
+        while not condition():
+            if time.monotonic() > deadline:
+                words = "; ".join(f"{robot.name}: {robot.last_words()}" for robot in self._stage.robots)
+                raise FailoverError(f"waited {limit_s:.0f} s in vain for {what}; last words of {words}")
+            time.sleep(every_s)
+
+    def _draw(self, components: dict[str, dict[str, Any]], robot: str) -> None:
+        lines, done = [], []
+        for act in self.acts:
+            component = components.get(act.program.name, {})
+            watcher = act.after if act.running_ns is not None else act.before
+            done.append(watcher.size / act.program.expected_size)
+            lines.append(
+                (
+                    act.program.title,
+                    robot,
+                    str(component.get("state") or ""),
+                    str(act.snapshots),
+                    picture.milliseconds(component.get("lag_ms")),
+                    picture.microseconds(component.get("freeze_us")),
+                    picture.size(watcher.size),
+                    watcher.last[:48],
+                )
+            )
+        self._screen.draw(lines, min(done, default=0.0), self._caption)
+
+
+def difference(output: bytes, expected: bytes, act: Act) -> str:
+    """Where two outputs differ, in words."""
+    at = next((index for index, (one, other) in enumerate(zip(output, expected, strict=False)) if one != other), None)
+    if at is not None:
+        return f"DIFFERENT from byte {at} on: {output[at : at + 40]!r} instead of {expected[at : at + 40]!r}"
+    if len(output) != len(expected):
+        return f"NOT ALL: an undisturbed run writes {len(expected)}"
+    return f"equal, but the exit status is {act.exit_status}, that of an undisturbed run {act.reference.returncode}"
+
+
+# --- What came of it -------------------------------------------------------------------------------------------------
+
+
+def _conclude(arguments: argparse.Namespace, play: Play, screen: _PlainScreen) -> int:
+    equal = bool(play.acts) and all(act.equal for act in play.acts)
+    lines = [result_line(act) for act in play.acts]
+    if arguments.json:
+        render.as_json({"equal": equal, "programs": [as_record(act) for act in play.acts]})
+    else:
+        print()
+        render.table(RESULT_COLUMNS, lines)
+        print("the programs outlived their robot" if equal else "this went wrong: the output differs, see above")
+    if arguments.picture:
+        render.save_picture(arguments.picture, "./run demo", screen.transcript, RESULT_COLUMNS, lines)
+    return 0 if equal else 1
+
+
+def result_line(act: Act) -> tuple[str, ...]:
+    """One program's row of the closing table."""
+    freezes = list(act.freezes_us.values())
+    return (
+        act.program.title,
+        picture.milliseconds(act.outage_ms),
+        picture.milliseconds(act.lag_ms),
+        picture.microseconds(statistics.median(freezes) if freezes else None),
+        picture.microseconds(max(freezes, default=None)),
+        f"{act.size} bytes",
+        "yes" if act.equal else "NO",
+    )
+
+
+def as_record(act: Act) -> dict[str, Any]:
+    """The same for machines."""
+    freezes = list(act.freezes_us.values())
+    return {
+        "name": act.program.name,
+        "command": list(act.program.argv),
+        "outage_ms": act.outage_ms,
+        "lag_ms": act.lag_ms,
+        "freeze_us_median": statistics.median(freezes) if freezes else None,
+        "freeze_us_max": max(freezes, default=None),
+        "output_size": act.size,
+        "exit_status": act.exit_status,
+        "equal": act.equal,
+    }

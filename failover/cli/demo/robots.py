@@ -1,0 +1,296 @@
+"""The robots of the demo: directories, keys, namespaces, agents; and the power cut.
+
+Nothing of a robot outlives its host process (`host`), and network namespaces have no names, so that they go with their
+last process: whatever ends the demo, only a temporary directory can be left.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from failover.cli.demo.host import descendants
+from failover.client import team
+from failover.client.control import Control
+from failover.client.team import Robot, Team
+from failover.errors import FailoverError, LostAgentError, NoAgentError
+
+NAMES: Final = ("robot1", "robot2")
+BEAT_MS: Final = 20
+LEASE_MS: Final = 120
+START_S: Final = 20.0
+"""How long an agent may take until it answers; a second is usual, a busy machine takes more."""
+
+ADDRESS: Final = "10.71.7.{}"
+"""Of the robots in network namespaces of their own; nothing outside them sees these addresses."""
+
+POLL_S: Final = 0.005
+
+GO: Final = b"g"
+"""What a host waits for before it starts its agent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Means:
+    """What this machine allows: each True makes the robots more like two machines."""
+
+    own_pids: bool
+    own_network: bool
+
+    def sentence(self) -> str:
+        """What the robots have of their own, and why not more."""
+        pids = "own PIDs" if self.own_pids else "shared PIDs (this system forbids user namespaces)"
+        reason = "needs root" if os.geteuid() else "needs iproute2"
+        network = "own network, joined by a cable" if self.own_network else f"loopback ports (a network of their own {reason})"
+        return f"{pids}, {network}"
+
+
+def means() -> Means:
+    """Find out what can be had here."""
+    probe = subprocess.run(host_command(True, ["/bin/true"]), input=GO, capture_output=True, check=False)
+    own_network = os.geteuid() == 0 and ip_command() is not None and can_unshare_network()
+    return Means(own_pids=probe.returncode == 0, own_network=own_network)
+
+
+def ip_command() -> str | None:
+    """The path of ip(8), also when sbin is not on the PATH."""
+    return shutil.which("ip", path=os.environ.get("PATH", "") + ":/usr/sbin:/sbin")
+
+
+def can_unshare_network() -> bool:
+    """Whether root may do here what root usually may (not so in many containers)."""
+    return subprocess.run(["unshare", "--net", "true"], capture_output=True, check=False).returncode == 0
+
+
+def host_command(own_pids: bool, command: list[str]) -> list[str]:
+    """The command line of a host process around ``command``."""
+    return [sys.executable, "-m", "failover.cli.demo.host", *(["--pids"] if own_pids else []), "--", *command]
+
+
+@dataclass(slots=True)
+class RobotMachine:
+    """One robot: its host process and how to talk to its agent.
+
+    Attributes:
+        directory: its configuration, state and sockets.
+    """
+
+    name: str
+    directory: Path
+    process: subprocess.Popen[bytes]
+
+    @property
+    def socket(self) -> Path:
+        """Its agent's control socket."""
+        return self.directory / "run" / "control.sock"
+
+    @property
+    def log(self) -> Path:
+        """What its agent said."""
+        return self.directory / "agent.log"
+
+    def switch_on(self) -> None:
+        """Let the host start the agent."""
+        assert self.process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # it has ended already: `control` says why
+            self.process.stdin.write(GO)
+            self.process.stdin.close()
+
+    def control(self) -> Control:
+        """A connection to its agent, as soon as it answers.
+
+        Raises:
+            FailoverError: it ended, or does not answer in time; with the last lines of its log.
+        """
+        deadline = time.monotonic() + START_S
+        while True:
+            try:
+                link = Control.open(self.socket)
+                link.ask("ping")
+                return link
+            except (NoAgentError, LostAgentError) as error:
+                if self.process.poll() is not None:
+                    raise FailoverError(f"the agent of {self.name} ended at once: {self.last_words()}") from error
+                if time.monotonic() > deadline:
+                    raise FailoverError(
+                        f"the agent of {self.name} did not answer in {START_S:.0f} s: {self.last_words()}"
+                    ) from error
+                time.sleep(POLL_S)
+
+    def status(self) -> dict[str, Any]:
+        """What its agent knows now."""
+        with Control.open(self.socket) as link:
+            return link.ask("status")
+
+    def processes(self) -> list[int]:
+        """All of the robot, its host's own children first."""
+        return descendants(self.process.pid)
+
+    def cut_power(self) -> int:
+        """Freeze every process of the robot, then kill them all at once; returns how many there were.
+
+        Frozen first, so that no one of them can notice that another has gone: to the outside it is silent from one instant on.
+        """
+        frozen: set[int] = set()
+        while fresh := set(self.processes()) - frozen:  # until no new one appears
+            for pid in fresh:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGSTOP)
+            frozen |= fresh
+        self.end()
+        return len(frozen)
+
+    def end(self) -> None:
+        """Kill whatever is left, and wait until nothing is."""
+        while left := self.processes():
+            for pid in left:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            time.sleep(POLL_S)
+        with contextlib.suppress(ProcessLookupError):
+            self.process.kill()
+        self.process.wait()
+
+    def last_words(self) -> str:
+        """The end of its agent's log, for a message."""
+        with contextlib.suppress(OSError):
+            return " / ".join(self.log.read_text(errors="replace").strip().splitlines()[-3:]) or "it said nothing"
+        return "it left no log"
+
+
+class Stage:
+    """Both robots and the place where they stand. A context manager: leaving it ends them and removes the place."""
+
+    def __init__(self, directory: Path, allowed: Means) -> None:
+        self.directory = directory
+        self.means = allowed
+        self.robots: list[RobotMachine] = []
+
+    def __enter__(self) -> Stage:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for robot in self.robots:
+            robot.end()
+        shutil.rmtree(self.directory, ignore_errors=True)
+
+    def start(self) -> None:
+        """Write keys and configuration, start both agents, join their networks, wait until both answer."""
+        self._write_team()
+        for name in NAMES:
+            self.robots.append(self._start_robot(name))
+        if self.means.own_network:
+            self._join()
+        for robot in self.robots:
+            robot.switch_on()
+        for robot in self.robots:
+            robot.control().close()
+
+    def _write_team(self) -> None:
+        addresses = [ADDRESS.format(index) if self.means.own_network else "127.0.0.1" for index in (1, 2)]
+        ports = [7420, 7421, 7420, 7421] if self.means.own_network else free_ports(4)
+        members = Team("demo")
+        for index, name in enumerate(NAMES):
+            public, secret = new_keys()
+            directory = self.directory / name / "team"
+            directory.mkdir(parents=True)
+            team.write_secret_key(directory, name, secret)
+            beats, bulk = (f"{addresses[index]}:{port}" for port in ports[2 * index : 2 * index + 2])
+            members = team.enrol(members, name, Robot((beats,), bulk, "robot", public))
+        for name in NAMES:
+            team.write(self.directory / name / "team", members)
+
+    def _start_robot(self, name: str) -> RobotMachine:
+        directory = self.directory / name
+        for part in ("state", "run"):
+            (directory / part).mkdir()
+        config = directory / "agent.toml"
+        config.write_text(
+            f'robot = "{name}"\n'
+            f'team_directory = "{directory / "team"}"\n'
+            f'state_directory = "{directory / "state"}"\n'
+            f'runtime_directory = "{directory / "run"}"\n'
+            f"beat_ms = {BEAT_MS}\nlease_ms = {LEASE_MS}\n"
+        )
+        command = host_command(self.means.own_pids, [sys.executable, "-m", "agent.main", "--config", str(config)])
+        if self.means.own_network:
+            assert shutil.which("unshare")
+            command = ["unshare", "--net", "--", *command]
+        with (directory / "agent.log").open("wb") as log:
+            process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True)
+        return RobotMachine(name, directory, process)
+
+    def _join(self) -> None:
+        """Lay a cable between the two network namespaces; one of its ends is in each."""
+        ip = ip_command()
+        assert ip is not None
+        first, second = (robot.process.pid for robot in self.robots)
+        for robot in self.robots:
+            wait_for_network(robot)
+        run([ip, "link", "add", "wire", "netns", str(first), "type", "veth", "peer", "name", "wire", "netns", str(second)])
+        for index, pid in enumerate((first, second), start=1):
+            enter = ["nsenter", "--net", f"--target={pid}", ip]
+            run([*enter, "address", "add", ADDRESS.format(index) + "/24", "dev", "wire"])
+            run([*enter, "link", "set", "lo", "up"])
+            run([*enter, "link", "set", "wire", "up"])
+
+
+def wait_for_network(robot: RobotMachine) -> None:
+    """Wait until a robot's host has left our network namespace."""
+    ours = os.readlink("/proc/self/ns/net")
+    deadline = time.monotonic() + START_S
+    while os.readlink(f"/proc/{robot.process.pid}/ns/net") == ours:
+        if robot.process.poll() is not None or time.monotonic() > deadline:
+            raise FailoverError(f"{robot.name} got no network of its own: {robot.last_words()}")
+        time.sleep(POLL_S)
+
+
+def run(command: list[str]) -> None:
+    """Run one set-up command.
+
+    Raises:
+        FailoverError: it failed; says what it said.
+    """
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    if ran.returncode:
+        raise FailoverError(f"{' '.join(command)} failed: {ran.stderr.strip() or ran.returncode}")
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports of the loopback that nobody uses now, as TCP and as UDP."""
+    held: list[socket.socket] = []
+    ports: list[int] = []
+    try:
+        while len(ports) < count:
+            stream = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+            held.append(stream)
+            stream.bind(("127.0.0.1", 0))
+            datagram = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            held.append(datagram)
+            with contextlib.suppress(OSError):  # somebody has this one as UDP
+                datagram.bind(stream.getsockname())
+                ports.append(stream.getsockname()[1])
+    finally:
+        for one in held:
+            one.close()
+    return ports
+
+
+def new_keys() -> tuple[str, str]:
+    """A fresh CURVE pair, public and secret; made by the agent's program, which alone knows the cryptography."""
+    ran = subprocess.run([sys.executable, "-m", "agent.main", "keypair"], capture_output=True, text=True, check=False)
+    try:
+        pair = json.loads(ran.stdout)
+        return str(pair["public"]), str(pair["secret"])
+    except (ValueError, KeyError) as error:
+        raise FailoverError(f"failover-agent keypair made no keys: {ran.stderr.strip() or ran.stdout.strip()}") from error
