@@ -3,13 +3,13 @@
 ::
 
     checks                       this machine has what the snapshot needs (`restore_checks`); nothing is touched before
-    seize, stand in a hole       the vessel is ours and dies with us; loop and tables lie where neither it nor the program has anything
+    seize, stand in a hole       the vessel is ours and dies with us; loop and tables lie where neither has a mapping
     first table                  its own mappings go, the vdso moves, everything the program had is mapped
     pages                        written from outside
     second table                 protections, files, marks, signals, timers, rights
     registers                    SIGTRAP's action, the area unmapped by the vdso's own syscall instruction, then the program's own
 
-Until `Restored.resume` the program stands still and dies with its tracer (PTRACE_O_EXITKILL): an unfinished restore leaves nothing.
+Until `Restored.resume` the program stands still and dies with its tracer (PTRACE_O_EXITKILL): an unfinished one leaves nothing.
 
 Source: ptrace(2), prctl(2), vdso(7); kernel/sys.c for PR_SET_MM_MAP.
 """
@@ -21,6 +21,7 @@ import os
 import resource
 import signal
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 from checkpoint.arch import x86_64, x86_64_stub
@@ -170,7 +171,7 @@ class _Restore:
         tracee.set_signal_mask(self._thread.signal_mask)
 
     def _restore_rseq_section(self) -> None:
-        """Registering cleared the pointer to the critical section that the thread may stand in; the kernel aborts it on return."""
+        """Point again to the critical section that the thread may stand in: registering forgot it, the kernel aborts it."""
         rseq = self._thread.rseq
         if rseq is None:
             return
@@ -242,15 +243,15 @@ def _hard_limits(pid: int) -> dict[int, int]:
 
 
 def _write_oom_score(pid: int, score: int, notes: list[str]) -> None:
+    if int(procfs.read_bytes(pid, "oom_score_adj")) == score:
+        return
     try:
-        with open(f"/proc/{pid}/oom_score_adj", "r+", encoding="ascii") as file:
-            if int(file.read()) != score:
-                file.seek(0)
-                file.write(str(score))
+        Path(f"/proc/{pid}/oom_score_adj").write_bytes(str(score).encode())
     except PermissionError:
         notes.append(f"oom_score_adj {score} is not kept: lowering it needs CAP_SYS_RESOURCE")
 
 
 def _timer_numbers_can_be_chosen() -> bool:
     """Whether the kernel lets timer numbers be chosen (Linux 6.15); asking changes nothing."""
-    return ctypes.CDLL(None).prctl(restore_process.PR_TIMER_CREATE_RESTORE_IDS, PR_TIMER_CREATE_RESTORE_IDS_GET, 0, 0, 0) >= 0
+    option, get = restore_process.PR_TIMER_CREATE_RESTORE_IDS, PR_TIMER_CREATE_RESTORE_IDS_GET
+    return bool(ctypes.CDLL(None).prctl(option, get, 0, 0, 0) >= 0)
