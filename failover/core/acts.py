@@ -135,7 +135,7 @@ class SetLease:
 
 @dataclass(frozen=True, slots=True)
 class KeepAside:
-    """Keep the state of a copy that lost as a snapshot of its own, for inspection, before the act Stop that follows. No answer."""
+    """Keep the state of a copy that lost as a snapshot of its own, for inspection, before the Stop that follows. No answer."""
 
     component: str
     epoch: int

@@ -1,7 +1,7 @@
 """Who lives, who hears whom, and for how long a beat that was heard lets its sender act.
 
-A peer is *suspect* when beats are missing, *dead* when it was silent on all links for longer than any lease that it may still act
-on. Invariants: a peer's counter and boot only grow; a lease is counted from the asking (the instant our beat left), never from the
+A peer is *suspect* when beats are missing, *dead* when it was silent on all links for longer than any lease it may still act
+on. Invariants: a peer's counter and boot only grow; a lease counts from the asking (the instant our beat left), never from the
 answer; lateness of our own loop makes peers look silent and is taken back before anybody is judged.
 """
 

@@ -1,7 +1,7 @@
 """What the rules of one robot tell those of another, as msgspec structs. The bytes are in ``PROTOCOL.md``.
 
 Two lanes. *Beats* carry state, never news: a lost beat is repaired by the next, so there is nothing to repeat and nothing to time
-out. A claim, a vote, a standby's acknowledgement and its wish for a base are fields of beats. The *bulk lane* carries snapshots, in
+out: a claim, a vote, a standby's acknowledgement, its wish for a base are fields of beats. The *bulk lane* carries snapshots, in
 chunks, under credit.
 """
 

@@ -1,0 +1,265 @@
+"""One component on one robot: its state, the table of its states, and what one step may do to it."""
+
+from __future__ import annotations
+
+import enum
+from collections import deque
+from dataclasses import dataclass, field
+
+from checkpoint.model import Position
+from failover.core.acts import Act
+from failover.core.membership import Membership
+from failover.core.types import HISTORY_MAX, HOLDING, ComponentSpec, Config, Decision, OnLoss, Record, Rules, State, WhenAlone
+
+JOURNAL_MAX = 512
+"""Decisions that are remembered for ``failover why``."""
+
+LOST_MAX = 8
+"""Generations that lost and are remembered; the agent moves their snapshots out of the chain long before."""
+
+
+class Cause(enum.StrEnum):
+    """What moves a component from one state to another."""
+
+    CLAIM = "claims it"
+    START = "may start it"
+    RESTORE = "may restore it"
+    RUNS = "runs it"
+    LEASE_OVER = "holds it still: nobody hears this robot"
+    LEASE_BACK = "is heard again"
+    CRASH = "saw it crash"
+    HAND_OVER = "hands it over"
+    CALL_OFF = "calls the handover off"
+    OUTBID = "gives its copy up"
+    YIELD_CLAIM = "gives its claim up"
+    CLEARED = "has cleared its copy away"
+    FOLLOW = "keeps its checkpoints"
+    CANNOT = "cannot run it"
+    FINISH = "records its end"
+    FAIL = "records its failure"
+    RELEASE = "lets it go"
+    FORGET = "forgets it"
+
+
+_RUNNING = (State.STARTING, State.TAKING_OVER, State.PRIMARY, State.FROZEN, State.HANDING_OVER, State.RECOVERING)
+_IDLE = (State.ABSENT, State.STANDBY, State.FINISHED, State.FAILED, State.RELEASED)
+
+TABLE: dict[tuple[State, Cause], State] = {
+    **{(state, Cause.CLAIM): State.CLAIMING for state in _IDLE},
+    (State.CLAIMING, Cause.START): State.STARTING,
+    (State.CLAIMING, Cause.RESTORE): State.TAKING_OVER,
+    (State.CLAIMING, Cause.YIELD_CLAIM): State.STANDBY,
+    (State.STARTING, Cause.RUNS): State.PRIMARY,
+    (State.TAKING_OVER, Cause.RUNS): State.PRIMARY,
+    (State.RECOVERING, Cause.RUNS): State.PRIMARY,
+    (State.PRIMARY, Cause.LEASE_OVER): State.FROZEN,
+    (State.FROZEN, Cause.LEASE_BACK): State.PRIMARY,
+    (State.PRIMARY, Cause.HAND_OVER): State.HANDING_OVER,
+    (State.HANDING_OVER, Cause.CALL_OFF): State.FROZEN,
+    **{(state, Cause.CRASH): State.RECOVERING for state in (State.PRIMARY, State.FROZEN, State.HANDING_OVER, State.RECOVERING)},
+    (State.STARTING, Cause.CRASH): State.RECOVERING,
+    (State.TAKING_OVER, Cause.CRASH): State.RECOVERING,
+    **{(state, Cause.OUTBID): State.STOPPING for state in _RUNNING},
+    (State.TAKING_OVER, Cause.CANNOT): State.STOPPING,
+    (State.STOPPING, Cause.CLEARED): State.STANDBY,
+    **{(state, Cause.FOLLOW): State.STANDBY for state in _IDLE},
+    **{(state, Cause.FINISH): State.FINISHED for state in (*_RUNNING, *_IDLE, State.CLAIMING)},
+    **{(state, Cause.FAIL): State.FAILED for state in (*_RUNNING, *_IDLE, State.CLAIMING)},
+    **{(state, Cause.RELEASE): State.RELEASED for state in (*_RUNNING, *_IDLE, State.CLAIMING)},
+    (State.STANDBY, Cause.FORGET): State.ABSENT,
+}
+"""Every arrow there is. What is not here does not happen: ``Component.move`` asserts it."""
+
+
+@dataclass(slots=True)
+class Flight:
+    """The one snapshot that is being taken, shipped or waited for.
+
+    Attributes:
+        position: None while it is being taken.
+        to: standby that it goes to; "" for this robot's own store only.
+        final: the last delta of a handover.
+    """
+
+    started_ns: int
+    until_ns: int
+    base: bool
+    to: str = ""
+    position: Position | None = None
+    parent: Position | None = None
+    final: bool = False
+
+
+@dataclass(slots=True)
+class Handing:
+    """A handover under way. ``yielded``: the last delta is acknowledged, ``to`` may claim."""
+
+    to: str
+    request: int
+    until_ns: int
+    yielded: bool = False
+
+
+@dataclass(slots=True)
+class Component:
+    """What one robot knows of one component. The first block survives a restart (``types.Record`` explains it).
+
+    Attributes:
+        plan: while claiming: the position to restore, None to start afresh.
+        alone_right: while claiming: may go on without the others' consent once they are dead.
+        claim_counter: beat of ours that first carried the present epoch.
+        generation, sequence: of the next snapshot; ``parent``: newest position that the keeper may count from.
+        born: epoch under which the present process was started or restored.
+        due_ns: next capture; ``until_ns``: when the present claim, start or restore is overdue.
+    """
+
+    name: str
+    epoch: int = 0
+    primary: str = ""
+    state: State = State.ABSENT
+    entrusted: tuple[str, ...] = ()
+    trusted: bool = False
+    lost: tuple[int, ...] = ()
+    status: int = 0
+    reason: str = ""
+    spec: ComponentSpec | None = None
+
+    held: list[Position] = field(default_factory=list)
+    autostart: bool = False
+    plan: Position | None = None
+    alone_right: bool = False
+    claim_counter: int = 0
+    request: int = 0
+    until_ns: int = 0
+    born: int = 0
+    generation: int = 0
+    sequence: int = 0
+    parent: Position | None = None
+    standby: str = ""
+    flight: Flight | None = None
+    due_ns: int = 0
+    base_wanted: bool = False
+    acked: Position | None = None
+    acked_ns: int = -1
+    freeze_us: int = 0
+    degraded: str = ""
+    unprotected: bool = False
+    lease_ns: int = 0
+    told_ns: int = 0
+    crashes: deque[int] = field(default_factory=lambda: deque(maxlen=128))
+    handing: Handing | None = None
+    ending: bool = False
+    needs_base: bool = False
+    admitted: tuple[str, int] = ("", 0)
+    unable: str = ""
+    tries: int = 0
+    retry_ns: int = 0
+    reported: bool = False
+
+    @property
+    def rules(self) -> Rules:
+        """The operator's choices, or the defaults until they are known."""
+        return self.spec.rules if self.spec else Rules()
+
+    @property
+    def freezes(self) -> bool:
+        """Whether safety was chosen: no primary acts alone."""
+        return self.rules.when_alone is WhenAlone.FREEZE
+
+    @property
+    def waits(self) -> bool:
+        """Whether a standby keeps the checkpoint for the primary instead of running it."""
+        return self.rules.on_loss is OnLoss.HOLD
+
+    @property
+    def holding(self) -> bool:
+        """Whether this robot says: the primacy is mine."""
+        return self.state in HOLDING
+
+    @property
+    def newest(self) -> Position | None:
+        """Newest position that this robot can restore."""
+        return self.held[-1] if self.held and not self.unable else None
+
+    def move(self, cause: Cause) -> None:
+        """Follow an arrow of the table."""
+        arrow = (self.state, cause)
+        assert arrow in TABLE, f"{self.name}: no arrow from {self.state} by {cause.name}"
+        self.state = TABLE[arrow]
+
+    def hold(self, position: Position) -> None:
+        """Remember a position that this robot's store can restore."""
+        if position not in self.held:
+            self.held = [*self.held, position][-HISTORY_MAX:]
+
+    def record(self) -> Record:
+        """What must not be forgotten."""
+        if self.holding:
+            state = State.PRIMARY
+        elif self.state is State.STOPPING:
+            state = State.STANDBY
+        else:
+            state = self.state
+        return Record(
+            self.name, self.epoch, self.primary, state, self.entrusted, self.trusted, self.lost, self.status, self.reason, self.spec
+        )
+
+    @classmethod
+    def remembered(cls, record: Record) -> Component:
+        """The component as the ballot remembers it, before anything is known of its process."""
+        return cls(
+            record.name,
+            record.epoch,
+            record.primary,
+            record.state,
+            record.entrusted,
+            record.trusted,
+            record.lost,
+            record.status,
+            record.reason,
+            record.spec,
+        )
+
+
+@dataclass(slots=True)
+class Journal:
+    """The last decisions, one sentence each."""
+
+    decisions: deque[Decision] = field(default_factory=lambda: deque(maxlen=JOURNAL_MAX))
+
+    def note(self, at_ns: int, component: str, sentence: str) -> None:
+        """Add a decision."""
+        self.decisions.append(Decision(at_ns, component, sentence))
+
+
+@dataclass(slots=True)
+class Turn:
+    """One step: its instant, what the rules may look at, and what they order."""
+
+    now_ns: int
+    config: Config
+    team: Membership
+    journal: Journal
+    next_counter: int
+    acts: list[Act] = field(default_factory=list)
+
+    @property
+    def me(self) -> str:
+        """This robot."""
+        return self.config.robot
+
+    def order(self, act: Act) -> None:
+        """An act, after those ordered before."""
+        self.acts.append(act)
+
+    def say(self, component: Component, sentence: str) -> None:
+        """For ``failover why``."""
+        self.journal.note(self.now_ns, component.name, sentence)
+
+    def alive(self, robot: str) -> bool:
+        """Whether a peer is alive."""
+        return self.team.alive(robot, self.now_ns)
+
+    def dead(self, robot: str) -> bool:
+        """Whether a peer is dead."""
+        return self.team.dead(robot, self.now_ns)
