@@ -8,39 +8,56 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import logging
 import os
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Protocol
 
+import msgspec
+from blake3 import blake3
+
 from agent.errors import LaneError
-from agent.lane_messages import CHUNK_SIZE, CREDIT_CHUNKS, Cancel, Chunk, Credit, Message, Offer, Refuse
+from failover.core.messages import (
+    CHUNK_SIZE_MAX,
+    SNAPSHOT_SIZE_MAX,
+    WINDOW_CHUNKS,
+    Bulk,
+    Cancel,
+    Chunk,
+    Credit,
+    Offer,
+    Refuse,
+    Taken,
+)
 
 PATIENCE_S: Final = 5.0
 """A transfer in which the other side does nothing for so long is given up; the next snapshot begins afresh."""
 
-SIZE_LIMIT: Final = 1 << 38
-"""Bytes that a snapshot may claim to have: 256 GiB. The disk decides earlier."""
+WINDOW: Final = WINDOW_CHUNKS * CHUNK_SIZE_MAX
+"""Bytes under way without credit for more: keeps a 1 Gbit/s link with 10 ms of delay busy."""
 
 INCOMING_LIMIT: Final = 64
 """Transfers that one peer may have open here: one a component is all that it needs."""
-
-BITS_A_BYTE: Final = 8
 
 
 class Lane(Protocol):
     """What of `agent.transport.BulkLane` is needed here."""
 
-    def say(self, peer: str, message: Message) -> None: ...
-    async def ship(self, peer: str, chunk: Chunk, content: bytes) -> None: ...
+    def say(self, peer: str, message: Bulk) -> None: ...
+    async def ship(self, peer: str, chunk: Chunk) -> None: ...
+
+
+log = logging.getLogger("failover.lane")
 
 
 @dataclass(slots=True)
 class _Outgoing:
     peer: str
-    below: int = 0
+    until: int = 0
+    taken: bool = False
     refused: str = ""
     moved: asyncio.Event = field(default_factory=asyncio.Event)
 
@@ -59,7 +76,7 @@ class Shipper:
         self._outgoing: dict[int, _Outgoing] = {}
 
     async def ship(self, peer: str, offer: Offer, descriptor: int) -> None:
-        """Send ``offer.size`` bytes of a file to a peer; returns when the last one has left.
+        """Send ``offer.size`` bytes of a file to a peer; returns when the peer has all of them.
 
         Args:
             offer: its transfer number is chosen here.
@@ -71,38 +88,49 @@ class Shipper:
         number = next(self._numbers)
         transfer = self._outgoing[number] = _Outgoing(peer)
         try:
-            self._lane.say(peer, Offer(number, *offer_fields(offer)))
-            for index in range(chunk_count(offer.size)):
-                await self._credit(transfer, index)
-                content = os.pread(descriptor, CHUNK_SIZE, index * CHUNK_SIZE)
-                await self._pace.wait(len(content))
-                await self._lane.ship(peer, Chunk(number, index), content)
+            self._lane.say(peer, msgspec.structs.replace(offer, transfer=number))
+            for offset in range(0, offer.size, CHUNK_SIZE_MAX):
+                size = min(CHUNK_SIZE_MAX, offer.size - offset)
+                await self._until(transfer, lambda end=offset + size: transfer.until >= end)  # type: ignore[misc]
+                await self._pace.wait(size)
+                await self._lane.ship(peer, Chunk(number, offset, os.pread(descriptor, size, offset)))
+            await self._until(transfer, lambda: transfer.taken)
         except (LaneError, asyncio.CancelledError):
             self._lane.say(peer, Cancel(number))
             raise
         finally:
             del self._outgoing[number]
 
-    def heard(self, peer: str, message: Credit | Refuse) -> None:
+    def heard(self, peer: str, message: Credit | Taken | Refuse) -> None:
         """Take the receiver's answer in; one for a transfer that has ended, or of another peer, is dropped."""
         transfer = self._outgoing.get(message.transfer)
         if transfer is None or transfer.peer != peer:
             return
-        if isinstance(message, Credit):
-            transfer.below = max(transfer.below, message.below)
-        else:
-            transfer.refused = message.why or "no reason given"
+        match message:
+            case Credit():
+                transfer.until = max(transfer.until, message.until)
+            case Taken():
+                transfer.taken = True
+            case Refuse():
+                transfer.refused = message.reason or "no reason given"
         transfer.moved.set()
 
-    async def _credit(self, transfer: _Outgoing, index: int) -> None:
-        while not transfer.refused and index >= transfer.below:
+    def lost(self, peer: str) -> None:
+        """The connection to the peer is gone, and with it every transfer on it."""
+        for transfer in self._outgoing.values():
+            if transfer.peer == peer:
+                transfer.refused = "the connection was lost"
+                transfer.moved.set()
+
+    async def _until(self, transfer: _Outgoing, reached: Callable[[], bool]) -> None:
+        while not transfer.refused and not reached():
             transfer.moved.clear()
             try:
                 await asyncio.wait_for(transfer.moved.wait(), PATIENCE_S)
             except TimeoutError:
                 raise LaneError(f"{transfer.peer} took nothing for {PATIENCE_S:.0f} s in the middle of a snapshot") from None
         if transfer.refused:
-            raise LaneError(f"{transfer.peer} refused the snapshot: {transfer.refused}")
+            raise LaneError(f"{transfer.peer} gave the snapshot back: {transfer.refused}")
 
 
 class Pace:
@@ -121,29 +149,42 @@ class Pace:
         await asyncio.sleep(self._free_at - now)
 
 
-Deliver = Callable[[str, Offer, int], Awaitable[str]]
-"""Called with (peer, offer, descriptor of the whole file); returns "" or why the snapshot is not wanted."""
+class Refusal(Exception):
+    """A snapshot that is not wanted; ``needs_base``: only a base would help."""
+
+    def __init__(self, reason: str, *, needs_base: bool = False) -> None:
+        super().__init__(reason)
+        self.needs_base = needs_base
+
+
+class Desk(Protocol):
+    """Who decides about what comes in."""
+
+    def admits(self, peer: str, offer: Offer) -> None:
+        """Raises `Refusal` when the snapshot is not wanted from this peer."""
+
+    async def take(self, peer: str, offer: Offer, descriptor: int) -> None:
+        """All bytes are in the file and their digest is right. The descriptor is closed afterwards."""
 
 
 @dataclass(slots=True)
 class _Incoming:
-    peer: str
     offer: Offer
-    chunks: asyncio.Queue[tuple[int, bytes]]
+    chunks: asyncio.Queue[Chunk]
     task: asyncio.Task[None] | None = None
 
 
 class Receiver:
     """The transfers that come in. Bytes are written by a thread, chunk by chunk; credit is given as they are written."""
 
-    def __init__(self, lane: Lane, directory: Path, deliver: Deliver) -> None:
+    def __init__(self, lane: Lane, directory: Path, desk: Desk) -> None:
         """
         Args:
             directory: on the store's file system, for the unnamed files.
         """
         self._lane = lane
         self._directory = directory
-        self._deliver = deliver
+        self._desk = desk
         self._incoming: dict[tuple[str, int], _Incoming] = {}
 
     def offered(self, peer: str, offer: Offer) -> None:
@@ -151,22 +192,21 @@ class Receiver:
         for key, older in list(self._incoming.items()):
             if key[0] == peer and older.offer.component == offer.component:
                 self._drop(key)
-        if not 0 < offer.size <= SIZE_LIMIT:
-            self._lane.say(peer, Refuse(offer.transfer, f"a size of {offer.size} bytes is outside the limits"))
-        elif sum(1 for key in self._incoming if key[0] == peer) >= INCOMING_LIMIT:
-            self._lane.say(peer, Refuse(offer.transfer, f"{INCOMING_LIMIT} snapshots of {peer} are under way already"))
-        else:
-            key = (peer, offer.transfer)
-            transfer = self._incoming[key] = _Incoming(peer, offer, asyncio.Queue(CREDIT_CHUNKS))
-            transfer.task = asyncio.create_task(self._receive(key, transfer))
+        try:
+            self._check(peer, offer)
+        except Refusal as refusal:
+            self._lane.say(peer, Refuse(offer.transfer, str(refusal), refusal.needs_base))
+            return
+        transfer = self._incoming[peer, offer.transfer] = _Incoming(offer, asyncio.Queue(WINDOW_CHUNKS))
+        transfer.task = asyncio.create_task(self._receive(peer, transfer))
 
-    def chunk(self, peer: str, chunk: Chunk, content: bytes) -> None:
+    def chunk(self, peer: str, chunk: Chunk) -> None:
         """Take one chunk in; one without credit ends its transfer."""
         transfer = self._incoming.get((peer, chunk.transfer))
         if transfer is None:
             return
         try:
-            transfer.chunks.put_nowait((chunk.index, content))
+            transfer.chunks.put_nowait(chunk)
         except asyncio.QueueFull:
             self._drop((peer, chunk.transfer))
             self._lane.say(peer, Refuse(chunk.transfer, "a chunk came without credit"))
@@ -180,49 +220,65 @@ class Receiver:
         for key in [key for key in self._incoming if key[0] == peer]:
             self._drop(key)
 
+    def _check(self, peer: str, offer: Offer) -> None:
+        if not 0 < offer.size <= SNAPSHOT_SIZE_MAX:
+            raise Refusal(f"a size of {offer.size} bytes is outside the limits")
+        if sum(1 for key in self._incoming if key[0] == peer) >= INCOMING_LIMIT:
+            raise Refusal(f"{INCOMING_LIMIT} snapshots of {peer} are under way already")
+        self._desk.admits(peer, offer)
+
     def _drop(self, key: tuple[str, int]) -> None:
         transfer = self._incoming.pop(key, None)
         if transfer is not None and transfer.task is not None:
             transfer.task.cancel()
 
-    async def _receive(self, key: tuple[str, int], transfer: _Incoming) -> None:
+    async def _receive(self, peer: str, transfer: _Incoming) -> None:
+        """Fill an unnamed file, so that whatever happens nothing half is left, and hand it over."""
+        offer = transfer.offer
         try:
             descriptor = os.open(self._directory, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
-        except OSError as error:
-            self._lane.say(transfer.peer, Refuse(transfer.offer.transfer, f"cannot write there: {error.strerror}"))
-            self._incoming.pop(key, None)
-            return
-        try:
-            await self._fill(transfer, descriptor)
-            why = await self._deliver(transfer.peer, transfer.offer, descriptor)
-        except (OSError, LaneError) as error:
-            why = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
-        finally:
-            os.close(descriptor)
-            self._incoming.pop(key, None)
-        if why:
-            self._lane.say(transfer.peer, Refuse(transfer.offer.transfer, why))
-
-    async def _fill(self, transfer: _Incoming, descriptor: int) -> None:
-        offer = transfer.offer
-        count = chunk_count(offer.size)
-        self._lane.say(transfer.peer, Credit(offer.transfer, CREDIT_CHUNKS))
-        for expected in range(count):
             try:
-                index, content = await asyncio.wait_for(transfer.chunks.get(), PATIENCE_S)
+                await self._fill(peer, transfer, descriptor)
+                self._lane.say(peer, Taken(offer.transfer))
+                self._incoming.pop((peer, offer.transfer), None)
+                await self._desk.take(peer, offer, descriptor)
+            finally:
+                os.close(descriptor)
+        except OSError as error:
+            why = f"cannot write it there: {error.strerror}"
+            log.warning("gave up snapshot %d of %s from %s: %s", offer.position.sequence, offer.component, peer, why)
+            self._lane.say(peer, Refuse(offer.transfer, why))
+        except LaneError as error:
+            log.warning("gave up snapshot %d of %s: %s", offer.position.sequence, offer.component, error)
+            self._lane.say(peer, Refuse(offer.transfer, str(error)))
+        finally:
+            self._incoming.pop((peer, offer.transfer), None)
+
+    async def _fill(self, peer: str, transfer: _Incoming, descriptor: int) -> None:
+        offer, digest, end = transfer.offer, blake3(), 0
+        self._lane.say(peer, Credit(offer.transfer, WINDOW))
+        while end < offer.size:
+            try:
+                chunk = await asyncio.wait_for(transfer.chunks.get(), PATIENCE_S)
             except TimeoutError:
-                raise LaneError(f"{transfer.peer} was silent for {PATIENCE_S:.0f} s in the middle of a snapshot") from None
-            if index != expected or len(content) != min(CHUNK_SIZE, offer.size - index * CHUNK_SIZE):
-                raise LaneError(f"chunk {index} of {len(content)} bytes came where {expected} of {count} was due")
-            await asyncio.to_thread(os.pwrite, descriptor, content, index * CHUNK_SIZE)
-            self._lane.say(transfer.peer, Credit(offer.transfer, expected + 1 + CREDIT_CHUNKS))
+                raise LaneError(f"{peer} was silent for {PATIENCE_S:.0f} s in the middle of a snapshot") from None
+            if chunk.offset != end or len(chunk.content) != min(CHUNK_SIZE_MAX, offer.size - end):
+                raise LaneError(f"{peer} sent {len(chunk.content)} bytes at {chunk.offset} where {end} of {offer.size} was due")
+            await asyncio.to_thread(_keep, descriptor, chunk, digest)
+            end += len(chunk.content)
+            self._lane.say(peer, Credit(offer.transfer, end + WINDOW))
+        if digest.digest() != offer.digest:
+            raise LaneError(f"{peer} sent {offer.size} bytes that have not the promised digest")
 
 
-def chunk_count(size: int) -> int:
-    """Chunks that ``size`` bytes make."""
-    return -(-size // CHUNK_SIZE)
+def _keep(descriptor: int, chunk: Chunk, digest: blake3) -> None:
+    os.pwrite(descriptor, chunk.content, chunk.offset)
+    digest.update(chunk.content)
 
 
-def offer_fields(offer: Offer) -> tuple[str, int, int, int, int]:
-    """Everything but the transfer number."""
-    return offer.component, offer.epoch, offer.generation, offer.sequence, offer.size
+def digest_of(descriptor: int, size: int) -> bytes:
+    """The blake3 digest of a file's first ``size`` bytes, for an `Offer`."""
+    digest = blake3()
+    for offset in range(0, size, CHUNK_SIZE_MAX):
+        digest.update(os.pread(descriptor, min(CHUNK_SIZE_MAX, size - offset), offset))
+    return digest.digest()

@@ -24,7 +24,8 @@ from zmq.utils import z85
 from zmq.utils.monitor import parse_monitor_message
 
 from agent.errors import LaneError
-from agent.lane_messages import CHUNK_SIZE, Chunk, Message, Word, decode, encode
+from failover.core.messages import CHUNK_SIZE_MAX, Bulk, Chunk
+from failover.core.wire import decode_bulk, encode_bulk
 
 QUEUE_LIMIT: Final = 1_024
 """Messages waiting for one peer, chunks not counted: a peer that takes none for so long has lost them anyway."""
@@ -32,7 +33,7 @@ QUEUE_LIMIT: Final = 1_024
 HIGH_WATER: Final = 6
 """Messages inside ZeroMQ for one peer: what is in there can no longer be overtaken by a vote."""
 
-MESSAGE_LIMIT: Final = CHUNK_SIZE + (64 << 10)
+MESSAGE_LIMIT: Final = CHUNK_SIZE_MAX + (64 << 10)
 """Bytes of one frame from a stranger; more closes the connection."""
 
 RECONNECT_FIRST_MS: Final = 50
@@ -73,8 +74,8 @@ class Keys:
         return bool(self.secret)
 
 
-Receive = Callable[[str, Message, bytes], None]
-"""Called with (peer, message, the second frame or b"")."""
+Receive = Callable[[str, Bulk], None]
+"""Called with (peer, message)."""
 
 Changed = Callable[[str, LinkState, str], None]
 """Called with (peer, state, reason) when a connection changed."""
@@ -107,7 +108,7 @@ class Link:
         self.reason = ""
         self._changed = changed
         self._words: deque[bytes] = deque(maxlen=QUEUE_LIMIT)
-        self._chunk: tuple[bytes, bytes, asyncio.Future[None]] | None = None
+        self._chunk: tuple[bytes, asyncio.Future[None]] | None = None
         self._wake = asyncio.Event()
         self._socket = context.socket(zmq.DEALER)
         _limits(self._socket)
@@ -124,13 +125,13 @@ class Link:
         self._socket.connect(f"tcp://{address}")
         self._tasks = (asyncio.create_task(self._watch()), asyncio.create_task(self._send()))
 
-    def say(self, message: Message) -> None:
+    def say(self, message: Bulk) -> None:
         """Queue a small message; it overtakes chunks. Dropped where there is no connection."""
         if self.state is LinkState.CONNECTED:
-            self._words.append(encode(message))
+            self._words.append(encode_bulk(message))
             self._wake.set()
 
-    async def ship(self, chunk: Chunk, content: bytes) -> None:
+    async def ship(self, chunk: Chunk) -> None:
         """Send one chunk after all small messages; returns when ZeroMQ has taken it.
 
         Raises:
@@ -138,11 +139,11 @@ class Link:
         """
         while self._chunk is not None and self.state is LinkState.CONNECTED:
             with contextlib.suppress(LaneError):
-                await asyncio.shield(self._chunk[2])
+                await asyncio.shield(self._chunk[1])
         if self.state is not LinkState.CONNECTED:
             raise LaneError(f"the bulk lane to {self.peer} is down: {self.reason or self.state}")
         done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._chunk = (encode(chunk), content, done)
+        self._chunk = (encode_bulk(chunk), done)
         self._wake.set()
         await done
 
@@ -167,9 +168,9 @@ class Link:
             if self._words:
                 await self._socket.send(self._words.popleft())
             elif self._chunk is not None:
-                head, content, done = self._chunk
-                await self._socket.send_multipart([head, content])
-                self._chunk = None if self._chunk and self._chunk[2] is done else self._chunk
+                body, done = self._chunk
+                await self._socket.send(body)
+                self._chunk = None if self._chunk and self._chunk[1] is done else self._chunk
                 if not done.done():
                     done.set_result(None)
             else:
@@ -202,8 +203,8 @@ class Link:
 
     def _fail_chunk(self, reason: str) -> None:
         waiting, self._chunk = self._chunk, None
-        if waiting is not None and not waiting[2].done():
-            waiting[2].set_exception(LaneError(f"the bulk lane to {self.peer} went down: {reason}"))
+        if waiting is not None and not waiting[1].done():
+            waiting[1].set_exception(LaneError(f"the bulk lane to {self.peer} went down: {reason}"))
 
 
 class BulkLane:
@@ -254,13 +255,13 @@ class BulkLane:
         for peer, address in self._peers.items():
             self.links[peer] = Link(self._context, self._me, peer, address, self._keys, self._changed)
 
-    def say(self, peer: str, message: Message) -> None:
+    def say(self, peer: str, message: Bulk) -> None:
         """Queue a small message to a peer; dropped when it is not connected."""
         self.links[peer].say(message)
 
-    async def ship(self, peer: str, chunk: Chunk, content: bytes) -> None:
+    async def ship(self, peer: str, chunk: Chunk) -> None:
         """Send one chunk; see `Link.ship`."""
-        await self.links[peer].ship(chunk, content)
+        await self.links[peer].ship(chunk)
 
     async def close(self) -> None:
         """Close every socket and wait for the tasks."""
@@ -276,11 +277,11 @@ class BulkLane:
             while True:
                 frames = await router.recv_multipart(copy=False)
                 peer = self._speaker(frames)
-                message = decode(frames[1].buffer) if peer and len(frames) in (2, 3) else None
+                message = decode_bulk(frames[1].bytes) if peer and len(frames) == 2 else None
                 if message is None:
                     self.strangers += 1
                     continue
-                self._receive(peer, message, frames[2].bytes if len(frames) == 3 else b"")
+                self._receive(peer, message)
         finally:
             router.close(0)
 
@@ -322,6 +323,3 @@ def _refusal(peer: str, kind: int) -> str:
     if kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
         return f"{peer} does not know this robot's key: bring the same team.toml to every robot"
     return f"the handshake with {peer} broke off: its key is not the one in team.toml, or one side runs without keys"
-
-
-__all__ = ["BulkLane", "Keys", "Link", "LinkState", "Word", "new_keys", "public_key_of"]

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from agent.errors import LaneError
-from agent.lane_messages import CHUNK_SIZE, Chunk, Message, Word
 from agent.transport import BulkLane, Keys, LinkState, new_keys
+from failover.core.messages import CHUNK_SIZE_MAX, Bulk, Cancel, Chunk
 
 PATIENCE_S = 20.0
 
@@ -34,12 +34,12 @@ class Pair:
 
     def __init__(self, keys1: Keys, keys2: Keys) -> None:
         self.ports = {"robot1": free_port(), "robot2": free_port()}
-        self.heard: dict[str, list[tuple[str, Message, bytes]]] = {"robot1": [], "robot2": []}
+        self.heard: dict[str, list[tuple[str, Bulk]]] = {"robot1": [], "robot2": []}
         self.lanes = {name: self.lane(name, keys) for name, keys in (("robot1", keys1), ("robot2", keys2))}
 
     def lane(self, name: str, keys: Keys) -> BulkLane:
-        def receive(peer: str, message: Message, content: bytes) -> None:
-            self.heard[name].append((peer, message, content))
+        def receive(peer: str, message: Bulk) -> None:
+            self.heard[name].append((peer, message))
 
         peers = {peer: f"127.0.0.1:{port}" for peer, port in self.ports.items() if peer != name}
         return BulkLane(name, f"127.0.0.1:{self.ports[name]}", peers, keys, receive, lambda *_: None)
@@ -79,14 +79,13 @@ def test_words_and_chunks_arrive_whole_and_in_order(keyed: bool) -> None:
 
     async def body(pair: Pair) -> None:
         await until(pair.connected)
-        pieces = [os.urandom(CHUNK_SIZE) for _ in range(20)]
+        pieces = [os.urandom(CHUNK_SIZE_MAX) for _ in range(20)]
         for index, piece in enumerate(pieces):
-            await pair.lanes["robot1"].ship("robot2", Chunk(1, index), piece)
-        pair.lanes["robot2"].say("robot1", Word(b"back"))
+            await pair.lanes["robot1"].ship("robot2", Chunk(1, index, piece))
+        pair.lanes["robot2"].say("robot1", Cancel(7))
         await until(lambda: len(pair.heard["robot2"]) == len(pieces) and bool(pair.heard["robot1"]))
-        assert [content for _, _, content in pair.heard["robot2"]] == pieces
-        assert [message.index for _, message, _ in pair.heard["robot2"] if isinstance(message, Chunk)] == list(range(20))
-        assert pair.heard["robot1"] == [("robot2", Word(b"back"), b"")]
+        assert [message for _, message in pair.heard["robot2"]] == [Chunk(1, i, piece) for i, piece in enumerate(pieces)]
+        assert pair.heard["robot1"] == [("robot2", Cancel(7))]
 
     run(keys1, keys2, body)
 
@@ -100,23 +99,23 @@ def test_a_stranger_with_a_key_of_its_own_is_refused_and_both_sides_say_so() -> 
         await until(lambda: pair.state("robot2") is LinkState.REFUSED)
         assert "team.toml" in pair.lanes["robot2"].links["robot1"].reason
         assert pair.lanes["robot1"].strangers > 0
-        pair.lanes["robot2"].say("robot1", Word(b"let me in"))
+        pair.lanes["robot2"].say("robot1", Cancel(1))
         with pytest.raises(LaneError, match="down"):
-            await pair.lanes["robot2"].ship("robot1", Chunk(1, 0), b"let me in")
+            await pair.lanes["robot2"].ship("robot1", Chunk(1, 0, b"let me in"))
         assert pair.heard["robot1"] == []
 
     run(keys1, stranger, body)
 
 
 def test_a_member_cannot_speak_under_another_members_name() -> None:
-    keys1, keys2 = team_keys()
+    keys1, _ = team_keys()
     public3, secret3 = new_keys()
     everybody = {**keys1.peers, "robot3": public3}
 
     async def body(pair: Pair) -> None:
         await until(lambda: pair.state("robot2") is LinkState.CONNECTED)
         before = pair.lanes["robot1"].strangers
-        pair.lanes["robot2"].say("robot1", Word(b"I am robot2, honestly"))
+        pair.lanes["robot2"].say("robot1", Cancel(1))
         await until(lambda: pair.lanes["robot1"].strangers > before)
         assert pair.heard["robot1"] == []
 
@@ -131,11 +130,11 @@ def test_a_link_that_is_lost_says_so_and_comes_back() -> None:
         await pair.lanes["robot2"].close()
         await until(lambda: pair.state("robot1") is not LinkState.CONNECTED)
         with pytest.raises(LaneError):
-            await pair.lanes["robot1"].ship("robot2", Chunk(1, 0), b"")
+            await pair.lanes["robot1"].ship("robot2", Chunk(1, 0, b""))
         pair.lanes["robot2"] = pair.lane("robot2", keys2)
         pair.lanes["robot2"].open()
         await until(pair.connected)
-        pair.lanes["robot1"].say("robot2", Word(b"welcome"))
-        await until(lambda: ("robot1", Word(b"welcome"), b"") in pair.heard["robot2"])
+        pair.lanes["robot1"].say("robot2", Cancel(2))
+        await until(lambda: ("robot1", Cancel(2)) in pair.heard["robot2"])
 
     run(keys1, keys2, body)
