@@ -1,0 +1,282 @@
+"""The verbs as a person or a script uses them: the real command, a real socket, exit statuses, no traceback."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from failover.cli import parser
+from failover.client.control import Output, Refused, Request, Result, Update
+from tests.failover.cli.stand_in import Answer, StandIn
+
+Start = Callable[[Callable[[Request], Answer]], StandIn]
+COMMAND = [sys.executable, "-m", "failover.cli.main"]
+
+COMPONENT = {
+    "name": "/lab/robot1/mapper", "role": "primary", "primary": "robot1", "state": "running", "epoch": 3, "generation": 1,
+    "sequence": 41, "engine": "ptrace", "pid": 77, "inner_pid": 2, "isolated": True, "standby": "robot2", "standby_sequence": 41,
+    "lag_ms": 98.0, "period_ms": 100, "freeze_us": 912, "freeze_us_max": 1404, "snapshot_size": 40_000, "dirty_bytes": 90_000,
+    "snapshots": 41, "restores": 0, "crashes": 0, "exit_status": None, "reasons": [], "notes": [],
+}  # fmt: skip
+PEER = {
+    "name": "robot2", "state": "live", "last_heard_ms": 12, "beats_lost": 0, "lane": "connected", "rtt_us": 120, "notes": [],
+}  # fmt: skip
+STATUS = {
+    "robot": "robot1", "team": "lab", "role": "robot", "pid": 4, "version": "0.1.0", "uptime_ms": 9, "insecure": False,
+    "realtime": True, "promise": "If robot1 dies now, robot2 goes on.", "notes": [], "peers": [PEER], "components": [COMPONENT],
+}  # fmt: skip
+
+
+@pytest.fixture
+def agent(tmp_path: Path) -> Iterator[Start]:
+    """Start stand-ins for an agent; they are closed afterwards."""
+    running: list[StandIn] = []
+
+    def start(answer: Callable[[Request], Answer]) -> StandIn:
+        running.append(StandIn(tmp_path / "control.sock", answer))
+        return running[-1]
+
+    yield start
+    for one in running:
+        one.close()
+
+
+def failover(*words: str, socket: Path | None = None, **kwargs: Any) -> subprocess.CompletedProcess[str]:
+    """Run the command."""
+    environment = os.environ | {"FAILOVER_SOCKET": str(socket or "/nonexistent/control.sock")}
+    kwargs.setdefault("stdin", subprocess.DEVNULL)
+    ran = subprocess.run([*COMMAND, *words], capture_output=True, text=True, env=environment, timeout=60, check=False, **kwargs)
+    assert "Traceback" not in ran.stderr + ran.stdout
+    return ran
+
+
+def answering(value: dict[str, Any]) -> Callable[[Request], Answer]:
+    """An agent that always says the same."""
+    return lambda request: [Result(value)]
+
+
+# --- Status ----------------------------------------------------------------------------------------------------------
+
+
+def test_status_shows_the_team_as_a_tree_and_is_healthy(agent: Start) -> None:
+    ran = failover("status", socket=agent(answering(STATUS)).path)
+    assert ran.returncode == 0, ran.stderr
+    lines = ran.stdout.splitlines()
+    assert lines[0].split() == ["role", "state", "epoch", "lag", "freeze", "standby", "links"]
+    assert lines[1].startswith("robot1 (here)")
+    assert " ".join(lines[2].split()) == "└─ /lab/robot1/mapper primary running 3 98 ms 0.91 ms (max 1.40) robot2"
+    assert lines[3].split()[:2] == ["robot2", "live"]
+    assert "promise: If robot1 dies now, robot2 goes on." in lines
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"components": [COMPONENT | {"state": "degraded", "reasons": ["fd 7 is a socket"]}]},
+        {"components": [COMPONENT | {"state": "failed"}]},
+        {"components": [COMPONENT | {"standby": None}]},
+        {"peers": [PEER | {"state": "dead"}]},
+    ],
+)
+def test_status_says_by_its_exit_status_that_something_is_degraded(agent: Start, change: dict[str, Any]) -> None:
+    ran = failover("status", socket=agent(answering(STATUS | change)).path)
+    assert ran.returncode == 1
+    for component in change.get("components", []):
+        for reason in component["reasons"]:
+            assert reason in ran.stdout
+
+
+def test_an_ended_component_needs_no_standby(agent: Start) -> None:
+    ended = COMPONENT | {"state": "ended", "standby": None, "exit_status": 0x300}
+    ran = failover("status", socket=agent(answering(STATUS | {"components": [ended]})).path)
+    assert ran.returncode == 0
+    assert "ended (exit 3)" in ran.stdout
+
+
+def test_status_as_json_is_the_agents_own_answer(agent: Start) -> None:
+    ran = failover("status", "--json", socket=agent(answering(STATUS)).path)
+    assert json.loads(ran.stdout) == STATUS
+
+
+def test_watching_shows_every_picture_until_interrupted(agent: Start) -> None:
+    more = threading.Event()
+
+    def pictures(request: Request) -> Iterator[Update]:
+        yield Update(STATUS)
+        yield Update(STATUS)
+        more.wait()
+
+    stand_in = agent(pictures)
+    environment = os.environ | {"FAILOVER_SOCKET": str(stand_in.path)}
+    with subprocess.Popen([*COMMAND, "status", "--watch", "--json"], env=environment, stdout=subprocess.PIPE, text=True) as ran:
+        assert ran.stdout is not None
+        assert [json.loads(ran.stdout.readline())["robot"] for _ in range(2)] == ["robot1", "robot1"]
+        ran.send_signal(signal.SIGINT)
+        assert ran.wait() == 0
+    more.set()
+    assert stand_in.asked[0].arguments["watch"] is True
+
+
+# --- Run -------------------------------------------------------------------------------------------------------------
+
+
+def started(name: str = "/demo/x") -> Update:
+    """What an agent says first about a program that it has started."""
+    return Update({"started": {"name": name, "pid": 5, "inner_pid": 2, "isolated": True, "notes": []}})
+
+
+@pytest.mark.parametrize(("wait_status", "status"), [(0, 0), (7 << 8, 7), (9, 137)])
+def test_output_and_exit_status_of_run_are_the_programs_own(agent: Start, wait_status: int, status: int) -> None:
+    stand_in = agent(
+        lambda request: [
+            started(),
+            Output(1, 0, b"one\n"),
+            Output(2, 0, b"two\n"),
+            Result({"name": "x", "exit_status": wait_status}),
+        ]
+    )
+    ran = failover("run", "--name", "/demo/x", "--", "prog", "--flag", socket=stand_in.path)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (status, "one\n", "two\n")
+    asked = stand_in.asked[0].arguments
+    assert asked["argv"] == ["prog", "--flag"]
+    assert asked["name"] == "/demo/x"
+    assert asked["cwd"] == os.getcwd()
+
+
+def test_run_goes_on_where_it_stopped_when_the_agent_was_restarted(agent: Start) -> None:
+    def answer(request: Request) -> Answer:
+        if request.verb == "run":
+            return [started(), Output(1, 0, b"before ")]
+        assert request.verb == "logs"
+        assert request.arguments["offsets"] == [7, 0]
+        return [Output(1, 7, b"after"), Result({"name": "/demo/x", "totals": [12, 0], "exit_status": 0})]
+
+    ran = failover("run", "--", "prog", socket=agent(answer).path)
+    assert (ran.returncode, ran.stdout) == (0, "before after")
+
+
+def test_ctrl_c_is_passed_on_to_the_program(agent: Start) -> None:
+    ended = threading.Event()
+
+    def answer(request: Request) -> Iterator[Update | Output | Result]:
+        if request.verb == "stop":
+            ended.set()
+            yield Result({"name": "/demo/x", "exit_status": int(request.arguments["signal"])})
+        else:
+            yield started()
+            yield Output(1, 0, b"ready\n")
+            ended.wait()
+            yield Result({"name": "/demo/x", "exit_status": 2})
+
+    stand_in = agent(answer)
+    environment = os.environ | {"FAILOVER_SOCKET": str(stand_in.path)}
+    with subprocess.Popen([*COMMAND, "run", "--", "prog"], env=environment, stdout=subprocess.PIPE, text=True) as ran:
+        assert ran.stdout is not None
+        assert ran.stdout.readline() == "ready\n"
+        ran.send_signal(signal.SIGINT)
+        assert ran.wait() == 130
+    assert [(request.verb, request.arguments.get("signal")) for request in stand_in.asked[1:]] == [("stop", 2)]
+
+
+def test_a_detached_run_prints_the_name(agent: Start) -> None:
+    ran = failover("run", "--detach", "--", "prog", socket=agent(answering({"name": "/x", "pid": 1, "notes": []})).path)
+    assert (ran.returncode, ran.stdout) == (0, "/x\n")
+
+
+# --- The others ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "answer", "sentence"),
+    [
+        (["protect", "41", "--name", "/a"], {"name": "/a", "pid": 41, "notes": []}, "pid 41 is protected as /a"),
+        (["release", "/a"], {"name": "/a", "pid": 41}, "/a runs on as pid 41, unprotected"),
+        (["stop", "/a"], {"name": "/a", "exit_status": 15}, "/a has ended: signal 15"),
+        (
+            ["handover", "/a"],
+            {"name": "/a", "to": "r2", "epoch": 4, "outage_ms": 12},
+            "/a runs on r2 now; it stood still for 12 ms",
+        ),
+        (["prefer", "/a", "r1"], {"name": "/a", "robot": "r1"}, "/a prefers r1"),
+    ],
+)
+def test_a_verb_says_in_a_sentence_what_came_of_it(agent: Start, words: list[str], answer: dict[str, Any], sentence: str) -> None:
+    stand_in = agent(answering(answer))
+    ran = failover(*words, socket=stand_in.path)
+    assert (ran.returncode, ran.stdout.strip()) == (0, sentence)
+    assert stand_in.asked[0].verb == words[0]
+    assert json.loads(failover(*words, "--json", socket=stand_in.path).stdout) == answer
+
+
+def test_logs_can_show_one_stream_alone(agent: Start) -> None:
+    stand_in = agent(
+        lambda request: [Output(1, 0, b"a"), Output(2, 0, b"b"), Result({"name": "x", "totals": [1, 1], "exit_status": 0})]
+    )
+    assert failover("logs", "x", socket=stand_in.path).stdout == "a"
+    assert failover("logs", "x", "--stream", "2", socket=stand_in.path).stderr == "b"
+
+
+def test_a_refusal_is_a_sentence_with_its_reasons_and_exit_status_1(agent: Start) -> None:
+    stand_in = agent(lambda request: [Refused("UnsupportedError", "cannot protect pid 41", ("fd 3 is a socket; close it",))])
+    ran = failover("protect", "41", socket=stand_in.path)
+    assert ran.returncode == 1
+    assert ran.stderr.splitlines() == ["failover: cannot protect pid 41", "  - fd 3 is a socket; close it"]
+    as_json = json.loads(failover("protect", "41", "--json", socket=stand_in.path).stdout)
+    assert as_json == {"error": "UnsupportedError", "message": "cannot protect pid 41", "reasons": ["fd 3 is a socket; close it"]}
+
+
+def test_an_agent_that_goes_away_is_an_error_and_not_a_hang(agent: Start) -> None:
+    ran = failover("status", socket=agent(lambda request: []).path)
+    assert ran.returncode == 1
+    assert "went away" in ran.stderr
+
+
+AGENT_VERBS = [
+    ["run", "--", "x"], ["protect", "1"], ["release", "x"], ["stop", "x"], ["status"], ["logs", "x"], ["why"], ["handover", "x"],
+    ["prefer", "x", "r"],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("words", AGENT_VERBS, ids=lambda words: words[0])
+def test_without_an_agent_the_exit_status_is_3_and_the_cure_is_named(words: list[str]) -> None:
+    ran = failover(*words)
+    assert ran.returncode == 3
+    assert "start failover-agent" in ran.stderr
+
+
+@pytest.mark.parametrize(
+    "words", [[], ["fly"], ["protect", "-3"], ["protect", "x"], ["stop", "x", "--signal", "FOO"], ["capture", "1"]]
+)
+def test_a_mistake_in_the_command_line_is_exit_status_2(words: list[str]) -> None:
+    assert failover(*words).returncode == 2
+
+
+@pytest.mark.parametrize("verb", parser.verbs())
+def test_every_verb_explains_itself(verb: str) -> None:
+    ran = failover(verb, "--help")
+    assert ran.returncode == 0
+    assert f"  failover {verb}" in ran.stdout, "no example"
+    assert "Exit status" in ran.stdout
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
+def test_completion_knows_every_verb(shell: str) -> None:
+    script = failover("completion", shell).stdout
+    assert all(verb in script for verb in parser.verbs())
+
+
+def test_a_reader_that_has_seen_enough_is_no_error_message(agent: Start) -> None:
+    stand_in = agent(lambda request: [*(Output(1, n * 1000, b"x" * 999 + b"\n") for n in range(2000)), Result({"name": "x"})])
+    command = f"{' '.join(COMMAND)} logs x | head -n 1"
+    environment = os.environ | {"FAILOVER_SOCKET": str(stand_in.path)}
+    ran = subprocess.run(["sh", "-c", command], env=environment, capture_output=True, text=True, check=False)
+    assert ran.stderr == ""
