@@ -30,7 +30,7 @@ class Offer:
     text: str
 
 
-def check(arguments: argparse.Namespace) -> int:
+def check_machine(arguments: argparse.Namespace) -> int:
     """Show what this machine offers; 1 when something is missing that nothing works without."""
     offers = [
         _architecture(),

@@ -152,9 +152,9 @@ def _print_notes(notes: tuple[str, ...]) -> None:
 def check(arguments: argparse.Namespace) -> int:
     """Say whether a process, or this machine, can be protected, and what to change."""
     if arguments.pid is None:
-        from failover.cli import machine
+        from failover.cli.machine import check_machine
 
-        return machine.check(arguments)
+        return check_machine(arguments)
     with Keeper.spawn() as keeper:
         report = keeper.ask(channel.Probe(arguments.pid), channel.Probed)[0].report
     if arguments.json:

@@ -59,8 +59,8 @@ def build() -> argparse.ArgumentParser:
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
+        room.set_defaults(function=verb.function)
         verb.arguments(room)
-        room.set_defaults(function=verb.function, room=room)
     return parser
 
 
@@ -204,6 +204,32 @@ def _check(room: argparse.ArgumentParser) -> None:
     _json(room)
 
 
+def _team(room: argparse.ArgumentParser) -> None:
+    acts = room.add_subparsers(dest="act", metavar="ACT", required=True, title="acts")
+    shared = argparse.ArgumentParser(add_help=False)
+    shared.add_argument(
+        "--directory", metavar="DIR", default="/etc/failover/team", help="the team directory (default: %(default)s)"
+    )
+    _json(shared)
+    create = acts.add_parser("create", parents=[shared], help="begin a team", allow_abbrev=False)
+    create.add_argument("name", metavar="TEAM", help="the team's name")
+    create.set_defaults(function="failover.cli.teams:create")
+    enrol = acts.add_parser("enrol", parents=[shared], help="add a robot and make its key", allow_abbrev=False)
+    enrol.add_argument("name", metavar="ROBOT", help="the robot's name")
+    enrol.add_argument(
+        "address", metavar="HOST[:PORT]", nargs="+", help="where it hears beats: one address for each of its links (port 7420)"
+    )
+    enrol.add_argument(
+        "--bulk", metavar="HOST[:PORT]", help="where it takes snapshots, on the wired link (default: first HOST, port 7421)"
+    )
+    enrol.add_argument("--role", choices=("robot", "server", "witness"), default="robot", help="what it does (default: robot)")
+    enrol.add_argument("--public-key", metavar="KEY", help="the public half of a key made on the robot itself")
+    enrol.add_argument("--replace", action="store_true", help="give a known robot new addresses and a new key")
+    enrol.set_defaults(function="failover.cli.teams:enrol")
+    show = acts.add_parser("show", parents=[shared], help="list the team", allow_abbrev=False)
+    show.set_defaults(function="failover.cli.teams:show")
+
+
 def _demo(room: argparse.ArgumentParser) -> None:
     room.add_argument("--picture", metavar="FILE", help="write what was shown to FILE as an SVG picture too")
     _json(room)
@@ -336,6 +362,21 @@ VERBS: Final = (
         """,
         _prefer,
         "failover.cli.components:prefer",
+    ),
+    Verb(
+        "team",
+        "who belongs to the team, and by which key",
+        """
+        Begin a team, enrol robots, list them. The team file is the same on every robot and holds nothing secret; a robot's secret
+        key stays on that robot alone. failover team ACT --help explains an act.
+
+          failover team create lab
+          failover team enrol robot1 192.168.7.11
+          failover team enrol robot2 192.168.7.12 10.0.0.12 --bulk 192.168.7.12
+          failover team show
+        """,
+        _team,
+        "failover.cli.teams:show",
     ),
     Verb(
         "check",

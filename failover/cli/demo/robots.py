@@ -7,7 +7,6 @@ last process: whatever ends the demo, only a temporary directory can be left.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 import signal
@@ -19,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from failover.cli import keys
 from failover.cli.demo.host import descendants
 from failover.client import team
 from failover.client.control import Control
@@ -201,7 +201,7 @@ class Stage:
         ports = [7420, 7421, 7420, 7421] if self.means.own_network else free_ports(4)
         members = Team("demo")
         for index, name in enumerate(NAMES):
-            public, secret = new_keys()
+            public, secret = keys.new_pair()
             directory = self.directory / name / "team"
             directory.mkdir(parents=True)
             team.write_secret_key(directory, name, secret)
@@ -284,13 +284,3 @@ def free_ports(count: int) -> list[int]:
         for one in held:
             one.close()
     return ports
-
-
-def new_keys() -> tuple[str, str]:
-    """A fresh CURVE pair, public and secret; made by the agent's program, which alone knows the cryptography."""
-    ran = subprocess.run([sys.executable, "-m", "agent.main", "keypair"], capture_output=True, text=True, check=False)
-    try:
-        pair = json.loads(ran.stdout)
-        return str(pair["public"]), str(pair["secret"])
-    except (ValueError, KeyError) as error:
-        raise FailoverError(f"failover-agent keypair made no keys: {ran.stderr.strip() or ran.stdout.strip()}") from error

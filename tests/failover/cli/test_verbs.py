@@ -280,3 +280,42 @@ def test_a_reader_that_has_seen_enough_is_no_error_message(agent: Start) -> None
     environment = os.environ | {"FAILOVER_SOCKET": str(stand_in.path)}
     ran = subprocess.run(["sh", "-c", command], env=environment, capture_output=True, text=True, check=False)
     assert ran.stderr == ""
+
+
+# --- Team ------------------------------------------------------------------------------------------------------------
+
+KEY = "a" * 40
+
+
+def test_a_team_is_created_enrolled_into_and_shown(tmp_path: Path) -> None:
+    place = ["--directory", str(tmp_path)]
+    assert failover("team", "create", "lab", *place).returncode == 0
+    assert failover("team", "enrol", "robot1", "10.0.0.1", "10.1.0.1:9", "--public-key", KEY, *place).returncode == 0
+    assert failover("team", "enrol", "robot2", "fe80::1", "--public-key", KEY, *place).returncode == 0
+    shown = json.loads(failover("team", "show", "--json", *place).stdout)
+    assert shown["team"] == "lab"
+    assert shown["robots"]["robot1"] == {
+        "role": "robot", "beats": ["10.0.0.1:7420", "10.1.0.1:9"], "bulk": "10.0.0.1:7421", "public_key": KEY,
+    }  # fmt: skip
+    assert shown["robots"]["robot2"]["beats"] == ["[fe80::1]:7420"]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["create", "lab"], "exists"),
+        (["enrol", "robot1", "10.0.0.9", "--public-key", KEY], "--replace"),
+        (["enrol", "two words", "10.0.0.9", "--public-key", KEY], "cannot name a robot"),
+        (["enrol", "robot2", "10.0.0.9", "--public-key", "short"], "not 40"),
+        (["enrol", "robot2", "10.0.0.9:x", "--public-key", KEY], "no address"),
+    ],
+)
+def test_a_mistake_with_the_team_is_named_and_changes_nothing(tmp_path: Path, words: list[str], sentence: str) -> None:
+    place = ["--directory", str(tmp_path)]
+    failover("team", "create", "lab", *place)
+    failover("team", "enrol", "robot1", "10.0.0.1", "--public-key", KEY, *place)
+    before = (tmp_path / "team.toml").read_text()
+    ran = failover("team", *words, *place)
+    assert ran.returncode == 1
+    assert sentence in ran.stderr
+    assert (tmp_path / "team.toml").read_text() == before
