@@ -5,13 +5,21 @@ Everything that is wrong is found at once, so that it can be put right at once.
 
 from __future__ import annotations
 
+import mmap
 import os
+from collections.abc import Iterator
+
+from blake3 import blake3
 
 from checkpoint.arch import x86_64
 from checkpoint.engine import RestoreOptions
+from checkpoint.engines.restore_memory import is_file_mapping, kernel_pages, kernel_pages_of
 from checkpoint.errors import MismatchError
-from checkpoint.linux import abi
-from checkpoint.model import Snapshot
+from checkpoint.linux import abi, procfs
+from checkpoint.model import FileIdentity, Resource, Snapshot
+from checkpoint.resources import rebuild
+
+_FAR: str = "bring it here from the machine that ran the program"
 
 
 def require(state: Snapshot, options: RestoreOptions) -> None:
@@ -28,12 +36,91 @@ def require(state: Snapshot, options: RestoreOptions) -> None:
 
 def mismatches(state: Snapshot, options: RestoreOptions) -> tuple[str, ...]:
     """Everything in which this machine differs from what the snapshot needs, one sentence each."""
+    architecture = os.uname().machine
+    if state.machine.architecture != architecture or architecture != x86_64.NAME:
+        return (f"it was taken on {state.machine.architecture}, this machine is {architecture}: restore it on such a machine",)
+    return (*_of_machine(state), *_of_files(state, options), *_of_descriptors(state, options))
+
+
+def _of_machine(state: Snapshot) -> Iterator[str]:
     machine = state.machine
-    if machine.architecture != os.uname().machine or machine.architecture != x86_64.NAME:
-        return (f"it was taken on {machine.architecture}, this machine is {os.uname().machine}: restore it on such a machine",)
-    reasons = []
     if machine.page_size != abi.PAGE_SIZE:
-        reasons.append(f"its pages are {machine.page_size} bytes, this kernel's {abi.PAGE_SIZE}: boot a kernel with the same")
+        yield f"its pages are {machine.page_size} bytes, this kernel's {abi.PAGE_SIZE}: boot a kernel with the same"
     if len(state.threads) != 1:
-        reasons.append(f"it has {len(state.threads)} threads: only single-threaded programs are supported so far")
-    return tuple(reasons)
+        yield f"it has {len(state.threads)} threads: only single-threaded programs are supported so far"
+    ours = kernel_pages(procfs.parse_maps(procfs.read_text(os.getpid(), "maps")))
+    theirs = kernel_pages_of(state.vmas)
+    if [page.size for page in ours] != [page.size for page in theirs]:
+        yield f"the vdso of its kernel ({machine.kernel}) is laid out unlike ours ({os.uname().release}): boot the same kernel"
+    if state.process.root_directory != "/":
+        yield f"its root directory is {state.process.root_directory}: programs in a chroot are not supported"
+    if not os.path.isdir(state.process.working_directory):
+        yield f"its working directory {state.process.working_directory} is missing: make it"
+
+
+# --- Files -----------------------------------------------------------------------------------------------------------
+
+
+def _of_files(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
+    """The executable and everything that is mapped: the program runs their bytes, so they must be the very same."""
+    mapped = [vma.file for vma in state.vmas if vma.file is not None and is_file_mapping(vma)]
+    for identity in {identity.path: identity for identity in (state.process.executable, *mapped)}.values():
+        if identity.path not in options.accept_changed:
+            yield from _of_file(identity)
+
+
+def _of_file(identity: FileIdentity) -> Iterator[str]:
+    path = identity.path
+    try:
+        about = os.stat(path)
+    except OSError as error:
+        yield f"{path} cannot be used ({error.strerror}): {_FAR}"
+        return
+    if (about.st_dev, about.st_ino, about.st_mtime_ns) == (identity.device, identity.inode, identity.mtime_ns):
+        return
+    if identity.size and about.st_size != identity.size:
+        yield f"{path} is another file: {about.st_size} bytes here, {identity.size} there; {_FAR}"
+    elif identity.digest and digest_of(path) != identity.digest:
+        yield f"{path} is another file: as long, but its content differs; {_FAR}"
+
+
+def digest_of(path: str) -> bytes:
+    """The blake3 digest of a whole file, 32 bytes.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        if not os.fstat(descriptor).st_size:
+            return blake3(b"").digest()
+        with mmap.mmap(descriptor, 0, prot=mmap.PROT_READ) as content:
+            return blake3(content).digest()
+    finally:
+        os.close(descriptor)
+
+
+def _of_descriptors(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
+    for held in state.resources:
+        path = str(held.facts.get("path", ""))
+        if held.kind not in rebuild.KINDS:
+            yield f"{held.name} is of kind {held.kind!r}, which this version does not know: use the version that captured it"
+        elif held.kind == "files" and not held.facts.get("deleted") and path not in options.accept_changed:
+            yield from _of_open_file(held, path)
+
+
+def _of_open_file(held: Resource, path: str) -> Iterator[str]:
+    """A file that was only read must be the same; one that was written to may have grown, and is cut back."""
+    try:
+        about = os.stat(path)
+    except OSError as error:
+        yield f"{path}, open as {held.name}, cannot be used ({error.strerror}): {_FAR}"
+        return
+    size, digest = rebuild.number_of(held.facts.get("size", 0)), held.facts.get("digest", b"")
+    if not os.path.isfile(path):
+        return
+    grown = rebuild.has_grown(held)
+    if about.st_size != size and not grown:
+        yield f"{path}, open as {held.name}, has {about.st_size} bytes here and {size} there; {_FAR}, or accept it as shared"
+    elif digest and not grown and digest_of(path) != digest:
+        yield f"{path}, open as {held.name}, has another content here; {_FAR}, or accept it as shared"

@@ -7,6 +7,7 @@ outlives everything that the calls map and unmap.
 from __future__ import annotations
 
 import errno
+import fcntl
 import itertools
 import os
 import signal
@@ -85,6 +86,20 @@ class CallTable:
         """Add the closing of a descriptor."""
         self.call(f"close descriptor {descriptor}", "close", descriptor)
         self.descriptors.discard(descriptor)
+
+    def duplicate(self, descriptor: int, number: int, flags: int) -> None:
+        """Add a second descriptor for what one stands for.
+
+        Args:
+            flags: O_CLOEXEC or 0.
+        """
+        what = f"make descriptor {number} a copy of {descriptor}"
+        self.call(what, "dup3", descriptor, number, flags, least=number, most=number)
+        self.descriptors.add(number)
+
+    def close_on_exec(self, descriptor: int) -> None:
+        """Have a descriptor closed by execve."""
+        self.call(f"mark descriptor {descriptor}", "fcntl", descriptor, fcntl.F_SETFD, fcntl.FD_CLOEXEC)
 
     def lowest_descriptor(self) -> int:
         """The number that the kernel gives to the next descriptor."""

@@ -1,12 +1,169 @@
-"""Every resource of a snapshot, put back inside a vessel by the file that knows its kind."""
+"""Every descriptor of a snapshot, put back inside a vessel under its own number.
+
+Resources of the kinds "files", "devices" and "streams" each stand for one *open file description*: descriptors made by dup share
+one, with its offset and flags, and share one again. Facts that all have: ``descriptors``, a list of [number, 1 if close-on-exec].
+
+Order: the vessel's own 0, 1 and 2 move out of the way; then every number in ascending order, so that whatever is opened gets a
+number that is still wanted or free; then what had moved is closed.
+
+Sources: open(2), dup(2), fdinfo of proc_pid_fdinfo(5).
+"""
 
 from __future__ import annotations
 
+import os
+import stat
+from dataclasses import dataclass
+from typing import Final
+
 from checkpoint.engine import RestoreOptions
+from checkpoint.errors import RestoreError
 from checkpoint.linux.call_table import CallTable
-from checkpoint.model import Snapshot
+from checkpoint.model import Fact, Resource, Snapshot
+
+REOPENED_FLAGS: Final = (
+    os.O_ACCMODE | os.O_APPEND | os.O_NONBLOCK | os.O_DSYNC | os.O_SYNC | os.O_DIRECT | os.O_NOATIME | os.O_DIRECTORY
+)
+"""Flags of open(2) that belong to an open file; O_CREAT, O_TRUNC and the like belong to the moment of opening."""
+
+O_PATH: Final = 0o10000000
+STREAMS: Final = (0, 1, 2)
+KINDS: Final = ("files", "devices", "streams")
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """One descriptor that the program had."""
+
+    number: int
+    close_on_exec: bool
+    resource: Resource
 
 
 def rebuild_all(table: CallTable, state: Snapshot, options: RestoreOptions) -> tuple[str, ...]:
-    """Add the calls that bring all resources back: a note for each difference."""
+    """Add the calls that bring all descriptors back: a note for each difference.
+
+    Raises:
+        RestoreError: a resource of a kind that this version does not know.
+    """
+    for held in state.resources:
+        if held.kind not in KINDS:
+            raise RestoreError(
+                f"cannot restore {held.name}: kind {held.kind!r} is unknown here; use the version that captured it"
+            )
+    wanted = sorted(descriptors_of(state), key=lambda one: one.number)
+    if not wanted:
+        return ()
+    moved = _move_streams_away(table, wanted[-1].number + 1)
+    holders: dict[int, int] = {}  # which number already stands for an open file description
+    for one in wanted:
+        if id(one.resource) in holders:
+            _duplicate(table, holders[id(one.resource)], one)
+        else:
+            _obtain(table, one, moved, options)
+            holders[id(one.resource)] = one.number
+    for number in moved:
+        table.close(number)
     return ()
+
+
+def descriptors_of(state: Snapshot) -> list[Wanted]:
+    """Every descriptor that the snapshot describes."""
+    return [
+        Wanted(int(str(number)), bool(close_on_exec), held)
+        for held in state.resources
+        for number, close_on_exec in _pairs(held.facts["descriptors"])
+    ]
+
+
+def _pairs(fact: Fact) -> list[tuple[Fact, Fact]]:
+    assert isinstance(fact, list)
+    return [(pair[0], pair[1]) for pair in fact if isinstance(pair, list)]
+
+
+def _move_streams_away(table: CallTable, first: int) -> tuple[int, ...]:
+    """Move the vessel's standard streams to numbers above all that are wanted."""
+    moved = tuple(max(first, len(STREAMS)) + stream for stream in STREAMS)
+    for stream, number in zip(STREAMS, moved, strict=True):
+        table.duplicate(stream, number, os.O_CLOEXEC)
+        table.close(stream)
+    return moved
+
+
+def _obtain(table: CallTable, one: Wanted, moved: tuple[int, ...], options: RestoreOptions) -> None:
+    """The first descriptor of an open file description."""
+    facts = one.resource.facts
+    if one.resource.kind == "streams":
+        table.duplicate(moved[number_of(facts["stream"])], one.number, os.O_CLOEXEC if one.close_on_exec else 0)
+        return
+    opened = _open_deleted(table, one.resource) if facts.get("deleted") else _open(table, one.resource, options)
+    if opened != one.number:
+        table.duplicate(opened, one.number, os.O_CLOEXEC if one.close_on_exec else 0)
+        table.close(opened)
+    elif one.close_on_exec:
+        table.close_on_exec(opened)
+
+
+def _duplicate(table: CallTable, holder: int, one: Wanted) -> None:
+    table.duplicate(holder, one.number, os.O_CLOEXEC if one.close_on_exec else 0)
+
+
+def _open(table: CallTable, held: Resource, options: RestoreOptions) -> int:
+    facts = held.facts
+    path, flags = str(facts["path"]), number_of(facts["flags"])
+    descriptor = table.open(path, flags & (REOPENED_FLAGS | O_PATH))
+    if held.kind == "files" and not flags & O_PATH:
+        if path not in options.accept_changed and has_grown(held):
+            table.call(f"cut {path} back to {facts['size']} bytes", "ftruncate", descriptor, number_of(facts["size"]))
+        _seek(table, descriptor, held)
+    return descriptor
+
+
+def _open_deleted(table: CallTable, held: Resource) -> int:
+    """Make a file that no name leads to, with the content that it had, opened as it was."""
+    facts = held.facts
+    path, content = str(facts["path"]), facts.get("content", b"")
+    assert isinstance(content, bytes)
+    mode = number_of(facts.get("mode", 0o600)) & 0o7777
+    if os.path.lexists(path):
+        made = table.open(os.path.dirname(path), os.O_TMPFILE | os.O_RDWR, mode)
+    else:
+        made = table.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR, mode)
+        table.call(f"unlink {path}", "unlinkat", -100, table.place_path(path), 0)
+    if content:
+        size = len(content)
+        table.call(f"fill {path}", "pwrite64", made, table.place(content), size, 0, least=size, most=size)
+    flags = number_of(facts["flags"]) & REOPENED_FLAGS & ~os.O_DIRECTORY  # part of O_TMPFILE, by which it may have been made
+    opened = table.open(f"/proc/self/fd/{made}", flags)
+    table.close(made)
+    _seek(table, opened, held)
+    return opened
+
+
+def _seek(table: CallTable, descriptor: int, held: Resource) -> None:
+    offset = number_of(held.facts.get("offset", 0))
+    if offset:
+        table.call(f"set the offset of {held.name}", "lseek", descriptor, offset, os.SEEK_SET, least=offset, most=offset)
+
+
+def is_writable(flags: int) -> bool:
+    """Whether something opened with these flags can be written to."""
+    return flags & os.O_ACCMODE in (os.O_WRONLY, os.O_RDWR) and not flags & O_PATH
+
+
+def has_grown(held: Resource) -> bool:
+    """Whether a regular file that the program writes to is longer here than the program knows: that part is not written yet."""
+    about = os.stat(str(held.facts["path"]))
+    writable = is_writable(number_of(held.facts["flags"]))
+    return writable and stat.S_ISREG(about.st_mode) and about.st_size > number_of(held.facts["size"])
+
+
+def number_of(fact: Fact) -> int:
+    """A fact that is an integer.
+
+    Raises:
+        RestoreError: it is not.
+    """
+    if not isinstance(fact, int):
+        raise RestoreError(f"cannot restore: a resource says {fact!r} where a number belongs")
+    return fact
