@@ -201,7 +201,16 @@ class Component:
         else:
             state = self.state
         return Record(
-            self.name, self.epoch, self.primary, state, self.entrusted, self.trusted, self.lost, self.status, self.reason, self.spec
+            self.name,
+            self.epoch,
+            self.primary,
+            state,
+            self.entrusted,
+            self.trusted,
+            self.lost,
+            self.status,
+            self.reason,
+            self.spec,
         )
 
     @classmethod

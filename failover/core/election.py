@@ -1,0 +1,329 @@
+"""Who runs a component: claims, consent, and what follows from hearing another robot's.
+
+A primacy is an epoch and the robot that all who know of it name as its primary. The rules:
+
+* A robot claims a *vacant* component: no living robot holds it, and everybody is either heard or dead.
+* Naming the claimant at its epoch is consent; hearing a claim raises the hearer's own epoch before it answers.
+* Of two claims the higher epoch wins; at the same epoch one that runs already, then the lesser name W.
+* Under ``when_alone = freeze`` a robot starts a component only with everybody's consent, or with the *right to act alone*: it was
+  entrusted by the primary that has gone silent, or it was the primary itself and had entrusted nobody. One robot has that right.
+"""
+
+from __future__ import annotations
+
+from checkpoint.model import Position
+from failover.core import acts
+from failover.core.component import LOST_MAX, Cause, Component, Turn
+from failover.core.membership import Peer
+from failover.core.messages import HOLDS, UNPROTECTED, Entry
+from failover.core.names import weight
+from failover.core.types import ENDED, HOLDING, MS, PEERS_MAX, State
+
+STATES = tuple(State)
+"""A state's place in here is its number in a beat."""
+
+_RUNS_HERE = frozenset({State.PRIMARY, State.FROZEN, State.HANDING_OVER})
+_END_CAUSES = {State.FINISHED: Cause.FINISH, State.FAILED: Cause.FAIL, State.RELEASED: Cause.RELEASE}
+
+
+def state_of(entry: Entry) -> State:
+    """The state that an entry tells of; a number that is none reads as absent."""
+    return STATES[entry.state] if 0 <= entry.state < len(STATES) else State.ABSENT
+
+
+def grants(component: Component, peer: Peer, me: str) -> bool:
+    """Whether the peer consents to our primacy of the present epoch, by its freshest word."""
+    entry = peer.entry(component.name)
+    agreed = entry is not None and (entry.epoch, entry.primary) == (component.epoch, me)
+    return agreed and entry is not None and state_of(entry) is not State.STOPPING
+
+
+# Claiming
+
+
+def consider(component: Component, turn: Turn) -> None:
+    """Claim the component if it is vacant and this robot is the one to run it."""
+    if component.state not in (State.ABSENT, State.STANDBY) or turn.now_ns < component.retry_ns or not vacant(component, turn):
+        return
+    entries = _living_entries(component, turn)
+    best = max((position for _, entry in entries if (position := entry.position)), default=None)
+    mine = component.newest
+    if component.waits and component.held:
+        chosen = component.primary == turn.me and mine is not None and (best is None or best <= mine)
+    elif mine is None:
+        chosen = best is None and _may_start_afresh(component)
+    else:
+        chosen = best is None or best < mine or (best == mine and _first_of_equals(component, turn, entries, mine))
+    if chosen and _may_go_on(component, turn):
+        claim(component, turn, mine, "nobody runs it")
+
+
+def vacant(component: Component, turn: Turn) -> bool:
+    """Nobody who lives holds it or knows its end, and everybody is heard or dead."""
+    for robot, peer in turn.team.peers.items():
+        if turn.dead(robot):
+            continue
+        if not turn.alive(robot):
+            return False
+        entry = peer.entry(component.name)
+        if entry is None:
+            if not peer.complete:
+                return False
+        elif state_of(entry) in HOLDING or (state_of(entry) in ENDED and entry.epoch >= component.epoch):
+            return False
+    return True
+
+
+def claim(component: Component, turn: Turn, plan: Position | None, why: str) -> None:
+    """Open a new epoch as its primary-to-be. The ballot holds it before anybody hears of it."""
+    component.alone_right = not component.freezes or _right_to_act_alone(component, turn)
+    component.move(Cause.CLAIM)
+    component.epoch += 1
+    component.primary = turn.me
+    component.entrusted, component.trusted, component.standby = (), False, ""
+    component.plan = plan
+    component.claim_counter = turn.next_counter
+    component.until_ns = turn.now_ns + turn.config.loyalty_ns
+    component.unprotected, component.degraded, component.needs_base = False, "", False
+    component.handing, component.ending, component.reported = None, False, False
+    component.lease_ns = component.told_ns = 0
+    open_line(component, turn)
+    start = "its newest checkpoint" if plan else "the beginning"
+    turn.say(component, f"{turn.me} claims epoch {component.epoch}, to run it from {start}: {why}")
+
+
+def advance(component: Component, turn: Turn) -> None:
+    """A claim: go on once it is granted, or once nobody is left whose consent is needed."""
+    if not _consented(component, turn):
+        return
+    entrust_holder(component, turn)
+    component.until_ns = turn.now_ns + turn.config.restore_ms * MS
+    component.born = component.epoch
+    lease_ns = turn.now_ns + turn.config.lease_ns if component.entrusted else 0
+    if component.plan is None:
+        assert component.spec is not None, f"{component.name}: claimed without knowing what to start"
+        component.move(Cause.START)
+        turn.order(acts.Start(component.name, component.epoch, component.spec, lease_ns))
+    else:
+        component.move(Cause.RESTORE)
+        turn.order(acts.Restore(component.name, component.epoch, component.plan, component.spec, lease_ns))
+    component.lease_ns = component.told_ns = lease_ns
+
+
+def entrust_holder(component: Component, turn: Turn) -> None:
+    """A peer that agreed and still holds an older checkpoint may use it should this robot die before the next one."""
+    for peer in sorted(turn.team.living(turn.now_ns), key=lambda peer: weight(peer.robot)):
+        entry = peer.entry(component.name)
+        if not component.standby and entry and entry.position and grants(component, peer, turn.me):
+            component.standby = peer.robot
+            component.entrusted = (peer.robot,)
+
+
+def open_line(component: Component, turn: Turn) -> None:
+    """A new generation, unlike any other robot's: the next snapshot is a base."""
+    names = sorted((turn.me, *turn.config.peers), key=weight)
+    component.generation = component.epoch * (PEERS_MAX + 1) + names.index(turn.me)
+    component.sequence = 0
+    component.parent = component.flight = None
+    component.base_wanted = True
+    component.due_ns = turn.now_ns
+
+
+def renew(component: Component, turn: Turn, above: int) -> None:
+    """The running primary goes on under an epoch above one that came to nothing."""
+    component.epoch = above + 1
+    component.handing = None
+    open_line(component, turn)
+    turn.say(component, f"{turn.me} goes on under epoch {component.epoch}: epoch {above} was claimed and runs nowhere")
+
+
+def _consented(component: Component, turn: Turn) -> bool:
+    overdue = turn.now_ns >= component.until_ns
+    for robot, peer in turn.team.peers.items():
+        if turn.dead(robot):
+            if not component.alone_right:
+                return False
+        elif not (peer.echoed >= component.claim_counter and grants(component, peer, turn.me)) and (
+            component.freezes or not overdue
+        ):
+            return False
+    return True
+
+
+def _living_entries(component: Component, turn: Turn) -> list[tuple[str, Entry]]:
+    found = ((peer.robot, peer.entry(component.name)) for peer in turn.team.living(turn.now_ns))
+    return [(robot, entry) for robot, entry in found if entry is not None]
+
+
+def _may_start_afresh(component: Component) -> bool:
+    """Configured to run, and no checkpoint of it was ever given away."""
+    return component.autostart and component.spec is not None and not component.entrusted and not component.trusted
+
+
+def _first_of_equals(component: Component, turn: Turn, entries: list[tuple[str, Entry]], mine: Position) -> bool:
+    rivals = [robot for robot, entry in entries if entry.position == mine]
+    prefer = component.rules.prefer
+    if prefer in (turn.me, *rivals):
+        return prefer == turn.me
+    return all(weight(turn.me) < weight(robot) for robot in rivals)
+
+
+def _right_to_act_alone(component: Component, turn: Turn) -> bool:
+    if component.primary == turn.me:
+        return component.epoch > 0 and not component.entrusted
+    return component.trusted and turn.dead(component.primary)
+
+
+def _may_go_on(component: Component, turn: Turn) -> bool:
+    """Under ``freeze``, with somebody out of reach, only the robot that has the right to act alone."""
+    somebody_gone = any(turn.dead(robot) for robot in turn.team.peers)
+    return not component.freezes or not somebody_gone or _right_to_act_alone(component, turn)
+
+
+# Hearing
+
+
+def heard(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
+    """What another robot's word about this component changes here."""
+    theirs = state_of(entry)
+    if theirs in HOLDING:
+        _heard_holder(component, turn, sender, entry, theirs)
+    elif theirs in ENDED and entry.epoch >= component.epoch:
+        _heard_end(component, turn, sender, entry, theirs)
+    elif entry.epoch > component.epoch:
+        _heard_later_epoch(component, turn, sender, entry)
+
+
+def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
+    if component.holding:
+        if _stronger(component, turn, sender, entry, theirs):
+            lose(component, turn, sender, entry)
+        return
+    if entry.epoch < component.epoch or (component.state in ENDED and entry.epoch == component.epoch):
+        return
+    if entry.epoch > component.epoch or component.primary != sender:
+        if not _may_switch(component, turn, sender, entry):
+            return
+        _accept(component, turn, sender, entry.epoch)
+    if component.state is not State.STANDBY and component.state is not State.STOPPING:
+        component.move(Cause.FOLLOW)
+    component.trusted = entry.standby == turn.me
+    admit(component, turn, sender)
+    if entry.flags & UNPROTECTED and component.held:
+        _drop(component, turn, f"{sender} protects it no longer")
+    if entry.yields_to == turn.me and component.state is State.STANDBY and component.newest == entry.position:
+        claim(component, turn, component.newest, f"{sender} hands it over")
+
+
+def _stronger(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> bool:
+    """Whether their hold on the component beats ours."""
+    their_claim = (entry.epoch, theirs is not State.CLAIMING)
+    our_claim = (component.epoch, component.state is not State.CLAIMING)
+    return their_claim > our_claim or (their_claim == our_claim and weight(sender) < weight(turn.me))
+
+
+def _may_switch(component: Component, turn: Turn, sender: str, entry: Entry) -> bool:
+    """One consent an epoch, except that the lesser name's claim overtakes."""
+    if entry.epoch > component.epoch or component.primary in ("", turn.me) or turn.dead(component.primary):
+        return True
+    return weight(sender) < weight(component.primary)
+
+
+def _accept(component: Component, turn: Turn, primary: str, epoch: int) -> None:
+    component.epoch, component.primary = epoch, primary
+    component.entrusted, component.trusted = (), False
+    component.unable, component.tries, component.retry_ns = "", 0, 0
+    component.needs_base = False
+    turn.say(component, f"{turn.me} accepts {primary} as primary of epoch {epoch}")
+
+
+def lose(component: Component, turn: Turn, winner: str, entry: Entry) -> None:
+    """Our primacy is over: keep our copy's state aside, stop it, and follow."""
+    handing = component.handing
+    tidy = handing is not None and handing.yielded and winner == handing.to
+    if handing is not None:
+        turn.order(acts.Answer(handing.request, tidy, f"{winner} {'takes' if tidy else 'has claimed'} {component.name}"))
+    if component.state is State.CLAIMING:
+        component.move(Cause.YIELD_CLAIM)
+        refuse_request(component, turn, f"{winner} runs {component.name} already")
+    else:
+        if component.state in _RUNS_HERE and not tidy:
+            reason = f"{winner} holds epoch {entry.epoch}, this copy had epoch {component.epoch}"
+            turn.order(acts.KeepAside(component.name, component.epoch, reason))
+            turn.say(component, f"{turn.me} is told stale: {reason}; its state is kept aside")
+        component.move(Cause.OUTBID)
+        component.until_ns = turn.now_ns + turn.config.retry_ms * MS
+        turn.order(acts.Stop(component.name, entry.epoch))
+    component.handing = component.flight = None
+    component.standby, component.lease_ns, component.told_ns = "", 0, 0
+    _accept(component, turn, winner, entry.epoch)
+    component.trusted = entry.standby == turn.me
+    admit(component, turn, winner)
+
+
+def refuse_request(component: Component, turn: Turn, sentence: str) -> None:
+    """Answer whoever waits for this component to start."""
+    if component.request:
+        turn.order(acts.Answer(component.request, False, sentence))
+        component.request = 0
+
+
+def _heard_end(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
+    if component.holding:
+        if entry.epoch > component.epoch:
+            lose(component, turn, sender, entry)
+        return
+    if component.state is State.STOPPING or (component.state in ENDED and entry.epoch == component.epoch):
+        return
+    component.epoch, component.primary, component.status = entry.epoch, entry.primary, entry.status
+    component.entrusted, component.trusted = (), False
+    component.reason = f"as {sender} says" if theirs is State.FAILED else ""
+    component.move(_END_CAUSES[theirs])
+    if theirs is State.RELEASED:
+        _drop(component, turn, f"{sender} released it")
+    turn.say(component, f"{turn.me} records that it is {theirs}, as {sender} says")
+
+
+def _heard_later_epoch(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
+    """Somebody who does not run it knows a later epoch than ours."""
+    elsewhere = entry.primary not in ("", turn.me, sender)
+    if component.state is State.CLAIMING:
+        component.epoch = entry.epoch + 1
+        component.claim_counter = turn.next_counter
+        component.until_ns = turn.now_ns + turn.config.loyalty_ns
+        open_line(component, turn)
+    elif component.holding and elsewhere:
+        lose(component, turn, entry.primary, entry)
+    elif component.state in (State.PRIMARY, State.FROZEN):
+        renew(component, turn, entry.epoch)
+    elif not component.holding:
+        component.epoch, component.trusted = entry.epoch, False
+        component.primary = entry.primary
+        if entry.primary == turn.me:
+            component.entrusted = (sender,)
+        if component.state is State.ABSENT and entry.flags & HOLDS:
+            component.move(Cause.FOLLOW)
+        if component.state in ENDED:
+            component.move(Cause.FOLLOW)
+
+
+def admit(component: Component, turn: Turn, sender: str) -> None:
+    """Take snapshots from this robot, of the present epoch, and from nobody else."""
+    if component.admitted != (sender, component.epoch):
+        component.admitted = (sender, component.epoch)
+        turn.order(acts.Admit(component.name, component.epoch, sender))
+
+
+def _drop(component: Component, turn: Turn, why: str) -> None:
+    component.held.clear()
+    turn.order(acts.Drop(component.name, component.epoch))
+    turn.say(component, f"{turn.me} forgets its checkpoints: {why}")
+
+
+def supersede(component: Component, turn: Turn, position: Position) -> None:
+    """A position of the winning line is here: later ones of lines that lost are never resumed from."""
+    beaten = tuple(sorted({held.generation for held in component.held if held.generation > position.generation}))
+    if beaten:
+        component.held = [held for held in component.held if held.generation not in beaten]
+        component.lost = (*component.lost, *beaten)[-LOST_MAX:]
+        turn.order(acts.Forget(component.name, component.epoch, beaten))

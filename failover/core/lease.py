@@ -1,0 +1,79 @@
+"""How long a primary may act, and when it stands still.
+
+Invariant: while anybody else may start the component, it runs here only before ``lease_ns``, and the guard knows that instant.
+"""
+
+from __future__ import annotations
+
+from failover.core import acts
+from failover.core.component import Cause, Component, Turn
+from failover.core.election import grants
+from failover.core.types import State
+
+TELL_SHARE = 4
+"""The guard is told of a new lease when it is longer by this part of a lease: not for every beat."""
+
+_UNDER_LEASE = frozenset({State.PRIMARY, State.STARTING, State.TAKING_OVER, State.RECOVERING})
+
+
+def watch(component: Component, turn: Turn) -> None:
+    """Count the lease anew; hold the component still when it is over, let it go on when it is back."""
+    _count(component, turn)
+    if component.state is State.PRIMARY and not _running_is_safe(component, turn):
+        component.move(Cause.LEASE_OVER)
+        turn.order(acts.Freeze(component.name, component.epoch))
+        turn.say(component, f"{turn.me} {Cause.LEASE_OVER}")
+    elif component.state is State.FROZEN and _may_thaw(component, turn):
+        component.move(Cause.LEASE_BACK)
+        component.told_ns = component.lease_ns
+        component.due_ns = turn.now_ns
+        turn.order(acts.Thaw(component.name, component.epoch, component.lease_ns))
+        turn.say(component, f"{turn.me} lets it run: it may act")
+    elif component.state in _UNDER_LEASE:
+        _tell(component, turn)
+
+
+def entrust(component: Component, turn: Turn, robot: str) -> bool:
+    """Name the robot that may take over; from now on this robot acts on leases. False when it does not hear us now."""
+    if robot in component.entrusted:
+        return True
+    peer = turn.team.peers.get(robot)
+    if peer is None or not grants(component, peer, turn.me) or turn.team.lease_ns(robot) <= turn.now_ns:
+        return False
+    component.entrusted = (*component.entrusted, robot)
+    component.lease_ns = component.told_ns = 0
+    watch(component, turn)
+    return True
+
+
+def _count(component: Component, turn: Turn) -> None:
+    if not component.entrusted:
+        component.lease_ns = 0
+    elif component.freezes:
+        granted = (_granted_ns(component, turn, robot) for robot in component.entrusted)
+        component.lease_ns = max(component.lease_ns, min(granted))
+    else:
+        component.lease_ns = turn.now_ns + turn.config.lease_ns
+
+
+def _granted_ns(component: Component, turn: Turn, robot: str) -> int:
+    peer = turn.team.peers.get(robot)
+    return turn.team.lease_ns(robot) if peer is not None and grants(component, peer, turn.me) else 0
+
+
+def _running_is_safe(component: Component, turn: Turn) -> bool:
+    return not component.entrusted or turn.now_ns < component.lease_ns
+
+
+def _may_thaw(component: Component, turn: Turn) -> bool:
+    """Under ``freeze`` a lease; otherwise (after a pause of ours) everybody entrusted agrees, or is dead."""
+    if component.freezes:
+        return _running_is_safe(component, turn)
+    return all(turn.dead(robot) or grants(component, turn.team.peers[robot], turn.me) for robot in component.entrusted)
+
+
+def _tell(component: Component, turn: Turn) -> None:
+    grown = component.lease_ns - component.told_ns >= turn.config.lease_ns // TELL_SHARE
+    if grown or (component.told_ns and not component.lease_ns):
+        component.told_ns = component.lease_ns
+        turn.order(acts.SetLease(component.name, component.epoch, component.lease_ns))
