@@ -101,6 +101,7 @@ class Config:
 class Settings:
     """Everything an agent is started with: the file, the team, and this robot's secret key ("" when insecure)."""
 
+    path: Path
     config: Config
     team: Team
     secret_key: str
@@ -137,7 +138,7 @@ def load(path: Path) -> Settings:
     except FailoverError as error:
         raise ConfigError(str(error)) from error
     _check_keys(path, config, members)
-    return Settings(config, members, secret)
+    return Settings(path, config, members, secret)
 
 
 def _check_keys(path: Path, config: Config, members: Team) -> None:

@@ -1,9 +1,10 @@
 """Persist → send → act, without letting a slow disk delay a beat.
 
-While a ballot is on its way to the disk, nothing that depends on it leaves: acts wait, and so does what beats say. But "I live"
-depends on nothing: a beat that is due meanwhile goes out stripped of its entries, with the ``settled`` of the last durable one, so that
-peers go on knowing exactly what they were told before. Echoes extend the leases of those who hear them; one is withheld
-from a robot whose primacy the waiting ballot gives up, because the vote that follows counts on that lease running out.
+While a ballot is on its way to the disk, nothing that depends on it leaves: acts wait, and so does what beats say. But
+"I live" depends on nothing: a beat that is due meanwhile goes out stripped of its entries, with the ``settled`` of the
+last durable one, so that peers go on knowing exactly what they were told before. Echoes extend the leases of those who
+hear them; one is withheld from a robot whose primacy the waiting ballot gives up, because the vote that follows counts on
+that lease running out.
 """
 
 from __future__ import annotations

@@ -1,0 +1,174 @@
+"""The lanes process, seen from the heart: started, spoken to without ever waiting for it, buried and replaced."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Iterator
+from typing import Final
+
+from agent import door
+from agent.config import Settings
+from agent.door import Inventory, ToHeart, ToLanes
+from agent.errors import AgentError
+from checkpoint.channel import Channel, ChannelError, pair
+from failover.core import acts, events
+from failover.core.acts import Act
+from failover.core.events import Event
+
+WAITING_LIMIT: Final = 4_096
+"""Messages that wait for a lanes process which does not read; beyond it, it is hung and is replaced."""
+
+MESSAGES_A_TURN: Final = 64
+"""Taken from the lanes in one turn of the heart."""
+
+END_PATIENCE_S: Final = 5.0
+
+LOST: Final = "the agent's lanes process was restarted in the middle of it"
+
+log = logging.getLogger("failover.heart")
+
+
+class LanesProcess:
+    """One child process after another, and what the core still expects of it."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._child: subprocess.Popen[bytes] | None = None
+        self._channel: Channel[ToHeart] | None = None
+        self._waiting: deque[ToLanes] = deque()
+        self._expected: dict[tuple[str, str], Act] = {}
+        self._admitted: dict[str, acts.Admit] = {}
+
+    def start(self) -> None:
+        """Start the process; it begins by sending its inventory.
+
+        Raises:
+            AgentError: it cannot be started.
+        """
+        ours, theirs = pair()
+        ours.setblocking(False)
+        command = [sys.executable, "-m", "agent.lanes", str(self._settings.path), str(theirs.fileno())]
+        try:
+            self._child = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL)
+        except OSError as error:
+            raise AgentError(
+                f"cannot start the lanes process: {error.strerror}; is memory or the process limit used up?"
+            ) from error
+        finally:
+            theirs.close()
+        self._channel = Channel(ours, ToHeart)
+        self._waiting.clear()
+
+    def fileno(self) -> int:
+        """Readable when `receive` has something."""
+        assert self._channel is not None, "start comes first"
+        return self._channel.fileno()
+
+    def send(self, message: ToLanes) -> None:
+        """Queue a message; it leaves in `flush`, as soon as the process reads."""
+        if len(self._waiting) >= WAITING_LIMIT:
+            log.error("the lanes process does not read; it is ended")
+            self._kill()
+            self._waiting.clear()
+        self._waiting.append(message)
+
+    def order(self, act: Act) -> None:
+        """Pass an act on, and remember it until it is answered."""
+        if isinstance(act, acts.Admit):
+            self._admitted[act.component] = act
+        if isinstance(act, acts.Start | acts.Restore | acts.Capture | acts.Ship | acts.Stop | acts.End):
+            self._expected[type(act).__name__, act.component] = act
+        self.send(door.order(act))
+
+    def flush(self) -> None:
+        """Send what waits, as much as goes without waiting."""
+        assert self._channel is not None, "start comes first"
+        while self._waiting:
+            try:
+                self._channel.send(self._waiting[0])
+            except ChannelError:
+                return  # full: the next turn; closed: `receive` says so
+            self._waiting.popleft()
+
+    def receive(self) -> Iterator[ToHeart]:
+        """What has come, without waiting.
+
+        Raises:
+            ChannelError: it has gone, or sent nonsense.
+        """
+        assert self._channel is not None, "start comes first"
+        for _ in range(MESSAGES_A_TURN):
+            try:
+                message, _descriptors = self._channel.receive()
+            except BlockingIOError:
+                return
+            yield message
+
+    def answered(self, event: Event) -> None:
+        """An event came: whatever it answers is expected no longer."""
+        for kind in ANSWERS.get(type(event), ()):
+            self._expected.pop((kind, event.component), None)  # type: ignore[union-attr]
+
+    def lost(self, inventory: Inventory) -> list[Event]:
+        """After a restart: what the core must hear, and what the new process must be told again."""
+        for admit in self._admitted.values():
+            self.send(door.order(admit))
+        expected, self._expected = self._expected, {}
+        told: list[Event] = []
+        for act in expected.values():
+            if isinstance(act, acts.Stop | acts.End):
+                self.order(act)
+            else:
+                told.append(_failure(act))
+        told += [events.Exited(found.component, found.epoch, found.status) for found in inventory.found if not found.running]
+        return told
+
+    def bury(self) -> None:
+        """Make sure that it is gone, and forget the channel."""
+        self._kill()
+        if self._channel is not None:
+            self._channel.close()
+        self._channel = None
+
+    def wait(self) -> None:
+        """Let it end by itself, for a while."""
+        if self._child is None:
+            return
+        try:
+            self._child.wait(END_PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            log.warning("the lanes process did not end in %.0f s; it is ended", END_PATIENCE_S)
+        self.bury()
+
+    def _kill(self) -> None:
+        if self._child is not None and self._child.poll() is None:
+            os.kill(self._child.pid, signal.SIGKILL)
+            self._child.wait()
+
+
+ANSWERS: Final[dict[type[Event], tuple[str, ...]]] = {
+    events.Started: ("Start",),
+    events.Restored: ("Restore",),
+    events.ActFailed: ("Start", "Restore"),
+    events.Captured: ("Capture",),
+    events.CaptureFailed: ("Capture",),
+    events.ShipEnded: ("Ship",),
+    events.Stopped: ("Stop", "Start", "Restore", "Capture", "End"),
+    events.Exited: ("End", "Capture"),
+}
+
+
+def _failure(act: Act) -> Event:
+    match act:
+        case acts.Capture():
+            return events.CaptureFailed(act.component, act.epoch, LOST, needs_base=True)
+        case acts.Ship():
+            return events.ShipEnded(act.component, act.epoch, act.position, act.to, False, LOST)
+        case acts.Start() | acts.Restore():
+            return events.ActFailed(act.component, act.epoch, LOST)
+    raise AssertionError(f"{type(act).__name__} has no failure")

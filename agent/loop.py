@@ -1,0 +1,262 @@
+"""The heart: the loop that beats and decides. Start reading the agent here.
+
+One thread, one process, nothing else in it. A turn is: sleep until something comes or the core's deadline, read the clock once,
+step the node, obey what it says: persist → send → act. Everything slow lives elsewhere: the disk in a thread
+(`agent.persister`), programs, snapshots and people in the lanes process. The same turn feeds systemd's watchdog, so the
+watchdog proves this loop and nothing beside it.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import os
+import select
+import signal
+import socket
+from collections import Counter
+from typing import Final
+
+from agent import ballot as ballot_file
+from agent import clock, door
+from agent.beats import BeatLane
+from agent.config import Settings
+from agent.door import BeatCounts, Farewell, Happened, HearKey, Inventory, Life, SpeakKey, ToHeart, ToLanes, Told
+from agent.errors import AgentError
+from agent.lanes_process import LanesProcess
+from agent.outbox import Due, Outbox
+from agent.persister import Persister
+from agent.rules import node_config
+from agent.systemd import Notifier, watchdog_period_ns
+from checkpoint.channel import ChannelClosedError, ChannelError
+from failover.core import ballot as core_ballot
+from failover.core import wire
+from failover.core.acts import Act
+from failover.core.events import Event, Received, Tick
+from failover.core.messages import Beat
+from failover.core.node import Node
+from failover.core.types import Ballot
+
+NANOSECONDS_A_SECOND: Final = 1_000_000_000
+SLEEP_LIMIT_S: Final = 0.5
+"""The loop turns at least so often, whatever the core's deadline."""
+
+PERSIST_PATIENCE_S: Final = 2.0
+"""How long an orderly end waits for the disk."""
+
+STARTED: Final = "protecting this robot and its neighbours"
+
+log = logging.getLogger("failover.heart")
+
+
+class Heart:
+    """One life of one robot's agent."""
+
+    def __init__(self, settings: Settings, ballot: ballot_file.Ballot, notifier: Notifier) -> None:
+        """Bind the beat sockets; nothing runs yet.
+
+        Raises:
+            LaneError: a beat address cannot be had.
+        """
+        self._settings = settings
+        self._me = settings.config.robot
+        self._ballot = ballot
+        self._notifier = notifier
+        self._beats = BeatLane(settings.me, settings.peers)
+        self._hearing = wire.Receiver(settings.team.team)
+        self._keys: dict[str, bytes] = {}
+        self._lanes = LanesProcess(settings)
+        self._node: Node | None = None
+        durable = core_ballot.decode(ballot.record.core)
+        self._outbox = Outbox(durable, settings.config.beat_ms * NANOSECONDS_A_SECOND // 1_000)
+        self._persister = Persister(lambda wanted: ballot.keep(core_ballot.encode(wanted)))
+        self._poll = select.epoll()
+        self._wake, self._signalled = socket.socketpair(
+            socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
+        )
+        self._ending = False
+        self._refused: Counter[str] = Counter()
+        self._sent = self._heard = self._late_us_max = 0
+        self._notes: tuple[str, ...] = ()
+
+    def run(self) -> None:
+        """Beat until SIGTERM or SIGINT. Components live on.
+
+        Raises:
+            AgentError: the lanes cannot be started at all.
+        """
+        self._begin()
+        watchdog_ns = watchdog_period_ns()
+        fed_ns = clock.now_ns()
+        while not self._ending:
+            self._turn()
+            now_ns = clock.now_ns()
+            if watchdog_ns and now_ns - fed_ns >= watchdog_ns and self._node is not None:
+                self._notifier.alive()
+                fed_ns = now_ns
+        self._end()
+
+    def _begin(self) -> None:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: None)
+        signal.set_wakeup_fd(self._signalled.fileno(), warn_on_full_buffer=False)
+        for descriptor in (*self._beats.filenos(), self._persister.fileno(), self._wake.fileno()):
+            self._poll.register(descriptor, select.EPOLLIN)
+        self._start_lanes()
+        if self._settings.config.realtime:
+            self._notes = clock.become_realtime()
+        else:
+            self._notes = ("beats run at normal priority, as the configuration says",)
+        gc.collect()
+        gc.freeze()
+        gc.disable()  # what a turn makes is freed by reference counts; a collection would be a pause of milliseconds
+
+    def _start_lanes(self) -> None:
+        """Start the other process; the node is born, or told what was lost, when its inventory comes."""
+        self._lanes.start()
+        self._poll.register(self._lanes.fileno(), select.EPOLLIN | select.EPOLLHUP)
+        self._lanes.send(Life(self._ballot.record.boot, os.getpid(), self._notes))
+
+    def _turn(self) -> None:
+        """Sleep, then one round of everything that came, then the core's deadline."""
+        self._lanes.flush()
+        for descriptor, _ in self._poll.poll(self._pause_s()):
+            if descriptor in self._beats.filenos():
+                self._hear(descriptor)
+            elif descriptor == self._lanes.fileno():
+                self._listen_to_lanes()
+            elif descriptor == self._persister.fileno():
+                self._note_persisted()
+            elif descriptor == self._wake.fileno():
+                self._ending = True
+        if self._node is not None:
+            late_ns = clock.now_ns() - self._node.next_deadline_ns()
+            if late_ns >= 0:
+                self._late_us_max = max(self._late_us_max, late_ns // 1_000)
+                self._step(Tick())
+
+    def _pause_s(self) -> float:
+        if self._node is None:
+            return SLEEP_LIMIT_S
+        left_ns = self._node.next_deadline_ns() - clock.now_ns()
+        return min(max(left_ns / NANOSECONDS_A_SECOND, 0.0), SLEEP_LIMIT_S)
+
+    # --- events in ---
+
+    def _step(self, event: Event) -> None:
+        if self._node is not None:
+            now_ns = clock.now_ns()
+            self._obey(self._outbox.take(self._node.step(event, now_ns), now_ns))
+
+    def _hear(self, descriptor: int) -> None:
+        for frame in self._beats.receive(descriptor):
+            opened = self._hearing.open(frame)
+            if isinstance(opened, Beat):
+                self._heard += 1
+                self._step(Received(opened))
+            else:
+                self._refused[str(opened.reason)] += 1
+
+    def _note_persisted(self) -> None:
+        for number, ballot in self._persister.finished():
+            self._obey(self._outbox.kept(number, ballot, clock.now_ns()))
+
+    def _listen_to_lanes(self) -> None:
+        try:
+            for message in self._lanes.receive():
+                self._heed(message)
+        except (ChannelClosedError, ChannelError) as error:
+            self._replace_lanes(str(error))
+
+    def _heed(self, message: ToHeart) -> None:
+        match message:
+            case Happened():
+                event = door.event_of(message)
+                self._lanes.answered(event)
+                self._step(event)
+            case Inventory():
+                self._take_inventory(message)
+            case SpeakKey(peer, key):
+                self._keys[peer] = key
+            case HearKey(peer, key):
+                self._hearing.accept(peer, key)
+            case _:
+                self._lanes.send(self._told(message))
+
+    def _take_inventory(self, inventory: Inventory) -> None:
+        """The node is born with what was found; a node that lives already is told what the old lanes took with them."""
+        if self._node is not None:
+            for event in self._lanes.lost(inventory):
+                self._step(event)
+            return
+        boot = self._ballot.record.boot
+        config = node_config(self._settings)
+        durable = self._outbox.durable
+        self._node = Node(config, boot, durable, clock.now_ns(), inventory.held, inventory.found)
+        self._notifier.ready(STARTED)
+        log.info("robot %s beats, life %d", self._me, boot)
+
+    def _replace_lanes(self, why: str) -> None:
+        log.error("the lanes process has gone (%s); guards and programs live on, another one starts", why)
+        self._poll.unregister(self._lanes.fileno())
+        self._lanes.bury()
+        self._start_lanes()
+
+    # --- obligations out ---
+
+    def _obey(self, due: Due) -> None:
+        """Persist, send, act: what is due of each."""
+        if due.persist is not None:
+            self._persister.submit(*due.persist)
+        for beat in due.beats:
+            for peer, key in self._keys.items():
+                self._beats.send(peer, wire.seal(beat, self._settings.team.team, key))
+            self._sent += 1
+        for act in due.acts:
+            self._act(act)
+
+    def _act(self, act: Act) -> None:
+        self._lanes.order(act)
+
+    def _told(self, question: door.Ask) -> ToLanes:
+        now_ns = clock.now_ns()
+        counts = BeatCounts(self._sent, self._heard, self._beats.unsent, dict(self._refused), self._late_us_max)
+        trouble = self._persister.trouble
+        if self._node is None:
+            return Told(question.number, now_ns, beats=counts, ballot_trouble=trouble)
+        if question.what == "why":
+            return Told(question.number, now_ns, story=self._node.why(question.component), beats=counts, ballot_trouble=trouble)
+        return Told(question.number, now_ns, self._node.status(now_ns), beats=counts, ballot_trouble=trouble)
+
+    def _end(self) -> None:
+        self._notifier.stopping()
+        self._lanes.send(Farewell())
+        self._lanes.flush()
+        self._persister.close(PERSIST_PATIENCE_S)
+        self._lanes.wait()
+        self._beats.close()
+        signal.set_wakeup_fd(-1)
+        log.info("robot %s ends; its components live on", self._me)
+
+
+def beat(settings: Settings, notifier: Notifier) -> None:
+    """Live one life: from the ballot to the farewell.
+
+    Raises:
+        AgentError: what is needed to begin cannot be had.
+    """
+    from pathlib import Path
+
+    directory = Path(settings.config.state_directory)
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise AgentError(
+            f"cannot use the state directory {directory}: {error.strerror}; name another in state_directory"
+        ) from error
+    ballot = ballot_file.Ballot(directory, settings.config.robot)
+    ballot.open()
+    Heart(settings, ballot, notifier).run()
+
+
+__all__ = ["Ballot", "Heart", "beat"]

@@ -1,0 +1,37 @@
+"""From the operator's configuration to the core's: the two speak the same words in different types."""
+
+from __future__ import annotations
+
+from agent.config import ComponentConfig, Config, Settings
+from failover.core import types
+from failover.core.types import OnCrash, OnLoss, OnUnsupported, Rules, WhenAlone
+
+ON_CRASH = {"resume": OnCrash.RESTORE, "leave": OnCrash.STOP}
+
+
+def node_config(settings: Settings) -> types.Config:
+    """What the node is told at birth.
+
+    Raises:
+        RulesError: the values contradict each other.
+    """
+    config = settings.config
+    return types.Config(
+        robot=config.robot,
+        peers=tuple(sorted(settings.peers)),
+        beat_ms=config.beat_ms,
+        lease_ms=config.lease_ms,
+    )
+
+
+def rules_for(config: Config, component: ComponentConfig) -> Rules:
+    """The rules of one component: its own table, the agent's defaults behind it."""
+    return Rules(
+        period_ms=component.snapshot_period_ms or config.snapshot_period_ms,
+        on_loss=OnLoss(component.on_loss),
+        on_crash=ON_CRASH[component.on_crash],
+        when_alone=WhenAlone(config.when_alone),
+        on_unsupported=OnUnsupported(component.on_unsupported),
+        prefer=component.prefer,
+        standby=component.standby,
+    )
