@@ -1,0 +1,77 @@
+"""The planned move: hold the program still, ship the last delta, let the other robot claim. No checkpoint is older than the program."""
+
+from __future__ import annotations
+
+from failover.core import acts, replication
+from failover.core.component import Cause, Component, Handing, Turn
+from failover.core.election import claim, renew, vacant
+from failover.core.types import MS, State
+
+
+def begin(component: Component, turn: Turn, to: str, request: int) -> None:
+    """Start a handover, or say why not. ``request`` 0: nobody waits for an answer."""
+    target = to or component.standby
+    refusal = _refusal(component, turn, target)
+    if refusal:
+        _answer(turn, request, False, refusal)
+        return
+    component.move(Cause.HAND_OVER)
+    component.handing = Handing(target, request, turn.now_ns + turn.config.handover_ms * MS)
+    turn.say(component, f"{turn.me} begins to hand it over to {target}")
+
+
+def resume_here(component: Component, turn: Turn, request: int) -> None:
+    """By order: run what nobody runs, from the checkpoint that this robot holds."""
+    if component.newest is None:
+        _answer(turn, request, False, f"{turn.me} holds no checkpoint of {component.name}")
+    elif not vacant(component, turn):
+        _answer(turn, request, False, f"{component.name} belongs to {component.primary}; ask there")
+    else:
+        claim(component, turn, component.newest, "an operator asked for it")
+        component.request = request
+
+
+def advance(component: Component, turn: Turn) -> None:
+    """The next step of a handover: last delta, then the word; or call it off."""
+    handing = component.handing
+    if handing is None or component.state is not State.HANDING_OVER:
+        return
+    if turn.now_ns >= handing.until_ns or (not turn.alive(handing.to) and not handing.yielded):
+        _call_off(component, turn, handing)
+    elif not handing.yielded:
+        replication.capture(component, turn, final=True)
+
+
+def last_delta_safe(component: Component, turn: Turn) -> None:
+    """The last delta is acknowledged: the other robot may claim."""
+    if component.handing is not None and component.state is State.HANDING_OVER:
+        component.handing.yielded = True
+        turn.say(component, f"{turn.me} lets {component.handing.to} claim it")
+
+
+def _call_off(component: Component, turn: Turn, handing: Handing) -> None:
+    """Back to running; if the other may have claimed, under an epoch above its claim and with its consent."""
+    if handing.yielded:
+        renew(component, turn, component.epoch + 1)
+    component.move(Cause.CALL_OFF)
+    component.handing = component.flight = None
+    turn.order(acts.Freeze(component.name, component.epoch))
+    _answer(turn, handing.request, False, f"{handing.to} did not take {component.name} in time; it stays at {turn.me}")
+    turn.say(component, f"the handover to {handing.to} is called off")
+
+
+def _refusal(component: Component, turn: Turn, target: str) -> str:
+    if component.state is not State.PRIMARY:
+        return f"{component.name} is {component.state} at {turn.me}; only a running primary can be handed over"
+    if not target or target == turn.me:
+        return f"{component.name} runs at {turn.me} and has no standby to go to; name another robot, or wait for one"
+    if target != component.standby or not turn.alive(target):
+        return f"{target} is not its living standby; set standby = {target!r} in its rules and wait until it is protected there"
+    if component.acked is None or component.parent is None:
+        return f"{target} has no checkpoint of {component.name} yet; try again when status says protected"
+    return ""
+
+
+def _answer(turn: Turn, request: int, ok: bool, sentence: str) -> None:
+    if request:
+        turn.order(acts.Answer(request, ok, sentence))

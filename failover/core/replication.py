@@ -1,0 +1,207 @@
+"""How a component's state gets to its standby and is acknowledged there.
+
+Invariants: one snapshot in flight per component (a slower link or standby means fewer snapshots, not longer queues); a position is
+acknowledged to the keeper only when it is safe elsewhere, or nobody else is there; a delta counts from what the standby has.
+"""
+
+from __future__ import annotations
+
+from checkpoint.model import Position
+from failover.core import acts, lease
+from failover.core.component import Component, Flight, Turn
+from failover.core.election import grants, supersede
+from failover.core.events import Captured, CaptureFailed, ShipEnded, Stored, StoreFailed
+from failover.core.messages import NEEDS_BASE, Entry
+from failover.core.names import weight
+from failover.core.types import HISTORY_MAX, MS, OnUnsupported, State
+
+
+def choose_standby(component: Component, turn: Turn) -> None:
+    """The operator's choice, else the least loaded living robot, else the lesser name. One that is dead is kept under ``freeze``."""
+    if component.standby and (turn.alive(component.standby) or component.freezes):
+        return
+    wanted = component.rules.standby
+    able = [
+        peer
+        for peer in turn.team.living(turn.now_ns)
+        if grants(component, peer, turn.me) and (not wanted or peer.robot == wanted)
+    ]
+    if able:
+        component.standby = min(able, key=lambda peer: (peer.load, weight(peer.robot))).robot
+        component.due_ns = turn.now_ns
+        turn.say(component, f"{component.standby} is its standby")
+
+
+def capture(component: Component, turn: Turn, final: bool = False) -> None:
+    """Order the next snapshot when it is due and none is in flight."""
+    if component.flight is not None or component.unprotected or (turn.now_ns < component.due_ns and not final):
+        return
+    to = component.standby if turn.alive(component.standby) else ""
+    base = component.base_wanted or component.parent is None
+    if to:
+        entry = _standby_entry(component, turn)
+        if entry is None:
+            return
+        base = base or entry.position != component.parent or bool(entry.flags & NEEDS_BASE)
+    component.sequence += 1
+    component.flight = Flight(turn.now_ns, turn.now_ns + turn.config.ship_ms * MS, base, to, final=final)
+    turn.order(acts.Capture(component.name, component.epoch, base, component.generation, component.sequence, final))
+
+
+def captured(component: Component, turn: Turn, event: Captured) -> None:
+    """The snapshot is in our own store: send it to the standby, or, alone, count from it."""
+    flight = component.flight
+    if flight is None or flight.position is not None or not _current(component, event.epoch, event.position):
+        return
+    component.hold(event.position)
+    component.freeze_us, component.degraded = event.freeze_us, ""
+    component.base_wanted = False
+    flight.position, flight.parent = event.position, event.parent
+    _tell_prune(component, turn)
+    to = component.standby if turn.alive(component.standby) else ""
+    if not to:
+        _safe(component, turn, event.position)
+        return
+    entry = _standby_entry(component, turn)
+    fits = event.parent is None or (entry is not None and entry.position == event.parent)
+    if not fits or not lease.entrust(component, turn, to) or component.spec is None:
+        _give_up(component, turn)
+        return
+    flight.to = to
+    turn.order(acts.Ship(component.name, component.epoch, event.position, event.parent, to, component.spec))
+
+
+def capture_failed(component: Component, turn: Turn, event: CaptureFailed) -> None:
+    """Skip this one: the program runs on, the last checkpoint stays; say since when it is only that."""
+    flight = component.flight
+    if flight is None or flight.position is not None or event.epoch != component.epoch:
+        return
+    component.flight = None
+    component.due_ns = turn.now_ns + turn.config.retry_ms * MS
+    component.base_wanted = component.base_wanted or event.needs_base
+    if component.degraded != event.message:
+        turn.say(component, f"not captured: {event.message}")
+    component.degraded = event.message
+    if event.unsupported and component.rules.on_unsupported is OnUnsupported.STOP_PROTECTING:
+        component.unprotected = True
+        turn.say(component, "it is protected no longer: on_unsupported = stop_protecting")
+
+
+def ship_ended(component: Component, turn: Turn, event: ShipEnded) -> None:
+    """All bytes are over (the acknowledgement follows soon, or never), or the transfer failed."""
+    flight = component.flight
+    if flight is None or flight.position != event.position or event.epoch != component.epoch:
+        return
+    if event.ok:
+        flight.until_ns = min(flight.until_ns, turn.now_ns + turn.config.retry_ms * MS)
+    else:
+        _give_up(component, turn, event.reason)
+
+
+def acknowledged(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
+    """The standby's word on what it holds."""
+    flight = component.flight
+    if flight is None or flight.position is None or flight.to != sender or not _follows_us(component, turn, entry):
+        return
+    if entry.position == flight.position:
+        _safe(component, turn, flight.position)
+    elif entry.flags & NEEDS_BASE and flight.parent is not None:
+        turn.order(acts.CancelShip(component.name, component.epoch, flight.position, sender))
+        _give_up(component, turn, f"{sender} needs a base")
+        component.due_ns = turn.now_ns
+
+
+def overdue(component: Component, turn: Turn) -> None:
+    """Give up a snapshot whose standby died or that has been under way for too long."""
+    flight = component.flight
+    if flight is None:
+        return
+    lost = bool(flight.to) and flight.position is not None and not turn.alive(flight.to)
+    if lost or turn.now_ns >= flight.until_ns:
+        if flight.to and flight.position is not None:
+            turn.order(acts.CancelShip(component.name, component.epoch, flight.position, flight.to))
+        _give_up(component, turn, f"{flight.to or turn.me} did not take it")
+
+
+def _safe(component: Component, turn: Turn, position: Position) -> None:
+    """The position is a checkpoint: the next delta counts from it."""
+    flight = component.flight
+    assert flight is not None
+    alone = not flight.to or not turn.alive(component.standby)
+    turn.order(acts.Acknowledge(component.name, component.epoch, position))
+    component.parent = component.acked = position
+    component.acked_ns = flight.started_ns
+    period_ms = turn.config.alone_period_ms if alone else component.rules.period_ms
+    component.due_ns = max(flight.started_ns + period_ms * MS, turn.now_ns)
+    component.flight = None
+
+
+def _give_up(component: Component, turn: Turn, why: str = "") -> None:
+    """Nothing is forgotten: the keeper's next delta counts from the same position."""
+    component.flight = None
+    component.due_ns = turn.now_ns + turn.config.retry_ms * MS
+    if why:
+        turn.say(component, f"a snapshot did not arrive: {why}")
+
+
+def _standby_entry(component: Component, turn: Turn) -> Entry | None:
+    peer = turn.team.peers.get(component.standby)
+    entry = peer.entry(component.name) if peer else None
+    return entry if entry is not None and _follows_us(component, turn, entry) else None
+
+
+def _follows_us(component: Component, turn: Turn, entry: Entry) -> bool:
+    return (entry.epoch, entry.primary) == (component.epoch, turn.me)
+
+
+def _current(component: Component, epoch: int, position: Position) -> bool:
+    return epoch == component.epoch and (position.generation, position.sequence) == (component.generation, component.sequence)
+
+
+def _tell_prune(component: Component, turn: Turn) -> None:
+    if component.sequence % HISTORY_MAX == 0:
+        turn.order(acts.Prune(component.name, component.epoch, component.held[0]))
+
+
+# The standby's side
+
+
+def stored(component: Component, turn: Turn, event: Stored) -> None:
+    """A snapshot of the primary's is durable here: our next beat acknowledges it."""
+    if (event.sender, event.epoch) != component.admitted or event.epoch != component.epoch or component.holding:
+        return
+    supersede(component, turn, event.position)
+    component.hold(event.position)
+    component.spec = event.spec
+    component.needs_base, component.unable, component.tries = False, "", 0
+    if event.position.sequence % HISTORY_MAX == 0:
+        turn.order(acts.Prune(component.name, component.epoch, component.held[0]))
+
+
+def store_failed(component: Component, turn: Turn, event: StoreFailed) -> None:
+    """A snapshot did not fit or could not be written; what we hold stays."""
+    if (event.sender, event.epoch) != component.admitted or component.holding:
+        return
+    component.needs_base = component.needs_base or event.needs_base
+    turn.say(component, f"a snapshot from {event.sender} was not stored: {event.message}")
+
+
+def give_back(component: Component, turn: Turn) -> None:
+    """``on_loss = hold``: the primary is back without its state, or with an older one: send it what we keep."""
+    flight, mine = component.flight, component.newest
+    if flight is not None and (turn.now_ns >= flight.until_ns or not turn.alive(flight.to)):
+        component.flight = flight = None
+    home = component.primary
+    if not component.waits or mine is None or component.spec is None or flight is not None or not turn.alive(home):
+        return
+    peer = turn.team.peers[home]
+    entry = peer.entry(component.name)
+    idle = entry is not None and entry.epoch == component.epoch and entry.state in _IDLE_NUMBERS
+    if idle and entry is not None and (entry.position is None or entry.position < mine):
+        until_ns = turn.now_ns + turn.config.ship_ms * MS
+        component.flight = Flight(turn.now_ns, until_ns, True, home, mine)
+        turn.order(acts.Ship(component.name, component.epoch, mine, None, home, component.spec, whole=True))
+        turn.say(component, f"{turn.me} gives its checkpoint back to {home}")
+
+
+_IDLE_NUMBERS = frozenset(tuple(State).index(state) for state in (State.ABSENT, State.STANDBY))

@@ -1,0 +1,96 @@
+"""What a robot says about itself: which entries go into the next beat, so that each fits one datagram and each is said in turn."""
+
+from __future__ import annotations
+
+from failover.core.component import Component
+from failover.core.election import STATES
+from failover.core.messages import HOLDS, NEEDS_BASE, UNPROTECTED, Beat, Echo, Entry
+from failover.core.types import State
+from failover.core.wire import BODY_SIZE_MAX, beat_size, entry_size
+
+BEAT_OVERHEAD = 16
+"""Bytes by which a beat may grow beyond the sum of its parts: longer array heads, a longer counter."""
+
+
+def entry_of(component: Component, me: str) -> Entry:
+    """One component as this robot holds it."""
+    newest = component.newest
+    handing = component.handing
+    flags = NEEDS_BASE * component.needs_base | UNPROTECTED * component.unprotected | HOLDS * component.waits
+    return Entry(
+        component.name,
+        STATES.index(component.state),
+        component.epoch,
+        component.primary,
+        newest.generation if newest else 0,
+        newest.sequence if newest else 0,
+        newest.digest if newest else b"",
+        component.standby if component.standby in component.entrusted and not component.unprotected else "",
+        handing.to if handing and handing.yielded else "",
+        flags,
+        component.status,
+    )
+
+
+def urgent(entry: Entry, before: Entry | None) -> bool:
+    """Whether others wait for this change: everything but a primary's own progress."""
+    if before is None or STATES[entry.state] in (State.STANDBY, State.ABSENT, State.HANDING_OVER):
+        return entry != before
+    return _essence(entry) != _essence(before) or (entry.standby, entry.yields_to) != (before.standby, before.yields_to)
+
+
+class Speaker:
+    """Makes the beats of one life of one robot. ``counter`` is that of the last one made."""
+
+    def __init__(self, me: str, boot: int) -> None:
+        self._me = me
+        self._boot = boot
+        self.counter = 0
+        self._settled = 0
+        self._said: dict[str, tuple[Entry, int]] = {}
+
+    def pressing(self, entries: dict[str, Entry]) -> bool:
+        """Whether something has changed that should not wait for the next beat."""
+        return any(urgent(entry, self._said[name][0] if name in self._said else None) for name, entry in entries.items())
+
+    def beat(self, entries: dict[str, Entry], echoes: tuple[Echo, ...]) -> Beat:
+        """The next beat. Entries that changed go first, then those that were not said for the longest time."""
+        self.counter += 1
+        changed = {name for name, entry in entries.items() if self._unsettling(entry)}
+        if changed or len(entries) != len(self._said):
+            self._settled = self.counter
+        self._said = {name: said for name, said in self._said.items() if name in entries}
+        order = sorted(entries, key=lambda name: (name not in changed, not self._news(entries[name]), self._last(name)))
+        empty = Beat(self._me, self._boot, self.counter, self._settled, 0, len(entries), echoes)
+        chosen = self._fitting([entries[name] for name in order], empty)
+        for name in changed:
+            self._said[name] = (entries[name], 0)
+        for entry in chosen:
+            self._said[entry.name] = (entry, self.counter)
+        return Beat(self._me, self._boot, self.counter, self._settled, min(len(entries), 255), len(entries), echoes, chosen)
+
+    def _fitting(self, entries: list[Entry], empty: Beat) -> tuple[Entry, ...]:
+        room = BODY_SIZE_MAX - beat_size(empty) - BEAT_OVERHEAD
+        chosen: list[Entry] = []
+        for entry in entries:
+            room -= entry_size(entry)
+            if room < 0:
+                break
+            chosen.append(entry)
+        return tuple(chosen)
+
+    def _unsettling(self, entry: Entry) -> bool:
+        said = self._said.get(entry.name)
+        return said is None or _essence(said[0]) != _essence(entry)
+
+    def _news(self, entry: Entry) -> bool:
+        said = self._said.get(entry.name)
+        return said is None or said[0] != entry
+
+    def _last(self, name: str) -> int:
+        return self._said[name][1] if name in self._said else 0
+
+
+def _essence(entry: Entry) -> tuple[int, int, str]:
+    """What unsettles an entry when it changes."""
+    return entry.epoch, entry.state, entry.primary
