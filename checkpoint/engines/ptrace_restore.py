@@ -20,6 +20,7 @@ import ctypes
 import os
 import resource
 import signal
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -28,7 +29,7 @@ from checkpoint.arch import x86_64, x86_64_stub
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import restore_checks, restore_memory, restore_process
 from checkpoint.engines.restore_process import Vessel
-from checkpoint.errors import CheckpointError, RestoreError
+from checkpoint.errors import CheckpointError, MismatchError, RestoreError
 from checkpoint.linux import abi, call_table, procfs
 from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.tracee import Stop, Tracee
@@ -97,6 +98,7 @@ class _Restore:
         tracee.freeze()
         tracee.set_signal_mask(abi.ALL_SIGNALS & ~(1 << (signal.SIGTRAP - 1)))
         vessel = look_at_vessel(tracee.pid)
+        self._require_identity(vessel)
         if not vessel.may_choose_executable:
             self._execute_program()
         self._xstate_size = len(tracee.xstate())
@@ -105,6 +107,23 @@ class _Restore:
         self._build_and_run(vessel, mappings)
         self._become_program()
         return RestoredProgram(tracee, self._state.position, tuple(self._notes))
+
+    def _require_identity(self, vessel: Vessel) -> None:
+        """A program that holds robust or priority-inheriting locks has written its thread id into them: it needs that id."""
+        if vessel.inner_pid == self._state.process.pid:
+            return
+        head = self._thread.robust_list[0]
+        listed = content_at(self._state, head, ROBUST_HEAD.size) if head else None
+        if listed is None:
+            return
+        first, _, acquiring = ROBUST_HEAD.unpack(listed)
+        if first != head or acquiring:
+            raise MismatchError(
+                f"cannot restore {self._state.component} as pid {vessel.inner_pid}: it holds a lock that names its own pid "
+                f"{self._state.process.pid}; "
+                "free that pid, or run it in PIDs of its own (failover run isolates)",
+                (f"pid {self._state.process.pid} cannot be had, and a lock that the program holds names it",),
+            )
 
     def _build_and_run(self, vessel: Vessel, mappings: tuple[procfs.MapsLine, ...]) -> None:
         state, tracee = self._state, self._tracee
@@ -215,6 +234,9 @@ class _Restore:
         if result < 0:
             raise RestoreError(f"cannot {name} as the last step of a restore: {os.strerror(-result)}")
 
+
+ROBUST_HEAD: Final = struct.Struct("<QqQ")
+"""struct robust_list_head (linux/futex.h): first entry (the head itself when there is none), offset, entry being taken."""
 
 RSEQ_SECTION_OFFSET: Final = 8
 """Offset of rseq_cs in struct rseq (linux/rseq.h)."""
