@@ -1,0 +1,233 @@
+"""capture, restore, inspect and check as a person types them, on real programs: the output is that of an undisturbed run."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.failover.cli.test_verbs import failover
+
+PYTHON = getattr(sys, "_base_executable", sys.executable)
+BOUND_S = 60.0
+
+COUNT = """\
+import hashlib, sys, time
+digest = hashlib.sha256()
+for number in range(1, 301):
+    digest.update(str(number).encode())
+    print(number, digest.hexdigest(), flush=True)
+    time.sleep(0.005)
+sys.exit(7)
+"""
+
+CHAOS = 'scale=50\nx=0.4\nfor(i=1;i<=300;i++){for(j=0;j<200;j++)x=3.99*x*(1-x);print i," ",x,"\\n"}\nquit\n'
+
+
+def wait_for(what: str, condition: Callable[[], bool]) -> None:
+    """Poll until a condition holds."""
+    deadline = time.monotonic() + BOUND_S
+    while not condition():
+        assert time.monotonic() < deadline, f"waited in vain for {what}"
+        time.sleep(0.002)
+
+
+def lines(path: Path) -> int:
+    """How many lines a program has written so far."""
+    return path.read_bytes().count(b"\n")
+
+
+class Script:
+    """A program whose standard streams are files in a directory of its own."""
+
+    def __init__(self, directory: Path, argv: list[str], text: str) -> None:
+        self.directory = directory
+        self.argv = argv
+        (directory / "program").write_text(text)
+
+    def run(self, output: Path) -> subprocess.Popen[bytes]:
+        """Start it."""
+        with output.open("ab") as file:
+            return subprocess.Popen(
+                self.argv,
+                cwd=self.directory,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=file,
+                start_new_session=True,
+                env={"PATH": os.environ["PATH"], "LANG": "C.UTF-8"},
+            )
+
+
+@pytest.fixture(params=["python", pytest.param("bc", marks=pytest.mark.command("bc"))])
+def script(request: pytest.FixtureRequest, tmp_path: Path) -> Script:
+    """A program that nobody prepared."""
+    if request.param == "python":
+        return Script(tmp_path, [PYTHON, "program"], COUNT)
+    return Script(tmp_path, [shutil.which("bc") or "bc", "-q", "program"], CHAOS)
+
+
+def has_ended(pid: int) -> bool:
+    """Whether a process is gone, or a zombie that was our grandchild (and is reaped here)."""
+    with contextlib.suppress(ChildProcessError):
+        os.waitpid(pid, os.WNOHANG)
+    return not Path(f"/proc/{pid}").exists()
+
+
+def test_a_program_captured_and_restored_three_times_in_a_row_writes_what_an_undisturbed_one_writes(script: Script) -> None:
+    expected, output = script.directory / "expected", script.directory / "output"
+    script.run(expected).wait()
+    process = script.run(output)
+    pid = process.pid
+    for turn in range(1, 4):
+        wait_for("some output", lambda turn=turn: lines(output) >= turn * 40)  # type: ignore[misc]
+        file = script.directory / f"snapshot{turn}"
+        captured = failover("capture", str(pid), "-o", str(file))
+        assert captured.returncode == 0, captured.stderr
+        wait_for("the captured program to end", lambda pid=pid: process.poll() is not None and has_ended(pid))  # type: ignore[misc]
+        assert file.stat().st_mode & 0o777 == 0o600
+        restored = failover("restore", str(file))
+        assert restored.returncode == 0, restored.stderr
+        assert re.fullmatch(r"\d+\n", restored.stdout)
+        pid = int(restored.stdout)
+    wait_for("the end", lambda: has_ended(pid))
+    assert output.read_bytes() == expected.read_bytes()
+
+
+def test_waiting_passes_on_the_exit_status_of_the_restored_program(tmp_path: Path) -> None:
+    script = Script(tmp_path, [PYTHON, "program"], COUNT)
+    process = script.run(tmp_path / "output")
+    wait_for("some output", lambda: lines(tmp_path / "output") >= 20)
+    assert failover("capture", str(process.pid), "-o", str(tmp_path / "snapshot")).returncode == 0
+    process.wait()
+    ran = failover("restore", "--wait", str(tmp_path / "snapshot"))
+    assert ran.returncode == 7, ran.stderr
+    assert lines(tmp_path / "output") == 300
+
+
+def test_a_program_left_running_writes_what_an_undisturbed_one_writes(tmp_path: Path) -> None:
+    script = Script(tmp_path, [PYTHON, "program"], COUNT)
+    script.run(tmp_path / "expected").wait()
+    process = script.run(tmp_path / "output")
+    for turn in range(3):
+        wait_for("some output", lambda turn=turn: lines(tmp_path / "output") >= 20 * (turn + 1))  # type: ignore[misc]
+        ran = failover("capture", str(process.pid), "--leave-running", "--json", "--force", "-o", str(tmp_path / "snapshot"))
+        assert ran.returncode == 0, ran.stderr
+        assert json.loads(ran.stdout)["running"] is True
+    assert process.wait() == 7
+    assert (tmp_path / "output").read_bytes() == (tmp_path / "expected").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def snapshot(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A snapshot's file of a Python program."""
+    directory = tmp_path_factory.mktemp("snapshot")
+    script = Script(directory, [PYTHON, "program"], COUNT)
+    process = script.run(directory / "output")
+    wait_for("some output", lambda: lines(directory / "output") >= 5)
+    ran = failover("capture", str(process.pid), "-o", str(directory / "snapshot"))
+    process.kill()
+    process.wait()
+    assert ran.returncode == 0, ran.stderr
+    return directory / "snapshot"
+
+
+def test_inspect_shows_what_a_snapshot_holds(snapshot: Path) -> None:
+    ran = failover("inspect", "--vmas", str(snapshot))
+    assert ran.returncode == 0, ran.stderr
+    for wanted in (f"{PYTHON} program", "base (whole)", "[stack]", "output", "heap"):
+        assert wanted in ran.stdout
+    as_json = json.loads(failover("inspect", "--json", str(snapshot)).stdout)
+    assert as_json["process"]["arguments"][1:] == ["program"]
+    assert as_json["file_size"] == snapshot.stat().st_size
+    assert as_json["contents_size"] > 0
+
+
+def test_a_snapshot_with_one_flipped_bit_is_refused_by_every_verb_that_reads_it(snapshot: Path, tmp_path: Path) -> None:
+    content = bytearray(snapshot.read_bytes())
+    content[len(content) // 2] ^= 1
+    altered = tmp_path / "altered"
+    altered.write_bytes(content)
+    for words in (["inspect"], ["restore"]):
+        ran = failover(*words, str(altered))
+        assert ran.returncode == 1
+        assert ran.stderr.startswith("failover: ")
+
+
+@pytest.mark.parametrize("size", [0, 7, 4096, -1])
+def test_a_truncated_snapshot_is_refused(snapshot: Path, tmp_path: Path, size: int) -> None:
+    short = tmp_path / "short"
+    short.write_bytes(snapshot.read_bytes()[:size])
+    for verb in ("inspect", "restore"):
+        assert failover(verb, str(short)).returncode == 1
+
+
+def test_a_file_that_is_missing_is_said_to_be(tmp_path: Path) -> None:
+    for verb in ("inspect", "restore"):
+        ran = failover(verb, str(tmp_path / "nothing"))
+        assert ran.returncode == 1
+        assert "nothing" in ran.stderr
+
+
+def test_a_process_that_does_not_exist_cannot_be_captured(tmp_path: Path) -> None:
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    for words in (["capture", "-o", str(tmp_path / "x")], ["check"]):
+        ran = failover(*words, str(gone.pid))
+        assert ran.returncode == 1
+        assert str(gone.pid) in ran.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_file_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
+    target = tmp_path / "precious"
+    target.write_text("precious")
+    ran = failover("capture", str(os.getpid()), "-o", str(target))
+    assert ran.returncode == 1
+    assert "--force" in ran.stderr
+    assert target.read_text() == "precious"
+
+
+def test_check_names_what_stands_against_a_capture_and_touches_nothing(tmp_path: Path) -> None:
+    with subprocess.Popen(
+        [PYTHON, "-c", "import socket, sys; a = socket.socket(); print(flush=True); sys.stdin.read()"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        ran = failover("check", str(process.pid))
+        assert ran.returncode == 1, ran.stderr
+        assert "socket" in ran.stdout
+        refused = failover("capture", str(process.pid), "-o", str(tmp_path / "x"))
+        assert refused.returncode == 1
+        assert "socket" in refused.stderr
+        assert process.poll() is None
+        process.communicate()
+    assert process.returncode == 0
+
+
+def test_check_without_a_pid_says_what_this_machine_offers() -> None:
+    ran = failover("check", "--json")
+    offers = json.loads(ran.stdout)["offers"]
+    assert {offer["what"] for offer in offers} >= {"processor", "looking into programs", "written pages"}
+    assert ran.returncode == 0
+
+
+def test_a_signal_that_ends_a_restored_program_is_passed_on_as_shells_do(snapshot: Path) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-m", "failover.cli.main", "restore", "--wait", str(snapshot)], stdout=subprocess.PIPE
+    ) as ran:
+        assert ran.stdout is not None
+        os.kill(int(ran.stdout.readline()), signal.SIGKILL)
+        assert ran.wait() == 137
