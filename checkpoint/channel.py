@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import array
 import contextlib
+import fcntl
 import mmap
 import os
 import socket
@@ -141,15 +142,18 @@ def memfd_holding(content: bytes | memoryview, name: str) -> int:
 
     Sealed: neither end can change or cut what the other is reading.
     """
-    import fcntl
-
     descriptor = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     view = memoryview(content)
     while view:
         view = view[os.write(descriptor, view) :]
+    seal(descriptor)
+    return descriptor
+
+
+def seal(descriptor: int) -> None:
+    """Close a memory file to every change, for everybody and for good."""
     seals = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE | fcntl.F_SEAL_SEAL
     fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, seals)
-    return descriptor
 
 
 def content_of(descriptor: int) -> bytes:
@@ -251,6 +255,7 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
     Attributes:
         size: bytes of the encoded snapshot.
         dirty_bytes: of the pages that it carries, before compression.
+        totals: bytes that the component had written to standard output and standard error at the freeze.
     """
 
     position: Position
@@ -259,6 +264,7 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
     freeze_us: int
     dirty_bytes: int
     notes: tuple[str, ...] = ()
+    totals: tuple[int, int] = (0, 0)
 
 
 class Restored(msgspec.Struct, frozen=True, tag=True):
