@@ -205,12 +205,14 @@ def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry, t
         if not _may_switch(component, turn, sender, entry):
             return
         _accept(component, turn, sender, entry.epoch)
+    if component.state in ENDED:
+        drop(component, turn, f"{sender} runs it anew")
     if component.state is not State.STANDBY and component.state is not State.STOPPING:
         component.move(Cause.FOLLOW)
     component.trusted = entry.standby == turn.me
     admit(component, turn, sender)
-    if entry.flags & UNPROTECTED and component.held:
-        _drop(component, turn, f"{sender} protects it no longer")
+    if entry.flags & UNPROTECTED:
+        drop(component, turn, f"{sender} protects it no longer")
     if entry.yields_to == turn.me and component.state is State.STANDBY and component.newest == entry.position:
         claim(component, turn, component.newest, f"{sender} hands it over")
 
@@ -280,7 +282,7 @@ def _heard_end(component: Component, turn: Turn, sender: str, entry: Entry, thei
     component.reason = f"as {sender} says" if theirs is State.FAILED else ""
     component.move(_END_CAUSES[theirs])
     if theirs is State.RELEASED:
-        _drop(component, turn, f"{sender} released it")
+        drop(component, turn, f"{sender} released it")
     turn.say(component, f"{turn.me} records that it is {theirs}, as {sender} says")
 
 
@@ -314,7 +316,10 @@ def admit(component: Component, turn: Turn, sender: str) -> None:
         turn.order(acts.Admit(component.name, component.epoch, sender))
 
 
-def _drop(component: Component, turn: Turn, why: str) -> None:
+def drop(component: Component, turn: Turn, why: str) -> None:
+    """Forget the checkpoints that this robot keeps."""
+    if not component.held:
+        return
     component.held.clear()
     turn.order(acts.Drop(component.name, component.epoch))
     turn.say(component, f"{turn.me} forgets its checkpoints: {why}")

@@ -1,6 +1,6 @@
 """What becomes of a component whose program ended, crashed, or could not be brought to run.
 
-Invariants: an end is a record before anybody is told of it; crashes never make an endless loop; no checkpoint is thrown away by them.
+Invariants: an end is a record before anybody is told of it; crashes make no endless loop and throw no checkpoint away.
 """
 
 from __future__ import annotations

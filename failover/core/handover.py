@@ -1,4 +1,4 @@
-"""The planned move: hold the program still, ship the last delta, let the other robot claim. No checkpoint is older than the program."""
+"""The planned move: hold the program still, ship the last delta, let the other robot claim: nothing is computed twice."""
 
 from __future__ import annotations
 
@@ -40,13 +40,6 @@ def advance(component: Component, turn: Turn) -> None:
         _call_off(component, turn, handing)
     elif not handing.yielded:
         replication.capture(component, turn, final=True)
-
-
-def last_delta_safe(component: Component, turn: Turn) -> None:
-    """The last delta is acknowledged: the other robot may claim."""
-    if component.handing is not None and component.state is State.HANDING_OVER:
-        component.handing.yielded = True
-        turn.say(component, f"{turn.me} lets {component.handing.to} claim it")
 
 
 def _call_off(component: Component, turn: Turn, handing: Handing) -> None:

@@ -6,9 +6,45 @@ The agent feeds it one event at a time with the instant of its own clock and obe
 
 from __future__ import annotations
 
+from failover.core import acts, commands, election, endings, handover, lease, replication, view
 from failover.core.acts import Ready
-from failover.core.events import Event
-from failover.core.types import Ballot, Config, Decision, Found, Held, StatusView
+from failover.core.component import Cause, Component, Journal, Turn
+from failover.core.events import (
+    ActFailed,
+    Captured,
+    CaptureFailed,
+    Event,
+    Exited,
+    Handover,
+    Prefer,
+    Received,
+    Release,
+    Restored,
+    Run,
+    ShipEnded,
+    Started,
+    Stop,
+    Stopped,
+    Stored,
+    StoreFailed,
+    Tick,
+)
+from failover.core.membership import Membership
+from failover.core.messages import HOLDS, Beat, Echo, Entry
+from failover.core.speaker import Speaker, entry_of
+from failover.core.types import COMPONENTS_MAX, ENDED, MS, Ballot, Config, Decision, Found, Held, State, StatusView
+
+URGENT_GAP_NS = 2 * MS
+"""Between a beat and the next one that carries a change: a flurry of changes makes no flood of beats."""
+
+LATE_NS = 5 * MS
+"""A step this much after the instant asked for is our own lateness, taken back from the peers' silence. Less than the margin."""
+
+REST_NS = MS
+"""Between two deadlines: what waits for somebody else is looked at again, but not without a pause."""
+
+FAILBACK_PAUSE = 10
+"""Of ``retry_ms``: how long a component stays before it goes back to the robot that is preferred, and between two tries."""
 
 
 class Node:
@@ -30,20 +66,261 @@ class Node:
         held: tuple[Held, ...] = (),
         found: tuple[Found, ...] = (),
     ) -> None:
-        raise NotImplementedError
+        self._config = config
+        self._boot = boot
+        self._now_ns = now_ns
+        self._asked_ns = self._next_beat_ns = now_ns
+        self._last_beat_ns = now_ns - URGENT_GAP_NS
+        self._durable = ballot
+        self._team = Membership(config, boot, now_ns)
+        self._speaker = Speaker(config.robot, boot)
+        self._journal = Journal()
+        self._components = {record.name: Component.remembered(record) for record in ballot.records}
+        self._found = {one.component: one for one in found}
+        self._begun = False
+        self._configure(held)
 
     def step(self, event: Event, now_ns: int) -> Ready:
-        """Take in one event at ``now_ns`` (this machine's monotonic clock) and say what must be done about it. Never raises."""
-        raise NotImplementedError
+        """Take in one event at ``now_ns`` (this machine's monotonic clock) and say what must be done about it."""
+        self._now_ns = now_ns = max(now_ns, self._now_ns)
+        if now_ns - self._asked_ns > LATE_NS:
+            self._team.forgive(now_ns - self._asked_ns, now_ns)
+        turn = self._turn(now_ns)
+        if not self._begun:
+            self._begin(turn)
+        touched = self._take(event, turn)
+        for component in touched:
+            _review(component, turn)
+        send = self._speak(turn)
+        self._asked_ns = self._deadline_ns()
+        return Ready(self._persist(), send, tuple(turn.acts))
 
     def next_deadline_ns(self) -> int:
         """The instant at which a Tick is due."""
-        raise NotImplementedError
+        return self._asked_ns
 
     def status(self, now_ns: int) -> StatusView:
         """The team as this robot sees it."""
-        raise NotImplementedError
+        return view.status(self._components, self._turn(max(now_ns, self._now_ns)), self._boot)
 
     def why(self, component: str = "") -> tuple[Decision, ...]:
         """The last decisions, oldest first; of one component, or all."""
-        raise NotImplementedError
+        return tuple(one for one in self._journal.decisions if component in ("", one.component))
+
+    def _turn(self, now_ns: int) -> Turn:
+        return Turn(now_ns, self._config, self._team, self._journal, self._speaker.counter + 1)
+
+    # Birth
+
+    def _configure(self, held: tuple[Held, ...]) -> None:
+        for spec in self._config.components:
+            component = self._components.setdefault(spec.name, Component(spec.name, spec=spec))
+            component.spec = component.spec or spec
+            component.autostart = True
+        for one in held:
+            if one.component in self._components:
+                component = self._components[one.component]
+                component.held = [position for position in one.positions if position.generation not in component.lost]
+
+    def _begin(self, turn: Turn) -> None:
+        """The first step of this life: take over what the last one left running, clear away what it should not have left."""
+        self._begun = True
+        for component in self._components.values():
+            found = self._found.pop(component.name, None)
+            if component.state is State.PRIMARY:
+                _take_up(component, turn, found)
+            elif found is not None and found.running:
+                component.state = State.STOPPING
+                turn.order(acts.Stop(component.name, component.epoch))
+        for stray in self._found.values():
+            turn.order(acts.Stop(stray.component, stray.epoch))
+        self._found.clear()
+
+    # One event
+
+    def _take(self, event: Event, turn: Turn) -> list[Component]:
+        """Take the event in; returns the components that it may have changed."""
+        if isinstance(event, Tick):
+            return list(self._components.values())
+        if isinstance(event, Received):
+            return self._hear(event, turn)
+        name = event.spec.name if isinstance(event, Run) else event.component
+        component = self._known(name) if isinstance(event, Run | Stored) else self._components.get(name)
+        if component is None:
+            if isinstance(event, Run | Release | Stop | Handover | Prefer):
+                turn.order(acts.Answer(event.request, False, f"{name} is not known at {turn.me}; failover status lists what is"))
+            return []
+        _tell(component, turn, event)
+        return [component]
+
+    def _hear(self, event: Received, turn: Turn) -> list[Component]:
+        beat = event.beat
+        news = self._team.hear(beat, event.link, turn.now_ns)
+        touched = {name: component for name, component in self._components.items() if component.holding}
+        for entry in news:
+            component = self._known(entry.name)
+            if component is None:
+                continue
+            election.heard(component, turn, beat.sender, entry)
+            replication.acknowledged(component, turn, beat.sender, entry)
+            touched[component.name] = component
+        return list(touched.values())
+
+    def _known(self, name: str) -> Component | None:
+        if name not in self._components and len(self._components) < COMPONENTS_MAX:
+            self._components[name] = Component(name)
+        return self._components.get(name)
+
+    # What leaves
+
+    def _speak(self, turn: Turn) -> tuple[Beat, ...]:
+        entries = self._entries()
+        pressing = self._speaker.pressing(entries)
+        if pressing:
+            self._next_beat_ns = min(self._next_beat_ns, self._last_beat_ns + URGENT_GAP_NS)
+        if turn.now_ns < self._next_beat_ns:
+            return ()
+        echoes = tuple(Echo(peer.robot, peer.boot, peer.counter) for peer in self._team.peers.values() if peer.boot)
+        beat = self._speaker.beat(entries, echoes)
+        self._team.asked(beat.counter, turn.now_ns)
+        self._last_beat_ns = turn.now_ns
+        self._next_beat_ns = turn.now_ns + self._config.beat_ns
+        return (beat,)
+
+    def _entries(self) -> dict[str, Entry]:
+        known = (component for component in self._components.values() if component.epoch)
+        return {component.name: entry_of(component, self._config.robot) for component in known}
+
+    def _persist(self) -> Ballot | None:
+        ballot = Ballot(tuple(component.record() for component in self._components.values() if component.epoch))
+        if ballot == self._durable:
+            return None
+        self._durable = ballot
+        return ballot
+
+    def _deadline_ns(self) -> int:
+        instants = [self._next_beat_ns]
+        for component in self._components.values():
+            instants += _instants(component)
+        return max(min(instants), self._now_ns + REST_NS)
+
+
+def _instants(component: Component) -> list[int]:
+    """When something is due for a component before the next beat, perhaps."""
+    match component.state:
+        case State.PRIMARY:
+            due = [] if component.flight or component.unprotected else [component.due_ns]
+            return [*due, *([component.lease_ns] if component.entrusted else [])]
+        case _:
+            return []
+
+
+def _take_up(component: Component, turn: Turn, found: Found | None) -> None:
+    """The last life of this agent held the primacy: its program runs on, has ended, or is gone with the machine."""
+    if found is None:
+        component.state = State.STANDBY
+        return
+    component.born = min(found.epoch, component.epoch)
+    component.state = State.FROZEN
+    component.standby = component.entrusted[0] if component.entrusted else ""
+    election.open_line(component, turn)
+    if not found.running:
+        endings.exited(component, turn, Exited(component.name, component.epoch, found.status))
+    elif component.entrusted:
+        turn.order(acts.Freeze(component.name, component.epoch))
+        turn.say(component, f"{turn.me} is back and holds it still until it is heard, or knows that nobody else runs it")
+    else:
+        component.move(Cause.LEASE_BACK)
+
+
+def _tell(component: Component, turn: Turn, event: Event) -> None:
+    match event:
+        case Started() | Restored():
+            _runs(component, turn, event)
+        case Captured():
+            replication.captured(component, turn, event)
+        case CaptureFailed():
+            replication.capture_failed(component, turn, event)
+        case ShipEnded():
+            replication.ship_ended(component, turn, event)
+        case Stored():
+            replication.stored(component, turn, event)
+        case StoreFailed():
+            replication.store_failed(component, turn, event)
+        case ActFailed():
+            endings.failed(component, turn, event)
+        case Exited():
+            endings.exited(component, turn, event)
+        case Stopped():
+            if component.state is State.STOPPING:
+                component.move(Cause.CLEARED)
+        case Run() | Release() | Stop() | Handover() | Prefer():
+            commands.obey(component, turn, event)
+
+
+def _runs(component: Component, turn: Turn, event: Started | Restored) -> None:
+    expected = component.state in (State.STARTING, State.TAKING_OVER, State.RECOVERING)
+    if not expected or event.epoch != component.epoch:
+        return
+    how = "it runs" if isinstance(event, Started) else f"it goes on from checkpoint {event.position.sequence}"
+    component.move(Cause.RUNS)
+    component.tries = 0
+    component.due_ns = turn.now_ns
+    component.retry_ns = turn.now_ns + FAILBACK_PAUSE * turn.config.retry_ms * MS
+    turn.say(component, f"{how} at {turn.me}, epoch {component.epoch}")
+    if component.request:
+        turn.order(acts.Answer(component.request, True, f"{component.name} runs at {turn.me}"))
+        component.request = 0
+
+
+def _review(component: Component, turn: Turn) -> None:
+    """What the passing of time, or what was just heard, makes due for one component."""
+    endings.overdue(component, turn)
+    if component.state in (State.ABSENT, State.STANDBY):
+        _review_idle(component, turn)
+    if component.state is State.CLAIMING:
+        election.advance(component, turn)
+    if component.holding and component.state is not State.CLAIMING:
+        _review_held(component, turn)
+    if component.state in ENDED:
+        endings.report(component, turn)
+
+
+def _review_idle(component: Component, turn: Turn) -> None:
+    endings.retry(component, turn)
+    _admit_a_return(component, turn)
+    election.consider(component, turn)
+    if component.state in (State.ABSENT, State.STANDBY):
+        replication.give_back(component, turn)
+
+
+def _review_held(component: Component, turn: Turn) -> None:
+    lease.watch(component, turn)
+    replication.overdue(component, turn)
+    if component.state is State.PRIMARY:
+        replication.choose_standby(component, turn)
+        replication.capture(component, turn)
+        _fail_back(component, turn)
+    handover.advance(component, turn)
+
+
+def _fail_back(component: Component, turn: Turn) -> None:
+    """Go to the robot that the operator prefers, once it keeps up and some time has passed."""
+    prefer = component.rules.prefer
+    if prefer in ("", turn.me) or prefer != component.standby or turn.now_ns < component.retry_ns:
+        return
+    if component.acked is not None and component.flight is None and turn.alive(prefer):
+        component.retry_ns = turn.now_ns + FAILBACK_PAUSE * turn.config.retry_ms * MS
+        handover.begin(component, turn, prefer, 0)
+
+
+def _admit_a_return(component: Component, turn: Turn) -> None:
+    """``on_loss = hold``: the checkpoint that another robot kept for us may come back."""
+    if component.primary != turn.me:
+        return
+    for peer in turn.team.living(turn.now_ns):
+        entry = peer.entry(component.name)
+        if entry is None or not entry.flags & HOLDS or entry.primary != turn.me or entry.epoch != component.epoch:
+            continue
+        if entry.position is not None and (component.newest is None or component.newest < entry.position):
+            election.admit(component, turn, peer.robot)

@@ -1,6 +1,6 @@
 """How a component's state gets to its standby and is acknowledged there.
 
-Invariants: one snapshot in flight per component (a slower link or standby means fewer snapshots, not longer queues); a position is
+Invariants: one snapshot in flight per component (a slower link means fewer snapshots, not longer queues); a position is
 acknowledged to the keeper only when it is safe elsewhere, or nobody else is there; a delta counts from what the standby has.
 """
 
@@ -17,7 +17,7 @@ from failover.core.types import HISTORY_MAX, MS, OnUnsupported, State
 
 
 def choose_standby(component: Component, turn: Turn) -> None:
-    """The operator's choice, else the least loaded living robot, else the lesser name. One that is dead is kept under ``freeze``."""
+    """The operator's choice, else the least loaded living robot, else the lesser name. Under ``freeze`` it stays for good."""
     if component.standby and (turn.alive(component.standby) or component.freezes):
         return
     wanted = component.rules.standby
@@ -76,8 +76,7 @@ def capture_failed(component: Component, turn: Turn, event: CaptureFailed) -> No
     flight = component.flight
     if flight is None or flight.position is not None or event.epoch != component.epoch:
         return
-    component.flight = None
-    component.due_ns = turn.now_ns + turn.config.retry_ms * MS
+    _give_up(component, turn)
     component.base_wanted = component.base_wanted or event.needs_base
     if component.degraded != event.message:
         turn.say(component, f"not captured: {event.message}")
@@ -134,10 +133,15 @@ def _safe(component: Component, turn: Turn, position: Position) -> None:
     period_ms = turn.config.alone_period_ms if alone else component.rules.period_ms
     component.due_ns = max(flight.started_ns + period_ms * MS, turn.now_ns)
     component.flight = None
+    if flight.final and component.handing is not None and flight.to == component.handing.to:
+        component.handing.yielded = True
+        turn.say(component, f"{turn.me} lets {flight.to} claim it")
 
 
 def _give_up(component: Component, turn: Turn, why: str = "") -> None:
-    """Nothing is forgotten: the keeper's next delta counts from the same position."""
+    """Nothing is forgotten: the keeper's next delta counts from the same position. A handover waits for nothing."""
+    if component.handing is not None:
+        component.handing.until_ns = turn.now_ns
     component.flight = None
     component.due_ns = turn.now_ns + turn.config.retry_ms * MS
     if why:

@@ -1,12 +1,15 @@
-"""What a robot says about itself: which entries go into the next beat, so that each fits one datagram and each is said in turn."""
+"""What a robot says about itself: the entries of the next beat, so that it fits one datagram and each is said in turn."""
 
 from __future__ import annotations
 
 from failover.core.component import Component
 from failover.core.election import STATES
 from failover.core.messages import HOLDS, NEEDS_BASE, UNPROTECTED, Beat, Echo, Entry
-from failover.core.types import State
+from failover.core.types import HOLDING, State
 from failover.core.wire import BODY_SIZE_MAX, beat_size, entry_size
+
+LOAD_MAX = 255
+"""A robot with more primaries than this is just very busy."""
 
 BEAT_OVERHEAD = 16
 """Bytes by which a beat may grow beyond the sum of its parts: longer array heads, a longer counter."""
@@ -67,7 +70,16 @@ class Speaker:
             self._said[name] = (entries[name], 0)
         for entry in chosen:
             self._said[entry.name] = (entry, self.counter)
-        return Beat(self._me, self._boot, self.counter, self._settled, min(len(entries), 255), len(entries), echoes, chosen)
+        return Beat(
+            self._me,
+            self._boot,
+            self.counter,
+            self._settled,
+            min(sum(STATES[entry.state] in HOLDING for entry in entries.values()), LOAD_MAX),
+            len(entries),
+            echoes,
+            chosen,
+        )
 
     def _fitting(self, entries: list[Entry], empty: Beat) -> tuple[Entry, ...]:
         room = BODY_SIZE_MAX - beat_size(empty) - BEAT_OVERHEAD

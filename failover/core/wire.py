@@ -15,6 +15,7 @@ from hashlib import blake2b
 import msgspec
 
 from failover.core.messages import VERSION, Beat, Bulk, Entry
+from failover.core.names import COMPONENT_SIZE_MAX, ROBOT_SIZE_MAX
 from failover.core.types import PEERS_MAX
 from failover.errors import FailoverError
 
@@ -29,6 +30,11 @@ WINDOW = 64
 
 KEYS_PER_SENDER = 2
 """The present key and the one before it, while a new one is being handed over."""
+
+EPOCH_MAX = 1 << 40
+NUMBER_MAX = 1 << 62
+DIGEST_SIZE_MAX = 32
+"""Beyond these a number is somebody's mistake; believing it would leave no room to count on."""
 
 _MAGIC = b"fB"
 _HEADER = struct.Struct("<2sBxI8s")
@@ -200,9 +206,21 @@ class Receiver:
 def _sound(beat: Beat) -> bool:
     """Whether the numbers lie in the ranges that ``PROTOCOL.md`` gives."""
     return (
-        beat.boot > 0
-        and 0 <= beat.settled <= beat.counter
-        and beat.counter > 0
+        0 < beat.boot < NUMBER_MAX
+        and beat.counter < NUMBER_MAX
+        and 0 <= beat.settled <= beat.counter > 0
         and beat.total >= 0
-        and all(entry.epoch >= 0 and entry.sequence >= 0 and entry.generation >= 0 and entry.name for entry in beat.entries)
+        and all(_sound_entry(entry) for entry in beat.entries)
+    )
+
+
+def _sound_entry(entry: Entry) -> bool:
+    robots = (entry.primary, entry.standby, entry.yields_to)
+    return (
+        0 < len(entry.name) <= COMPONENT_SIZE_MAX
+        and all(len(robot) <= ROBOT_SIZE_MAX for robot in robots)
+        and 0 <= entry.epoch < EPOCH_MAX
+        and 0 <= entry.generation < EPOCH_MAX * (PEERS_MAX + 1)
+        and 0 <= entry.sequence < NUMBER_MAX
+        and len(entry.digest) <= DIGEST_SIZE_MAX
     )

@@ -1,0 +1,99 @@
+"""What an operator may ask of the robot where the component runs. Each request is answered by the act Answer, once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from failover.core import acts, handover
+from failover.core.component import Cause, Component, Turn
+from failover.core.election import claim, drop, vacant
+from failover.core.events import Command, Handover, Prefer, Release, Run, Stop
+from failover.core.types import ENDED, State
+
+_RUNNING = frozenset({State.PRIMARY, State.FROZEN})
+
+
+def obey(component: Component, turn: Turn, command: Command) -> None:
+    """Carry out one command, or say why not."""
+    match command:
+        case Run():
+            _run(component, turn, command)
+        case Release():
+            _release(component, turn, command)
+        case Stop():
+            _stop(component, turn, command)
+        case Prefer():
+            _prefer(component, turn, command)
+        case Handover():
+            if component.state in (State.STANDBY, State.FAILED) and command.to in ("", turn.me):
+                handover.resume_here(component, turn, command.request)
+            else:
+                handover.begin(component, turn, command.to, command.request)
+
+
+def _run(component: Component, turn: Turn, command: Run) -> None:
+    refusal = _why_not_run(component, turn)
+    if refusal:
+        turn.order(acts.Answer(command.request, False, refusal))
+        return
+    drop(component, turn, "an operator runs it anew")
+    component.spec = replace(command.spec, home=command.spec.home or turn.me)
+    component.request, component.acked, component.acked_ns = command.request, None, -1
+    component.crashes.clear()
+    claim(component, turn, None, "an operator asked for it")
+
+
+def _why_not_run(component: Component, turn: Turn) -> str:
+    name = component.name
+    if component.holding or component.state is State.STOPPING:
+        return (
+            f"cannot run {name}: it is {component.state} here; failover stop or release it first, or choose another name"
+        )
+    for peer in turn.team.living(turn.now_ns):
+        entry = peer.entry(name)
+        if entry is not None and not vacant(component, turn) and component.state not in ENDED:
+            return f"cannot run {name}: {peer.robot} has it, epoch {entry.epoch}; choose another name, or stop it there"
+    if component.held and component.state not in ENDED:
+        return f"cannot run {name}: a checkpoint of it waits here; failover handover {name} resumes it, release forgets it"
+    return ""
+
+
+def _release(component: Component, turn: Turn, command: Release) -> None:
+    if component.state in _RUNNING:
+        turn.order(acts.LetGo(component.name, component.epoch))
+    elif component.holding or component.state is State.STOPPING or not (component.state in ENDED or vacant(component, turn)):
+        _elsewhere(component, turn, command.request, "release")
+        return
+    component.move(Cause.RELEASE)
+    component.primary = turn.me
+    component.flight = None
+    drop(component, turn, "an operator released it")
+    turn.order(acts.Answer(command.request, True, f"{component.name} is protected no longer"))
+    turn.say(component, f"{turn.me} {Cause.RELEASE}: an operator asked for it")
+
+
+def _stop(component: Component, turn: Turn, command: Stop) -> None:
+    if component.state not in _RUNNING:
+        _elsewhere(component, turn, command.request, "stop")
+        return
+    component.ending = True
+    turn.order(acts.End(component.name, component.epoch, command.signal))
+    turn.order(acts.Answer(command.request, True, f"signal {command.signal} sent to {component.name}"))
+
+
+def _prefer(component: Component, turn: Turn, command: Prefer) -> None:
+    known = ("", turn.me, *turn.config.peers)
+    if command.robot not in known:
+        refusal = f"cannot prefer {command.robot!r}: the team knows {', '.join(known[1:])}"
+        turn.order(acts.Answer(command.request, False, refusal))
+    elif component.state not in _RUNNING or component.spec is None:
+        _elsewhere(component, turn, command.request, "prefer a robot for")
+    else:
+        component.spec = replace(component.spec, rules=replace(component.spec.rules, prefer=command.robot))
+        turn.order(acts.Answer(command.request, True, f"{component.name} prefers {command.robot or 'to stay where it is'}"))
+
+
+def _elsewhere(component: Component, turn: Turn, request: int, verb: str) -> None:
+    where = component.primary if component.primary not in ("", turn.me) else ""
+    cure = f"; ask at {where}, which runs it" if where else ""
+    turn.order(acts.Answer(request, False, f"cannot {verb} {component.name}: here it is {component.state}{cure}"))

@@ -1,0 +1,102 @@
+"""What ``failover status`` says: one robot's sight of the team, and the promise in force in one sentence."""
+
+from __future__ import annotations
+
+from failover.core.component import Component, Turn
+from failover.core.types import ENDED, ComponentView, Protection, State, StatusView
+
+NS_PER_S = 10**9
+
+
+def status(components: dict[str, Component], turn: Turn, boot: int) -> StatusView:
+    """Everything, as this robot sees it."""
+    views = tuple(
+        _component(component, turn) for _, component in sorted(components.items()) if component.state is not State.ABSENT
+    )
+    peers = turn.team.views(turn.now_ns)
+    bad = any(view.protection is Protection.DEGRADED or view.state is State.FAILED for view in views)
+    lost = any(peer.state == "dead" for peer in peers)
+    return StatusView(turn.me, boot, "pair", _team_promise(turn), not bad and not lost, peers, views)
+
+
+def _team_promise(turn: Turn) -> str:
+    living = [peer.robot for peer in turn.team.living(turn.now_ns)]
+    if not turn.team.peers:
+        return f"{turn.me} is alone in its team: a lost robot takes its programs with it."
+    if not living:
+        return f"{turn.me} hears nobody: what runs here is not protected."
+    silence_ms = turn.config.loyalty_ns // 10**6
+    return (
+        f"{turn.me} and {', '.join(living)} protect each other: whoever is silent for {silence_ms} ms is replaced; "
+        "a total cut between two that live can run a component twice, except where when_alone is freeze."
+    )
+
+
+def _component(component: Component, turn: Turn) -> ComponentView:
+    protection = _protection(component, turn)
+    lag_ns = turn.now_ns - component.acked_ns if component.acked_ns >= 0 and component.holding else -1
+    return ComponentView(
+        component.name,
+        component.state,
+        component.epoch,
+        component.primary,
+        _standby(component, turn),
+        protection,
+        lag_ns,
+        component.freeze_us,
+        tuple(reversed(component.held)),
+        _promise(component, turn, protection),
+        _notes(component, turn),
+        component.status,
+        component.lease_ns,
+        component.rules.period_ms,
+        component.spec.home if component.spec else "",
+        component.rules.prefer,
+    )
+
+
+def _standby(component: Component, turn: Turn) -> str:
+    if component.holding:
+        return component.standby
+    return turn.me if component.state is State.STANDBY and component.held else ""
+
+
+def _protection(component: Component, turn: Turn) -> Protection:
+    if component.unprotected:
+        return Protection.STOPPED
+    if not component.holding:
+        return Protection.NONE
+    if component.degraded:
+        return Protection.DEGRADED
+    protected = component.acked is not None and component.standby in component.entrusted and turn.alive(component.standby)
+    return Protection.PROTECTED if protected else Protection.NONE
+
+
+def _promise(component: Component, turn: Turn, protection: Protection) -> str:
+    if component.state in ENDED:
+        return f"It is {component.state}; nobody runs it."
+    if not component.holding:
+        return f"{turn.me} keeps its checkpoints for {component.primary or 'whoever runs it'}."
+    if protection is not Protection.PROTECTED:
+        return "If this robot is lost now, it goes on from its last checkpoint, if there is one."
+    if component.waits:
+        return f"If {turn.me} is lost, {component.standby} keeps its newest checkpoint until {turn.me} is back."
+    alone = "stands still here first" if component.freezes else "may run twice if both live on and cannot hear each other"
+    return f"If {turn.me} is silent for {turn.config.loyalty_ns // 10**6} ms, {component.standby} runs it; it {alone}."
+
+
+def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
+    notes = []
+    if component.degraded:
+        age_s = (turn.now_ns - component.acked_ns) / NS_PER_S
+        age = f"the last checkpoint is {age_s:.1f} s old" if component.acked_ns >= 0 else "there is no checkpoint yet"
+        notes.append(f"not captured: {component.degraded}; {age}")
+    if component.unable:
+        notes.append(f"{turn.me} cannot run it: {component.unable}")
+    if component.state is State.FROZEN:
+        notes.append("held still: nobody entrusted with it hears this robot; it goes on when the peer is back")
+    if component.state is State.CLAIMING and turn.now_ns > component.until_ns:
+        notes.append("waiting for the others' consent: when_alone = freeze")
+    if component.reason:
+        notes.append(component.reason)
+    return tuple(notes)
