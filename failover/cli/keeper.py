@@ -62,6 +62,14 @@ class Keeper:
             raise CheckpointError(f"the keeper answered {type(request).__name__} with {type(answer).__name__}; same version?")
         return answer, found
 
+    def tell(self, request: msgspec.Struct) -> None:
+        """Send a request that has no answer.
+
+        Raises:
+            ChannelError: the keeper has gone.
+        """
+        self._link.send(request)
+
     def close(self) -> None:
         """Hang up, and wait until it has let go."""
         self._link.close()

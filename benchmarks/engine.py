@@ -1,0 +1,122 @@
+"""The engine by itself: freeze time of a base and of deltas, size and time of a capture, time of a restore."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from benchmarks.figures import Figure
+from checkpoint import channel
+from checkpoint.linux import vessel
+from checkpoint.linux.vessel import Birth
+from failover.cli.keeper import Keeper
+
+SIZES_MB = (10, 100, 500)
+DIRTY_KB = (40, 400, 2000)
+"""Written between two snapshots; the largest belongs to a program that writes 20 MB a second under ten snapshots a second."""
+
+PERIOD_S = 0.1
+PROGRAM = Path(__file__).parent / "resident.py"
+
+
+def freeze(quick: bool, directory: Path) -> list[Figure]:
+    """What the program feels: how long it stands still for the first base and for each delta."""
+    found = []
+    for megabytes in SIZES_MB[: 2 if quick else None]:
+        for dirty_kb in DIRTY_KB:
+            found += _freeze_of(megabytes, dirty_kb, 20 if quick else 60, directory)
+    return found
+
+
+def _freeze_of(megabytes: int, dirty_kb: int, count: int, directory: Path) -> list[Figure]:
+    case = f"{megabytes} MB, {dirty_kb} KB written each 50 ms"
+    freezes: list[float] = []
+    walls: list[float] = []
+    dirty: list[float] = []
+    with resident(megabytes, dirty_kb, directory) as pid, Keeper.spawn() as keeper:
+        keeper.ask(channel.Protect(pid, "/benchmark"), channel.Protected)
+        base, _ = _capture(keeper, base=True, sequence=1)
+        for sequence in range(2, count + 2):
+            time.sleep(PERIOD_S)
+            captured, wall_ms = _capture(keeper, base=False, sequence=sequence)
+            freezes.append(captured.freeze_us / 1000)
+            walls.append(wall_ms)
+            dirty.append(captured.dirty_bytes / 1e6)
+        keeper.ask(channel.Release(), channel.Released)
+    return [
+        Figure("freeze of the first base", case, "ms", (base.freeze_us / 1000,)),
+        Figure("freeze of a delta", case, "ms", tuple(freezes)),
+        Figure("capture of a delta, encoded", case, "ms", tuple(walls)),
+        Figure("pages in a delta", case, "MB", tuple(dirty)),
+    ]
+
+
+@contextmanager
+def resident(megabytes: int, dirty_kb: int, directory: Path) -> Iterator[int]:
+    """The measured program with files as its standard streams; yields its PID once it has all its memory."""
+    python = getattr(sys, "_base_executable", sys.executable)
+    output = directory / "output"
+    with output.open("wb") as file:
+        process = subprocess.Popen(
+            [python, str(PROGRAM), str(megabytes), str(dirty_kb)],
+            stdin=subprocess.DEVNULL,
+            stdout=file,
+            stderr=file,
+            start_new_session=True,
+        )
+    try:
+        while output.stat().st_size == 0:
+            time.sleep(0.005)
+        yield process.pid
+    finally:
+        process.kill()
+        process.wait()
+
+
+def _capture(keeper: Keeper, base: bool, sequence: int) -> tuple[channel.Captured, float]:
+    """One snapshot, acknowledged at once: what the keeper told, and milliseconds from asking to having it encoded."""
+    began = time.perf_counter()
+    captured, (content,) = keeper.ask(channel.Capture(base=base, generation=1, sequence=sequence), channel.Captured)
+    wall_ms = (time.perf_counter() - began) * 1000
+    os.close(content)
+    keeper.tell(channel.Acknowledge(captured.position))
+    return captured, wall_ms
+
+
+def restore(quick: bool, directory: Path) -> list[Figure]:
+    """From an encoded base in memory to the program running: the vessel's birth, the keeper's work, the resumption."""
+    return [_restore_of(megabytes, 3 if quick else 8, directory) for megabytes in SIZES_MB[: 2 if quick else None]]
+
+
+def _restore_of(megabytes: int, count: int, directory: Path) -> Figure:
+    with resident(megabytes, 40, directory) as pid, Keeper.spawn() as keeper:
+        keeper.ask(channel.Protect(pid, "/benchmark"), channel.Protected)
+        _, (content,) = keeper.ask(channel.Capture(base=True, generation=1, sequence=1, hold=True), channel.Captured)
+        os.kill(pid, signal.SIGKILL)
+    times = tuple(_restored_once(content, pid) for _ in range(count))
+    os.close(content)
+    return Figure("restore", f"{megabytes} MB", "ms", times)
+
+
+def _restored_once(content: int, pid: int) -> float:
+    with Keeper.spawn() as keeper:
+        _wait_until_ready(keeper)
+        began = time.perf_counter()
+        born = vessel.spawn_vessel(Birth(pid))
+        try:
+            keeper.ask(channel.Restore(born.pid, "/benchmark"), channel.Restored, (content,))
+            keeper.ask(channel.Resume(), channel.Resumed)
+            return (time.perf_counter() - began) * 1000
+        finally:
+            vessel.discard(born)
+
+
+def _wait_until_ready(keeper: Keeper) -> None:
+    """A standby's keeper runs already when it is needed: the interpreter's start is not part of a restore."""
+    keeper.ask(channel.Probe(os.getpid()), channel.Probed)
