@@ -8,7 +8,8 @@ from __future__ import annotations
 import contextlib
 import subprocess
 import sys
-from typing import TypeVar
+import tempfile
+from typing import IO, TypeVar
 
 import msgspec
 
@@ -25,21 +26,24 @@ A = TypeVar("A", bound=msgspec.Struct)
 class Keeper:
     """One keeper process and our end of its channel. A context manager; leaving it lets go of the tracee."""
 
-    def __init__(self, process: subprocess.Popen[bytes], link: Channel[Reply]) -> None:
+    def __init__(self, process: subprocess.Popen[bytes], link: Channel[Reply], complaints: IO[bytes]) -> None:
         self._process = process
         self._link = link
+        self._complaints = complaints
 
     @classmethod
     def spawn(cls) -> Keeper:
         """Start one."""
         ours, theirs = channel.pair()
+        complaints = tempfile.TemporaryFile()  # noqa: SIM115  # ours until `close`
         with theirs:
             process = subprocess.Popen(
                 [sys.executable, "-m", "checkpoint", "keeper", str(theirs.fileno())],
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
+                stderr=complaints,
             )
-        return cls(process, Channel(ours, Reply))
+        return cls(process, Channel(ours, Reply), complaints)
 
     def ask(self, request: msgspec.Struct, wanted: type[A], descriptors: tuple[int, ...] = ()) -> tuple[A, tuple[int, ...]]:
         """Send one request and wait for its answer: it, and the descriptors that came with it, now ours.
@@ -52,7 +56,8 @@ class Keeper:
             answer, found = self._link.receive()
         except ChannelClosedError as error:
             raise CheckpointError(
-                f"the keeper (the tracer's process) ended during {type(request).__name__}; the program is unharmed; try again"
+                f"the keeper (the tracer's process) ended during {type(request).__name__}; what it traced runs on unharmed. "
+                f"It said: {self._last_words()}"
             ) from error
         if isinstance(answer, Failed):
             channel.close_all(found)
@@ -70,8 +75,16 @@ class Keeper:
         """
         self._link.send(request)
 
+    def _last_words(self) -> str:
+        """The last line of what it wrote to standard error."""
+        self._process.wait(LEAVE_S)
+        self._complaints.seek(0)
+        lines = self._complaints.read().decode(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "nothing"
+
     def close(self) -> None:
         """Hang up, and wait until it has let go."""
+        self._complaints.close()
         self._link.close()
         try:
             self._process.wait(LEAVE_S)
