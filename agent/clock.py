@@ -40,3 +40,8 @@ def become_realtime() -> tuple[str, ...]:
     except OSError as error:
         notes.append(f"the heart's memory can be swapped out: {error.strerror}; give the agent CAP_IPC_LOCK")
     return tuple(notes)
+
+
+def age_ns(descriptor: int) -> int:
+    """How long ago a file was written, by this machine's calendar; never negative."""
+    return max(0, time.time_ns() - os.fstat(descriptor).st_mtime_ns)

@@ -29,6 +29,7 @@ ACTS: Final[dict[str, Any]] = {
         acts.Thaw,
         acts.SetLease,
         acts.KeepAside,
+        acts.Forget,
         acts.End,
         acts.Stop,
         acts.LetGo,

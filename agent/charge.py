@@ -1,0 +1,393 @@
+"""One component in this robot's charge: the core's acts on it, carried out in order, and answered by events.
+
+Acts of one component wait for one another; acts of two components do not. Two kinds do not wait: a lease must be renewed, and a
+program frozen, however long a capture takes; they go to the guard, which nothing else keeps busy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from agent import clock
+from agent.ballot import write_durably
+from agent.component import Captured, Component, Places, Program
+from agent.errors import AgentError, KeeperLostError
+from agent.records import Records
+from checkpoint.channel import close_all, content_of
+from checkpoint.errors import CheckpointError, UnsupportedError
+from checkpoint.model import Position
+from checkpoint.shelf import folder_name
+from checkpoint.store import Store
+from failover.core import acts, events
+from failover.core.acts import Act
+from failover.core.events import Event
+from failover.core.types import Launch
+
+KILLED: Final = 9
+"""The wait status of a program whose guard was lost: as of one that was killed."""
+
+TROUBLE: Final = (CheckpointError, AgentError, OSError)
+"""What can go wrong with a program, its processes or a disk, and is told; anything else is our mistake and ends the lanes."""
+
+log = logging.getLogger("failover.component")
+
+
+@dataclass(slots=True)
+class Figures:
+    """What ``failover status`` shows of one component on this robot; None where it is not known."""
+
+    snapshots: int = 0
+    restores: int = 0
+    crashes: int = 0
+    freeze_us: int | None = None
+    freeze_us_max: int | None = None
+    snapshot_size: int | None = None
+    dirty_bytes: int | None = None
+    newest: Position | None = None
+    exit_status: int | None = None
+    outage_ms: float | None = None
+    reasons: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def captured(self, captured: Captured) -> None:
+        """Count one snapshot that was taken here."""
+        self.snapshots += 1
+        self.freeze_us = captured.freeze_us
+        self.freeze_us_max = max(self.freeze_us_max or 0, captured.freeze_us)
+        self.snapshot_size, self.dirty_bytes = captured.size, captured.dirty_bytes
+        self.newest = captured.position
+        self.notes = captured.notes
+
+    def stored(self, position: Position, size: int) -> None:
+        """Count one snapshot that came from the primary."""
+        self.snapshots += 1
+        self.newest, self.snapshot_size = position, size
+
+
+@dataclass(slots=True)
+class Surroundings:
+    """What every charge works with.
+
+    Attributes:
+        tell: passes an event to the core.
+        silence_ns: how long the robot that the component is taken over from has been silent, as far as known; for the outage.
+    """
+
+    places: Places
+    store: Store
+    records: Records
+    tell: Callable[[Event], None]
+    silence_ns: Callable[[str], Coroutine[Any, Any, int]]
+
+
+@dataclass(slots=True)
+class Charge:
+    """The component and what is to be done with it.
+
+    Attributes:
+        component: None while nothing of it runs here.
+        epoch: of the newest act; an older one is dropped.
+        ended: set by the core's word that the component's end is a record.
+    """
+
+    name: str
+    around: Surroundings
+    component: Component | None = None
+    epoch: int = 0
+    figures: Figures = field(default_factory=Figures)
+    started: asyncio.Event = field(default_factory=asyncio.Event)
+    ended: asyncio.Future[acts.ReportExit] | None = None
+    _queue: asyncio.Queue[Act] = field(default_factory=asyncio.Queue)
+    _tasks: set[asyncio.Task[None]] = field(default_factory=set)
+    _stopping: bool = False
+
+    def begin(self) -> None:
+        """Start to carry acts out."""
+        self._task(self._work())
+
+    def order(self, act: Act) -> None:
+        """Take an act in."""
+        if isinstance(act, acts.SetLease | acts.Freeze):
+            self._task(self._at_once(act))
+        else:
+            self._queue.put_nowait(act)
+
+    def adopt(self, component: Component, epoch: int) -> None:
+        """A guard was found alive after a restart."""
+        self.component, self.epoch = component, epoch
+        self.started.set()
+        self._task(self._see_the_end(component))
+
+    async def close(self) -> None:
+        """Let everything go; the program runs on."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self.component is not None:
+            self.component.close()
+
+    def _task(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        task.add_done_callback(end_lanes_on_mistake)
+
+    # --- acts ---
+
+    async def _work(self) -> None:
+        while True:
+            act = await self._queue.get()
+            if act.epoch < self.epoch and not isinstance(act, acts.Stop):  # type: ignore[union-attr]
+                log.info("%s: an order of epoch %d came after epoch %d; dropped", self.name, act.epoch, self.epoch)  # type: ignore[union-attr]
+                continue
+            self.epoch = max(self.epoch, act.epoch)  # type: ignore[union-attr]
+            try:
+                await self._carry_out(act)
+            except TROUBLE as trouble:
+                self._told_of(act, trouble)
+
+    async def _carry_out(self, act: Act) -> None:
+        match act:
+            case acts.Start():
+                await self._start(act)
+            case acts.Restore():
+                await self._restore(act)
+            case acts.Capture():
+                await self._capture(act)
+            case acts.Acknowledge():
+                if self.component is not None:
+                    await self.component.acknowledge(act.position)
+            case acts.Thaw():
+                await self._thaw(act)
+            case acts.End():
+                if self.component is not None:
+                    self._task(self._end(self.component, act.signal))
+            case acts.Stop():
+                await self._stop()
+                self.around.tell(events.Stopped(self.name, act.epoch))
+            case acts.LetGo():
+                await self._let_go()
+            case acts.KeepAside():
+                await self._keep_aside(act)
+            case acts.Forget() | acts.Prune() | acts.Drop():
+                await self._keep_house(act)
+            case acts.ReportExit():
+                await self._report(act)
+
+    def _told_of(self, act: Act, trouble: Exception) -> None:
+        """Say what went wrong, to the log and to the core where it waits for it."""
+        message = str(trouble) or type(trouble).__name__
+        log.warning("%s: %s: %s", self.name, type(act).__name__, message)
+        match act:
+            case acts.Capture():
+                unsupported = isinstance(trouble, UnsupportedError)
+                self.figures.reasons = trouble.reasons if isinstance(trouble, UnsupportedError) else (message,)
+                lost = isinstance(trouble, KeeperLostError)
+                self.around.tell(events.CaptureFailed(self.name, act.epoch, message, unsupported, lost))
+            case acts.Start() | acts.Restore():
+                self.figures.reasons = (*getattr(trouble, "reasons", ()),) or (message,)
+                self.around.tell(events.ActFailed(self.name, act.epoch, message))
+
+    async def _at_once(self, act: acts.SetLease | acts.Freeze) -> None:
+        if self.component is None or act.epoch < self.epoch:
+            return
+        try:
+            if isinstance(act, acts.SetLease):
+                await self.component.lease(act.until_ns)
+            else:
+                await self.component.freeze()
+        except TROUBLE as trouble:
+            log.warning("%s: %s: %s", self.name, type(act).__name__, trouble)
+
+    async def _start(self, act: acts.Start) -> None:
+        if self.component is None:
+            self.around.records.note(self.name, act.epoch)
+            self._settle(await self._begun(act.spec.launch))
+        assert self.component is not None
+        self.around.records.note(self.name, act.epoch)
+        await self.component.lease(act.lease_until_ns)
+        await self._protect(refuse=act.spec.launch.pid != 0)
+        self.started.set()
+        self.around.tell(events.Started(self.name, act.epoch))
+
+    async def _begun(self, launch: Launch) -> Component:
+        if launch.pid:
+            return await Component.watch(self.name, launch.pid, self.around.places)
+        program = Program(
+            tuple(os.fsencode(argument) for argument in launch.argv),
+            tuple(os.fsencode(f"{name}={value}") for name, value in launch.environment),
+            os.fsencode(launch.directory),
+            launch.umask,
+            launch.isolate,
+        )
+        return await Component.start(self.name, program, self.around.places)
+
+    async def _protect(self, *, refuse: bool) -> None:
+        """Give it a keeper. A program that was started here runs on unprotected where it cannot have one; a guest is refused."""
+        assert self.component is not None
+        try:
+            self.figures.notes = await self.component.protect()
+            self.figures.reasons = ()
+        except UnsupportedError as trouble:
+            self.figures.reasons = trouble.reasons
+            if refuse:
+                await self._let_go()
+                raise
+
+    async def _restore(self, act: acts.Restore) -> None:
+        began_ns = clock.now_ns()
+        silent_ns = await self.around.silence_ns(self.name)
+        await self._stop()
+        descriptors = await asyncio.to_thread(self.around.store.open_chain, self.name, act.position)
+        try:
+            outage_ns = clock.age_ns(descriptors[-1])
+            component = await Component.restore(
+                self.name, descriptors, self.around.places, outage_ns=outage_ns, lease_until_ns=act.lease_until_ns
+            )
+        finally:
+            close_all(tuple(descriptors))
+        self.around.records.note(self.name, act.epoch)
+        await component.resume()
+        self._settle(component)
+        self.figures.restores += 1
+        self.figures.reasons = ()
+        self.figures.outage_ms = (silent_ns + clock.now_ns() - began_ns) / 1e6
+        self.started.set()
+        self.around.tell(events.Restored(self.name, act.epoch, act.position))
+
+    async def _capture(self, act: acts.Capture) -> None:
+        component = self._present()
+        captured = await component.capture(
+            base=act.base, generation=act.generation, sequence=act.sequence, epoch=act.epoch, hold=act.hold
+        )
+        try:
+            await asyncio.to_thread(self.around.store.put, captured.snapshot, prove=False)
+        finally:
+            os.close(captured.snapshot)
+        self.figures.captured(captured)
+        self.figures.reasons = ()
+        self.around.tell(
+            events.Captured(
+                self.name,
+                act.epoch,
+                captured.position,
+                captured.parent,
+                captured.size,
+                captured.freeze_us,
+                captured.dirty_bytes,
+            )
+        )
+
+    async def _thaw(self, act: acts.Thaw) -> None:
+        component = self._present()
+        self.around.records.note(self.name, act.epoch)
+        await component.lease(act.lease_until_ns)
+        await component.thaw()
+
+    async def _end(self, component: Component, number: int) -> None:
+        try:
+            await component.stop(number)
+        except TROUBLE as trouble:
+            log.warning("%s: cannot end it: %s", self.name, trouble)
+
+    async def _stop(self) -> None:
+        """Kill this robot's copy and clear it away; there may be none."""
+        component, self.component = self.component, None
+        if component is None:
+            return
+        self._stopping = True
+        try:
+            await component.stop(signal.SIGKILL)
+            await component.forget()
+        finally:
+            self._stopping = False
+            self.around.records.forget(self.name)
+            component.close()
+
+    async def _let_go(self) -> None:
+        component, self.component = self.component, None
+        if component is not None:
+            await component.release()
+            self.around.records.forget(self.name)
+
+    async def _keep_aside(self, act: acts.KeepAside) -> None:
+        """One last snapshot of a copy that lost, where nobody resumes from it by himself."""
+        component = self._present()
+        newest = self.figures.newest or Position(1, 0, b"")
+        captured = await component.capture(
+            base=True, generation=newest.generation, sequence=newest.sequence + 1, epoch=act.epoch, hold=True
+        )
+        try:
+            content = content_of(captured.snapshot)
+        finally:
+            os.close(captured.snapshot)
+        folder = self.around.places.logs.parent / "lost"
+        folder.mkdir(mode=0o700, exist_ok=True)
+        path = folder / f"{folder_name(self.name)}-epoch{act.epoch}.snapshot"
+        await asyncio.to_thread(write_durably, path, content)
+        log.warning("%s: the copy that lost is kept for inspection in %s: %s", self.name, path, act.reason)
+
+    async def _keep_house(self, act: acts.Forget | acts.Prune | acts.Drop) -> None:
+        store = self.around.store
+        match act:
+            case acts.Forget():
+                await asyncio.to_thread(store.set_aside, self.name, act.generations)
+            case acts.Prune():
+                await asyncio.to_thread(store.prune, self.name, act.oldest)
+            case acts.Drop():
+                await asyncio.to_thread(store.drop, self.name)
+
+    async def _report(self, act: acts.ReportExit) -> None:
+        """The end is a record now: tell who waits, and let the guard go."""
+        self.figures.exit_status = act.status
+        self.started.set()
+        ended = self.end()
+        if not ended.done():
+            ended.set_result(act)
+        component, self.component = self.component, None
+        if component is not None:
+            if act.failed and not component.ended.done():
+                await component.stop(signal.SIGKILL)
+            await component.forget()
+            self.around.records.forget(self.name)
+
+    # --- the program ---
+
+    def end(self) -> asyncio.Future[acts.ReportExit]:
+        """Done once the end of the component is a record."""
+        if self.ended is None or (self.ended.done() and self.component is not None):
+            self.ended = asyncio.get_running_loop().create_future()
+        return self.ended
+
+    def _present(self) -> Component:
+        if self.component is None:
+            raise AgentError(f"{self.name} does not run on this robot")
+        return self.component
+
+    def _settle(self, component: Component) -> None:
+        self.component = component
+        self._task(self._see_the_end(component))
+
+    async def _see_the_end(self, component: Component) -> None:
+        try:
+            status = await asyncio.shield(component.ended)
+        except AgentError as trouble:
+            log.error("%s: its guard is gone: %s", self.name, trouble)
+            status = KILLED
+        if self.component is component and not self._stopping:
+            self.figures.crashes += bool(status and os.WIFSIGNALED(status))
+            self.around.tell(events.Exited(self.name, self.epoch, status or 0))
+
+
+def end_lanes_on_mistake(task: asyncio.Task[Any]) -> None:
+    """A task that ended by an error nobody foresaw: say it and end the process; the heart starts another, components live on."""
+    if task.cancelled() or task.exception() is None:
+        return
+    log.critical("a mistake in the agent: please report it", exc_info=task.exception())
+    os._exit(70)

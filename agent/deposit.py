@@ -1,0 +1,89 @@
+"""What a standby does with what comes in: only from whom the core admitted, verified, stored, and only then told."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+
+from agent.component import Places, log_directory
+from agent.shipping import Refusal
+from agent.streams import OutputLogs
+from checkpoint import format
+from checkpoint.errors import ChainError, CheckpointError, FormatError
+from checkpoint.model import Snapshot
+from checkpoint.store import Store
+from failover.core.acts import Admit
+from failover.core.events import Event, Stored, StoreFailed
+from failover.core.messages import Offer
+
+log = logging.getLogger("failover.deposit")
+
+
+class Deposit:
+    """The desk (`agent.shipping.Desk`) at which peers hand in snapshots."""
+
+    def __init__(
+        self, store: Store, places: Places, tell: Callable[[Event], None], kept: Callable[[str, Snapshot, int], None]
+    ) -> None:
+        """
+        Args:
+            kept: called with (component, the snapshot without its pages, its size) for the status.
+        """
+        self._store = store
+        self._places = places
+        self._tell = tell
+        self._kept = kept
+        self._admitted: dict[str, Admit] = {}
+        self._turns: dict[str, asyncio.Lock] = {}
+
+    def admit(self, act: Admit) -> None:
+        """From now on take this component's snapshots from this sender alone."""
+        self._admitted[act.component] = act
+
+    def sender(self, component: str) -> str:
+        """From whom its snapshots come; "" from nobody."""
+        admitted = self._admitted.get(component)
+        return admitted.sender if admitted else ""
+
+    def admits(self, peer: str, offer: Offer) -> None:
+        """Refuse what was not asked for, before a byte of it travels.
+
+        Raises:
+            Refusal: with the reason for the sender's status.
+        """
+        admitted = self._admitted.get(offer.component)
+        if admitted is None or admitted.sender != peer:
+            raise Refusal(f"this robot does not take snapshots of {offer.component} from {peer}")
+        if offer.epoch < admitted.epoch:
+            raise Refusal(f"epoch {offer.epoch} of {offer.component} is over; {admitted.epoch} has begun")
+
+    async def take(self, peer: str, offer: Offer, descriptor: int) -> None:
+        """Verify, store durably, extend the output streams; then the core hears of it. One at a time for each component."""
+        async with self._turns.setdefault(offer.component, asyncio.Lock()):
+            try:
+                self.admits(peer, offer)
+                snapshot = await asyncio.to_thread(self._put, offer, descriptor)
+            except Refusal as refusal:
+                log.info("dropped a snapshot of %s from %s: %s", offer.component, peer, refusal)
+                return
+            except (CheckpointError, OSError) as error:
+                log.warning("a snapshot of %s from %s was not kept: %s", offer.component, peer, error)
+                needs_base = isinstance(error, ChainError)
+                self._tell(StoreFailed(offer.component, offer.epoch, peer, str(error), needs_base))
+                return
+        self._kept(offer.component, snapshot, offer.size)
+        self._tell(Stored(offer.component, offer.epoch, snapshot.position, peer, offer.spec))
+
+    def _put(self, offer: Offer, descriptor: int) -> Snapshot:
+        header = format.read_header(descriptor)
+        told = (offer.component, offer.position, offer.parent, offer.epoch)
+        if (header.component, header.position, header.parent, header.epoch) != told:
+            raise FormatError(f"a snapshot of {offer.component} is not the one that was offered: it names {header.component}")
+        snapshot = self._store.put(descriptor)
+        logs = OutputLogs(log_directory(offer.component, self._places))
+        try:
+            logs.apply(snapshot.output)
+        finally:
+            logs.close()
+        return snapshot

@@ -1,0 +1,79 @@
+"""``failover-agent``: the daemon's command line."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import sys
+from pathlib import Path
+from typing import Final
+
+from agent import config as configuration
+from agent.errors import AgentError
+from agent.journal import set_up_log
+from agent.systemd import notifier
+from failover.errors import FailoverError
+
+DEFAULT_CONFIG: Final = Path("/etc/failover/agent.toml")
+FAILED: Final = 1
+
+log = logging.getLogger("failover.agent")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the agent until SIGTERM, or print a key pair, or check a configuration."""
+    wanted = _parser().parse_args(arguments)
+    try:
+        if wanted.command == "keypair":
+            return _print_keys()
+        settings = configuration.load(wanted.config)
+        if wanted.command == "check":
+            print(
+                f"{wanted.config}: robot {settings.config.robot} of team {settings.team.team}, peers {', '.join(settings.peers)}"
+            )
+            return 0
+        return _run(settings)
+    except (AgentError, FailoverError) as error:
+        print(f"failover-agent: {error}", file=sys.stderr)
+        return FAILED
+
+
+def _run(settings: configuration.Settings) -> int:
+    from agent.loop import beat
+
+    set_up_log(settings.config.log_level)
+    if settings.config.insecure:
+        log.warning(
+            "INSECURE: running without keys; anybody on the network can read the memory of programs and start programs here"
+        )
+    beat(settings, notifier())
+    return 0
+
+
+def _print_keys() -> int:
+    from agent.transport import new_keys
+
+    public, secret = new_keys()
+    print(json.dumps({"public": public, "secret": secret}))
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="failover-agent",
+        description="Protect the programs of this robot and of its neighbours. Runs in the foreground; components outlive it.",
+    )
+    parser.add_argument(
+        "command",
+        nargs="?",
+        default="run",
+        choices=("run", "check", "keypair"),
+        help="run (the default); check reads the configuration and says what it found; keypair prints a new pair as JSON",
+    )
+    parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG, metavar="FILE", help=f"default {DEFAULT_CONFIG}")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

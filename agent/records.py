@@ -1,0 +1,54 @@
+"""Under which epoch each program on this robot was let run: noted before it runs, read by the next agent.
+
+One small file a component in the runtime directory: it has to outlive the agent, not the robot.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import msgspec
+
+from checkpoint.shelf import folder_name
+
+
+class Running(msgspec.Struct, frozen=True):
+    """One note."""
+
+    component: str
+    epoch: int
+
+
+class Records:
+    """The notes of one robot."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+
+    def note(self, component: str, epoch: int) -> None:
+        """From now on it runs under this epoch.
+
+        Raises:
+            OSError: it cannot be written; the program must not run.
+        """
+        path = self._path(component)
+        aside = path.with_suffix(".new")
+        aside.write_bytes(msgspec.json.encode(Running(component, epoch)))
+        aside.replace(path)
+
+    def epoch(self, component: str) -> int:
+        """Under which it runs; 0 if nobody noted it."""
+        try:
+            return msgspec.json.decode(self._path(component).read_bytes(), type=Running).epoch
+        except (OSError, msgspec.MsgspecError):
+            return 0
+
+    def forget(self, component: str) -> None:
+        """It runs here no longer."""
+        with contextlib.suppress(FileNotFoundError):
+            self._path(component).unlink()
+
+    def _path(self, component: str) -> Path:
+        return self._directory / (folder_name(component) + ".running")

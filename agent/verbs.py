@@ -1,0 +1,347 @@
+"""What the agent does for a client of the control socket, verb by verb. What the core must decide goes to it as a command."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Callable
+from typing import Any, Final, Protocol, TypeVar
+
+import msgspec
+
+from agent import clock
+from agent.charge import Charge
+from agent.component import Places, log_directory
+from agent.config import Settings
+from agent.control import Conversation, Verb
+from agent.door import Told
+from agent.errors import RefusedError
+from agent.rules import rules_for
+from agent.streams import STREAMS, OutputLogs
+from agent.view import version
+from failover.core import acts, events
+from failover.core.names import check_component
+from failover.core.types import ENDED, ComponentSpec, Launch
+from failover.errors import NameFormatError
+
+LOG_POLL_S: Final = 0.02
+"""How soon new output is passed on to whoever watches."""
+
+START_PATIENCE_S: Final = 30.0
+"""How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
+
+NANOSECONDS_A_SECOND: Final = 1_000_000_000
+
+T = TypeVar("T")
+
+
+class Lanes(Protocol):
+    """What of `agent.lanes.Lanes` is needed here."""
+
+    settings: Settings
+    places: Places
+    charges: dict[str, Charge]
+
+    async def ask(self, what: Any, component: str = "") -> Told: ...
+    async def command(self, make: Callable[[int], events.Command]) -> acts.Answer: ...
+    def charge(self, name: str) -> Charge: ...
+    def picture(self, told: Told) -> dict[str, Any]: ...
+
+
+class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``run``."""
+
+    argv: list[str]
+    name: str = ""
+    env: dict[str, str] = {}
+    cwd: str = "/"
+    umask: int = 0o022
+    isolate: bool = True
+    wait: bool = True
+
+
+class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``protect``."""
+
+    pid: int
+    name: str
+
+
+class StopArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``stop``."""
+
+    name: str
+    signal: int = 15
+
+
+class LogsArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``logs``."""
+
+    name: str
+    follow: bool = False
+    offsets: tuple[int, int] = (0, 0)
+
+
+class NameArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``release`` and ``why``."""
+
+    name: str = ""
+
+
+class HandoverArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``handover``."""
+
+    name: str
+    to: str = ""
+
+
+class PreferArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``prefer``."""
+
+    name: str
+    robot: str
+
+
+class StatusArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``status``."""
+
+    watch: bool = False
+    every_ms: int = 500
+
+
+class Verbs:
+    """Every verb of the control socket."""
+
+    def __init__(self, lanes: Lanes) -> None:
+        self._lanes = lanes
+
+    def table(self) -> dict[str, Verb]:
+        """By name, as the client says them."""
+        return {
+            "ping": self.ping,
+            "status": self.status,
+            "run": self.run,
+            "protect": self.protect,
+            "release": self.release,
+            "stop": self.stop,
+            "logs": self.logs,
+            "why": self.why,
+            "handover": self.handover,
+            "prefer": self.prefer,
+        }
+
+    async def ping(self, _say: Conversation, _arguments: dict[str, Any]) -> dict[str, Any]:
+        """Who are you?"""
+        await self._lanes.ask("status")
+        config = self._lanes.settings.config
+        team = self._lanes.settings.team.team
+        return {"robot": config.robot, "team": team, "pid": os.getppid(), "version": version(), "insecure": config.insecure}
+
+    async def status(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """How does the team stand?"""
+        wanted = _read(StatusArguments, "status", arguments)
+        while wanted.watch:
+            await say.update(self._lanes.picture(await self._lanes.ask("status")))
+            await asyncio.sleep(max(wanted.every_ms, 10) / 1_000)
+        return self._lanes.picture(await self._lanes.ask("status"))
+
+    async def why(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """What was decided, when and why?"""
+        wanted = _read(NameArguments, "why", arguments)
+        name = await self._known(wanted.name) if wanted.name else ""
+        told = await self._lanes.ask("why", name)
+        wall_s = clock.wall_time_s()
+        story = [
+            {
+                "at": wall_s - (told.now_ns - decision.at_ns) / NANOSECONDS_A_SECOND,
+                "robot": self._lanes.settings.config.robot,
+                "component": decision.component,
+                "saw": "",
+                "did": decision.sentence,
+            }
+            for decision in told.story
+        ]
+        return {"story": story}
+
+    async def run(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Start a program under protection; with ``wait`` pass its output on until it has ended."""
+        wanted = _read(RunArguments, "run", arguments)
+        if not wanted.argv:
+            raise RefusedError("run needs a command: failover run -- COMMAND …")
+        name = await self._fresh_name(wanted.name, wanted.argv[0])
+        launch = Launch(tuple(wanted.argv), tuple(wanted.env.items()), wanted.cwd, wanted.umask, isolate=wanted.isolate)
+        charge = await self._begin(name, launch)
+        started: dict[str, Any] = {"name": name, "notes": list(charge.figures.notes), "reasons": list(charge.figures.reasons)}
+        if charge.component is not None:
+            component = charge.component
+            started |= {"pid": component.pid, "inner_pid": component.inner_pid, "isolated": component.isolated}
+            started["notes"] = [*component.notes, *charge.figures.notes]
+        if not wanted.wait:
+            return started
+        await say.update({"started": started})
+        await self._pass_output_on(say, charge, (0, 0), committed=False, follow=True)
+        report = await asyncio.shield(charge.end())
+        return {"name": name, "exit_status": report.status, "failed": report.failed, "reason": report.reason}
+
+    async def protect(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Take a running process under protection."""
+        wanted = _read(ProtectArguments, "protect", arguments)
+        name = await self._fresh_name(wanted.name, "")
+        charge = await self._begin(name, Launch(pid=wanted.pid))
+        return {"name": name, "pid": wanted.pid, "notes": list(charge.figures.notes)}
+
+    async def release(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Let a component run on unprotected."""
+        name = await self._known(_read(NameArguments, "release", arguments).name)
+        charge = self._lanes.charge(name)
+        pid = charge.component.pid if charge.component is not None else None
+        await self._command(lambda number: events.Release(number, name))
+        return {"name": name, "pid": pid}
+
+    async def stop(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """End a component."""
+        wanted = _read(StopArguments, "stop", arguments)
+        name = await self._known(wanted.name)
+        end = self._lanes.charge(name).end()
+        await self._command(lambda number: events.Stop(number, name, wanted.signal))
+        report = await asyncio.shield(end)
+        return {"name": name, "exit_status": report.status}
+
+    async def handover(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Move a component."""
+        wanted = _read(HandoverArguments, "handover", arguments)
+        name = await self._known(wanted.name)
+        began_ns = clock.now_ns()
+        answer = await self._command(lambda number: events.Handover(number, name, wanted.to))
+        view = await self._view(name)
+        took_ms = (clock.now_ns() - began_ns) / 1e6
+        told = {"name": name, "to": view.get("primary", wanted.to), "epoch": view.get("epoch")}
+        return {**told, "outage_ms": took_ms, "sentence": answer.sentence}
+
+    async def prefer(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Say where a component should run."""
+        wanted = _read(PreferArguments, "prefer", arguments)
+        name = await self._known(wanted.name)
+        await self._command(lambda number: events.Prefer(number, name, wanted.robot))
+        return {"name": name, "robot": wanted.robot}
+
+    async def logs(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """The component's output as far as no takeover can take it back; all of it once it has ended."""
+        wanted = _read(LogsArguments, "logs", arguments)
+        name = await self._known(wanted.name)
+        charge = self._lanes.charge(name)
+        totals = await self._pass_output_on(say, charge, wanted.offsets, committed=True, follow=wanted.follow)
+        view = await self._view(name)
+        return {"name": name, "totals": list(totals), "exit_status": view.get("exit_status")}
+
+    # --- what verbs share ---
+
+    async def _begin(self, name: str, launch: Launch) -> Charge:
+        """Have a component started or taken in, and wait until it is.
+
+        Raises:
+            RefusedError: the core says no, or it could not be started; with the reasons.
+        """
+        config = self._lanes.settings.config
+        rules = rules_for(config, self._lanes.settings.component(name))
+        charge = self._lanes.charge(name)
+        charge.started.clear()
+        charge.ended = None
+        end = charge.end()
+        await self._command(lambda number: events.Run(number, ComponentSpec(name, config.robot, launch, rules)))
+        begun = asyncio.ensure_future(charge.started.wait())
+        try:
+            both: set[asyncio.Future[Any]] = {begun, end}
+            await asyncio.wait(both, timeout=START_PATIENCE_S, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            begun.cancel()
+        if end.done() and end.result().failed:
+            raise RefusedError(f"cannot start {name}: {end.result().reason}", "RefusedError", charge.figures.reasons)
+        if not charge.started.is_set():
+            raise RefusedError(f"{name} has not begun in {START_PATIENCE_S:.0f} s; failover why {name} tells what it waits for")
+        return charge
+
+    async def _command(self, make: Callable[[int], events.Command]) -> acts.Answer:
+        answer = await self._lanes.command(make)
+        if not answer.ok:
+            raise RefusedError(answer.sentence)
+        return answer
+
+    async def _view(self, name: str) -> dict[str, Any]:
+        """The component's part of the picture; empty when it is unknown."""
+        picture = self._lanes.picture(await self._lanes.ask("status"))
+        return next((one for one in picture["components"] if one["name"] == name), {})
+
+    async def _names(self) -> dict[str, bool]:
+        """Every component that the team knows → whether its end is a record."""
+        told = await self._lanes.ask("status")
+        return {one.name: one.state in ENDED for one in told.status.components} if told.status else {}
+
+    async def _known(self, wanted: str) -> str:
+        """The component that a person means: its whole name, or an end of it that fits one alone.
+
+        Raises:
+            RefusedError: none, or more than one.
+        """
+        names = await self._names()
+        if wanted in names:
+            return wanted
+        fitting = [name for name in names if name.endswith("/" + wanted.lstrip("/"))]
+        if len(fitting) == 1:
+            return fitting[0]
+        if fitting:
+            raise RefusedError(f"{wanted!r} could be {', '.join(sorted(fitting))}; give the whole name", "UnknownComponentError")
+        known = ", ".join(sorted(names)) or "nothing"
+        raise RefusedError(f"no component is called {wanted!r}; this team protects {known}", "UnknownComponentError")
+
+    async def _fresh_name(self, wanted: str, command: str) -> str:
+        """A name for something new: as given, under this robot's own path, or made from the command."""
+        own = f"/{self._lanes.settings.team.team}/{self._lanes.settings.config.robot}/"
+        names = await self._names()
+        if not wanted:
+            stem = own + (os.path.basename(command) or "program")
+            numbered = (f"{stem}-{number}" for number in range(2, len(names) + 3))
+            wanted = stem if stem not in names else next(name for name in numbered if name not in names)
+        name = wanted if wanted.startswith("/") else own + wanted
+        try:
+            return check_component(name)
+        except NameFormatError as error:
+            raise RefusedError(str(error), "NameFormatError") from error
+
+    async def _pass_output_on(
+        self, say: Conversation, charge: Charge, offsets: tuple[int, int], *, committed: bool, follow: bool
+    ) -> tuple[int, int]:
+        """Send the streams' bytes from the offsets on; with ``follow`` until the component's end is a record."""
+        logs = OutputLogs(log_directory(charge.name, self._lanes.places))
+        at = dict(zip(STREAMS, offsets, strict=True))
+        try:
+            while True:
+                ended = await self._is_over(charge, follow)
+                sent = False
+                for stream in STREAMS:
+                    piece = logs.read(stream, at[stream], committed=committed and not ended)
+                    if piece.content:
+                        await say.output(stream, piece.offset, piece.content)
+                        at[stream] = piece.offset + len(piece.content)
+                        sent = True
+                if not sent and (ended or not follow):
+                    return at[1], at[2]
+                if not sent:
+                    await asyncio.sleep(LOG_POLL_S)
+        finally:
+            logs.close()
+
+    async def _is_over(self, charge: Charge, follow: bool) -> bool:
+        """Whether its end is a record: known here, or heard of from the robot where it ran."""
+        if charge.ended is not None and charge.ended.done():
+            return True
+        if charge.component is not None and follow:
+            return False
+        return (await self._names()).get(charge.name, False)
+
+
+def _read(kind: type[T], verb: str, arguments: dict[str, Any]) -> T:
+    try:
+        return msgspec.convert(arguments, kind)
+    except msgspec.ValidationError as error:
+        raise RefusedError(f"{verb}: its arguments are not right: {error}") from error

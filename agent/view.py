@@ -1,0 +1,137 @@
+"""What ``failover status`` shows: the core's view and what the lanes know. The fields: `failover.client.control`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from importlib import metadata
+from typing import Any, Final
+
+from agent.charge import Charge
+from agent.config import Settings
+from agent.door import Life, Told
+from agent.transport import Link, LinkState
+from failover.core.types import ComponentView, PeerView, Protection, State
+
+NANOSECONDS_A_MILLISECOND: Final = 1_000_000
+
+STATES: Final[dict[State, str]] = {
+    State.CLAIMING: "starting",
+    State.STARTING: "starting",
+    State.PRIMARY: "running",
+    State.FROZEN: "frozen",
+    State.HANDING_OVER: "running",
+    State.RECOVERING: "restoring",
+    State.TAKING_OVER: "restoring",
+    State.STOPPING: "ended",
+    State.STANDBY: "held",
+    State.FINISHED: "ended",
+    State.FAILED: "failed",
+    State.RELEASED: "released",
+    State.ABSENT: "absent",
+}
+PRIMARY_STATES: Final = frozenset(
+    {State.CLAIMING, State.STARTING, State.PRIMARY, State.FROZEN, State.HANDING_OVER, State.RECOVERING, State.TAKING_OVER}
+)
+PEER_STATES: Final = {"alive": "live", "unheard": "unknown"}
+
+INSECURE: Final = (
+    "INSECURE: links are neither authenticated nor encrypted; anybody on the network can read memory and start programs here"
+)
+
+
+def version() -> str:
+    """Of the installed package."""
+    try:
+        return metadata.version("failover")
+    except metadata.PackageNotFoundError:
+        return "unknown"
+
+
+def team_view(
+    settings: Settings, life: Life, told: Told, charges: Mapping[str, Charge], links: Mapping[str, Link], notices: list[str]
+) -> dict[str, Any]:
+    """The whole picture."""
+    view = told.status
+    notes = [*life.notes, *notices]
+    notes += [INSECURE] if settings.config.insecure else []
+    notes += [told.ballot_trouble] if told.ballot_trouble else []
+    beats = told.beats
+    return {
+        "robot": settings.config.robot,
+        "team": settings.team.team,
+        "role": settings.me.role,
+        "pid": life.heart,
+        "version": version(),
+        "life": life.boot,
+        "insecure": settings.config.insecure,
+        "realtime": not life.notes,
+        "rule": view.rule if view else settings.config.rule,
+        "promise": view.promise if view else "not decided yet: the agent is starting",
+        "healthy": view.healthy if view else False,
+        "notes": notes,
+        "peers": [_peer(peer, links.get(peer.robot), told) for peer in (view.peers if view else ())],
+        "components": [_component(one, charges.get(one.name), settings) for one in (view.components if view else ())],
+        "beats": {
+            "sent": beats.sent,
+            "heard": beats.heard,
+            "unsent": beats.unsent,
+            "refused": dict(beats.refused),
+            "late_us_max": beats.late_us_max,
+        },
+        "lanes_pid": os.getpid(),
+    }
+
+
+def _peer(peer: PeerView, link: Link | None, told: Told) -> dict[str, Any]:
+    reason = [link.reason] if link is not None and link.reason else []
+    return {
+        "name": peer.robot,
+        "state": PEER_STATES.get(peer.state, peer.state),
+        "last_heard_ms": peer.silent_ns // NANOSECONDS_A_MILLISECOND if peer.silent_ns >= 0 else None,
+        "hears_us": peer.hears_us,
+        "load": peer.load,
+        "lane": str(link.state if link is not None else LinkState.DOWN),
+        "beats_lost": None,
+        "rtt_us": None,
+        "notes": reason,
+    }
+
+
+def _component(view: ComponentView, charge: Charge | None, settings: Settings) -> dict[str, Any]:
+    figures = charge.figures if charge is not None else None
+    running = charge.component if charge is not None else None
+    newest = view.positions[0] if view.positions else None
+    degraded = view.protection in (Protection.DEGRADED, Protection.STOPPED) and view.state is State.PRIMARY
+    return {
+        "name": view.name,
+        "role": "primary" if view.state in PRIMARY_STATES else "standby" if view.state is State.STANDBY else "none",
+        "primary": view.primary,
+        "state": "degraded" if degraded else STATES[view.state],
+        "protection": str(view.protection),
+        "epoch": view.epoch,
+        "generation": newest.generation if newest else None,
+        "sequence": newest.sequence if newest else None,
+        "engine": "ptrace",
+        "pid": running.pid if running is not None else None,
+        "inner_pid": running.inner_pid if running is not None else None,
+        "isolated": running.isolated if running is not None else None,
+        "standby": view.standby,
+        "standby_sequence": newest.sequence if newest and view.standby else None,
+        "lag_ms": view.lag_ns / NANOSECONDS_A_MILLISECOND if view.lag_ns >= 0 else None,
+        "period_ms": view.period_ms,
+        "freeze_us": figures.freeze_us if figures else view.freeze_us or None,
+        "freeze_us_max": figures.freeze_us_max if figures else None,
+        "snapshot_size": figures.snapshot_size if figures else None,
+        "dirty_bytes": figures.dirty_bytes if figures else None,
+        "snapshots": figures.snapshots if figures else 0,
+        "restores": figures.restores if figures else 0,
+        "crashes": figures.crashes if figures else 0,
+        "outage_ms": figures.outage_ms if figures else None,
+        "exit_status": view.status if view.state is State.FINISHED else None,
+        "promise": view.promise,
+        "home": view.home,
+        "prefer": view.prefer,
+        "reasons": list(figures.reasons) if figures else [],
+        "notes": [*view.notes, *(figures.notes if figures else ())],
+    }
