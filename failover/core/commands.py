@@ -46,9 +46,7 @@ def _run(component: Component, turn: Turn, command: Run) -> None:
 def _why_not_run(component: Component, turn: Turn) -> str:
     name = component.name
     if component.holding or component.state is State.STOPPING:
-        return (
-            f"cannot run {name}: it is {component.state} here; failover stop or release it first, or choose another name"
-        )
+        return f"cannot run {name}: it is {component.state} here; failover stop or release it first, or choose another name"
     for peer in turn.team.living(turn.now_ns):
         entry = peer.entry(name)
         if entry is not None and not vacant(component, turn) and component.state not in ENDED:

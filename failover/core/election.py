@@ -12,30 +12,15 @@ A primacy is an epoch and the robot that all who know of it name as its primary.
 from __future__ import annotations
 
 from checkpoint.model import Position
-from failover.core import acts
+from failover.core import acts, lease
 from failover.core.component import LOST_MAX, Cause, Component, Turn
-from failover.core.membership import Peer
+from failover.core.consent import grants, state_of
 from failover.core.messages import HOLDS, UNPROTECTED, Entry
 from failover.core.names import weight
 from failover.core.types import ENDED, HOLDING, MS, PEERS_MAX, State
 
-STATES = tuple(State)
-"""A state's place in here is its number in a beat."""
-
 _RUNS_HERE = frozenset({State.PRIMARY, State.FROZEN, State.HANDING_OVER})
 _END_CAUSES = {State.FINISHED: Cause.FINISH, State.FAILED: Cause.FAIL, State.RELEASED: Cause.RELEASE}
-
-
-def state_of(entry: Entry) -> State:
-    """The state that an entry tells of; a number that is none reads as absent."""
-    return STATES[entry.state] if 0 <= entry.state < len(STATES) else State.ABSENT
-
-
-def grants(component: Component, peer: Peer, me: str) -> bool:
-    """Whether the peer consents to our primacy of the present epoch, by its freshest word."""
-    entry = peer.entry(component.name)
-    agreed = entry is not None and (entry.epoch, entry.primary) == (component.epoch, me)
-    return agreed and entry is not None and state_of(entry) is not State.STOPPING
 
 
 # Claiming
@@ -99,7 +84,7 @@ def advance(component: Component, turn: Turn) -> None:
     entrust_holder(component, turn)
     component.until_ns = turn.now_ns + turn.config.restore_ms * MS
     component.born = component.epoch
-    lease_ns = turn.now_ns + turn.config.lease_ns if component.entrusted else 0
+    lease_ns = lease.counted_ns(component, turn)
     if component.plan is None:
         assert component.spec is not None, f"{component.name}: claimed without knowing what to start"
         component.move(Cause.START)

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from failover.core import acts
 from failover.core.component import Cause, Component, Turn
-from failover.core.election import open_line, refuse_request, state_of
+from failover.core.consent import state_of
+from failover.core.election import open_line, refuse_request
 from failover.core.events import ActFailed, Exited
 from failover.core.types import ENDED, MS, OnCrash, State
 

@@ -7,23 +7,28 @@ from __future__ import annotations
 
 from failover.core import acts
 from failover.core.component import Cause, Component, Turn
-from failover.core.election import grants
+from failover.core.consent import grants
 from failover.core.types import State
 
 TELL_SHARE = 4
 """The guard is told of a new lease when it is longer by this part of a lease: not for every beat."""
+
+RACE_SHARE = 16
+"""What the guard knows counts as over this part of a lease early: a longer one could reach it too late."""
 
 _UNDER_LEASE = frozenset({State.PRIMARY, State.STARTING, State.TAKING_OVER, State.RECOVERING})
 
 
 def watch(component: Component, turn: Turn) -> None:
     """Count the lease anew; hold the component still when it is over, let it go on when it is back."""
-    _count(component, turn)
-    if component.state is State.PRIMARY and not _running_is_safe(component, turn):
+    ran_out = component.told_ns > 0 and turn.now_ns >= component.told_ns - turn.config.lease_ns // RACE_SHARE
+    component.lease_ns = counted_ns(component, turn)
+    over = bool(component.entrusted) and (ran_out or turn.now_ns >= component.lease_ns)
+    if component.state is State.PRIMARY and over:
         component.move(Cause.LEASE_OVER)
         turn.order(acts.Freeze(component.name, component.epoch))
         turn.say(component, f"{turn.me} {Cause.LEASE_OVER}")
-    elif component.state is State.FROZEN and _may_thaw(component, turn):
+    if component.state is State.FROZEN and _may_thaw(component, turn):
         component.move(Cause.LEASE_BACK)
         component.told_ns = component.lease_ns
         component.due_ns = turn.now_ns
@@ -46,14 +51,13 @@ def entrust(component: Component, turn: Turn, robot: str) -> bool:
     return True
 
 
-def _count(component: Component, turn: Turn) -> None:
+def counted_ns(component: Component, turn: Turn) -> int:
+    """Until when this robot may act; 0 where nobody else may start the component. What was granted once stays granted."""
     if not component.entrusted:
-        component.lease_ns = 0
-    elif component.freezes:
-        granted = (_granted_ns(component, turn, robot) for robot in component.entrusted)
-        component.lease_ns = max(component.lease_ns, min(granted))
-    else:
-        component.lease_ns = turn.now_ns + turn.config.lease_ns
+        return 0
+    if not component.freezes:
+        return turn.now_ns + turn.config.lease_ns
+    return max(component.lease_ns, min(_granted_ns(component, turn, robot) for robot in component.entrusted))
 
 
 def _granted_ns(component: Component, turn: Turn, robot: str) -> int:
@@ -61,15 +65,12 @@ def _granted_ns(component: Component, turn: Turn, robot: str) -> int:
     return turn.team.lease_ns(robot) if peer is not None and grants(component, peer, turn.me) else 0
 
 
-def _running_is_safe(component: Component, turn: Turn) -> bool:
-    return not component.entrusted or turn.now_ns < component.lease_ns
-
-
 def _may_thaw(component: Component, turn: Turn) -> bool:
-    """Under ``freeze`` a lease; otherwise (after a pause of ours) everybody entrusted agrees, or is dead."""
+    """Under ``freeze`` a lease; otherwise everybody entrusted agrees by its newest word, or is dead."""
     if component.freezes:
-        return _running_is_safe(component, turn)
-    return all(turn.dead(robot) or grants(component, turn.team.peers[robot], turn.me) for robot in component.entrusted)
+        return not component.entrusted or turn.now_ns < component.lease_ns
+    heard = (turn.dead(robot) or _granted_ns(component, turn, robot) > turn.now_ns for robot in component.entrusted)
+    return all(heard)
 
 
 def _tell(component: Component, turn: Turn) -> None:

@@ -9,7 +9,8 @@ from __future__ import annotations
 from checkpoint.model import Position
 from failover.core import acts, lease
 from failover.core.component import Component, Flight, Turn
-from failover.core.election import grants, supersede
+from failover.core.consent import grants
+from failover.core.election import supersede
 from failover.core.events import Captured, CaptureFailed, ShipEnded, Stored, StoreFailed
 from failover.core.messages import NEEDS_BASE, Entry
 from failover.core.names import weight

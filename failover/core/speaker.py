@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from failover.core.component import Component
-from failover.core.election import STATES
+from failover.core.consent import STATES
 from failover.core.messages import HOLDS, NEEDS_BASE, UNPROTECTED, Beat, Echo, Entry
 from failover.core.types import HOLDING, State
 from failover.core.wire import BODY_SIZE_MAX, beat_size, entry_size

@@ -1,0 +1,23 @@
+"""What a peer's entry says: its state, and whether it consents to our primacy."""
+
+from __future__ import annotations
+
+from failover.core.component import Component
+from failover.core.membership import Peer
+from failover.core.messages import Entry
+from failover.core.types import State
+
+STATES = tuple(State)
+"""A state's place in here is its number in a beat."""
+
+
+def state_of(entry: Entry) -> State:
+    """The state that an entry tells of; a number that is none reads as absent."""
+    return STATES[entry.state] if 0 <= entry.state < len(STATES) else State.ABSENT
+
+
+def grants(component: Component, peer: Peer, me: str) -> bool:
+    """Whether the peer consents to our primacy of the present epoch, by its freshest word."""
+    entry = peer.entry(component.name)
+    agreed = entry is not None and (entry.epoch, entry.primary) == (component.epoch, me)
+    return agreed and entry is not None and state_of(entry) is not State.STOPPING
