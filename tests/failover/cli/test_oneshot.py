@@ -31,7 +31,7 @@ for number in range(1, 301):
 sys.exit(7)
 """
 
-CHAOS = 'scale=50\nx=0.4\nfor(i=1;i<=300;i++){for(j=0;j<200;j++)x=3.99*x*(1-x);print i," ",x,"\\n"}\nquit\n'
+CHAOS = 'scale=50\nx=0.4\nfor(i=1;i<=300;i++){for(j=0;j<4000;j++)x=3.99*x*(1-x);print i," ",x,"\\n"}\nquit\n'
 
 
 def wait_for(what: str, condition: Callable[[], bool]) -> None:

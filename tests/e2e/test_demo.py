@@ -1,0 +1,119 @@
+"""The demo as a person runs it: the programs outlive their robot, and nothing is left, however it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+COMMAND = [sys.executable, "-m", "failover.cli.main", "demo"]
+BOUND_S = 100.0
+NOBODY = 65534
+
+
+def wait_for(what: str, condition: Callable[[], bool]) -> None:
+    """Poll until a condition holds."""
+    deadline = time.monotonic() + BOUND_S
+    while not condition():
+        assert time.monotonic() < deadline, f"waited in vain for {what}"
+        time.sleep(0.02)
+
+
+def environment(directory: Path) -> dict[str, str]:
+    """Ours, with every temporary directory inside ``directory``."""
+    return os.environ | {"TMPDIR": str(directory)}
+
+
+def processes_in(directory: Path) -> list[int]:
+    """Processes whose command line or working directory names the directory: what the demo has started."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdecimal() or int(entry.name) == os.getpid():
+            continue
+        try:
+            named = str(directory).encode() in (entry / "cmdline").read_bytes() or str(directory) in os.readlink(entry / "cwd")
+        except OSError:
+            continue
+        if named:
+            found.append(int(entry.name))
+    return found
+
+
+def assert_nothing_left(directory: Path) -> None:
+    """No process, no file."""
+    wait_for("every process to end", lambda: processes_in(directory) == [])
+    assert list(directory.iterdir()) == []
+
+
+def assert_outlived(ran: subprocess.CompletedProcess[str]) -> None:
+    """The demo says that all outputs are equal, and gives its figures."""
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    told = json.loads(ran.stdout)
+    assert told["equal"] is True
+    for program in told["programs"]:
+        assert program["equal"] is True
+        assert program["exit_status"] == 0
+        assert program["outage_ms"] > 0
+        assert program["lag_ms"] is not None
+        assert program["freeze_us_median"] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(150)
+def test_the_programs_of_the_demo_outlive_their_robot(tmp_path: Path) -> None:
+    ran = subprocess.run([*COMMAND, "--json"], env=environment(tmp_path), capture_output=True, text=True, check=False)
+    assert_outlived(ran)
+    assert_nothing_left(tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.root
+@pytest.mark.timeout(150)
+def test_an_ordinary_user_sees_the_same(tmp_path: Path) -> None:
+    may = subprocess.run([sys.executable, "-c", "import failover"], user=NOBODY, group=NOBODY, check=False, capture_output=True)
+    if may.returncode:
+        pytest.skip(f"{sys.executable} cannot be run by an ordinary user here; run the tests as one to see it")
+    place = Path("/tmp") / f"failover-test-{os.getpid()}"
+    place.mkdir(mode=0o777)
+    place.chmod(0o777)
+    try:
+        ran = subprocess.run(
+            [*COMMAND, "--json"],
+            env=environment(place) | {"HOME": str(place)},
+            user=NOBODY,
+            group=NOBODY,
+            extra_groups=[],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert_outlived(ran)
+        assert_nothing_left(place)
+    finally:
+        place.rmdir()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "terminated"])
+def test_a_demo_that_is_interrupted_leaves_nothing(tmp_path: Path, number: signal.Signals) -> None:
+    with subprocess.Popen(COMMAND, env=environment(tmp_path), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as ran:
+        assert ran.stdout is not None
+        said = []
+        while line := ran.stdout.readline():
+            said.append(line)
+            if " runs on robot1 " in line:
+                break
+        else:
+            pytest.fail(f"the demo ended early: {''.join(said)}")
+        assert processes_in(tmp_path) != []
+        ran.send_signal(number)
+        rest, _ = ran.communicate()
+    assert ran.returncode == 130
+    assert "Traceback" not in rest
+    assert_nothing_left(tmp_path)
