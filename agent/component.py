@@ -25,6 +25,7 @@ from pathlib import Path
 
 from agent.streams import OutputLogs
 from checkpoint.model import Position
+from checkpoint.shelf import folder_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,3 +206,8 @@ class Component:
 def guard_sockets(places: Places) -> tuple[Path, ...]:
     """The sockets of all guards that may still live, for `Component.reconnect` after a restart."""
     return tuple(sorted(places.sockets.glob("*.guard")))
+
+
+def log_directory(name: str, places: Places) -> Path:
+    """Where a component's output is kept on this robot."""
+    return places.logs / folder_name(name)

@@ -1,7 +1,8 @@
-"""The lanes process: snapshots, programs and people; everything that may take its time. `python -m agent.lanes CONFIG DESCRIPTOR`.
+"""The lanes process: snapshots, programs and people; everything that may take its time.
 
-One asyncio loop at ordinary priority. The heart orders (`agent.door`), this carries out and answers. If it dies, the heart starts
-another; guards and programs live on and are found again by their sockets. If the heart dies, this ends.
+Started as `python -m agent.lanes CONFIG DESCRIPTOR`. One asyncio loop at ordinary priority. The heart orders
+(`agent.door`), this carries out and answers. If it dies, the heart starts another; guards and programs live on and are found
+again by their sockets. If the heart dies, this ends.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from agent.transport import BulkLane, Keys, LinkState, public_key_of
 from agent.verbs import Verbs
 from agent.view import team_view
 from checkpoint.channel import Channel, ChannelClosedError, ChannelError
-from checkpoint.errors import CheckpointError
+from checkpoint.errors import CheckpointError, StoreError
 from checkpoint.model import Snapshot
 from checkpoint.store import Store, open_store
 from failover.client.control import SOCKET_NAME
@@ -52,6 +53,10 @@ ANSWER_PATIENCE_S: Final = 60.0
 """How long an operator's command may take; a handover's own limit in the core is shorter."""
 
 MESSAGES_A_TURN: Final = 64
+
+STORE_TRIES: Final = 50
+STORE_PAUSE_S: Final = 0.1
+"""Between two tries to have the store: it is also what keeps two lives of an agent apart."""
 
 log = logging.getLogger("failover.lanes")
 
@@ -95,7 +100,7 @@ class Lanes:
         loop.add_reader(self._heart.fileno(), self._listen_to_heart)
         speaking = asyncio.create_task(self._speak_to_heart())
         self._life = await self._begun
-        store = await asyncio.to_thread(open_store, self._store_path)
+        store = await self._open_store()
         around = Surroundings(self.places, store, Records(self._runtime / "running"), self.tell, self._silence_ns)
         self._around = around
         self._deposit = Deposit(store, self.places, self.tell, self._stored)
@@ -116,6 +121,16 @@ class Lanes:
             await self._lane.close()
             speaking.cancel()
             store.close()
+
+    async def _open_store(self) -> Store:
+        """Have the store to ourselves; an earlier life of the agent that still ends is waited for."""
+        for _ in range(STORE_TRIES):
+            try:
+                return await asyncio.to_thread(open_store, self._store_path)
+            except StoreError as error:
+                trouble: StoreError = error
+                await asyncio.sleep(STORE_PAUSE_S)
+        raise trouble
 
     def _prepare_directories(self) -> None:
         for directory in (self._runtime, self.places.sockets, self.places.logs):
@@ -174,9 +189,9 @@ class Lanes:
                     self._end.set()
                     return
                 except ChannelError:
-                    writable: asyncio.Future[None] = loop.create_future()
-                    loop.add_writer(self._heart.fileno(), lambda: writable.done() or writable.set_result(None))  # noqa: B023
-                    await writable
+                    writable = asyncio.Event()
+                    loop.add_writer(self._heart.fileno(), writable.set)
+                    await writable.wait()
                     loop.remove_writer(self._heart.fileno())
 
     def _listen_to_heart(self) -> None:

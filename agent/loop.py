@@ -44,6 +44,9 @@ SLEEP_LIMIT_S: Final = 0.5
 PERSIST_PATIENCE_S: Final = 2.0
 """How long an orderly end waits for the disk."""
 
+LANES_TRIES: Final = 5
+"""Lanes processes that may die before their first word; then something is wrong that no restart cures."""
+
 STARTED: Final = "protecting this robot and its neighbours"
 
 log = logging.getLogger("failover.heart")
@@ -75,6 +78,7 @@ class Heart:
             socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
         )
         self._ending = False
+        self._lanes_deaths = 0
         self._refused: Counter[str] = Counter()
         self._sent = self._heard = self._late_us_max = 0
         self._notes: tuple[str, ...] = ()
@@ -185,6 +189,7 @@ class Heart:
 
     def _take_inventory(self, inventory: Inventory) -> None:
         """The node is born with what was found; a node that lives already is told what the old lanes took with them."""
+        self._lanes_deaths = 0
         if self._node is not None:
             for event in self._lanes.lost(inventory):
                 self._step(event)
@@ -197,6 +202,14 @@ class Heart:
         log.info("robot %s beats, life %d", self._me, boot)
 
     def _replace_lanes(self, why: str) -> None:
+        """Start another lanes process; one that never gets as far as an inventory is not tried for ever.
+
+        Raises:
+            AgentError: `LANES_TRIES` of them died at once.
+        """
+        self._lanes_deaths += 1
+        if self._lanes_deaths > LANES_TRIES:
+            raise AgentError(f"the lanes process ended {LANES_TRIES} times at once ({why}); what it said stands above")
         log.error("the lanes process has gone (%s); guards and programs live on, another one starts", why)
         self._poll.unregister(self._lanes.fileno())
         self._lanes.bury()

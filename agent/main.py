@@ -17,6 +17,7 @@ from failover.errors import FailoverError
 
 DEFAULT_CONFIG: Final = Path("/etc/failover/agent.toml")
 FAILED: Final = 1
+INSECURE: Final = "INSECURE: running without keys: anybody on the network can read programs' memory and start programs here"
 
 log = logging.getLogger("failover.agent")
 
@@ -29,9 +30,8 @@ def main(arguments: list[str] | None = None) -> int:
             return _print_keys()
         settings = configuration.load(wanted.config)
         if wanted.command == "check":
-            print(
-                f"{wanted.config}: robot {settings.config.robot} of team {settings.team.team}, peers {', '.join(settings.peers)}"
-            )
+            peers = ", ".join(settings.peers) or "none"
+            print(f"{wanted.config}: robot {settings.config.robot} of team {settings.team.team}; peers: {peers}")
             return 0
         return _run(settings)
     except (AgentError, FailoverError) as error:
@@ -44,9 +44,7 @@ def _run(settings: configuration.Settings) -> int:
 
     set_up_log(settings.config.log_level)
     if settings.config.insecure:
-        log.warning(
-            "INSECURE: running without keys; anybody on the network can read the memory of programs and start programs here"
-        )
+        log.warning("%s", INSECURE)
     beat(settings, notifier())
     return 0
 
