@@ -1,0 +1,98 @@
+"""One seed, one life: what goes wrong, when, and how it ends well."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from random import Random
+
+from failover.core.events import Handover
+from failover.core.types import MS, ComponentSpec, Launch, OnLoss, Rules, WhenAlone
+from tests.simulation.invariants import Invariants
+from tests.simulation.world import World, pair
+
+TROUBLE_NS = 4_000 * MS
+HEALING_NS = 4_000 * MS
+CRASH = 11
+
+
+def life(seed: int) -> World:
+    """Play one seed to its end; raises ``Broken`` when an invariant does not hold."""
+    random = Random(seed ^ 0x5EED)
+    specs = tuple(_spec(random, index) for index in range(random.choice((1, 1, 2, 3))))
+    invariants = Invariants(safe={spec.name for spec in specs if spec.rules.when_alone is WhenAlone.FREEZE})
+    world = World(seed, pair(specs), (invariants,))
+    _weather(world, random)
+    for name in world.robots:
+        world.at(random.randrange(300) * MS, lambda name=name: world.power_on(name))
+    for _ in range(random.randrange(1, 9)):
+        world.at(random.randrange(TROUBLE_NS), _trouble(world, invariants, random, specs))
+    world.run(TROUBLE_NS)
+    _heal(world)
+    world.run(TROUBLE_NS + HEALING_NS)
+    invariants.ended_well(world)
+    return world
+
+
+def _spec(random: Random, index: int) -> ComponentSpec:
+    alone = random.choice((WhenAlone.RUN, WhenAlone.FREEZE))
+    loss = random.choice((OnLoss.TAKEOVER, OnLoss.TAKEOVER, OnLoss.HOLD))
+    return ComponentSpec(
+        f"/team/part{index}", launch=Launch(("part",)), rules=Rules(when_alone=alone, on_loss=loss, crash_limit=20)
+    )
+
+
+def _weather(world: World, random: Random) -> None:
+    network = world.network
+    network.loss = random.choice((0, 0, 0.02, 0.2))
+    network.duplicate = random.choice((0, 0.1))
+    network.spread_ns = random.choice((1, 5, 30, 60)) * MS
+    for robot in world.robots.values():
+        robot.slow = random.choice((1, 1, 1, 4))
+
+
+def _trouble(world: World, invariants: Invariants, random: Random, specs: tuple[ComponentSpec, ...]) -> Callable[[], None]:
+    name = random.choice(list(world.robots))
+    other = next(robot for robot in world.robots if robot != name)
+    spec = random.choice(specs)
+    pause_ns = int(random.choice((30, 100, 200, 400, 900)) * MS * random.uniform(0.5, 1.5))
+
+    def cut(*ways: tuple[str, str]) -> None:
+        world.note(f"cut {ways} for {pause_ns / MS:.0f} ms")
+        world.network.cuts.update(ways)
+        world.after(pause_ns, lambda: world.network.cuts.difference_update(ways))
+
+    def outage(stop: Callable[[str], None]) -> None:
+        stop(name)
+        world.after(pause_ns, lambda: world.power_on(name))
+
+    def crash() -> None:
+        invariants.crashing.add((name, spec.name))
+        world.program_ends(name, spec.name, CRASH)
+
+    def full() -> None:
+        world.robots[name].broken_store = True
+        world.after(pause_ns, lambda: setattr(world.robots[name], "broken_store", False))
+
+    kinds: list[Callable[[], None]] = [
+        lambda: cut((name, other), (other, name)),
+        lambda: cut((name, other)),
+        lambda: outage(world.power_off),
+        lambda: outage(world.power_off),
+        lambda: outage(world.agent_dies),
+        lambda: world.stall(name, pause_ns),
+        lambda: world.jump(name, pause_ns),
+        lambda: world.command(name, Handover(world.request(), spec.name)),
+        crash,
+        full,
+    ]
+    return random.choice(kinds)
+
+
+def _heal(world: World) -> None:
+    world.note("healing")
+    world.network.cuts.clear()
+    world.network.loss = world.network.duplicate = 0
+    world.network.spread_ns = 1 * MS
+    for name, robot in world.robots.items():
+        robot.slow, robot.broken_store = 1, False
+        world.power_on(name)

@@ -1,0 +1,143 @@
+"""What must hold at every instant of every world, whatever happens to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from checkpoint.model import Position
+from failover.core import acts
+from failover.core.messages import Beat
+from failover.core.types import Ballot, State, WhenAlone
+from tests.simulation.world import World, ballot_of
+
+
+class Broken(AssertionError):
+    """An invariant does not hold; the message is the story."""
+
+
+@dataclass(slots=True)
+class Invariants:
+    """Watches one world.
+
+    Attributes:
+        safe: components whose ``when_alone`` is freeze.
+        split: components that computed in two places at once (allowed under ``run``, after a cut).
+        acknowledged: newest position that each component's primaries acknowledged while a standby held it.
+        last: components whose end was reported as acknowledged.
+    """
+
+    safe: set[str] = field(default_factory=set)
+    split: set[str] = field(default_factory=set)
+    epochs: dict[tuple[str, str], int] = field(default_factory=dict)
+    acknowledged: dict[str, Position] = field(default_factory=dict)
+    shipped: dict[str, Position] = field(default_factory=dict)
+    last: set[str] = field(default_factory=set)
+    crashing: set[tuple[str, str]] = field(default_factory=set)
+
+    def __call__(self, world: World, robot: str, what: object) -> None:
+        """Look at one thing that happened, or (None) at the state of the world."""
+        match what:
+            case None:
+                self._one_acts(world)
+            case Ballot():
+                self._epochs_grow(world, robot, what)
+            case Beat():
+                self._durable_before_said(world, robot, what)
+            case acts.Capture():
+                if what.component in world.robots[robot].capturing:
+                    raise _broken(world, f"{robot}: a second capture of {what.component} at once")
+            case acts.Ship():
+                self.shipped[what.component] = what.position
+            case acts.Acknowledge():
+                self._acknowledged(world, robot, what)
+            case acts.Restore():
+                self._not_older(world, robot, what)
+            case acts.ReportExit():
+                if what.acknowledged:
+                    self.last.add(what.component)
+
+    def _one_acts(self, world: World) -> None:
+        for component in {name for robot in world.robots.values() for name in robot.programs}:
+            where = world.acting(component)
+            if len(where) > 1:
+                self.split.add(component)
+                if component in self.safe:
+                    raise _broken(world, f"{component} acts at {' and '.join(where)} at once")
+
+    def _epochs_grow(self, world: World, robot: str, ballot: Ballot) -> None:
+        kept = {record.name: record.epoch for record in ballot.records}
+        for (name, component), epoch in self.epochs.items():
+            if name == robot and kept.get(component, 0) < epoch:
+                raise _broken(world, f"{robot}: the epoch of {component} fell from {epoch} to {kept.get(component, 0)}")
+        self.epochs.update({(robot, component): epoch for component, epoch in kept.items()})
+
+    def _durable_before_said(self, world: World, robot: str, beat: Beat) -> None:
+        durable = {record.name: record.epoch for record in ballot_of(world.robots[robot]).records}
+        for entry in beat.entries:
+            if entry.epoch > durable.get(entry.name, 0):
+                raise _broken(world, f"{robot} says epoch {entry.epoch} of {entry.name} before its disk knows it")
+
+    def _acknowledged(self, world: World, robot: str, act: acts.Acknowledge) -> None:
+        elsewhere = any(
+            act.position in other.store.get(act.component, []) for name, other in world.robots.items() if name != robot
+        )
+        if not elsewhere and self.shipped.get(act.component) == act.position:
+            raise _broken(world, f"{robot} acknowledges {act.position} of {act.component}, which nobody else holds")
+        if elsewhere:
+            before = self.acknowledged.get(act.component)
+            self.acknowledged[act.component] = act.position if before is None else max(before, act.position)
+
+    def _not_older(self, world: World, robot: str, act: acts.Restore) -> None:
+        if act.component in self.last:
+            raise _broken(world, f"{robot} runs {act.component} again, whose end was reported")
+        safe_from = self.acknowledged.get(act.component)
+        in_place = (
+            any(
+                record.name == act.component and record.state is State.PRIMARY and record.primary == robot
+                for record in ballot_of(world.robots[robot]).records
+            )
+            and (robot, act.component) in self.crashing
+        )
+        comparable = act.component not in self.split and not in_place
+        if comparable and safe_from is not None and world.values[act.position] < world.values[safe_from]:
+            raise _broken(world, f"{robot} resumes {act.component} from {act.position}, older than the acknowledged {safe_from}")
+
+    def ended_well(self, world: World) -> None:
+        """After healing: each component that goes on acts at one robot, and the other protects it."""
+        for component in sorted({record.name for robot in world.robots.values() for record in ballot_of(robot).records}):
+            states = {name: _state(world, name, component) for name in world.robots}
+            if any(state in (State.FINISHED, State.FAILED, State.RELEASED) for state in states.values()):
+                if len(set(states.values())) > 1:
+                    raise _broken(world, f"{component} has ended for some only: {states}")
+                continue
+            self._lives_well(world, component, states)
+
+    def _lives_well(self, world: World, component: str, states: dict[str, State]) -> None:
+        primaries = [name for name, state in states.items() if state is State.PRIMARY]
+        if len(primaries) != 1 or world.acting(component) != primaries:
+            raise _broken(world, f"{component} should act at one robot: {states}, acts at {world.acting(component)}")
+        node = world.robots[primaries[0]].node
+        assert node is not None
+        seen = next(one for one in node.status(world.local(world.robots[primaries[0]])).components if one.name == component)
+        if seen.protection != "protected" or not 0 <= seen.lag_ns < 1_000_000_000:
+            raise _broken(
+                world, f"{component} at {primaries[0]} is {seen.protection}, its checkpoint {seen.lag_ns / 1e6:.0f} ms old"
+            )
+
+
+def _state(world: World, robot: str, component: str) -> State:
+    node = world.robots[robot].node
+    assert node is not None
+    views = node.status(world.local(world.robots[robot])).components
+    return next((one.state for one in views if one.name == component), State.ABSENT)
+
+
+def _broken(world: World, sentence: str) -> Broken:
+    story = "\n".join(world.log[-60:])
+    return Broken(f"{sentence}\n(at {world.now_ns / 1e6:.3f} ms; the story so far)\n{story}")
+
+
+def safe_components(world: World) -> set[str]:
+    """The configured components that must never act twice."""
+    specs = (spec for robot in world.robots.values() for spec in robot.config.components)
+    return {spec.name for spec in specs if spec.rules.when_alone is WhenAlone.FREEZE}

@@ -1,0 +1,472 @@
+"""A team of robots in one process: their clocks, disks, programs and network are made up; their rules are the daemon's own ``Node``.
+
+Everything that happens comes from one seed. True time is the world's alone (nanoseconds from 0); each robot reads a clock of its own
+that drifts and jumps. A robot works off one step at a time: the ballot is durable some time after the step, the beats leave and the
+acts begin after that, and a power cut in between loses what had not happened yet.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from random import Random
+
+from checkpoint.model import Position
+from failover.core import acts, wire
+from failover.core.ballot import decode, encode
+from failover.core.events import (
+    ActFailed,
+    Captured,
+    CaptureFailed,
+    Event,
+    Exited,
+    Received,
+    Restored,
+    ShipEnded,
+    Started,
+    Stopped,
+    Stored,
+    StoreFailed,
+    Tick,
+)
+from failover.core.node import Node
+from failover.core.types import MS, Ballot, ComponentSpec, Config, Found, Held
+
+TEAM = "simulated"
+KEY = bytes(range(32))
+QUEUE_MAX = 4_096
+"""Events that may wait for one robot; more means that somebody floods."""
+
+RESTARTS_AT_LEAST_NS = 30 * MS
+
+
+@dataclass(slots=True)
+class Clock:
+    """One robot's clock: ``rate`` local nanoseconds per true one, from ``origin``."""
+
+    rate: float
+    origin_ns: int
+    since_ns: int = 0
+
+    def read(self, true_ns: int) -> int:
+        return self.origin_ns + int((true_ns - self.since_ns) * self.rate)
+
+    def true(self, local_ns: int) -> int:
+        """The first true instant at which this clock shows ``local_ns`` or more."""
+        return self.since_ns + int((local_ns - self.origin_ns) / self.rate) + 1
+
+    def jump(self, true_ns: int, by_ns: int) -> None:
+        self.origin_ns, self.since_ns = self.read(true_ns) + by_ns, true_ns
+
+
+@dataclass(slots=True)
+class Program:
+    """A running copy and its guard. ``value``: how much it has computed, in true nanoseconds of running."""
+
+    epoch: int
+    lease_ns: int
+    value: int = 0
+    frozen: bool = False
+    since_ns: int = 0
+    exit_status: int | None = None
+
+
+@dataclass(slots=True)
+class Robot:
+    """One robot: a clock, a disk, programs, and (while its agent lives) the rules."""
+
+    name: str
+    config: Config
+    clock: Clock
+    boot: int = 0
+    ballot: bytes = b""
+    store: dict[str, list[Position]] = field(default_factory=dict)
+    node: Node | None = None
+    programs: dict[str, Program] = field(default_factory=dict)
+    keeper: dict[str, Position] = field(default_factory=dict)
+    admitted: dict[str, tuple[str, int]] = field(default_factory=dict)
+    serial: dict[str, int] = field(default_factory=dict)
+    capturing: set[str] = field(default_factory=set)
+    inbox: list[Event] = field(default_factory=list)
+    receiver: wire.Receiver = field(default_factory=lambda: wire.Receiver(TEAM))
+    life: int = 0
+    busy: bool = False
+    stalled_until_ns: int = 0
+    slow: int = 1
+    broken_store: bool = False
+
+
+@dataclass(slots=True)
+class Network:
+    """How messages fare. ``cuts``: directed pairs that nothing passes."""
+
+    loss: float = 0.0
+    duplicate: float = 0.0
+    delay_ns: int = 1 * MS
+    spread_ns: int = 1 * MS
+    cuts: set[tuple[str, str]] = field(default_factory=set)
+
+
+Watcher = Callable[["World", str, object], None]
+"""Called with (world, robot, what happened): an act that is carried out, a ballot that became durable, beats that leave."""
+
+
+class World:
+    """All robots, the network between them, and what is going to happen."""
+
+    def __init__(self, seed: int, configs: list[Config], watchers: tuple[Watcher, ...] = ()) -> None:
+        self.random = Random(seed)
+        self.now_ns = 0
+        self.network = Network()
+        self.values: dict[Position, int] = {}
+        self.log: list[str] = []
+        self._watchers = watchers
+        self._agenda: list[tuple[int, int, Callable[[], None]]] = []
+        self._order = itertools.count()
+        self._digests = itertools.count(1)
+        self._requests = itertools.count(1)
+        self.robots: dict[str, Robot] = {}
+        for config in configs:
+            clock = Clock(1 + self.random.uniform(-0.01, 0.01), self.random.randrange(10**15))
+            self.robots[config.robot] = Robot(config.robot, config, clock)
+
+    # Time
+
+    def at(self, true_ns: int, happen: Callable[[], None]) -> None:
+        """Let something happen at an instant."""
+        heapq.heappush(self._agenda, (max(true_ns, self.now_ns), next(self._order), happen))
+
+    def after(self, delay_ns: int, happen: Callable[[], None]) -> None:
+        """Let something happen after a while."""
+        self.at(self.now_ns + delay_ns, happen)
+
+    def run(self, until_ns: int) -> None:
+        """Let the world go on until an instant."""
+        while self._agenda and self._agenda[0][0] <= until_ns:
+            self.now_ns, _, happen = heapq.heappop(self._agenda)
+            happen()
+            self._tell("", None)
+        self.now_ns = until_ns
+
+    def note(self, sentence: str) -> None:
+        """Something for whoever reads the story afterwards."""
+        self.log.append(f"{self.now_ns / MS:10.3f}  {sentence}")
+
+    def _tell(self, robot: str, what: object) -> None:
+        for watcher in self._watchers:
+            watcher(self, robot, what)
+
+    def _soon(self, low_ms: float, high_ms: float) -> int:
+        return int(self.random.uniform(low_ms, high_ms) * MS)
+
+    # Lives of robots
+
+    def power_on(self, name: str) -> None:
+        """Start a robot's agent; whatever its guards kept is found."""
+        robot = self.robots[name]
+        if robot.node is not None:
+            return
+        robot.boot += 1
+        robot.life += 1
+        robot.inbox, robot.busy, robot.receiver = [], False, wire.Receiver(TEAM)
+        robot.admitted.clear()
+        robot.capturing.clear()
+        robot.keeper.clear()
+        for other in self.robots:
+            if other != name:
+                robot.receiver.accept(other, KEY + other.encode())
+        held = tuple(Held(component, tuple(positions[-8:])) for component, positions in robot.store.items() if positions)
+        found = tuple(
+            Found(component, program.epoch, program.exit_status is None, program.exit_status or 0)
+            for component, program in robot.programs.items()
+        )
+        robot.node = Node(robot.config, robot.boot, decode(robot.ballot), self.local(robot), held, found)
+        self.note(f"{name} starts, life {robot.boot}")
+        self._feed(robot, Tick())
+
+    def agent_dies(self, name: str) -> None:
+        """Kill the agent and the keepers; guards and programs live on."""
+        robot = self.robots[name]
+        robot.node = None
+        robot.life += 1
+        for component in robot.serial:
+            robot.serial[component] += 1
+        self.note(f"{name}: its agent dies")
+
+    def power_off(self, name: str) -> None:
+        """Take everything that is not on the disk."""
+        self.agent_dies(name)
+        self.robots[name].programs.clear()
+        self.note(f"{name} loses its power")
+
+    def stall(self, name: str, for_ns: int) -> None:
+        """The agent's loop gets no processor for a while; guards do."""
+        robot = self.robots[name]
+        robot.stalled_until_ns = max(robot.stalled_until_ns, self.now_ns + for_ns)
+        self.note(f"{name} stalls for {for_ns / MS:.0f} ms")
+        self.at(robot.stalled_until_ns, lambda: self._work(robot))
+
+    def jump(self, name: str, by_ns: int) -> None:
+        """The robot's clock leaps ahead."""
+        self.robots[name].clock.jump(self.now_ns, by_ns)
+        self.note(f"the clock of {name} leaps by {by_ns / MS:.0f} ms")
+
+    def command(self, name: str, event: Event) -> None:
+        """An operator's command."""
+        self.note(f"operator at {name}: {event}")
+        self._feed(self.robots[name], event)
+
+    def request(self) -> int:
+        """A fresh number for a command."""
+        return next(self._requests)
+
+    def program_ends(self, name: str, component: str, status: int) -> None:
+        """The program at a robot exits or is killed, if it is there and not frozen."""
+        robot = self.robots[name]
+        program = robot.programs.get(component)
+        if program is None or program.exit_status is not None or not self.unfrozen(robot, component):
+            return
+        self._settle(robot, program)
+        program.exit_status = status
+        self.note(f"{name}: {component} ends with status {status}")
+        self._feed(robot, Exited(component, program.epoch, status))
+
+    def local(self, robot: Robot) -> int:
+        """What the robot's clock shows."""
+        return robot.clock.read(self.now_ns)
+
+    def unfrozen(self, robot: Robot, component: str) -> bool:
+        """Whether a copy computes at this very instant."""
+        program = robot.programs.get(component)
+        if program is None or program.exit_status is not None or program.frozen:
+            return False
+        return not program.lease_ns or self.local(robot) < program.lease_ns
+
+    def acting(self, component: str) -> list[str]:
+        """The robots where the component computes at this instant."""
+        return [name for name, robot in self.robots.items() if self.unfrozen(robot, component)]
+
+    # The loop of one robot
+
+    def _feed(self, robot: Robot, event: Event) -> None:
+        if robot.node is None:
+            return
+        robot.inbox.append(event)
+        assert len(robot.inbox) <= QUEUE_MAX, f"{robot.name}: {len(robot.inbox)} events wait"
+        self._work(robot)
+
+    def _work(self, robot: Robot) -> None:
+        """Step once, if there is something to step and nothing in the way."""
+        if robot.node is None or robot.busy or self.now_ns < robot.stalled_until_ns:
+            return
+        now_ns = self.local(robot)
+        if not robot.inbox:
+            if robot.node.next_deadline_ns() > now_ns:
+                return
+            robot.inbox.append(Tick())
+        ready = robot.node.step(robot.inbox.pop(0), now_ns)
+        life = robot.life
+        robot.busy = True
+        disk_ns = self._soon(0.1, 4) * robot.slow if ready.persist is not None else 0
+        self.after(disk_ns, lambda: self._persisted(robot, life, ready))
+
+    def _persisted(self, robot: Robot, life: int, ready: acts.Ready) -> None:
+        if robot.life != life:
+            return
+        if ready.persist is not None:
+            robot.ballot = encode(ready.persist)
+            self._tell(robot.name, ready.persist)
+        wait_ns = self._soon(0, 0.2) if ready.persist is not None else 0
+        self.after(wait_ns, lambda: self._obey(robot, life, ready))
+
+    def _obey(self, robot: Robot, life: int, ready: acts.Ready) -> None:
+        if robot.life != life:
+            return
+        robot.busy = False
+        for beat in ready.send:
+            self._tell(robot.name, beat)
+            frame = wire.seal(beat, TEAM, KEY + robot.name.encode())
+            for other in self.robots.values():
+                if other is not robot:
+                    self._transmit(robot.name, other, frame)
+        for act in ready.act:
+            self._tell(robot.name, act)
+            self._carry_out(robot, act)
+        if robot.inbox:
+            self.after(0, lambda: self._work(robot))
+        elif robot.node is not None:
+            self.at(robot.clock.true(robot.node.next_deadline_ns()), lambda: self._work(robot))
+
+    # The network
+
+    def passes(self, sender: str, receiver: str) -> bool:
+        """Whether a message gets through at this instant."""
+        return (sender, receiver) not in self.network.cuts and self.random.random() >= self.network.loss
+
+    def _transmit(self, sender: str, to: Robot, frame: bytes) -> None:
+        copies = 1 + (self.random.random() < self.network.duplicate)
+        for _ in range(copies):
+            if self.passes(sender, to.name):
+                delay_ns = self.network.delay_ns + int(self.random.random() * self.network.spread_ns)
+                self.after(delay_ns, lambda: self._arrive(to, frame))
+
+    def _arrive(self, robot: Robot, frame: bytes) -> None:
+        if robot.node is None:
+            return
+        beat = robot.receiver.open(frame)
+        if not isinstance(beat, wire.Refused):
+            self._feed(robot, Received(beat, "wire"))
+
+    # Acts
+
+    def _carry_out(self, robot: Robot, act: acts.Act) -> None:
+        match act:
+            case acts.Start() | acts.Restore() | acts.Stop():
+                self._whole_program(robot, act)
+            case acts.Capture():
+                self._capture(robot, act)
+            case acts.Ship():
+                self._ship(robot, act)
+            case acts.Acknowledge():
+                robot.keeper[act.component] = act.position
+            case acts.Admit():
+                robot.admitted[act.component] = (act.sender, act.epoch)
+            case acts.Forget():
+                kept = [position for position in robot.store.get(act.component, []) if position.generation not in act.generations]
+                robot.store[act.component] = kept
+            case acts.Drop():
+                robot.store.pop(act.component, None)
+            case acts.Freeze() | acts.Thaw() | acts.SetLease() | acts.End() | acts.LetGo():
+                self._guard(robot, act)
+            case acts.Answer():
+                self.note(f"{robot.name} answers: {act.sentence}")
+
+    def _guard(self, robot: Robot, act: acts.Freeze | acts.Thaw | acts.SetLease | acts.End | acts.LetGo) -> None:
+        program = robot.programs.get(act.component)
+        if program is None or program.exit_status is not None:
+            return
+        self._settle(robot, program)
+        program.epoch = max(program.epoch, act.epoch)
+        match act:
+            case acts.Freeze():
+                program.frozen = True
+            case acts.Thaw():
+                program.frozen, program.lease_ns = False, act.lease_until_ns
+            case acts.SetLease():
+                program.lease_ns = act.until_ns
+            case acts.End():
+                self.program_ends(robot.name, act.component, act.signal)
+            case acts.LetGo():
+                del robot.programs[act.component]
+
+    def _settle(self, robot: Robot, program: Program) -> None:
+        """Add up what the program has computed, and let a lease that has run out freeze it for good."""
+        ran_until_ns = self.now_ns
+        if program.lease_ns and self.local(robot) >= program.lease_ns:
+            ran_until_ns = min(robot.clock.true(program.lease_ns), self.now_ns)
+        if not program.frozen and program.exit_status is None:
+            program.value += max(ran_until_ns - program.since_ns, 0)
+        if ran_until_ns < self.now_ns:
+            program.frozen = True
+        program.since_ns = self.now_ns
+
+    def _whole_program(self, robot: Robot, act: acts.Start | acts.Restore | acts.Stop) -> None:
+        name, life = act.component, robot.life
+        robot.serial[name] = serial = robot.serial.get(name, 0) + 1
+        robot.capturing.discard(name)
+        if not isinstance(act, acts.Start):
+            robot.programs.pop(name, None)
+            robot.keeper.pop(name, None)
+
+        def done() -> None:
+            if robot.life != life or robot.serial[name] != serial:
+                return
+            match act:
+                case acts.Stop():
+                    self._feed(robot, Stopped(name, act.epoch))
+                case acts.Start():
+                    robot.programs[name] = Program(act.epoch, act.lease_until_ns, since_ns=self.now_ns)
+                    self._feed(robot, Started(name, act.epoch))
+                case acts.Restore():
+                    self._restored(robot, act)
+
+        self.after(self._soon(2, 40) * robot.slow, done)
+
+    def _restored(self, robot: Robot, act: acts.Restore) -> None:
+        if act.position not in robot.store.get(act.component, []):
+            self._feed(robot, ActFailed(act.component, act.epoch, f"{act.position} is not in the store"))
+            return
+        program = Program(act.epoch, act.lease_until_ns, self.values[act.position], since_ns=self.now_ns)
+        robot.programs[act.component] = program
+        self.note(f"{robot.name}: {act.component} goes on from {act.position.generation}/{act.position.sequence}")
+        self._feed(robot, Restored(act.component, act.epoch, act.position))
+
+    def _capture(self, robot: Robot, act: acts.Capture) -> None:
+        name, life, serial = act.component, robot.life, robot.serial.get(act.component, 0)
+        program = robot.programs.get(name)
+        if program is not None:
+            program.epoch = max(program.epoch, act.epoch)
+        robot.capturing.add(name)
+
+        def done() -> None:
+            if robot.life != life or robot.serial.get(name, 0) != serial:
+                return
+            robot.capturing.discard(name)
+            program = robot.programs.get(name)
+            if program is None or program.exit_status is not None:
+                self._feed(robot, CaptureFailed(name, act.epoch, "the program is gone"))
+                return
+            self._settle(robot, program)
+            program.frozen = program.frozen or act.hold
+            position = Position(act.generation, act.sequence, next(self._digests).to_bytes(8, "big"))
+            parent = None if act.base else robot.keeper.get(name)
+            self.values[position] = program.value
+            robot.store.setdefault(name, []).append(position)
+            self._feed(robot, Captured(name, act.epoch, position, parent, freeze_us=900))
+
+        self.after(self._soon(1, 8) * robot.slow, done)
+
+    def _ship(self, robot: Robot, act: acts.Ship) -> None:
+        life, to = robot.life, self.robots[act.to]
+
+        def arrive() -> None:
+            ok = (
+                robot.life == life and self.passes(robot.name, act.to) and self.passes(act.to, robot.name) and to.node is not None
+            )
+            admitted = to.admitted.get(act.component) == (robot.name, act.epoch)
+            if robot.life == life:
+                self._feed(robot, ShipEnded(act.component, act.epoch, act.position, act.to, ok and admitted))
+            if ok and admitted:
+                self._store(to, robot.name, act)
+
+        self.after((self._soon(2, 30) + self.network.delay_ns) * robot.slow, arrive)
+
+    def _store(self, robot: Robot, sender: str, act: acts.Ship) -> None:
+        life = robot.life
+
+        def done() -> None:
+            if robot.life != life:
+                return
+            kept = robot.store.get(act.component, [])
+            if robot.broken_store:
+                self._feed(robot, StoreFailed(act.component, act.epoch, sender, "no space left", False))
+            elif act.parent is not None and act.parent not in kept:
+                self._feed(robot, StoreFailed(act.component, act.epoch, sender, "its parent is not here", True))
+            else:
+                robot.store[act.component] = [*kept, act.position]
+                self._feed(robot, Stored(act.component, act.epoch, act.position, sender, act.spec))
+
+        self.after(self._soon(1, 10) * robot.slow, done)
+
+
+def pair(components: tuple[ComponentSpec, ...] = (), names: tuple[str, ...] = ("robot1", "robot2")) -> list[Config]:
+    """Configurations of a small team, with times that make a minute of life cheap to simulate."""
+    plain = Config(names[0], (), components, 25, 150, 20, 10, 300, 200, 2_000, 400, 3_000, 2_000)
+    return [replace(plain, robot=name, peers=tuple(other for other in names if other != name)) for name in names]
+
+
+def ballot_of(robot: Robot) -> Ballot:
+    """What the robot will remember after a power cut at this instant."""
+    return decode(robot.ballot)
