@@ -151,6 +151,18 @@ def stopped_call(registers: bytes) -> int:
     return x86_64.decode_registers(registers)["rbx"]
 
 
+_INSTRUCTION_SETS: Final = """
+abm adx aes amx_bf16 amx_fp16 amx_int8 amx_tile avx avx2 avx512_4fmaps avx512_4vnniw avx512_bf16 avx512_bitalg
+avx512_fp16 avx512_vbmi2 avx512_vnni avx512_vp2intersect avx512_vpopcntdq avx512bw avx512cd avx512dq avx512er avx512f
+avx512ifma avx512pf avx512vbmi avx512vl avx_vnni bmi1 bmi2 clflushopt clwb clzero cmov cx16 cx8 enqcmd erms f16c fma
+fma4 fsgsbase fsrm gfni hle lahf_lm lwp movbe movdir64b movdiri mmx pclmulqdq pku popcnt prefetchw rdpid rdrand rdseed
+rdtscp rtm serialize sha_ni sse sse2 sse4_1 sse4_2 sse4a ssse3 tbm user_shstk vaes vpclmulqdq waitpkg xop xsave xsavec
+xsaveopt
+"""
+INSTRUCTION_SETS: Final = frozenset(_INSTRUCTION_SETS.split())
+"""Flags of /proc/cpuinfo that stand for instructions which a program may use. Source: arch/x86/include/asm/cpufeatures.h."""
+
+
 def program(code: bytes) -> bytes:
     """A static executable that runs ``code`` and nothing else: one segment, no libraries, a stack that cannot execute."""
     header_size, segment_size = 64, 56

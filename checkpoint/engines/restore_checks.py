@@ -11,8 +11,10 @@ from collections.abc import Iterator
 
 from blake3 import blake3
 
-from checkpoint.arch import x86_64
+from checkpoint.arch import x86_64, x86_64_stub
 from checkpoint.engine import RestoreOptions
+from checkpoint.engines.identities import build_id
+from checkpoint.engines.ptrace_capture import this_machine
 from checkpoint.engines.restore_memory import is_file_mapping, kernel_pages, kernel_pages_of
 from checkpoint.errors import MismatchError
 from checkpoint.linux import abi, procfs
@@ -43,7 +45,7 @@ def mismatches(state: Snapshot, options: RestoreOptions) -> tuple[str, ...]:
 
 
 def _of_machine(state: Snapshot) -> Iterator[str]:
-    machine = state.machine
+    machine, here = state.machine, this_machine()
     if machine.page_size != abi.PAGE_SIZE:
         yield f"its pages are {machine.page_size} bytes, this kernel's {abi.PAGE_SIZE}: boot a kernel with the same"
     if len(state.threads) != 1:
@@ -52,6 +54,11 @@ def _of_machine(state: Snapshot) -> Iterator[str]:
     theirs = kernel_pages_of(state.vmas)
     if [page.size for page in ours] != [page.size for page in theirs]:
         yield f"the vdso of its kernel ({machine.kernel}) is laid out unlike ours ({os.uname().release}): boot the same kernel"
+    elif machine.vdso_digest != here.vdso_digest:
+        yield f"the vdso of its kernel ({machine.kernel}) differs from ours ({here.kernel}): boot the same kernel"
+    if lacking := set(machine.features) & x86_64_stub.INSTRUCTION_SETS - set(here.features):
+        listed = ", ".join(sorted(lacking))
+        yield f"this processor lacks {listed}, by which the program may have chosen its code: use one that has them"
     if state.process.root_directory != "/":
         yield f"its root directory is {state.process.root_directory}: programs in a chroot are not supported"
     if not os.path.isdir(state.process.working_directory):
@@ -82,6 +89,8 @@ def _of_file(identity: FileIdentity) -> Iterator[str]:
         yield f"{path} is another file: {about.st_size} bytes here, {identity.size} there; {_FAR}"
     elif identity.digest and digest_of(path) != identity.digest:
         yield f"{path} is another file: as long, but its content differs; {_FAR}"
+    elif not identity.digest and identity.build_id and build_id(path) != identity.build_id:
+        yield f"{path} is another build of that file (its build id differs); {_FAR}"
 
 
 def digest_of(path: str) -> bytes:

@@ -11,6 +11,7 @@ Sources: open(2), dup(2), fdinfo of proc_pid_fdinfo(5).
 
 from __future__ import annotations
 
+import fcntl
 import os
 import stat
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from checkpoint.engine import RestoreOptions
 from checkpoint.errors import RestoreError
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource, Snapshot
+from checkpoint.resources import pipes
 
 REOPENED_FLAGS: Final = (
     os.O_ACCMODE | os.O_APPEND | os.O_NONBLOCK | os.O_DSYNC | os.O_SYNC | os.O_DIRECT | os.O_NOATIME | os.O_DIRECTORY
@@ -28,7 +30,7 @@ REOPENED_FLAGS: Final = (
 
 O_PATH: Final = 0o10000000
 STREAMS: Final = (0, 1, 2)
-KINDS: Final = ("files", "devices", "streams")
+KINDS: Final = ("files", "devices", "streams", pipes.KIND)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,14 +57,15 @@ def rebuild_all(table: CallTable, state: Snapshot, options: RestoreOptions) -> t
     if not wanted:
         return ()
     moved = _move_streams_away(table, wanted[-1].number + 1)
+    piped = pipes.rebuild(table, [held for held in state.resources if held.kind == pipes.KIND], moved[-1] + 1)
     holders: dict[int, int] = {}  # which number already stands for an open file description
     for one in wanted:
         if id(one.resource) in holders:
             _duplicate(table, holders[id(one.resource)], one)
         else:
-            _obtain(table, one, moved, options)
+            _obtain(table, one, moved, piped, options)
             holders[id(one.resource)] = one.number
-    for number in moved:
+    for number in (*moved, *piped.values()):
         table.close(number)
     return ()
 
@@ -90,11 +93,18 @@ def _move_streams_away(table: CallTable, first: int) -> tuple[int, ...]:
     return moved
 
 
-def _obtain(table: CallTable, one: Wanted, moved: tuple[int, ...], options: RestoreOptions) -> None:
+def _obtain(
+    table: CallTable, one: Wanted, moved: tuple[int, ...], piped: dict[tuple[int, int], int], options: RestoreOptions
+) -> None:
     """The first descriptor of an open file description."""
     facts = one.resource.facts
+    if one.resource.kind == pipes.KIND:
+        _duplicate(table, piped[number_of(facts["pipe"]), number_of(facts["end"])], one)
+        return
     if one.resource.kind == "streams":
         table.duplicate(moved[number_of(facts["stream"])], one.number, os.O_CLOEXEC if one.close_on_exec else 0)
+        if number_of(facts.get("flags", 0)) & os.O_NONBLOCK:
+            table.attempt(f"{one.resource.name} waits where it did not", "fcntl", one.number, fcntl.F_SETFL, os.O_NONBLOCK)
         return
     opened = _open_deleted(table, one.resource) if facts.get("deleted") else _open(table, one.resource, options)
     if opened != one.number:
@@ -114,7 +124,8 @@ def _open(table: CallTable, held: Resource, options: RestoreOptions) -> int:
     descriptor = table.open(path, flags & (REOPENED_FLAGS | O_PATH))
     if held.kind == "files" and not flags & O_PATH:
         if path not in options.accept_changed and has_grown(held):
-            table.call(f"cut {path} back to {facts['size']} bytes", "ftruncate", descriptor, number_of(facts["size"]))
+            size = number_of(facts["size"])
+            table.call(f"cut {path} back to {size} bytes", "ftruncate", descriptor, size)
         _seek(table, descriptor, held)
     return descriptor
 

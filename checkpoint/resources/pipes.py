@@ -1,0 +1,175 @@
+"""Pipes that a process keeps to itself: both ends are its own, so the pipe and what is in it come back whole.
+
+Programs wake themselves by such a pipe from a signal handler (xz does). A pipe that somebody else holds an end of is refused
+until that somebody can come along.
+
+Facts: ``descriptors``; ``pipe``, a number that both ends have in common; ``end``, 0 to read, 1 to write; ``flags`` of fcntl(2);
+``capacity`` in bytes; ``content``: the bytes in it, with the reading end, b"" with the writing one.
+
+Sources: pipe(7), tee(2), fcntl(2) F_SETPIPE_SZ.
+"""
+
+from __future__ import annotations
+
+import array
+import ctypes
+import fcntl
+import os
+import stat
+import termios
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Final
+
+from checkpoint.errors import CaptureError
+from checkpoint.linux import abi
+from checkpoint.linux.call_table import CallTable
+from checkpoint.linux.procfs import Descriptor
+from checkpoint.model import Fact, Resource
+from checkpoint.resources import OpenFile, Surroundings
+
+KIND: Final = "pipes"
+
+F_SETPIPE_SZ: Final = 1031
+F_GETPIPE_SZ: Final = 1032
+DEFAULT_CAPACITY: Final = 65536
+PIPES_KNOWN: Final = 1024
+"""Pipes remembered as held by nobody else: others can only get hold of one by a fork or a socket, which are refused."""
+
+_libc = ctypes.CDLL(None, use_errno=True)
+_libc.tee.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_size_t, ctypes.c_uint)
+_libc.tee.restype = ctypes.c_ssize_t
+
+
+def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
+    """One end of a pipe, if an open file is one."""
+    if not is_pipe(held.first):
+        return None
+    facts: dict[str, Fact] = {
+        "descriptors": held.numbers,
+        "pipe": held.first.inode,
+        "end": int(writes(held.first)),
+        "flags": held.first.flags & ~os.O_CLOEXEC,
+        "capacity": held.capacity,
+        "content": held.content or b"",
+    }
+    return Resource(KIND, held.name, facts)
+
+
+def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
+    """Why a pipe cannot be kept."""
+    if not is_pipe(held.first):
+        return None
+    what = f"{held.name} is a pipe"
+    if held.first.flags & os.O_DIRECT:
+        return f"{what} in packet mode, which is not kept: let the program use an ordinary one"
+    if not held.both_ends:
+        return f"{what} to somebody else: only pipes of which the program holds both ends are kept; redirect it to a file"
+    if held_elsewhere(held.pid, held.first.target):
+        return f"{what} that another process holds too: protect the program when that has ended"
+    return None
+
+
+def is_pipe(one: Descriptor) -> bool:
+    """Whether a descriptor is an end of a pipe without a name."""
+    return stat.S_ISFIFO(one.mode) and one.target.startswith("pipe:")
+
+
+def writes(one: Descriptor) -> bool:
+    """Whether it is the writing end."""
+    return one.flags & os.O_ACCMODE == os.O_WRONLY
+
+
+@lru_cache(maxsize=PIPES_KNOWN)
+def held_elsewhere(pid: int, target: str) -> bool:
+    """Whether another process that we may look at holds an end of a pipe.
+
+    Args:
+        target: its name in /proc/PID/fd.
+    """
+    return any(other.isdigit() and int(other) != pid and target in _targets(other) for other in os.listdir("/proc"))
+
+
+def _targets(pid: str) -> set[str]:
+    found = set()
+    try:
+        with os.scandir(f"/proc/{pid}/fd") as entries:
+            for entry in entries:
+                try:
+                    found.add(os.readlink(entry.path))
+                except OSError:  # closed meanwhile
+                    continue
+    except OSError:  # ended meanwhile, or another user's
+        return found
+    return found
+
+
+def look_into(held: OpenFile) -> tuple[int, bytes]:
+    """A pipe's capacity and, for the reading end, what is in it; it stays there. The process stands still.
+
+    Raises:
+        CaptureError: it cannot be looked into.
+    """
+    path, reads = f"/proc/{held.pid}/fd/{held.first.number}", not writes(held.first)
+    try:
+        pipe = os.open(path, (os.O_RDONLY if reads else os.O_WRONLY) | os.O_NONBLOCK | os.O_CLOEXEC)
+        try:
+            capacity = fcntl.fcntl(pipe, F_GETPIPE_SZ)
+            return capacity, _copy_of(pipe, capacity) if reads else b""
+        finally:
+            os.close(pipe)
+    except OSError as error:
+        raise CaptureError(f"cannot look into the pipe {path}: {error.strerror}; capture it again") from error
+
+
+def _copy_of(pipe: int, capacity: int) -> bytes:
+    waiting = array.array("i", [0])
+    fcntl.ioctl(pipe, termios.FIONREAD, waiting)
+    if not waiting[0]:
+        return b""
+    reader, writer = os.pipe()
+    try:
+        fcntl.fcntl(writer, F_SETPIPE_SZ, capacity)
+        if _libc.tee(pipe, writer, waiting[0], 0) != waiting[0]:
+            abi.raise_errno("tee of a pipe")
+        return os.read(reader, waiting[0])
+    finally:
+        os.close(reader)
+        os.close(writer)
+
+
+def rebuild(table: CallTable, ends: Sequence[Resource], first: int) -> dict[tuple[int, int], int]:
+    """Make the pipes at numbers from ``first`` on: the descriptor of each (pipe, end).
+
+    Args:
+        ends: every resource of this kind.
+    """
+    made: dict[tuple[int, int], int] = {}
+    for held in ends:
+        pipe = int(str(held.facts["pipe"]))
+        if (pipe, 0) not in made:
+            made[pipe, 0], made[pipe, 1] = _make(table, first + len(made))
+    for held in ends:
+        pipe, end = int(str(held.facts["pipe"])), int(str(held.facts["end"]))
+        descriptor, content, capacity = made[pipe, end], held.facts["content"], int(str(held.facts["capacity"]))
+        if capacity != DEFAULT_CAPACITY and not end:
+            table.call(f"size the pipe of {held.name}", "fcntl", descriptor, F_SETPIPE_SZ, capacity, least=capacity)
+        if isinstance(content, bytes) and content:
+            table.call(
+                f"fill the pipe of {held.name}", "write", made[pipe, 1], table.place(content), len(content), least=len(content)
+            )
+        if int(str(held.facts["flags"])) & os.O_NONBLOCK:
+            table.call(f"set the flags of {held.name}", "fcntl", descriptor, fcntl.F_SETFL, os.O_NONBLOCK)
+    return made
+
+
+def _make(table: CallTable, target: int) -> tuple[int, int]:
+    reader = table.lowest_descriptor()
+    table.descriptors.add(reader)
+    writer = table.lowest_descriptor()
+    table.descriptors.add(writer)
+    table.call("make a pipe", "pipe2", table.place(bytes(8)), os.O_CLOEXEC)
+    for number, place in ((reader, target), (writer, target + 1)):
+        table.duplicate(number, place, os.O_CLOEXEC)
+        table.close(number)
+    return target, target + 1
