@@ -160,8 +160,15 @@ class Play:
         """All of it, in order.
 
         Raises:
-            FailoverError: something did not come about; says what, with the standby's own words.
+            FailoverError: something did not come about; says what, with the agents' last words.
         """
+        try:
+            self._perform()
+        except FailoverError as error:
+            words = "\n".join(f"  {robot.name} said last: {robot.last_words()}" for robot in self._stage.robots)
+            raise FailoverError(f"{error}\n{words}" if words else str(error)) from error
+
+    def _perform(self) -> None:
         self._stage.start()
         self._screen.say(f"{self._primary.name} and {self._standby.name} are up: {self._stage.means.sentence()}")
         self._protect()
@@ -301,8 +308,7 @@ class Play:
         deadline = time.monotonic() + limit_s
         while not condition():
             if time.monotonic() > deadline:
-                words = "; ".join(f"{robot.name}: {robot.last_words()}" for robot in self._stage.robots)
-                raise FailoverError(f"waited {limit_s:.0f} s in vain for {what}; last words of {words}")
+                raise FailoverError(f"waited {limit_s:.0f} s in vain for {what}")
             time.sleep(every_s)
 
     def _draw(self, components: dict[str, dict[str, Any]], robot: str) -> None:

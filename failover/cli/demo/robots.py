@@ -36,6 +36,9 @@ ADDRESS: Final = "10.71.7.{}"
 
 POLL_S: Final = 0.005
 
+LAST_LINES: Final = 5
+"""Of an agent's log, shown when something goes wrong."""
+
 GO: Final = b"g"
 """What a host waits for before it starts its agent."""
 
@@ -164,7 +167,7 @@ class RobotMachine:
     def last_words(self) -> str:
         """The end of its agent's log, for a message."""
         with contextlib.suppress(OSError):
-            return " / ".join(self.log.read_text(errors="replace").strip().splitlines()[-3:]) or "it said nothing"
+            return " / ".join(self.log.read_text(errors="replace").strip().splitlines()[-LAST_LINES:]) or "it said nothing"
         return "it left no log"
 
 
