@@ -89,6 +89,7 @@ class CaptureOrder:
         base: whole, whatever was acknowledged; a delta is made only when this is False and a position was acknowledged.
         generation, sequence: of the position that it gets.
         robot: name of the robot, "" for a one-shot capture.
+        hold: leave the program standing still afterwards, until the session is closed.
     """
 
     base: bool = True
@@ -96,6 +97,7 @@ class CaptureOrder:
     sequence: int = 1
     epoch: int = 0
     robot: str = ""
+    hold: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +116,8 @@ class RestoreOptions:
 class Session(Protocol):
     """One protected process. Every call comes from the thread that opened it."""
 
+    totals: tuple[int, int]
+    """Bytes that the component had written to its standard output and error at the last capture."""
     notes: tuple[str, ...]
     """What is not as it could be: a fallback that was taken, something that will differ."""
 
@@ -139,11 +143,14 @@ class Session(Protocol):
 class Restored(Protocol):
     """A program that was brought back and stands still until `resume`."""
 
-    pid: int
-    """As this process sees it."""
     position: Position
     """Of the snapshot that it stands at."""
     notes: tuple[str, ...]
+
+    @property
+    def pid(self) -> int:
+        """As this process sees it."""
+        ...
 
     def resume(self) -> None:
         """Let it go on."""

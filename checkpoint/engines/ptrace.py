@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from checkpoint.engine import Report, RestoreOptions, Restored, Session, Streams
+from checkpoint.engine import Report, Restored, RestoreOptions, Session, Streams
 from checkpoint.model import Snapshot
 
 

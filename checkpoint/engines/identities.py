@@ -1,0 +1,129 @@
+"""Which files stand behind a process's mappings, told so that another machine can tell whether it has the same."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from checkpoint.linux.dirty import NOT_CARRIED
+from checkpoint.linux.procfs import DELETED, MapsLine
+from checkpoint.model import FileIdentity, Vma, VmaKind
+from checkpoint.resources import files
+
+KEPT_FLAGS: Final = frozenset(("gd", "dc", "dd", "wf", "hg", "nh", "lo", "nr", "sr", "rr", "mg"))
+"""VmFlags that a restore gives back."""
+VSYSCALL: Final = "[vsyscall]"
+KINDS: Final = {
+    "[heap]": VmaKind.HEAP,
+    "[stack]": VmaKind.STACK,
+    "[vdso]": VmaKind.VDSO,
+    "[vvar]": VmaKind.VVAR,
+    "[vvar_vclock]": VmaKind.VVAR,
+    VSYSCALL: VmaKind.VSYSCALL,
+}
+
+
+class Identities:
+    """Identities of one process's files; each file is looked at once while it stays as it is."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._known: dict[tuple[int, int, str], FileIdentity] = {}
+
+    def vmas(self, lines: Sequence[MapsLine], flags: Mapping[int, tuple[str, ...]]) -> tuple[Vma, ...]:
+        """The mappings as the model has them.
+
+        Args:
+            flags: VmFlags by start, possibly older than ``lines``.
+        """
+        return tuple(self._vma(line, flags.get(line.start, ())) for line in lines if line.name != VSYSCALL)
+
+    def _vma(self, line: MapsLine, flags: tuple[str, ...]) -> Vma:
+        is_file = line.has_file and line.name not in NOT_CARRIED and not line.name.startswith("/dev/zero")
+        return Vma(
+            start=line.start,
+            end=line.end,
+            protection=line.protection,
+            shared=line.shared,
+            kind=VmaKind.FILE if is_file else KINDS.get(line.name, VmaKind.ANONYMOUS),
+            offset=line.offset,
+            name=line.name,
+            file=self.of_mapping(line) if is_file else None,
+            flags=tuple(flag for flag in flags if flag in KEPT_FLAGS),
+        )
+
+    def of_mapping(self, line: MapsLine) -> FileIdentity:
+        """The file behind a mapping."""
+        key = (line.device, line.inode, line.name)
+        if key not in self._known:
+            through = f"/proc/{self._pid}/map_files/{line.start:x}-{line.end:x}"
+            deleted = line.name.endswith(DELETED)
+            path = line.name.removesuffix(DELETED) if deleted else line.name
+            self._known[key] = self._identity(path, through if deleted else f"/proc/{self._pid}/root{path}", deleted)
+        return self._known[key]
+
+    def executable(self) -> FileIdentity:
+        """The program itself."""
+        target = os.readlink(f"/proc/{self._pid}/exe")
+        deleted = target.endswith(DELETED)
+        return self._identity(target.removesuffix(DELETED), f"/proc/{self._pid}/exe", deleted)
+
+    def _identity(self, path: str, through: str, deleted: bool) -> FileIdentity:
+        try:
+            about = os.stat(through)
+        except OSError:
+            return FileIdentity(path, deleted=deleted)
+        return FileIdentity(
+            path=path,
+            device=about.st_dev,
+            inode=about.st_ino,
+            mode=about.st_mode,
+            size=about.st_size,
+            mtime_ns=about.st_mtime_ns,
+            build_id=build_id(through),
+            digest=files.digest_at(through, (about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns)),
+            deleted=deleted,
+        )
+
+
+_HEADER: Final = struct.Struct("<16sHHIQQQIHHHHHH")
+_PROGRAM_HEADER: Final = struct.Struct("<IIQQQQQQ")
+PT_NOTE: Final = 4
+NT_GNU_BUILD_ID: Final = 3
+NOTE_LIMIT: Final = 1 << 16
+"""Bytes of one note segment that are looked at."""
+
+
+def build_id(path: str) -> bytes:
+    """The GNU build id of a 64-bit ELF file, b"" where there is none. Source: elf(5)."""
+    try:
+        with open(path, "rb") as file:
+            header = file.read(_HEADER.size)
+            if len(header) < _HEADER.size or header[:5] != b"\x7fELF\x02":
+                return b""
+            fields = _HEADER.unpack(header)
+            file.seek(fields[5])
+            table = file.read(fields[9] * fields[10])
+            for index in range(fields[10]):
+                kind, _, offset, _, _, size, _, _ = _PROGRAM_HEADER.unpack_from(table, index * fields[9])
+                if kind == PT_NOTE and size <= NOTE_LIMIT:
+                    file.seek(offset)
+                    if found := _build_id_in(file.read(size)):
+                        return found
+    except (OSError, struct.error):
+        return b""
+    return b""
+
+
+def _build_id_in(notes: bytes) -> bytes:
+    place = 0
+    while place + 12 <= len(notes):
+        name_size, size, kind = struct.unpack_from("<III", notes, place)
+        name_at = place + 12
+        content_at = name_at + -(-name_size // 4) * 4
+        if kind == NT_GNU_BUILD_ID and notes[name_at : name_at + 4] == b"GNU\0":
+            return notes[content_at : content_at + size]
+        place = content_at + -(-size // 4) * 4
+    return b""

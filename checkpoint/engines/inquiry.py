@@ -1,0 +1,150 @@
+"""What only the process itself can be asked: one batch of system calls made inside it, and the reading of their answers."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from checkpoint.linux import abi
+from checkpoint.linux.procfs import Status, TimerLine
+from checkpoint.linux.remote import Answers, Batch
+from checkpoint.model import Clocks, IntervalTimer, PosixTimer, SignalAction
+
+SIGCHLD: Final = 17
+NS_PER_S: Final = 1_000_000_000
+US_PER_S: Final = 1_000_000
+CLOCK_REALTIME: Final = 0
+CLOCK_MONOTONIC: Final = 1
+CLOCK_BOOTTIME: Final = 7
+INTERVAL_TIMER_COUNT: Final = 3
+TIMER_LIMIT: Final = 40
+"""POSIX timers that one batch has room for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What the process said about itself; the fields are those of ``checkpoint.model``."""
+
+    clocks: Clocks
+    actions: tuple[SignalAction, ...]
+    altstack: tuple[int, int, int]
+    interval_timers: tuple[IntervalTimer, ...]
+    posix_timers: tuple[PosixTimer, ...]
+    robust_list: tuple[int, int]
+    clear_tid: int
+    brk: int
+    dumpable: int
+    keep_caps: bool
+    child_subreaper: bool
+    parent_death_signal: int
+    thp_disabled: bool
+    securebits: int
+    timer_slack_ns: int
+
+
+class Inquiry:
+    """One set of questions; `read` understands the answers to exactly these.
+
+    Args:
+        status: read while the process stands still: says which signals have an action of their own.
+        close_inside: a descriptor number to be closed in the process first, or -1.
+    """
+
+    def __init__(self, table: int, status: Status, timers: Sequence[TimerLine], close_inside: int = -1) -> None:
+        self.batch = Batch(table)
+        self._timers = timers
+        if close_inside >= 0:
+            self.batch.add("close", close_inside)
+        self._clocks = [self._writes(16, "clock_gettime", clock) for clock in (CLOCK_REALTIME, CLOCK_MONOTONIC, CLOCK_BOOTTIME)]
+        special = status.caught | status.ignored | 1 << (SIGCHLD - 1)
+        self._actions = [
+            (number, self._asks_action(number)) for number in range(1, abi.SIGNAL_COUNT + 1) if special >> (number - 1) & 1
+        ]
+        self._altstack = self._filled(24, lambda address: ("sigaltstack", 0, address))
+        self._intervals = [self._writes(32, "getitimer", which) for which in range(INTERVAL_TIMER_COUNT)]
+        self._posix = [
+            (line, self._writes(32, "timer_gettime", line.timer_id), self.batch.add("timer_getoverrun", line.timer_id))
+            for line in timers
+        ]
+        self._robust = self.batch.output(16)
+        self.batch.add("get_robust_list", 0, self._robust, self._robust + 8)
+        self._clear_tid = self._writes(8, "prctl", abi.PR_GET_TID_ADDRESS)
+        self._brk = self.batch.add("brk", 0)
+        self._dumpable = self.batch.add("prctl", abi.PR_GET_DUMPABLE)
+        self._keep_caps = self.batch.add("prctl", abi.PR_GET_KEEPCAPS)
+        self._subreaper = self._writes(8, "prctl", abi.PR_GET_CHILD_SUBREAPER)
+        self._death_signal = self._writes(8, "prctl", abi.PR_GET_PDEATHSIG)
+        self._thp = self.batch.add("prctl", abi.PR_GET_THP_DISABLE, 0, 0, 0, 0)
+        self._securebits = self.batch.add("prctl", abi.PR_GET_SECUREBITS)
+        self._slack = self.batch.add("prctl", abi.PR_GET_TIMERSLACK)
+
+    def _asks_action(self, signal: int) -> int:
+        return self._filled(32, lambda address: ("rt_sigaction", signal, 0, address, abi.SIGSET_SIZE))
+
+    def _writes(self, size: int, name: str, *arguments: int) -> int:
+        """A call whose last argument points to what it writes; answers with that address."""
+        return self._filled(size, lambda address: (name, *arguments, address))
+
+    def _filled(self, size: int, call: Callable[[int], tuple[str | int, ...]]) -> int:
+        address = self.batch.output(size)
+        name, *arguments = call(address)
+        self.batch.add(str(name), *(int(argument) for argument in arguments))
+        return address
+
+    def read(self, answers: Answers) -> Told:
+        """Understand the answers."""
+
+        def words(address: int, form: str) -> tuple[int, ...]:
+            return struct.unpack(form, answers.at(address, struct.calcsize(form)))
+
+        result = answers.results
+        realtime, monotonic, boottime = (seconds * NS_PER_S + rest for seconds, rest in (words(at, "<qq") for at in self._clocks))
+        sp, flags, _, size = words(self._altstack, "<QiiQ")
+        head, length = words(self._robust, "<QQ")
+        return Told(
+            clocks=Clocks(realtime, monotonic, boottime),
+            actions=tuple(_action(number, words(at, "<QQQQ")) for number, at in self._actions),
+            altstack=(sp, flags, size),
+            interval_timers=tuple(
+                timer for which, at in enumerate(self._intervals) if (timer := _interval(which, words(at, "<qqqq"))) is not None
+            ),
+            posix_timers=tuple(_posix(line, words(at, "<qqqq"), result[overrun]) for line, at, overrun in self._posix),
+            robust_list=(head, length),
+            clear_tid=words(self._clear_tid, "<Q")[0],
+            brk=result[self._brk],
+            dumpable=result[self._dumpable],
+            keep_caps=result[self._keep_caps] == 1,
+            child_subreaper=words(self._subreaper, "<i")[0] == 1,
+            parent_death_signal=words(self._death_signal, "<i")[0],
+            thp_disabled=result[self._thp] == 1,
+            securebits=max(result[self._securebits], 0),
+            timer_slack_ns=max(result[self._slack], 0),
+        )
+
+
+def _action(number: int, words: tuple[int, ...]) -> SignalAction:
+    handler, flags, restorer, mask = words
+    return SignalAction(number, handler, flags, restorer, mask)
+
+
+def _interval(which: int, words: tuple[int, ...]) -> IntervalTimer | None:
+    interval_s, interval_us, value_s, value_us = words
+    timer = IntervalTimer(which, interval_s * US_PER_S + interval_us, value_s * US_PER_S + value_us)
+    return timer if timer.interval_us or timer.value_us else None
+
+
+def _posix(line: TimerLine, words: tuple[int, ...], overrun: int) -> PosixTimer:
+    interval_s, interval_ns, value_s, value_ns = words
+    return PosixTimer(
+        timer_id=line.timer_id,
+        clock=line.clock,
+        notify=line.notify,
+        signal=line.signal,
+        value=line.value,
+        tid=line.tid,
+        interval_ns=interval_s * NS_PER_S + interval_ns,
+        value_ns=value_s * NS_PER_S + value_ns,
+        overrun=max(overrun, 0),
+    )

@@ -1,0 +1,93 @@
+"""What a capture of a process would preserve, found without touching it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import Final
+
+from checkpoint.engine import NOTED, REFUSED, Finding, Report, Streams
+from checkpoint.errors import ProbeError, ProcessGoneError
+from checkpoint.linux import dirty, procfs
+from checkpoint.linux.procfs import Status
+from checkpoint.resources import Surroundings, gather, look, pipes_of, unsupported
+
+COMMAND_LENGTH: Final = 200
+"""Characters of a command line that a report shows."""
+
+
+def probe(pid: int, streams: Streams | None = None) -> Report:
+    """Look at a process.
+
+    Args:
+        streams: the guard's ends of its standard streams, if it has a guard.
+
+    Raises:
+        ProbeError: there is no such process, it is no program, somebody traces it, or we may not look.
+    """
+    try:
+        return _probe(pid, surroundings_of(pid, streams))
+    except ProcessGoneError as error:
+        raise ProbeError(f"cannot look at pid {pid}: there is no such process (any more)") from error
+
+
+def _probe(pid: int, surroundings: Surroundings) -> Report:
+    if not 0 < pid <= _largest_pid():
+        raise ProbeError(f"cannot look at pid {pid}: that is not the number of a process")
+    status = procfs.status(pid)
+    unsupported.require_traceable(pid, status)
+    _require_permission(pid, status)
+    findings = (
+        *_process_findings(pid, status),
+        *_memory_findings(pid),
+        *look(gather(pid), surroundings).findings,
+    )
+    return Report(pid, _command(pid, status), status.resident_size, dirty.best_tracking(), findings)
+
+
+def surroundings_of(pid: int, streams: Streams | None) -> Surroundings:
+    """What the kinds of resources must know about a process and its guard."""
+    if not 0 < pid <= _largest_pid():
+        raise ProbeError(f"cannot look at pid {pid}: that is not the number of a process")
+    return Surroundings(pipes_of(streams.outputs) if streams else {})
+
+
+def _largest_pid() -> int:
+    with open("/proc/sys/kernel/pid_max") as file:
+        return int(file.read())
+
+
+def _require_permission(pid: int, status: Status) -> None:
+    """Fail as seizing would, before anything is touched."""
+    try:
+        procfs.read_bytes(pid, "auxv")
+        os.stat(f"/proc/{pid}/exe")
+    except (ProbeError, PermissionError) as error:
+        raise ProbeError(
+            f"cannot look at pid {pid} ({status.name}) of uid {status.uids[0]}: not permitted; run as that user or as root"
+        ) from error
+
+
+def _process_findings(pid: int, status: Status) -> Iterator[Finding]:
+    for reason in unsupported.refuse_process(pid, status):
+        yield Finding("process", f"pid {pid}", REFUSED, reason)
+    if status.ppid and len(status.pids) == 1:
+        text = "its PID is kept where it is free on the other side: failover run gives a program a PID namespace of its own"
+        yield Finding("process", f"pid {pid}", NOTED, text)
+
+
+def _memory_findings(pid: int) -> Iterator[Finding]:
+    smaps = procfs.read_text(pid, "smaps")
+    flags = procfs.parse_vm_flags(smaps)
+    for line in procfs.parse_maps(procfs.read_text(pid, "maps")):
+        reason = unsupported.refuse_mapping(line, flags.get(line.start, ()))
+        if reason is not None:
+            yield Finding("memory", f"VMA {line.start:x}-{line.end:x}", REFUSED, reason)
+    for reason in unsupported.refuse_protection_keys(smaps):
+        yield Finding("memory", "protection key", REFUSED, reason)
+
+
+def _command(pid: int, status: Status) -> str:
+    words = procfs.read_text(pid, "cmdline").rstrip("\0").split("\0")
+    command = " ".join(words).strip() or f"[{status.name}]"
+    return command if len(command) <= COMMAND_LENGTH else command[: COMMAND_LENGTH - 1] + "…"

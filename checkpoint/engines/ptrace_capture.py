@@ -1,0 +1,631 @@
+"""Capture by ptrace: one protected process, from `PtraceSession.open` to `PtraceSession.close`.
+
+One capture::
+
+    freeze       stop it; registers, mask, pending signals; maps                  the program stands still
+    scan, copy   which pages were written, and their bytes
+    ask          a batch of system calls inside it (`checkpoint.linux.remote`); descriptors; output counts
+    thaw         everything as it was
+    describe     zero pages dropped, digests, files identified, refusals          the program runs
+
+The first base does not freeze for its size: pages are protected and copied while the program runs, and the freeze brings what was
+written meanwhile.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gc
+import os
+import resource
+import socket
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from blake3 import blake3
+
+from checkpoint import pages
+from checkpoint.arch import x86_64 as arch
+from checkpoint.chain import position_of
+from checkpoint.engine import CaptureOrder, Streams
+from checkpoint.engines import probe as probing
+from checkpoint.engines.identities import Identities
+from checkpoint.engines.inquiry import Inquiry, Told
+from checkpoint.engines.outputs import Outputs, Totals
+from checkpoint.engines.restart import Interruption, outside_critical_section
+from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, UnsupportedError
+from checkpoint.linux import abi, dirty, procfs, remote
+from checkpoint.linux.dirty import NONE, DigestTracker, PagemapTracker, SharedPages, SoftDirtyTracker, Tracker
+from checkpoint.linux.procfs import MapsLine, MapsReader, Stat, Status
+from checkpoint.linux.remote import BorrowedPages
+from checkpoint.linux.tracee import Tracee
+from checkpoint.model import (
+    Credentials,
+    Machine,
+    MemoryLayout,
+    Position,
+    ProcessState,
+    Rseq,
+    Snapshot,
+    ThreadState,
+    Vma,
+)
+from checkpoint.pages import PageTable, Words
+from checkpoint.resources import OpenFile, Surroundings, gather, look, unsupported, with_contents
+
+LIMIT_COUNT: Final = 16
+"""RLIMIT numbers of Linux. Source: asm-generic/resource.h."""
+US_PER_NS: Final = 1000
+EMPTY_CONTENT: Final = bytearray()
+
+
+@dataclass(frozen=True, slots=True)
+class Frozen:
+    """Everything that one freeze brought home; nothing in it needs the process any more.
+
+    Attributes:
+        written, cleared: relative to the acknowledged position, see `dirty.Scan`; ``content`` are the bytes of ``written``.
+        freeze_us: how long the program stood still.
+    """
+
+    registers: bytes
+    xstate: bytes
+    mask: int
+    pending: tuple[bytes, ...]
+    shared_pending: tuple[bytes, ...]
+    rseq: Rseq | None
+    settled: arch.Registers
+    interrupted: str
+    lines: tuple[MapsLine, ...]
+    status: Status
+    stat: Stat
+    told: Told
+    opened: tuple[OpenFile, ...]
+    totals: Totals
+    written: Words
+    cleared: Words
+    content: bytearray
+    freeze_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class Unacknowledged:
+    """What one scan found, kept until a position that holds it is acknowledged."""
+
+    position: Position | None
+    written: Words
+    cleared: Words
+
+
+class PtraceSession:
+    """One protected process; every call from the thread that opened it. See ``checkpoint.engine.Session``.
+
+    Invariants: between captures nobody traces the process; ``_unacknowledged`` holds every page written since the newest
+    acknowledged position; ``_table`` is the state at the last capture that was handed out.
+    """
+
+    def __init__(self, pid: int, component: str, tracee: Tracee, pages_inside: BorrowedPages, tracker: Tracker) -> None:
+        self.pid = pid
+        self.component = component
+        self.notes: tuple[str, ...] = ()
+        self.totals: Totals = (0, 0)
+        self._tracee = tracee
+        self._borrowed = pages_inside
+        self._tracker = tracker
+        self._shared = SharedPages(pid)
+        self._maps = MapsReader(pid)
+        self._maps_seen: tuple[MapsLine, ...] = ()
+        self._flags: dict[int, tuple[str, ...]] = {}
+        self._flags_of: tuple[MapsLine, ...] = ()
+        self._identities = Identities(pid)
+        self._interruption = Interruption(tracee.memory)
+        self._outputs: Outputs | None = None
+        self._close_inside = -1
+        self._based = False
+        self._table = PageTable.empty(abi.PAGE_SIZE)
+        self._unacknowledged: list[Unacknowledged] = []
+        self._acknowledged: Position | None = None
+        self._totals_at: dict[Position, Totals] = {}
+        self._held = False
+        self._closed = False
+
+    # Opening and closing
+
+    @classmethod
+    def open(cls, pid: int, component: str, streams: Streams | None) -> PtraceSession:
+        """See ``checkpoint.engine.Engine.protect``."""
+        outputs = Outputs(streams) if streams else None
+        try:
+            report = probing.probe(pid, streams)
+            if not report.supported:
+                listed = "; ".join(report.reasons)
+                raise UnsupportedError(f"cannot protect pid {pid} ({report.command}): {listed}", report.reasons)
+            session = _entered(cls, pid, component)
+        except BaseException:
+            if outputs:
+                outputs.close()
+            raise
+        session._outputs = outputs
+        session.notes += report.notes
+        return session
+
+    def close(self) -> None:
+        """See ``checkpoint.engine.Session.close``."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._held:
+            with contextlib.suppress(CaptureError):
+                self._tracee.detach()
+        self._tracker.close()
+        self._shared.close()
+        if self._outputs:
+            self._outputs.close()
+
+    def acknowledge(self, position: Position) -> None:
+        """See ``checkpoint.engine.Session.acknowledge``. A position that is not known (any more) changes nothing."""
+        places = [index for index, held in enumerate(self._unacknowledged) if held.position == position]
+        if not places:
+            return
+        del self._unacknowledged[: places[-1] + 1]
+        self._acknowledged = position
+        self._totals_at = {known: totals for known, totals in self._totals_at.items() if known >= position}
+
+    # Capturing
+
+    def capture(self, order: CaptureOrder) -> Snapshot:
+        """See ``checkpoint.engine.Session.capture``."""
+        parent = None if order.base else self._acknowledged
+        try:
+            copied = self._copy_running() if parent is None else None
+            frozen = self._frozen_look(base=copied is not None, hold=order.hold)
+        except ProcessGoneError as error:
+            raise self._gone(error) from error
+        held = look(frozen.opened, self._outputs.surroundings if self._outputs else Surroundings())
+        reasons = (*held.reasons, *self._reasons_of(frozen))
+        if reasons:
+            raise UnsupportedError(f"cannot capture {self.component} (pid {self.pid}): {'; '.join(reasons)}", reasons)
+        if copied is not None:
+            frozen = _merged(copied, frozen)
+        vmas = self._identities.vmas(frozen.lines, self._flags)
+        snapshot = self._with_pages(self._outline(order, parent, frozen, vmas), frozen)
+        snapshot = replace(
+            snapshot,
+            resources=held.resources,
+            output=self._outputs.pieces(self._output_since(), frozen.totals) if self._outputs else (),
+        )
+        snapshot = replace(snapshot, position=position_of(snapshot, order.generation, order.sequence))
+        self._unacknowledged[-1] = replace(self._unacknowledged[-1], position=snapshot.position)
+        self._totals_at[snapshot.position] = self.totals = frozen.totals
+        return snapshot
+
+    def _gone(self, error: ProcessGoneError) -> ProcessGoneError:
+        """A process that executed another program is not the one that was protected."""
+        with contextlib.suppress(ProcessGoneError, ProbeError):
+            procfs.status(self.pid)
+            self._based = False
+            return ProcessGoneError(f"{self.component} (pid {self.pid}) has become another program (exec): protect it anew")
+        return error
+
+    def _output_since(self) -> Totals:
+        return self._totals_at.get(self._acknowledged, (0, 0)) if self._acknowledged else (0, 0)
+
+    def _copy_running(self) -> tuple[Words, bytearray]:
+        """Copy everything that exists while the program runs: the set of pages, and their bytes.
+
+        What changes meanwhile is written once more by the scan that follows. A page that cannot be read now has gone
+        or is coming, and is then found by that scan, too.
+        """
+        self._maps.refresh()
+        lines = self._private_lines()
+        if not self._based:
+            self._tracker.arm(lines)
+            self._based = True
+        self._shared.forget()
+        self._read_flags()
+        existing = self._tracker.existing(lines)
+        found, content = [], bytearray(pages.total_size(existing))
+        filled = 0
+        for chunk in dirty.chunks_of(existing):
+            try:
+                part = self._tracee.memory.read_pages(chunk)
+            except ProcessGoneError:
+                raise
+            except CaptureError:
+                chunk, part = _readable(self._tracee, chunk)
+            found.append(chunk)
+            content[filled : filled + len(part)] = part
+            filled += len(part)
+        del content[filled:]
+        return dirty.pages_joined(np.concatenate(found)) if found else NONE, content
+
+    def _frozen_look(self, *, base: bool, hold: bool) -> Frozen:
+        tracee = self._tracee
+        began = self._freeze()
+        try:
+            look_ = self._look(base=base)
+        except BaseException:
+            self._thaw()
+            raise
+        if hold:
+            self._held = True
+        else:
+            self._thaw()
+        return replace(look_, freeze_us=(time.perf_counter_ns() - began) // US_PER_NS if tracee else 0)
+
+    def _freeze(self) -> int:
+        """Stop it, nothing of ours half done inside; answers when that began."""
+        if self._held:
+            return time.perf_counter_ns()
+        gc.disable()
+        began = time.perf_counter_ns()
+        self._tracee.seize()
+        self._tracee.freeze()
+        return began
+
+    def _thaw(self) -> None:
+        self._held = False
+        with contextlib.suppress(ProcessGoneError):
+            self._tracee.detach()
+        gc.enable()
+
+    def _look(self, *, base: bool) -> Frozen:
+        """Everything that needs the program to stand still."""
+        tracee = self._tracee
+        registers, mask = tracee.registers(), tracee.signal_mask()
+        decoded = arch.decode_registers(registers)
+        if self._borrowed.holds(decoded[arch.INSTRUCTION_POINTER]):
+            raise CaptureError(f"pid {self.pid} still stands in code of an earlier look; capture it again in a moment")
+        pending, shared_pending = tracee.pending(shared=False), tracee.pending(shared=True)
+        rseq = tracee.rseq()
+        if rseq and decoded[arch.CALL_NUMBER] >> 63:
+            decoded = outside_critical_section(decoded, tracee.memory, rseq.address)
+            registers = arch.encode_registers(decoded)
+        changed = self._maps.refresh()
+        lines = self._private_lines()
+        scan = self._tracker.scan(lines, changed=changed)
+        shared = self._shared.scan([line for line in self._maps.lines if line.shared])
+        self._remember(dirty.Scan(pages.union(scan.written, shared.written), pages.union(scan.cleared, shared.cleared)))
+        written, cleared = self._since_acknowledged(base=base)
+        content = tracee.memory.read_pages(written) if len(written) else EMPTY_CONTENT
+        status, timers = procfs.status(self.pid), procfs.parse_timers(procfs.read_text(self.pid, "timers"))
+        inquiry = Inquiry(self._borrowed.table, status, timers, self._close_inside)
+        told = inquiry.read(self._borrowed.run(tracee, inquiry.batch, registers, mask))
+        self._close_inside = -1
+        settled, interrupted = self._interruption.settled(decoded, lambda: bool(_unblocked(pending + shared_pending, mask)))
+        return Frozen(
+            registers=registers,
+            xstate=tracee.xstate(),
+            mask=mask,
+            pending=pending,
+            shared_pending=shared_pending,
+            rseq=rseq,
+            settled=settled,
+            interrupted=interrupted,
+            lines=tuple(line for line in self._maps.lines if not self._borrowed.holds(line.start)),
+            status=status,
+            stat=procfs.stat(self.pid),
+            told=told,
+            opened=with_contents(gather(self.pid)),
+            totals=self._outputs.totals() if self._outputs else (0, 0),
+            written=written,
+            cleared=cleared,
+            content=content,
+            freeze_us=0,
+        )
+
+    def _private_lines(self) -> list[MapsLine]:
+        return [line for line in self._maps.lines if dirty.is_private(line) and not self._borrowed.holds(line.start)]
+
+    def _read_flags(self) -> None:
+        """VmFlags cost a walk over all pages: read while the program runs, and only when the mappings changed."""
+        if self._flags_of != self._maps.lines:
+            self._flags = procfs.parse_vm_flags(procfs.read_text(self.pid, "smaps"))
+            self._flags_of = self._maps.lines
+
+    def _remember(self, scan: dirty.Scan) -> None:
+        """Keep what a scan found until it is acknowledged; a scan whose capture failed is joined with the next."""
+        if self._unacknowledged and self._unacknowledged[-1].position is None:
+            last = self._unacknowledged.pop()
+            still = pages.difference(last.written, scan.cleared)
+            scan = dirty.Scan(pages.union(still, scan.written), pages.union(last.cleared, scan.cleared))
+        self._unacknowledged.append(Unacknowledged(None, scan.written, scan.cleared))
+
+    def _since_acknowledged(self, *, base: bool) -> tuple[Words, Words]:
+        """What a delta must carry: the union of all scans since. A base needs the last scan alone."""
+        scans = self._unacknowledged[-1:] if base else self._unacknowledged
+        written, cleared = NONE, NONE
+        for one in scans:
+            written = pages.union(pages.difference(written, one.cleared), one.written) if len(written) else one.written
+            cleared = pages.union(cleared, one.cleared) if len(cleared) else one.cleared
+        mapped = dirty.extents_of([line for line in self._maps.lines if line.name not in dirty.NOT_CARRIED])
+        return pages.intersection(written, mapped), cleared
+
+    # Describing, while the program runs
+
+    def _reasons_of(self, frozen: Frozen) -> tuple[str, ...]:
+        """Why what it has turned into cannot be captured."""
+        try:
+            self._read_flags()
+            own = {line.start for line in self._private_lines()}
+            flags = {
+                start: tuple(flag for flag in found if flag not in ("um", "uw") or start not in own)
+                for start, found in self._flags.items()
+            }
+            of_mappings = (unsupported.refuse_mapping(line, flags.get(line.start, ())) for line in frozen.lines)
+            return (*unsupported.refuse_process(self.pid, frozen.status), *(reason for reason in of_mappings if reason))
+        except ProcessGoneError:
+            return ()  # the picture was taken before it ended
+
+    def _outline(self, order: CaptureOrder, parent: Position | None, frozen: Frozen, vmas: tuple[Vma, ...]) -> Snapshot:
+        """A snapshot without pages, descriptors and output."""
+        return Snapshot(
+            component=self.component,
+            engine="ptrace",
+            position=Position(order.generation, order.sequence, bytes(16)),
+            parent=parent,
+            machine=replace(this_machine(), robot=order.robot, xstate_mask=_xstate_mask(frozen.xstate)),
+            clocks=frozen.told.clocks,
+            process=self._process_state(frozen),
+            threads=(self._thread_state(frozen),),
+            vmas=vmas,
+            epoch=order.epoch,
+            freeze_us=frozen.freeze_us,
+            notes=self.notes,
+        )
+
+    def _with_pages(self, outline: Snapshot, frozen: Frozen) -> Snapshot:
+        """Add the pages: zero pages of anonymous memory are told, not carried."""
+        addresses = pages.addresses_of(frozen.written, abi.PAGE_SIZE)
+        content: bytearray | memoryview = frozen.content
+        zero = pages.zero_pages(content, abi.PAGE_SIZE) if len(addresses) else np.zeros(0, dtype=np.bool_)
+        of_files = dirty.extents_of([line for line in frozen.lines if line.has_file])
+        zero &= ~pages.covered(of_files, addresses)
+        cleared = frozen.cleared
+        if zero.any():
+            rows = np.frombuffer(content, dtype=np.uint8).reshape(-1, abi.PAGE_SIZE)
+            content = memoryview(rows[~zero].reshape(-1)).toreadonly()
+            cleared = pages.union(cleared, pages.extents_of_addresses(addresses[zero], abi.PAGE_SIZE))
+            addresses = addresses[~zero]
+        runs = pages.page_runs(pages.extents_of_addresses(addresses, abi.PAGE_SIZE))
+        is_base = outline.parent is None
+        forgotten = () if is_base else pages.page_runs(cleared)
+        before = PageTable.empty(abi.PAGE_SIZE) if is_base else self._table
+        self._table = before.apply(forgotten, runs, content, outline.vmas)
+        return replace(
+            outline, cleared=forgotten, runs=runs, contents=memoryview(content).toreadonly(), page_sum=self._table.page_sum
+        )
+
+    def _thread_state(self, frozen: Frozen) -> ThreadState:
+        told, stat = frozen.told, frozen.stat
+        return ThreadState(
+            tid=frozen.status.pids[-1],
+            name=frozen.status.name,
+            registers={"prstatus": arch.encode_registers(frozen.settled), "xstate": frozen.xstate},
+            signal_mask=frozen.mask,
+            pending=frozen.pending,
+            altstack=told.altstack,
+            robust_list=told.robust_list,
+            clear_tid=told.clear_tid,
+            rseq=frozen.rseq,
+            policy=stat.policy,
+            priority=stat.priority,
+            nice=stat.nice,
+            io_priority=0,
+            affinity=_affinity(self.pid),
+            timer_slack_ns=told.timer_slack_ns,
+            interrupted=frozen.interrupted,
+        )
+
+    def _process_state(self, frozen: Frozen) -> ProcessState:
+        status, told = frozen.status, frozen.told
+        return ProcessState(
+            pid=status.pids[-1],
+            ppid=status.ppid if len(status.pids) == 1 else 0,
+            pgid=status.pgids[-1] if status.pgids else 0,
+            sid=status.sids[-1] if status.sids else 0,
+            executable=self._identities.executable(),
+            arguments=tuple(os.fsdecode(procfs.read_bytes(self.pid, "cmdline")).split("\0")[:-1]),
+            layout=_layout(frozen.stat, told, procfs.read_bytes(self.pid, "auxv")),
+            working_directory=procfs.read_link(self.pid, "cwd"),
+            root_directory=procfs.read_link(self.pid, "root"),
+            umask=status.umask,
+            credentials=_credentials(status, told),
+            personality=int(procfs.read_text(self.pid, "personality"), 16),
+            limits=_limits(self.pid),
+            oom_score_adj=int(procfs.read_text(self.pid, "oom_score_adj")),
+            dumpable=told.dumpable,
+            keep_caps=told.keep_caps,
+            child_subreaper=told.child_subreaper,
+            parent_death_signal=told.parent_death_signal,
+            thp_disabled=told.thp_disabled,
+            signal_actions=told.actions,
+            pending=frozen.shared_pending,
+            interval_timers=told.interval_timers,
+            posix_timers=told.posix_timers,
+            isolated=len(status.pids) > 1,
+        )
+
+
+# Entering
+
+
+def _entered(kind: type[PtraceSession], pid: int, component: str) -> PtraceSession:
+    """Borrow pages, choose how to track, and let go again."""
+    tracee = Tracee(pid)
+    notes: tuple[str, ...] = ()
+    with _stopped(tracee):
+        registers, mask = tracee.registers(), tracee.signal_mask()
+        lines = procfs.parse_maps(procfs.read_text(pid, "maps"))
+        if rseq := tracee.rseq():
+            decoded = arch.decode_registers(registers)
+            if decoded[arch.CALL_NUMBER] >> 63:
+                registers = arch.encode_registers(outside_critical_section(decoded, tracee.memory, rseq.address))
+        entered = remote.enter(tracee, lines, registers, mask)
+        batch = remote.Batch(entered.pages.table)
+        if entered.inside >= 0:
+            batch.add("close", entered.inside)
+        entered.pages.run(tracee, batch, registers, mask)
+    tracker: Tracker
+    if entered.faults is not None:
+        try:
+            tracker = PagemapTracker(pid, entered.faults)
+        except OSError as error:
+            os.close(entered.faults)
+            tracker, notes = _without_write_protection(pid, error.strerror)
+    else:
+        tracker, notes = _without_write_protection(pid, os.strerror(entered.why_not))
+    session = kind(pid, component, tracee, entered.pages, tracker)
+    session.notes = notes
+    return session
+
+
+@contextlib.contextmanager
+def _stopped(tracee: Tracee) -> Iterator[None]:
+    """Hold it still for the body; let it go however that ends."""
+    tracee.seize()
+    try:
+        tracee.freeze()
+        yield
+    finally:
+        with contextlib.suppress(ProcessGoneError):
+            tracee.detach()
+
+
+def _without_write_protection(pid: int, why: str) -> tuple[Tracker, tuple[str, ...]]:
+    tracker: Tracker = SoftDirtyTracker(pid) if dirty.has_soft_dirty() else DigestTracker(pid)
+    return tracker, (f"written pages are found by {tracker.name}, which takes longer: no write protection ({why})",)
+
+
+# Pieces of a description
+
+
+def _readable(tracee: Tracee, ranges: Words) -> tuple[Words, bytearray]:
+    """The pages of a set that can be read just now, and their bytes."""
+    kept, content = [], bytearray()
+    for address in pages.addresses_of(ranges, abi.PAGE_SIZE).tolist():
+        try:
+            content += tracee.memory.read(address, abi.PAGE_SIZE)
+        except ProcessGoneError:
+            raise
+        except CaptureError:
+            continue
+        kept.append((address, address + abi.PAGE_SIZE))
+    return np.array(kept, dtype=np.uint64).reshape(-1, 2), content
+
+
+def _merged(copied: tuple[Words, bytearray], frozen: Frozen) -> Frozen:
+    """One base of the pages that were copied while the program ran and those of the freeze."""
+    before, content = copied
+    mapped = dirty.extents_of([line for line in frozen.lines if line.name not in dirty.NOT_CARRIED])
+    replaced = pages.union(frozen.written, frozen.cleared)
+    keep = pages.intersection(pages.difference(before, replaced), mapped)
+    old = pages.addresses_of(before, abi.PAGE_SIZE)
+    kept = pages.covered(keep, old)
+    new = pages.addresses_of(frozen.written, abi.PAGE_SIZE)
+    addresses = np.concatenate((old[kept], new))
+    order = np.argsort(addresses, kind="stable")
+    rows = np.empty((len(addresses), abi.PAGE_SIZE), dtype=np.uint8)
+    places = np.empty(len(addresses), dtype=np.int64)
+    places[order] = np.arange(len(addresses))
+    count = int(kept.sum())
+    rows[places[:count]] = np.frombuffer(content, dtype=np.uint8).reshape(-1, abi.PAGE_SIZE)[kept]
+    rows[places[count:]] = np.frombuffer(frozen.content, dtype=np.uint8).reshape(-1, abi.PAGE_SIZE)
+    return replace(
+        frozen,
+        written=pages.extents_of_addresses(addresses[order], abi.PAGE_SIZE),
+        cleared=NONE,
+        content=bytearray(memoryview(rows.reshape(-1))),
+    )
+
+
+def _unblocked(pending: tuple[bytes, ...], mask: int) -> list[int]:
+    numbers = (int.from_bytes(siginfo[:4], "little") for siginfo in pending)
+    return [number for number in numbers if not mask >> (number - 1) & 1]
+
+
+def _layout(stat: Stat, told: Told, auxv: bytes) -> MemoryLayout:
+    return MemoryLayout(
+        start_code=stat.start_code,
+        end_code=stat.end_code,
+        start_data=stat.start_data,
+        end_data=stat.end_data,
+        start_brk=stat.start_brk,
+        brk=told.brk,
+        start_stack=stat.start_stack,
+        arg_start=stat.arg_start,
+        arg_end=stat.arg_end,
+        env_start=stat.env_start,
+        env_end=stat.env_end,
+        auxv=auxv,
+    )
+
+
+def _credentials(status: Status, told: Told) -> Credentials:
+    return Credentials(
+        uids=status.uids,
+        gids=status.gids,
+        groups=status.groups,
+        capabilities=status.capabilities,
+        no_new_privs=status.no_new_privs,
+        securebits=told.securebits,
+    )
+
+
+def _limits(pid: int) -> dict[int, tuple[int, int]]:
+    try:
+        return {number: resource.prlimit(pid, number) for number in range(LIMIT_COUNT)}
+    except ProcessLookupError as error:
+        raise ProcessGoneError(f"pid {pid} ended while it was being described") from error
+
+
+def _affinity(pid: int) -> tuple[int, ...]:
+    try:
+        return tuple(sorted(os.sched_getaffinity(pid)))
+    except ProcessLookupError as error:
+        raise ProcessGoneError(f"pid {pid} ended while it was being described") from error
+
+
+XSTATE_HEADER: Final = 512
+"""Offset of XSTATE_BV, the bits of the components that are in use. Source: Intel SDM volume 1, 13.4.2."""
+
+
+def _xstate_mask(xstate: bytes) -> int:
+    return int.from_bytes(xstate[XSTATE_HEADER : XSTATE_HEADER + 8], "little")
+
+
+@functools.cache
+def this_machine() -> Machine:
+    """Where we run; ``robot`` and ``xstate_mask`` are left to the capture."""
+    about = os.uname()
+    with open("/proc/sys/kernel/random/boot_id") as file:
+        boot_id = file.read().strip()
+    return Machine(
+        architecture=about.machine,
+        page_size=abi.PAGE_SIZE,
+        kernel=about.release,
+        boot_id=boot_id,
+        hostname=socket.gethostname(),
+        features=_features(),
+        vdso_digest=_vdso_digest(),
+    )
+
+
+def _features() -> tuple[str, ...]:
+    with open("/proc/cpuinfo") as file:
+        for line in file:
+            if line.startswith("flags"):
+                return tuple(sorted(line.partition(":")[2].split()))
+    return ()
+
+
+def _vdso_digest() -> bytes:
+    own = os.getpid()
+    for line in procfs.parse_maps(procfs.read_text(own, "maps")):
+        if line.name == "[vdso]":
+            return blake3(Tracee(own).memory.read(line.start, line.size)).digest()
+    return b""

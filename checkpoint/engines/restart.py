@@ -1,0 +1,113 @@
+"""Interrupted system calls: how a snapshot goes on from a stop inside one.
+
+The live program needs nothing of this: it gets its registers back as they were and the kernel decides. A snapshot has no
+kernel that remembers, so the call is set to be made again, with what is left of its time where the program can be told.
+
+Source: signal(7), restart_syscall(2), nanosleep(2).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+from collections.abc import Callable
+
+from checkpoint.arch import x86_64 as arch
+from checkpoint.errors import CaptureError
+from checkpoint.linux.memory import Memory
+
+CODE_LOOKED_AT = 32
+"""Bytes before a ``syscall`` instruction in which the C library loads the call's number."""
+
+Place = tuple[int, ...]
+"""Instruction pointer, stack pointer and arguments: the same while one call is restarted again and again."""
+
+
+class Interruption:
+    """Remembers which call a thread stands in, over several stops of the same call.
+
+    After the first stop the kernel goes on by restart_syscall(2), and the number of the call itself is gone from the registers.
+    """
+
+    def __init__(self, memory: Memory) -> None:
+        self._memory = memory
+        self._place: Place = ()
+        self._number = -1
+
+    def settled(self, registers: arch.Registers, signals_wait: Callable[[], bool]) -> tuple[arch.Registers, str]:
+        """The registers that a snapshot goes on with, and the name of the call that is made again ("" if none).
+
+        Args:
+            signals_wait: tells whether a signal that is not blocked is pending: then EINTR is what the program must see.
+        """
+        number = ctypes.c_int64(registers[arch.CALL_NUMBER]).value
+        result = ctypes.c_int64(registers[arch.RESULT]).value
+        if number < 0:
+            return registers, ""
+        if result in arch.RESTARTABLE:
+            return _again(registers, number)
+        if result == arch.RESTART_BLOCK:
+            return self._from_restart_block(registers, number)
+        if result == -errno.EINTR and _is_endless(registers, number) and not signals_wait():
+            return _again(registers, number)
+        return registers, ""
+
+    def _from_restart_block(self, registers: arch.Registers, number: int) -> tuple[arch.Registers, str]:
+        place = tuple(registers[name] for name in (arch.INSTRUCTION_POINTER, arch.STACK_POINTER, *arch.ARGUMENTS))
+        if number == arch.SYSCALLS["restart_syscall"]:
+            number = self._number if place == self._place else self._read_from_code(registers[arch.INSTRUCTION_POINTER])
+        self._place, self._number = place, number
+        name = arch.SYSCALL_NAMES.get(number, "")
+        if name not in arch.RESTART_BLOCK_USERS:
+            ended = {**registers, arch.RESULT: -errno.EINTR, arch.CALL_NUMBER: -1}
+            return ended, ""
+        if name in arch.REMAINING_TIME:
+            asked, remaining = (arch.ARGUMENTS[index] for index in arch.REMAINING_TIME[name])
+            if registers[remaining]:
+                registers = {**registers, asked: registers[remaining]}
+        return _again(registers, number)
+
+    def _read_from_code(self, instruction_pointer: int) -> int:
+        try:
+            code = self._memory.read(instruction_pointer - CODE_LOOKED_AT, CODE_LOOKED_AT)
+        except CaptureError:
+            return -1
+        found = arch.call_number_before(code)
+        return -1 if found is None else found
+
+
+def _again(registers: arch.Registers, number: int) -> tuple[arch.Registers, str]:
+    again = {
+        **registers,
+        arch.RESULT: number,
+        arch.CALL_NUMBER: -1,
+        arch.INSTRUCTION_POINTER: registers[arch.INSTRUCTION_POINTER] - len(arch.SYSCALL),
+    }
+    return again, arch.SYSCALL_NAMES.get(number, str(number))
+
+
+def _is_endless(registers: arch.Registers, number: int) -> bool:
+    name = arch.SYSCALL_NAMES.get(number, "")
+    if name not in arch.ENDLESS_TIMEOUT:
+        return False
+    condition = arch.ENDLESS_TIMEOUT[name]
+    if condition is None:
+        return True
+    index, value = condition
+    mask = 0xFFFFFFFF if value else (1 << 64) - 1
+    return registers[arch.ARGUMENTS[index]] & mask == value
+
+
+def outside_critical_section(registers: arch.Registers, memory: Memory, rseq_address: int) -> arch.Registers:
+    """The registers as the kernel itself would set them after a preemption inside a restartable sequence: at its abort point.
+
+    Source: rseq(2); kernel/rseq.c, rseq_ip_fixup(): struct rseq holds the address of struct rseq_cs at offset 8.
+    """
+    section = int.from_bytes(memory.read(rseq_address + 8, 8), "little")
+    if not section:
+        return registers
+    described = memory.read(section, 32)
+    start, length, abort = (int.from_bytes(described[offset : offset + 8], "little") for offset in (8, 16, 24))
+    if not start <= registers[arch.INSTRUCTION_POINTER] < start + length:
+        return registers
+    return {**registers, arch.INSTRUCTION_POINTER: abort}

@@ -1,0 +1,140 @@
+"""What a process holds besides memory: one file a kind, each with the same furniture.
+
+``describe`` (an open file that is of this kind, as facts), ``refuse`` (why one cannot be kept), and ``rebuild`` for all of them.
+`gather` reads while the process stands still; `look` sorts what was read, afterwards.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+from checkpoint.engine import KEPT, REFUSED, Finding
+from checkpoint.linux import abi, procfs
+from checkpoint.linux.procfs import Descriptor
+from checkpoint.model import Fact, Resource
+
+STREAM_NUMBERS: Final = (1, 2)
+
+
+@dataclass(frozen=True, slots=True)
+class OpenFile:
+    """One open file description and every descriptor that shares it, lowest number first.
+
+    Attributes:
+        content: the whole of a deleted file, or what waits in a pipe, read while the process stood still; None where that was
+            not needed.
+        capacity: of a pipe, in bytes.
+        both_ends: of a pipe: the process itself has another descriptor for its other end.
+    """
+
+    pid: int
+    descriptors: tuple[Descriptor, ...]
+    content: bytes | None = None
+    capacity: int = 0
+    both_ends: bool = False
+
+    @property
+    def first(self) -> Descriptor:
+        """The descriptor that speaks for all."""
+        return self.descriptors[0]
+
+    @property
+    def name(self) -> str:
+        """What reports call it."""
+        return self.first.name
+
+    @property
+    def numbers(self) -> list[Fact]:
+        """[number, 1 if close-on-exec] of each."""
+        return [[one.number, int(bool(one.flags & os.O_CLOEXEC))] for one in self.descriptors]
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What the kinds must know about the process's guard.
+
+    Attributes:
+        pipes: "pipe:[123]" or a terminal's path → stream 1 or 2, of a component under a guard.
+    """
+
+    pipes: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """What a process's descriptors are."""
+
+    resources: tuple[Resource, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why it cannot be captured as it is."""
+        return tuple(finding.text for finding in self.findings if finding.verdict == REFUSED)
+
+
+def pipes_of(outputs: Sequence[int]) -> dict[str, int]:
+    """How /proc names the other ends of the guard's pipes, standard output first."""
+    return {
+        os.readlink(f"/proc/self/fd/{descriptor}"): stream for stream, descriptor in zip(STREAM_NUMBERS, outputs, strict=True)
+    }
+
+
+def gather(pid: int) -> tuple[OpenFile, ...]:
+    """Read every descriptor, and which of them share an open file. For an exact picture the process stands still."""
+    groups: list[list[Descriptor]] = []
+    alike: dict[tuple[int, int, int, int], list[list[Descriptor]]] = {}
+    for one in procfs.descriptors(pid):
+        candidates = alike.setdefault((one.device, one.inode, one.offset, one.flags & ~os.O_CLOEXEC), [])
+        shared = next((group for group in candidates if _is_shared(pid, group[0], one)), None)
+        if shared is not None:
+            shared.append(one)
+        else:
+            candidates.append([one])
+            groups.append(candidates[-1])
+    ends = {(group[0].target, group[0].flags & os.O_ACCMODE) for group in groups}
+    other = {os.O_RDONLY: os.O_WRONLY, os.O_WRONLY: os.O_RDONLY}
+    return tuple(
+        OpenFile(pid, tuple(group), both_ends=(group[0].target, other.get(group[0].flags & os.O_ACCMODE)) in ends)
+        for group in groups
+    )
+
+
+def _is_shared(pid: int, left: Descriptor, right: Descriptor) -> bool:
+    """Whether both stand for one open file description. Source: kcmp(2), KCMP_FILE."""
+    return abi.kcmp(pid, pid, abi.KCMP_FILE, left.number, right.number) == 0
+
+
+def with_contents(opened: Sequence[OpenFile]) -> tuple[OpenFile, ...]:
+    """Add the content of every deleted file and of every pipe that is kept; the process stands still."""
+    from checkpoint.resources import files, pipes
+
+    found = []
+    for held in opened:
+        if files.must_carry(held):
+            held = replace(held, content=files.content_of(held))
+        elif pipes.is_pipe(held.first) and held.both_ends:
+            capacity, content = pipes.look_into(held)
+            held = replace(held, capacity=capacity, content=content)
+        found.append(held)
+    return tuple(found)
+
+
+def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
+    """Sort open files into the kinds: what comes back, and what does not."""
+    from checkpoint.resources import devices, files, pipes, streams, unsupported
+
+    resources, findings = [], []
+    for held in opened:
+        for kind in (streams, devices, files, pipes, unsupported):
+            if reason := kind.refuse(held, surroundings):
+                findings.append(Finding(kind.KIND, held.name, REFUSED, reason))
+                break
+            if resource := kind.describe(held, surroundings):
+                resources.append(resource)
+                findings.append(Finding(kind.KIND, held.name, KEPT, f"{held.name} is {held.first.target}"))
+                break
+    return Held(tuple(resources), tuple(findings))

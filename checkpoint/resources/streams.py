@@ -1,0 +1,48 @@
+"""Standard input, output and error: streams of the component, not of a robot.
+
+A terminal, pipe or socket at 0, 1 or 2 becomes the restored side's own stream of that number; what the guard of a component
+holds the other end of is told by its pipes. A regular file or a device there is no stream but itself.
+
+Facts: ``descriptors``; ``stream``, 0, 1 or 2: which of the vessel's own it becomes; ``flags`` of open(2) and fcntl(2).
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from typing import Final
+
+from checkpoint.model import Resource
+from checkpoint.resources import OpenFile, Surroundings
+
+KIND: Final = "streams"
+STANDARD: Final = (0, 1, 2)
+
+
+def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
+    """The stream that an open file stands for, if it does."""
+    stream = _stream_of(held, surroundings)
+    if stream is None:
+        return None
+    return Resource(KIND, held.name, {"descriptors": held.numbers, "stream": stream, "flags": held.first.flags & ~os.O_CLOEXEC})
+
+
+def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
+    """Streams are never refused."""
+    return None
+
+
+def _stream_of(held: OpenFile, surroundings: Surroundings) -> int | None:
+    guarded = surroundings.pipes.get(held.first.target)
+    if guarded is not None:
+        return guarded
+    standard = next((one.number for one in held.descriptors if one.number in STANDARD), None)
+    if standard is not None and (stat.S_ISFIFO(held.first.mode) or stat.S_ISSOCK(held.first.mode) or _is_terminal(held)):
+        return standard
+    return None
+
+
+def _is_terminal(held: OpenFile) -> bool:
+    """Whether it is a terminal: /dev/tty, a console or serial line, or the inside of a pseudo-terminal."""
+    majors = (4, 5, *range(136, 144))  # Documentation/admin-guide/devices.txt
+    return stat.S_ISCHR(held.first.mode) and os.major(held.first.rdev) in majors and held.first.rdev != os.makedev(5, 2)

@@ -1,0 +1,214 @@
+"""What cannot be kept yet: found by name, with what to do about it. Nothing here touches the process.
+
+This is the table's last row of every kind: an open file that no other kind took, a mapping that cannot be made again, a process
+that is not one thread by itself.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+from checkpoint.errors import ProbeError, ProcessGoneError
+from checkpoint.linux import procfs
+from checkpoint.linux.procfs import MapsLine, Status
+from checkpoint.model import Resource
+from checkpoint.resources import OpenFile, Surroundings
+
+KIND: Final = "unsupported"
+
+_ADVICE: Final = "is not kept yet: protect the program while it has none, or let it use the cooperative engine"
+
+ANONYMOUS_INODES: Final[Mapping[str, str]] = {
+    "eventpoll": "an epoll instance",
+    "eventfd": "an eventfd",
+    "timerfd": "a timerfd",
+    "signalfd": "a signalfd",
+    "inotify": "an inotify instance",
+    "fanotify": "a fanotify group",
+    "io_uring": "an io_uring",
+    "userfaultfd": "a userfaultfd",
+    "perf_event": "a perf event",
+    "pidfd": "a pidfd",
+}
+"""What /proc calls a descriptor without a path → what people call it."""
+
+_MAPPINGS: Final = (
+    (re.compile(r"anon_inode:\[io_uring\]"), "the rings of an io_uring"),
+    (re.compile(r"anon_inode:\[perf_event\]"), "the buffer of a perf event"),
+    (re.compile(r"/\[aio\]"), "a ring of asynchronous I/O (aio)"),
+    (re.compile(r"/SYSV[0-9a-f]+"), "System V shared memory"),
+    (re.compile(r"/secretmem"), "secret memory"),
+    (re.compile(r"/memfd:"), "a memory file"),
+    (re.compile(r"/anon_hugepage"), "huge pages"),
+    (re.compile(r"/dev/(?!zero|shm/)"), "memory of a device"),
+)
+
+_VM_FLAGS: Final[Mapping[str, str]] = {
+    "ht": "huge pages (hugetlb)",
+    "um": "memory that the program's own userfaultfd watches",
+    "uw": "memory that the program's own userfaultfd write-protects",
+    "ui": "memory that the program's own userfaultfd watches",
+    "pf": "memory of a device",
+    "io": "memory of a device",
+    "ss": "a shadow stack",
+}
+"""VmFlags of proc_pid_smaps(5) that no fresh mapping can be given."""
+
+_KERNEL_PAGES: Final = ("[vvar", "[vdso", "[vsyscall")
+"""Mappings that the kernel gives every process: they move, see ``restore_memory``."""
+
+
+# --- Descriptors -----------------------------------------------------------------------------------------------------
+
+
+def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
+    """Nothing is described here."""
+    return None
+
+
+def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
+    """Name what nobody else took."""
+    return f"{held.name} is {_called(held)}, which {_ADVICE}"
+
+
+def _called(held: OpenFile) -> str:
+    target, mode = held.first.target, held.first.mode
+    if stat.S_ISSOCK(mode):
+        return f"a socket ({socket_family(held)}, {target})"
+    if stat.S_ISFIFO(mode):
+        return f"a pipe ({target})" if target.startswith("pipe:") else f"a named pipe (fifo {target})"
+    if stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
+        terminal = " (a terminal)" if target.startswith(("/dev/pt", "/dev/tty")) else ""
+        return f"the device {target}{terminal}"
+    match = re.fullmatch(r"anon_inode:\[?([a-z_-]+)\]?", target)
+    if match:
+        return ANONYMOUS_INODES.get(match[1], f"an open {match[1]}")
+    if re.match(r"[a-z_]+:\[\d+\]", target):
+        return f"a namespace ({target})"
+    return f"{target}, of a kind that we do not know"
+
+
+def socket_family(held: OpenFile) -> str:
+    """TCP, UDP, unix, netlink … as far as /proc/PID/net tells."""
+    for table in ("tcp", "tcp6", "udp", "udp6", "unix", "netlink", "packet", "raw"):
+        try:
+            text = procfs.read_text(held.pid, f"net/{table}")
+        except (ProbeError, ProcessGoneError):
+            continue
+        if re.search(rf"\b{held.first.inode}\b", text):
+            return table.upper() if table[:3] in ("tcp", "udp") else table
+    return "unbound"
+
+
+# --- Mappings --------------------------------------------------------------------------------------------------------
+
+
+def refuse_mapping(line: MapsLine, flags: tuple[str, ...]) -> str | None:
+    """Why a mapping cannot be made again; None if it can.
+
+    Args:
+        flags: its VmFlags.
+    """
+    where = f"mapping {line.start:x}-{line.end:x}"
+    for pattern, what in _MAPPINGS:
+        if pattern.match(line.name):
+            return f"{where} is {what} ({line.name}), which {_ADVICE}"
+    for flag in flags if not line.name.startswith(_KERNEL_PAGES) else ():
+        if flag in _VM_FLAGS:
+            return f"{where} is {_VM_FLAGS[flag]}, which {_ADVICE}"
+    if line.has_file and line.name.endswith(procfs.DELETED) and not is_shared_anonymous(line):
+        return f"{where} is of {line.name}, replaced since the program started: restart the program, then protect it"
+    return None
+
+
+def is_shared_anonymous(line: MapsLine) -> bool:
+    """Whether this is MAP_SHARED|MAP_ANONYMOUS, which the kernel shows as a deleted /dev/zero."""
+    return line.shared and line.name == f"/dev/zero{procfs.DELETED}"
+
+
+_PROTECTION_KEY: Final = re.compile(r"([0-9a-f]+)-[0-9a-f]+ [r-][w-]|ProtectionKey: +([0-9]+)")
+
+
+def refuse_protection_keys(smaps: str) -> Iterator[str]:
+    """Mappings with a protection key (pkeys(7)) of their own."""
+    start = "?"
+    for match in _PROTECTION_KEY.finditer(smaps):
+        if match[1]:
+            start = match[1]
+        elif match[2] != "0":
+            yield f"the mapping at {start} has protection key {match[2]}, which {_ADVICE}"
+
+
+# --- The process as a whole --------------------------------------------------------------------------------------------
+
+
+def require_traceable(pid: int, status: Status) -> None:
+    """Raise `ProbeError` where no tracer can or should go."""
+    if status.tgid != pid:
+        raise ProbeError(f"cannot protect {pid}: it is a thread of process {status.tgid}; name that one")
+    if procfs.stat(pid).flags & procfs.PF_KTHREAD:
+        raise ProbeError(f"cannot protect pid {pid} ({status.name}): it is a kernel thread; choose a program")
+    if status.state in "ZX":
+        raise ProbeError(f"cannot protect pid {pid} ({status.name}): it has ended and is a zombie, waiting for its parent")
+    if pid == os.getpid():
+        raise ProbeError(f"cannot protect pid {pid}: a process cannot trace itself; run failover from another one")
+    if status.tracer not in (0, os.getpid()):
+        raise ProbeError(
+            f"cannot protect pid {pid} ({status.name}): pid {status.tracer} traces it already; end that debugger or release it"
+        )
+
+
+def refuse_process(pid: int, status: Status) -> Iterator[str]:
+    """Why a process as a whole cannot be captured."""
+    if status.threads != 1:
+        yield (
+            f"it has {status.threads} threads, which {_ADVICE}; numerical libraries often run with one thread: "
+            "OPENBLAS_NUM_THREADS=1, OMP_NUM_THREADS=1"
+        )
+    children = procfs.read_text(pid, f"task/{pid}/children").split()
+    if children:
+        yield f"it has child processes ({', '.join(children)}), which are not kept yet: protect it while it has none"
+    if status.seccomp:
+        yield "it runs under a seccomp filter, which forbids what a capture asks of it: run it without the filter"
+    yield from _refuse_image(pid)
+    yield from _refuse_places(pid)
+    yield from _refuse_namespaces(pid)
+
+
+def _refuse_image(pid: int) -> Iterator[str]:
+    executable = procfs.read_link(pid, "exe")
+    if executable.endswith(procfs.DELETED):
+        yield f"its program file {executable} is no longer there: restart the program, then protect it"
+        return
+    with open(f"/proc/{pid}/exe", "rb") as file:
+        if file.read(5)[4:] != b"\x02":
+            yield f"it is a program of 32 bits ({executable}), which is not supported: use a 64-bit build"
+
+
+def _refuse_places(pid: int) -> Iterator[str]:
+    directory = procfs.read_link(pid, "cwd")
+    if directory.endswith(procfs.DELETED) and not Path(directory).exists():
+        yield f"its working directory {directory} is gone: let it change to another one"
+    root = procfs.read_link(pid, "root")
+    if root != "/":
+        yield f"its root directory is {root}: a program in a chroot is not kept yet; run it without"
+
+
+def _refuse_namespaces(pid: int) -> Iterator[str]:
+    """Namespaces of its own, except those that `failover run` gives: PID and time, and with them mount and user."""
+
+    def differs(kind: str) -> bool:
+        try:
+            return procfs.read_link(pid, f"ns/{kind}") != os.readlink(f"/proc/self/ns/{kind}")
+        except (ProcessGoneError, FileNotFoundError):
+            return False  # a kernel without this kind
+
+    isolated = differs("pid")
+    for kind in ("net", "ipc", "uts", "cgroup", *(() if isolated else ("mnt", "user", "time"))):
+        if differs(kind):
+            yield f"it lives in a {kind} namespace of its own, which is not kept yet: run it, and failover, in the same one"
