@@ -1,0 +1,63 @@
+"""What must not be forgotten: it survives, and what cannot be trusted is refused."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from agent.ballot import FILE_NAME, Ballot
+from agent.errors import BallotError
+
+
+def test_what_was_kept_is_there_in_the_next_life_which_counts_one_more(tmp_path: Path) -> None:
+    first = Ballot(tmp_path, "robot1")
+    assert first.open().boot == 1
+    first.keep(b"epoch 7")
+    second = Ballot(tmp_path, "robot1")
+    assert second.open().boot == 2
+    assert second.record.core == b"epoch 7"
+
+
+@pytest.mark.parametrize("size_left", [0, 1, 20, -1])
+def test_a_ballot_that_was_cut_is_not_trusted(tmp_path: Path, size_left: int) -> None:
+    ballot = Ballot(tmp_path, "robot1")
+    ballot.open()
+    ballot.keep(b"epoch 7")
+    path = tmp_path / FILE_NAME
+    os.truncate(path, size_left if size_left >= 0 else path.stat().st_size - 10)
+    with pytest.raises(BallotError, match="cannot trust"):
+        Ballot(tmp_path, "robot1").open()
+
+
+def test_a_flipped_bit_is_noticed(tmp_path: Path) -> None:
+    Ballot(tmp_path, "robot1").open()
+    path = tmp_path / FILE_NAME
+    content = bytearray(path.read_bytes())
+    content[len(content) // 3] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(BallotError, match="cannot trust"):
+        Ballot(tmp_path, "robot1").open()
+
+
+def test_another_robots_ballot_is_refused_by_name(tmp_path: Path) -> None:
+    Ballot(tmp_path, "robot1").open()
+    with pytest.raises(BallotError, match="belongs to robot1"):
+        Ballot(tmp_path, "robot2").open()
+
+
+def test_a_half_written_ballot_beside_the_old_one_changes_nothing(tmp_path: Path) -> None:
+    ballot = Ballot(tmp_path, "robot1")
+    ballot.open()
+    ballot.keep(b"epoch 7")
+    (tmp_path / FILE_NAME).with_suffix(".new").write_bytes(b'{"version":1,"robot":"ro')
+    again = Ballot(tmp_path, "robot1")
+    again.open()
+    assert again.record.core == b"epoch 7"
+
+
+def test_a_disk_that_refuses_leaves_the_old_record(tmp_path: Path) -> None:
+    ballot = Ballot(tmp_path / "gone", "robot1")
+    with pytest.raises(BallotError, match="gives no vote"):
+        ballot.open()

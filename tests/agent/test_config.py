@@ -1,0 +1,110 @@
+"""The configuration file: every default documented, every mistake named with its line."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from agent import config as configuration
+from agent.config import ComponentConfig, Config
+from agent.errors import ConfigError
+from failover.client import team
+from failover.client.team import Robot, Team
+
+DOCUMENTED = Path(__file__).parents[2] / "systemd" / "agent.toml"
+ROBOT = Robot(("127.0.0.1:7420",), "127.0.0.1:7421")
+
+
+@pytest.fixture
+def directory(tmp_path: Path) -> Path:
+    team.write(tmp_path / "team", Team("lab", {"robot1": ROBOT, "robot2": ROBOT}))
+    return tmp_path
+
+
+def written(directory: Path, *lines: str) -> Path:
+    path = directory / "agent.toml"
+    head = ['robot = "robot1"', f'team_directory = "{directory / "team"}"', "insecure = true"]
+    path.write_text("\n".join([*head, *lines]) + "\n")
+    return path
+
+
+def test_every_key_and_its_default_stand_in_the_documented_file() -> None:
+    text = DOCUMENTED.read_text()
+    documented = tomllib.loads(re.sub(r"^#(\w+ = |\[)", r"\1", text, flags=re.MULTILINE))
+    (component,) = documented.pop("components").values()
+    assert documented.pop("robot") == "robot1"
+    defaults = dataclasses.asdict(Config("robot1"))
+    del defaults["robot"], defaults["components"]
+    assert documented == defaults
+    assert component == dataclasses.asdict(ComponentConfig())
+
+
+def test_a_whole_configuration_is_read(directory: Path) -> None:
+    path = written(directory, "beat_ms = 10", '[components."/lab/robot1/mapper"]', 'on_loss = "hold"')
+    settings = configuration.load(path)
+    assert settings.config.beat_ms == 10
+    assert settings.component("/lab/robot1/mapper").on_loss == "hold"
+    assert settings.component("/lab/robot1/other") == ComponentConfig()
+    assert list(settings.peers) == ["robot2"]
+
+
+@pytest.mark.parametrize(
+    ("lines", "line", "said"),
+    [
+        (("baet_ms = 10",), 4, "did you mean 'beat_ms'"),
+        (("# fine", 'beat_ms = "often"'), 5, "Expected `int`"),
+        (('rule = "trio"',), 4, "Invalid enum value 'trio'"),
+        (('[components."/lab/a"]', 'on_lost = "hold"'), 5, "did you mean 'on_loss'"),
+        (('[components."/lab/a"]', 'on_loss = "give up"'), 5, "Invalid enum value 'give up'"),
+    ],
+)
+def test_a_mistake_is_named_with_file_line_and_cure(directory: Path, lines: tuple[str, ...], line: int, said: str) -> None:
+    path = written(directory, *lines)
+    with pytest.raises(ConfigError) as caught:
+        configuration.load(path)
+    assert str(caught.value).startswith(f"{path}:{line}: ")
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        (("beat_ms = 100", "lease_ms = 200"), "one lost beat would count as a death"),
+        (("beat_ms = 0",), "must be at least 1"),
+        (("= 3",), "this is not TOML"),
+    ],
+)
+def test_values_that_contradict_each_other_are_refused(directory: Path, lines: tuple[str, ...], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        configuration.load(written(directory, *lines))
+
+
+def test_a_robot_outside_the_team_is_told_who_is_in_it(directory: Path) -> None:
+    path = directory / "agent.toml"
+    path.write_text(f'robot = "robot9"\nteam_directory = "{directory / "team"}"\n')
+    with pytest.raises(ConfigError, match="robot1, robot2"):
+        configuration.load(path)
+
+
+def test_keys_are_asked_for_unless_the_operator_says_insecure(directory: Path) -> None:
+    path = directory / "agent.toml"
+    path.write_text(f'robot = "robot1"\nteam_directory = "{directory / "team"}"\n')
+    with pytest.raises(ConfigError, match=r"cannot read this robot's key .* insecure = true"):
+        configuration.load(path)
+    team.write_secret_key(directory / "team", "robot1", "x" * 40)
+    with pytest.raises(ConfigError, match=r"robot1, robot2 .* have no public key"):
+        configuration.load(path)
+
+
+def test_a_secret_key_that_others_can_read_is_refused(directory: Path) -> None:
+    key = team.write_secret_key(directory / "team", "robot1", "x" * 40)
+    assert key.stat().st_mode & 0o777 == 0o600
+    key.chmod(0o644)
+    path = directory / "agent.toml"
+    path.write_text(f'robot = "robot1"\nteam_directory = "{directory / "team"}"\n')
+    with pytest.raises(ConfigError, match="chmod 600"):
+        configuration.load(path)
