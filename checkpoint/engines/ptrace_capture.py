@@ -351,15 +351,14 @@ class PtraceSession:
         """Why what it has turned into cannot be captured."""
         try:
             self._read_flags()
-            own = {line.start for line in self._private_lines()}
-            flags = {
-                start: tuple(flag for flag in found if flag not in ("um", "uw") or start not in own)
-                for start, found in self._flags.items()
-            }
-            of_mappings = (unsupported.refuse_mapping(line, flags.get(line.start, ())) for line in frozen.lines)
+            of_mappings = (unsupported.refuse_mapping(line, self._foreign_flags(line)) for line in frozen.lines)
             return (*unsupported.refuse_process(self.pid, frozen.status), *(reason for reason in of_mappings if reason))
         except ProcessGoneError:
             return ()  # the picture was taken before it ended
+
+    def _foreign_flags(self, line: MapsLine) -> tuple[str, ...]:
+        """VmFlags without those that our own write protection sets."""
+        return tuple(flag for flag in self._flags.get(line.start, ()) if flag not in ("um", "uw"))
 
     def _outline(self, order: CaptureOrder, parent: Position | None, frozen: Frozen, vmas: tuple[Vma, ...]) -> Snapshot:
         """A snapshot without pages, descriptors and output."""
@@ -388,7 +387,7 @@ class PtraceSession:
         cleared = frozen.cleared
         if zero.any():
             rows = np.frombuffer(content, dtype=np.uint8).reshape(-1, abi.PAGE_SIZE)
-            content = memoryview(rows[~zero].reshape(-1)).toreadonly()
+            content = rows[~zero].data.cast("B").toreadonly()
             cleared = pages.union(cleared, pages.extents_of_addresses(addresses[zero], abi.PAGE_SIZE))
             addresses = addresses[~zero]
         runs = pages.page_runs(pages.extents_of_addresses(addresses, abi.PAGE_SIZE))
@@ -476,7 +475,7 @@ def _entered(kind: type[PtraceSession], pid: int, component: str) -> PtraceSessi
             tracker = PagemapTracker(pid, entered.faults)
         except OSError as error:
             os.close(entered.faults)
-            tracker, notes = _without_write_protection(pid, error.strerror)
+            tracker, notes = _without_write_protection(pid, str(error))
     else:
         tracker, notes = _without_write_protection(pid, os.strerror(entered.why_not))
     session = kind(pid, component, tracee, entered.pages, tracker)
@@ -539,7 +538,7 @@ def _merged(copied: tuple[Words, bytearray], frozen: Frozen) -> Frozen:
         frozen,
         written=pages.extents_of_addresses(addresses[order], abi.PAGE_SIZE),
         cleared=NONE,
-        content=bytearray(memoryview(rows.reshape(-1))),
+        content=bytearray(rows.data.cast("B")),
     )
 
 

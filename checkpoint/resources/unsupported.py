@@ -131,17 +131,19 @@ def is_shared_anonymous(line: MapsLine) -> bool:
     return line.shared and line.name == f"/dev/zero{procfs.DELETED}"
 
 
-_PROTECTION_KEY: Final = re.compile(r"([0-9a-f]+)-[0-9a-f]+ [r-][w-]|ProtectionKey: +([0-9]+)")
+_PROTECTION_KEY: Final = re.compile(r"([0-9a-f]+)-[0-9a-f]+ ([r-][w-][x-])|ProtectionKey: +([0-9]+)")
+_EXECUTE_ONLY: Final = "--x"
+"""The kernel itself gives such a mapping a key, and does so again when it is made again."""
 
 
 def refuse_protection_keys(smaps: str) -> Iterator[str]:
-    """Mappings with a protection key (pkeys(7)) of their own."""
-    start = "?"
+    """Mappings with a protection key (pkeys(7)) that the program chose."""
+    start, protection = "?", ""
     for match in _PROTECTION_KEY.finditer(smaps):
         if match[1]:
-            start = match[1]
-        elif match[2] != "0":
-            yield f"the mapping at {start} has protection key {match[2]}, which {_ADVICE}"
+            start, protection = match[1], match[2]
+        elif match[3] != "0" and protection != _EXECUTE_ONLY:
+            yield f"the mapping at {start} has protection key {match[3]}, which {_ADVICE}"
 
 
 # --- The process as a whole --------------------------------------------------------------------------------------------
