@@ -105,10 +105,10 @@ def entrust_holder(component: Component, turn: Turn) -> None:
 
 
 def open_line(component: Component, turn: Turn) -> None:
-    """A new generation, unlike any other robot's: the next snapshot is a base."""
+    """A new generation, unlike any other robot's: the next snapshot is a base. An agent that came back goes on counting."""
     names = sorted((turn.me, *turn.config.peers), key=weight)
     component.generation = component.epoch * (PEERS_MAX + 1) + names.index(turn.me)
-    component.sequence = 0
+    component.sequence = max((held.sequence for held in component.held if held.generation == component.generation), default=0)
     component.parent = component.flight = None
     component.base_wanted = True
     component.due_ns = turn.now_ns

@@ -16,8 +16,6 @@ TELL_SHARE = 4
 RACE_SHARE = 16
 """What the guard knows counts as over this part of a lease early: a longer one could reach it too late."""
 
-_UNDER_LEASE = frozenset({State.PRIMARY, State.STARTING, State.TAKING_OVER, State.RECOVERING})
-
 
 def watch(component: Component, turn: Turn) -> None:
     """Count the lease anew; hold the component still when it is over, let it go on when it is back."""
@@ -34,7 +32,7 @@ def watch(component: Component, turn: Turn) -> None:
         component.due_ns = turn.now_ns
         turn.order(acts.Thaw(component.name, component.epoch, component.lease_ns))
         turn.say(component, f"{turn.me} lets it run: it may act")
-    elif component.state in _UNDER_LEASE:
+    elif component.state is State.PRIMARY:
         _tell(component, turn)
 
 
