@@ -31,6 +31,13 @@ from checkpoint.validity import check_snapshot
 Source = int | str | os.PathLike[str] | bytes | bytearray | memoryview | mmap.mmap | BinaryIO
 """Where a file's bytes are: a descriptor, a path, the bytes themselves, or an open file. Read from its first byte on."""
 
+
+class Sink(Protocol):
+    """Where a file goes: a binary file, or anything that takes bytes and says how many."""
+
+    def write(self, content: bytes | memoryview, /) -> int | None: ...
+
+
 COMPRESSION_LEVEL = -1
 """zstd's fastest useful level: about 1 GB/s and 5× on a Python heap, 2.7 GB/s on what does not compress."""
 
@@ -44,7 +51,7 @@ _RUN_SIZE = 16
 # Writing
 
 
-def encode(snapshot: Snapshot, file: BinaryIO) -> int:
+def encode(snapshot: Snapshot, file: Sink) -> int:
     """Write a snapshot to a file, at its position, in one pass.
 
     Returns:
@@ -106,7 +113,7 @@ def _stored(raw: bytes | memoryview, compressor: zstandard.ZstdCompressor) -> tu
     return Codec.RAW, raw
 
 
-def _write_frame(file: BinaryIO, raw: memoryview, offset: int, compressor: zstandard.ZstdCompressor, seal: blake3) -> int:
+def _write_frame(file: Sink, raw: memoryview, offset: int, compressor: zstandard.ZstdCompressor, seal: blake3) -> int:
     """Write one frame whose head lies at ``offset``; answer how many bytes it took."""
     codec, body = _stored(raw, compressor)
     padding = layout.padding_at(offset, codec)
@@ -117,12 +124,11 @@ def _write_frame(file: BinaryIO, raw: memoryview, offset: int, compressor: zstan
     return len(head) + padding + len(body)
 
 
-def _write_all(file: BinaryIO, content: bytes | memoryview) -> None:
+def _write_all(file: Sink, content: bytes | memoryview) -> None:
     """Write all of it: an unbuffered file may take less at a time."""
     rest = memoryview(content)
     while rest:
-        written = file.write(rest)
-        rest = rest[written:]
+        rest = rest[file.write(rest) or 0 :]
 
 
 def _pack_runs(cleared: tuple[PageRun, ...], runs: tuple[PageRun, ...]) -> bytes:

@@ -1,0 +1,107 @@
+"""The store's door to the disk: every operation that changes something, one method each, so that a test can cut between any two."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+from pathlib import Path
+
+FILE_MODE = 0o600
+FOLDER_MODE = 0o700
+"""Memory is secret: nobody else reads a snapshot."""
+
+COPY_SIZE = 1 << 20
+"""Bytes copied at a time."""
+
+
+class Disk:
+    """A real file system. Every method raises OSError as the kernel gives it."""
+
+    def make_folder(self, path: Path) -> None:
+        """Create a folder for our eyes only; durable after ``sync_folder`` of its parent."""
+        path.mkdir(mode=FOLDER_MODE)
+
+    def create(self, path: Path) -> int:
+        """Create a file for our eyes only; answer its descriptor, for writing."""
+        return os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_CLOEXEC, FILE_MODE)
+
+    def write(self, descriptor: int, content: bytes | memoryview) -> int:
+        """Append all of the content."""
+        rest = memoryview(content).cast("B")
+        while rest:
+            rest = rest[os.write(descriptor, rest) :]
+        return len(content)
+
+    def is_unnamed(self, descriptor: int) -> bool:
+        """Whether it is a file that no name leads to (O_TMPFILE, or a memory file)."""
+        return os.fstat(descriptor).st_nlink == 0
+
+    def name(self, descriptor: int, path: Path) -> bool:
+        """Give an unnamed file a name.
+
+        Returns:
+            False where it cannot have that one: it lies on another file system, or is a memory file.
+        """
+        try:
+            os.link(f"/proc/self/fd/{descriptor}", path, follow_symlinks=True)
+        except OSError as error:
+            if error.errno in (errno.EXDEV, errno.ENOENT, errno.EPERM, errno.EOPNOTSUPP):
+                return False
+            raise
+        os.chmod(path, FILE_MODE)
+        return True
+
+    def sync_file(self, descriptor: int) -> None:
+        """Return when the file's content would survive a power cut."""
+        os.fdatasync(descriptor)
+
+    def rename(self, old: Path, new: Path) -> None:
+        """Change a name in one step; durable after ``sync_folder``."""
+        os.rename(old, new)
+
+    def sync_folder(self, path: Path) -> None:
+        """Return when the names in a folder would survive a power cut."""
+        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def remove(self, path: Path) -> None:
+        """Remove a file; one that is gone already is fine."""
+        path.unlink(missing_ok=True)
+
+    def remove_folder(self, path: Path) -> None:
+        """Remove an empty folder."""
+        path.rmdir()
+
+
+class DiskFile:
+    """A file being written through the door: what ``format.encode`` needs of a file."""
+
+    def __init__(self, disk: Disk, descriptor: int) -> None:
+        self._disk = disk
+        self._descriptor = descriptor
+
+    def write(self, content: bytes | memoryview, /) -> int:
+        """Append all of the content."""
+        return self._disk.write(self._descriptor, content)
+
+    def copy_from(self, source: int) -> None:
+        """Append the whole of another file."""
+        offset = 0
+        while content := os.pread(source, COPY_SIZE, offset):
+            self.write(content)
+            offset += len(content)
+
+
+def lock_exclusively(path: Path) -> int | None:
+    """Take the lock that one process can hold; the answer keeps it, None means that another has it."""
+    descriptor = os.open(path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, FILE_MODE)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        return None
+    return descriptor

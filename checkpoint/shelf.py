@@ -1,0 +1,126 @@
+"""What a store holds of one component, as values: which files, which chains they make, which positions can be restored.
+
+Pure: ``store`` reads and writes the files, this says what they mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote
+
+from blake3 import blake3
+
+from checkpoint.model import Position
+from checkpoint.state import Header
+
+BASE_SUFFIX = ".base"
+DELTA_SUFFIX = ".delta"
+
+FOLDER_PREFIX = "@"
+"""Begins the name of a component's folder, so that no component is called "..", "lock" or "aside"."""
+
+MAX_NAME_SIZE = 160
+"""Bytes of a folder's name; a component whose encoded path is longer is cut and told apart by a digest."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One snapshot file.
+
+    Attributes:
+        size: bytes of the file.
+    """
+
+    path: Path
+    position: Position
+    parent: Position | None
+    epoch: int
+    size: int
+
+    @property
+    def order(self) -> tuple[int, int, int]:
+        """Later is greater: a later primacy counts before a later capture."""
+        return self.epoch, self.position.generation, self.position.sequence
+
+
+@dataclass(frozen=True, slots=True)
+class Shelf:
+    """The intact files of one component, in no particular order."""
+
+    component: str
+    entries: tuple[Entry, ...] = ()
+
+    def with_entry(self, entry: Entry) -> Shelf:
+        """The shelf after a file came."""
+        return Shelf(self.component, (*self.entries, entry))
+
+    def without(self, gone: Iterable[Entry]) -> Shelf:
+        """The shelf after files went."""
+        removed = set(gone)
+        return Shelf(self.component, tuple(entry for entry in self.entries if entry not in removed))
+
+    def positions(self) -> tuple[Position, ...]:
+        """What can be restored, oldest first."""
+        return tuple(entry.position for entry in self._restorable())
+
+    def newest(self) -> Position | None:
+        """The newest position that can be restored."""
+        return max(self._restorable(), key=lambda entry: entry.order).position if self._restorable() else None
+
+    def chain_to(self, position: Position) -> tuple[Entry, ...]:
+        """The files that lead to a position, a base first; empty where the chain is not whole."""
+        return _chain(self._by_position(), position)
+
+    def unneeded_for(self, oldest: Position) -> tuple[Entry, ...]:
+        """Files without which ``oldest`` and everything later can still be restored; none if it cannot be restored itself."""
+        restorable = self._restorable()
+        floor = next((entry.order for entry in restorable if entry.position == oldest), None)
+        if floor is None:
+            return ()
+        needed = {entry for kept in restorable if kept.order >= floor for entry in self.chain_to(kept.position)}
+        return tuple(entry for entry in self.entries if entry not in needed and entry.order <= restorable[-1].order)
+
+    def _restorable(self) -> list[Entry]:
+        """One file for every position whose chain is whole, oldest first."""
+        best = self._by_position()
+        return sorted((entry for entry in best.values() if _chain(best, entry.position)), key=lambda entry: entry.order)
+
+    def _by_position(self) -> dict[Position, Entry]:
+        """The best file for each position: a base before a delta."""
+        best: dict[Position, Entry] = {}
+        for entry in self.entries:
+            known = best.get(entry.position)
+            if known is None or (known.parent is not None and entry.parent is None):
+                best[entry.position] = entry
+        return best
+
+
+def _chain(best: dict[Position, Entry], position: Position) -> tuple[Entry, ...]:
+    """Follow parents to a base. A parent is before its child in every file (``validity``), so this ends."""
+    chain: list[Entry] = []
+    wanted: Position | None = position
+    while wanted is not None:
+        entry = best.get(wanted)
+        if entry is None:
+            return ()
+        chain.append(entry)
+        wanted = entry.parent
+    return tuple(reversed(chain))
+
+
+def folder_name(component: str) -> str:
+    """A component's path as one safe file name, which begins with ``FOLDER_PREFIX``."""
+    name = FOLDER_PREFIX + quote(component, safe="")
+    if len(name) <= MAX_NAME_SIZE:
+        return name
+    digest = blake3(component.encode()).hexdigest(length=16)
+    return f"{name[: MAX_NAME_SIZE - len(digest) - 1]}~{digest}"
+
+
+def file_name(header: Header) -> str:
+    """The name of a snapshot's file: sorts by age, says which position it is and whether it stands alone."""
+    position = header.position
+    suffix = BASE_SUFFIX if header.is_base else DELTA_SUFFIX
+    return f"{header.epoch:016x}-{position.generation:016x}-{position.sequence:016x}-{position.digest.hex()}{suffix}"

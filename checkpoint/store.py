@@ -1,0 +1,437 @@
+"""A directory of snapshots that survives power loss at any point.
+
+``ROOT/lock``, and one folder for each component with a file for each snapshot. A file appears under its name only when it is
+whole and on the disk: written aside, synced, renamed, folder synced. What was acknowledged is therefore always
+there, and what did not arrive whole leaves nothing but a temporary that the next opening removes.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+
+from checkpoint import chain, format
+from checkpoint.disk import Disk, DiskFile, lock_exclusively
+from checkpoint.errors import ChainError, FormatError, StoreError
+from checkpoint.model import OutputPiece, Position, Snapshot
+from checkpoint.pages import PageTable
+from checkpoint.shelf import BASE_SUFFIX, DELTA_SUFFIX, FOLDER_PREFIX, Entry, Shelf, file_name, folder_name
+from checkpoint.state import header_of
+from checkpoint.validity import place
+
+log = logging.getLogger("failover.store")
+
+TEMPORARY_PREFIX = "arriving-"
+"""Begins the name of a file that is not whole yet; such files are removed when the store is opened."""
+
+ASIDE_FOLDER = "aside"
+"""Holds what is kept for inspection only."""
+
+LOCK_NAME = "lock"
+
+FOLD_DELTA_COUNT = 64
+"""A chain to the oldest wanted position with more deltas than this is folded: a restore reads them all."""
+
+FOLD_DELTA_PART = 0.5
+"""…and one whose deltas together take more than this part of its base: otherwise the store would grow without end."""
+
+FOLDED_OUTPUT_SIZE = 1 << 20
+"""Bytes of output of each stream that a folded base keeps; the whole is in the component's logs."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Proved:
+    """The pages of the newest position that was proved, so that the next delta is proved by its own pages alone."""
+
+    position: Position
+    table: PageTable
+
+
+class Store:
+    """The snapshots on one machine. Methods may be called from any thread; one process at a time.
+
+    Made by ``open_store``. Every method raises StoreError when the disk fails; what the store already held is intact.
+    """
+
+    def __init__(self, root: Path, disk: Disk, lock: int) -> None:
+        self._root = root
+        self._disk = disk
+        self._lock_descriptor = lock
+        self._lock = threading.RLock()
+        self._shelves: dict[str, Shelf] = {}
+        self._proved: dict[str, _Proved] = {}
+        self._serial = count()
+        self.notices: list[str] = []
+        """What was found damaged or left over: one sentence each."""
+
+    # Asking
+
+    def components(self) -> tuple[str, ...]:
+        """Everything of which there is a position to return to, by name."""
+        with self._lock:
+            return tuple(sorted(name for name, shelf in self._shelves.items() if shelf.newest()))
+
+    def positions(self, component: str) -> tuple[Position, ...]:
+        """The positions that can be restored, oldest first."""
+        with self._lock:
+            return self._shelf(component).positions()
+
+    def newest(self, component: str) -> Position | None:
+        """The newest position that can be restored, None if there is none."""
+        with self._lock:
+            return self._shelf(component).newest()
+
+    def chain_of(self, component: str, position: Position | None = None) -> tuple[Entry, ...]:
+        """The files that lead to a position (the newest, if none is named), a base first.
+
+        Raises:
+            StoreError: there is no such position.
+        """
+        with self._lock:
+            shelf = self._shelf(component)
+            wanted = position or shelf.newest()
+            found = shelf.chain_to(wanted) if wanted else ()
+        if not found:
+            named = f"position {place(position)}" if position else "any snapshot"
+            raise StoreError(f"the store {self._root} does not hold {named} of {component}")
+        return found
+
+    def open_chain(self, component: str, position: Position | None = None) -> list[int]:
+        """Descriptors of the files that lead to a position, a base first; the caller closes them.
+
+        They stay readable whatever the store does with the files meanwhile.
+        """
+        opened: list[int] = []
+        try:
+            with self._lock, self._disk_trouble(f"open the chain of {component}"):
+                for entry in self.chain_of(component, position):
+                    opened.append(os.open(entry.path, os.O_RDONLY | os.O_CLOEXEC))
+        except StoreError:
+            for descriptor in opened:
+                os.close(descriptor)
+            raise
+        return opened
+
+    def load(self, component: str, position: Position | None = None) -> Snapshot:
+        """The state at a position as one base, verified and proved.
+
+        Without a position: the newest that is intact. A damaged file on the way is set out of use and noted, and the next older
+        position is tried.
+
+        Raises:
+            StoreError: there is none, or the position that was asked for is damaged.
+        """
+        while True:
+            folded = self._try_fold(component, self.chain_of(component, position))
+            if folded is not None:
+                return folded
+            if position is not None:
+                raise StoreError(f"position {place(position)} of {component} cannot be restored: {self.notices[-1]}")
+
+    def _try_fold(self, component: str, entries: tuple[Entry, ...]) -> Snapshot | None:
+        """The folded chain, or None when a file of it had to be set out of use."""
+        snapshots = []
+        for entry in entries:
+            try:
+                snapshots.append(format.decode(entry.path))
+            except FormatError as error:
+                self._set_out_of_use(component, entry, str(error))
+                return None
+        try:
+            return chain.fold(snapshots)
+        except ChainError as error:
+            self._set_out_of_use(component, entries[-1], str(error))
+            return None
+
+    # Keeping
+
+    def put(self, source: int, *, prove: bool = True) -> Snapshot:
+        """Keep a snapshot; when this returns it survives a power cut.
+
+        Args:
+            source: descriptor of the whole file; it stays the caller's. An unnamed file (O_TMPFILE) in ``root`` or a folder of the
+                same file system is taken as it is, any other is copied.
+            prove: compare the state that it leads to with its digest. Not needed where the snapshot was made here.
+
+        Returns:
+            The snapshot without its pages: its position, its output.
+
+        Raises:
+            FormatError: not a whole, unaltered snapshot.
+            ChainError: it continues no position that the store holds, or does not lead to the state it names; ask for a base.
+            StoreError: the disk does not take it; nothing of it is left.
+        """
+        with self._lock:
+            snapshot = format.decode(source) if prove else format.read_outline(source)
+            header = format.verify(source) if not prove else header_of(snapshot)
+            shelf = self._shelf(snapshot.component)
+            self._check_parent(shelf, snapshot)
+            proved = self._prove(shelf, snapshot) if prove else None
+            final = self._root / folder_name(header.component) / file_name(header)
+            if all(entry.path != final for entry in shelf.entries):
+                size = self._write_whole(final, lambda file: file.copy_from(source), source)
+                self._shelves[shelf.component] = shelf.with_entry(_entry_of(final, snapshot, size))
+            if proved is not None:
+                self._proved[shelf.component] = proved
+            return replace(snapshot, runs=(), cleared=(), contents=b"")
+
+    def _check_parent(self, shelf: Shelf, snapshot: Snapshot) -> None:
+        if snapshot.parent is not None and not shelf.chain_to(snapshot.parent):
+            held = shelf.newest()
+            ours = f"the newest position here is {place(held)}" if held else "nothing of it is here"
+            raise ChainError(
+                f"delta {place(snapshot.position)} of {snapshot.component} continues {place(snapshot.parent)}, "
+                f"which is not held with that digest: {ours}; ask for a base"
+            )
+
+    def _prove(self, shelf: Shelf, snapshot: Snapshot) -> _Proved:
+        """Apply a snapshot to the page table of its parent and compare."""
+        table = PageTable.empty(snapshot.machine.page_size) if snapshot.parent is None else self._table_at(shelf, snapshot.parent)
+        table = table.apply(snapshot.cleared, snapshot.runs, memoryview(snapshot.contents), snapshot.vmas)
+        chain.check_state(snapshot, table.page_sum)
+        return _Proved(snapshot.position, table)
+
+    def _table_at(self, shelf: Shelf, position: Position) -> PageTable:
+        """The page table of a position: remembered, or counted again from the files."""
+        known = self._proved.get(shelf.component)
+        if known is not None and known.position == position:
+            return known.table
+        table: PageTable | None = None
+        for entry in shelf.chain_to(position):
+            snapshot = self._decoded(shelf.component, entry)
+            table = table or PageTable.empty(snapshot.machine.page_size)
+            table = table.apply(snapshot.cleared, snapshot.runs, memoryview(snapshot.contents), snapshot.vmas)
+        assert table is not None, "a chain has a base"
+        return table
+
+    def _decoded(self, component: str, entry: Entry) -> Snapshot:
+        try:
+            return format.decode(entry.path)
+        except FormatError as error:
+            self._set_out_of_use(component, entry, str(error))
+            raise ChainError(
+                f"a snapshot of {component} that this delta needs is damaged here: {error}; ask for a base"
+            ) from error
+
+    # Forgetting
+
+    def prune(self, component: str, oldest: Position) -> None:
+        """Forget what is not needed to restore ``oldest`` or a later position; fold its chain where that has grown long.
+
+        An ``oldest`` that is not held forgets nothing.
+        """
+        if self._fold_is_due(component, oldest):
+            self.fold(component, oldest)
+        with self._lock:
+            self._remove(component, self._shelf(component).unneeded_for(oldest))
+
+    def keep_newest(self, component: str, positions: int) -> None:
+        """Forget all but the newest positions; as ``prune``."""
+        held = self.positions(component)[-positions:]
+        if held:
+            self.prune(component, held[0])
+
+    def fold(self, component: str, position: Position) -> None:
+        """Write the state at a position as a base of its own, so that what is older can go.
+
+        The long part holds no lock: snapshots are taken in meanwhile. Cut off anywhere, the old chain is whole.
+
+        Raises:
+            StoreError: the position cannot be loaded, or the disk does not take the base.
+        """
+        folded = self.load(component, position)
+        folded = replace(folded, output=_newest_output(folded.output))
+        final = self._root / folder_name(component) / file_name(header_of(folded))
+        size = self._write_whole(final, lambda file: format.encode(folded, file))
+        with self._lock:
+            self._shelves[component] = self._shelf(component).with_entry(_entry_of(final, folded, size))
+
+    def _fold_is_due(self, component: str, oldest: Position) -> bool:
+        with self._lock:
+            entries = self._shelf(component).chain_to(oldest)
+        delta_size = sum(entry.size for entry in entries[1:])
+        return len(entries) > FOLD_DELTA_COUNT + 1 or (bool(entries) and delta_size > FOLD_DELTA_PART * entries[0].size)
+
+    def set_aside(self, component: str, generations: Iterable[int]) -> Path | None:
+        """Take generations out of the chain; their newest state is kept as one file for inspection.
+
+        Returns:
+            That file; None when nothing of these generations could be restored.
+        """
+        with self._lock:
+            shelf = self._shelf(component)
+            chosen = set(generations)
+            gone = tuple(entry for entry in shelf.entries if entry.position.generation in chosen)
+            restorable = [position for position in shelf.positions() if position.generation in chosen]
+            kept = self._write_aside(component, restorable[-1]) if restorable else None
+            self._remove(component, gone)
+            return kept
+
+    def _write_aside(self, component: str, position: Position) -> Path:
+        folded = self.load(component, position)
+        final = self._root / ASIDE_FOLDER / f"{folder_name(component)}-{file_name(header_of(folded))}"
+        self._write_whole(final, lambda file: format.encode(folded, file))
+        return final
+
+    def drop(self, component: str) -> None:
+        """Forget everything of a component; what was set aside stays."""
+        with self._lock:
+            self._remove(component, self._shelf(component).entries)
+            self._shelves.pop(component, None)
+
+    def close(self) -> None:
+        """Let another process have the store; nothing else may be called afterwards."""
+        os.close(self._lock_descriptor)
+
+    # The disk
+
+    def _write_whole(self, final: Path, fill: Callable[[DiskFile], object], unnamed: int | None = None) -> int:
+        """Make a file appear under its name, whole and durable, or not at all; answer its size.
+
+        1. Written under a temporary name, so that its own name never stands for a part.
+        2. Its content is synced before it is renamed: a name that survived has its content.
+        3. The folder is synced before we return: an acknowledgement outlives a power cut.
+        """
+        with self._disk_trouble(f"write {final}"):
+            self._ensure_folder(final.parent)
+            temporary = final.parent / f"{TEMPORARY_PREFIX}{next(self._serial)}"
+            try:
+                size = self._write_temporary(temporary, fill, unnamed)
+                self._disk.rename(temporary, final)
+            except BaseException:
+                self._disk.remove(temporary)
+                raise
+            self._disk.sync_folder(final.parent)
+            return size
+
+    def _write_temporary(self, temporary: Path, fill: Callable[[DiskFile], object], unnamed: int | None) -> int:
+        """Write and sync, or sync and name what is written already."""
+        if unnamed is not None and self._disk.is_unnamed(unnamed):
+            self._disk.sync_file(unnamed)
+            if self._disk.name(unnamed, temporary):
+                return os.fstat(unnamed).st_size
+        descriptor = self._disk.create(temporary)
+        try:
+            fill(DiskFile(self._disk, descriptor))
+            self._disk.sync_file(descriptor)
+            return os.fstat(descriptor).st_size
+        finally:
+            os.close(descriptor)
+
+    def _ensure_folder(self, folder: Path) -> None:
+        if not folder.is_dir():
+            self._disk.make_folder(folder)
+            self._disk.sync_folder(folder.parent)
+
+    def _remove(self, component: str, entries: tuple[Entry, ...]) -> None:
+        """Remove files, the youngest first: what is left at any instant is whole chains."""
+        with self._disk_trouble(f"remove snapshots of {component}"):
+            for entry in sorted(entries, key=lambda entry: entry.order, reverse=True):
+                self._shelves[component] = self._shelf(component).without((entry,))
+                self._disk.remove(entry.path)
+
+    def _set_out_of_use(self, component: str, entry: Entry, why: str) -> None:
+        """Never offer this file again; it stays where it is, for whoever wants to look, until it is pruned."""
+        with self._lock:
+            self._shelves[component] = self._shelf(component).without((entry,))
+            self._proved.pop(component, None)
+            newest = self.newest(component)
+            self._notice(f"{why}; going back to position {place(newest)}" if newest else f"{why}; nothing older is intact")
+
+    def _notice(self, sentence: str) -> None:
+        self.notices.append(sentence)
+        log.warning("%s", sentence)
+
+    def _shelf(self, component: str) -> Shelf:
+        return self._shelves.get(component) or Shelf(component)
+
+    @contextmanager
+    def _disk_trouble(self, tried: str) -> Iterator[None]:
+        """Turn what the kernel says into one sentence."""
+        try:
+            yield
+        except OSError as error:
+            cure = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+            raise StoreError(f"cannot {tried}: {error.strerror}{cure}; what the store held is intact") from error
+
+    # Opening
+
+    def read_folders(self) -> None:
+        """Find out what is there: remove leftovers, verify every file, keep what is intact."""
+        with self._disk_trouble(f"read the store {self._root}"):
+            for folder in sorted(self._root.iterdir()):
+                if folder.is_dir():
+                    self._read_folder(folder)
+
+    def _read_folder(self, folder: Path) -> None:
+        for path in sorted(folder.iterdir()):
+            if path.name.startswith(TEMPORARY_PREFIX):
+                self._disk.remove(path)
+                self._notice(f"{path} had not arrived whole and was removed")
+            elif folder.name.startswith(FOLDER_PREFIX) and path.suffix in (BASE_SUFFIX, DELTA_SUFFIX):
+                self._read_file(path)
+
+    def _read_file(self, path: Path) -> None:
+        try:
+            header = format.verify(path)
+        except FormatError as error:
+            self._notice(f"{error}; it is not used")
+            return
+        if (path.parent.name, path.name) != (folder_name(header.component), file_name(header)):
+            self._notice(f"{path} holds {place(header.position)} of {header.component}, which is not its name; it is not used")
+            return
+        entry = Entry(path, header.position, header.parent, header.epoch, path.stat().st_size)
+        self._shelves[header.component] = self._shelf(header.component).with_entry(entry)
+
+
+def open_store(root: Path, disk: Disk | None = None) -> Store:
+    """Open a store, or make an empty one; removes leftovers and verifies what is there.
+
+    Raises:
+        StoreError: another process has it open, or the folder cannot be used.
+    """
+    disk = disk or Disk()
+    try:
+        if not root.is_dir():
+            root.parent.mkdir(parents=True, exist_ok=True)
+            disk.make_folder(root)
+            disk.sync_folder(root.parent)
+        lock = lock_exclusively(root / LOCK_NAME)
+    except OSError as error:
+        raise StoreError(f"cannot open the store {root}: {error.strerror}; it must be a folder that we may write") from error
+    if lock is None:
+        raise StoreError(f"cannot open the store {root}: another process has it open; one agent uses one store")
+    store = Store(root, disk, lock)
+    try:
+        store.read_folders()
+    except StoreError:
+        store.close()
+        raise
+    return store
+
+
+def _entry_of(path: Path, snapshot: Snapshot, size: int) -> Entry:
+    return Entry(path, snapshot.position, snapshot.parent, snapshot.epoch, size)
+
+
+def _newest_output(output: tuple[OutputPiece, ...]) -> tuple[OutputPiece, ...]:
+    """The end of each stream, so that a base that was folded a thousand times does not carry all that was ever written."""
+    ends = {piece.stream: piece.offset + len(piece.content) for piece in output}
+    return tuple(
+        _cut(piece, ends[piece.stream] - FOLDED_OUTPUT_SIZE)
+        for piece in output
+        if piece.offset + len(piece.content) >= ends[piece.stream] - FOLDED_OUTPUT_SIZE
+    )
+
+
+def _cut(piece: OutputPiece, first: int) -> OutputPiece:
+    """The part of a piece from an offset of its stream on."""
+    skipped = max(0, first - piece.offset)
+    return replace(piece, offset=piece.offset + skipped, content=piece.content[skipped:])
