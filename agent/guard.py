@@ -84,7 +84,7 @@ class Guard:
             Freeze: lambda _, __: self._act(lambda ward: ward.freeze()),
             Thaw: lambda _, __: self._act(lambda ward: ward.thaw()),
             Kill: lambda request, _: self._act(lambda ward: ward.kill(request.signal)),
-            Describe: lambda _, __: self._reply(self._description()),
+            Describe: lambda _, __: self._reply(self._description(), self._ward.descriptors() if self._ward is not None else ()),
             LetGo: self._let_go,
             Forget: self._forget,
         }

@@ -1,6 +1,6 @@
 """What agent and guard say to each other (ARCHITECTURE.md, section 5). Arguments and environment are bytes: programs' are.
 
-Stream descriptors travel with `Started` and `VesselReady`, in this order: counters, read end 1, read end 2, log 1, log 2.
+Stream descriptors travel with `Started`, `VesselReady` and `Described`: counters, read end 1, read end 2, log 1, log 2.
 """
 
 from __future__ import annotations

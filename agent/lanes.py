@@ -31,6 +31,7 @@ from agent.dispatch import Dispatch
 from agent.door import Ask, Farewell, HearKey, Inventory, Life, Order, SpeakKey, ToLanes, Told
 from agent.errors import AgentError, GuardLostError
 from agent.journal import set_up_log
+from agent.nursery import Nursery
 from agent.records import Records
 from agent.scope import launcher
 from agent.shipping import Receiver, Shipper
@@ -71,7 +72,9 @@ class Lanes:
         state, runtime = Path(config.state_directory), Path(config.runtime_directory)
         self._runtime = runtime
         self._store_path = state / "store"
-        self.places = Places(sockets=runtime / "guards", logs=state / "logs", launcher=launcher())
+        sockets = runtime / "guards"
+        self._nursery = Nursery(sockets, launcher())
+        self.places = Places(sockets, state / "logs", self._nursery, robot=config.robot)
         self._heart = heart
         self._outgoing: asyncio.Queue[door.ToHeart] = asyncio.Queue()
         self._numbers = itertools.count(1)
@@ -107,6 +110,7 @@ class Lanes:
         self._dispatch = Dispatch(store, self._shipper, self.tell)
         self._receiver = Receiver(self._lane, self._store_path, self._deposit)
         found = await self._find_guards(around.records)
+        self._nursery.prepare()
         self._say(Inventory(_held(store), found))
         self._lane.open()
         server = ControlServer(self._runtime / SOCKET_NAME, self.settings.config.group, Verbs(self).table())
@@ -119,6 +123,7 @@ class Lanes:
             await self._dispatch.close()
             await asyncio.gather(*(charge.close() for charge in self.charges.values()))
             await self._lane.close()
+            await self._nursery.close()
             speaking.cancel()
             store.close()
 
