@@ -12,7 +12,7 @@ from checkpoint.linux.procfs import DELETED, MapsLine
 from checkpoint.model import FileIdentity, Vma, VmaKind
 from checkpoint.resources import files
 
-KEPT_FLAGS: Final = frozenset(("gd", "dc", "dd", "wf", "hg", "nh", "lo", "nr", "sr", "rr", "mg"))
+KEPT_FLAGS: Final = frozenset(("gd", "dc", "dd", "wf", "hg", "nh", "lo", "lf", "nr", "sr", "rr", "mg"))
 """VmFlags that a restore gives back."""
 VSYSCALL: Final = "[vsyscall]"
 KINDS: Final = {

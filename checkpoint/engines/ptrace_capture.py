@@ -18,7 +18,7 @@ import contextlib
 import functools
 import gc
 import os
-import resource
+import re
 import socket
 import time
 from collections.abc import Iterator
@@ -36,10 +36,11 @@ from checkpoint.engines import probe as probing
 from checkpoint.engines.identities import Identities
 from checkpoint.engines.inquiry import Inquiry, Told
 from checkpoint.engines.outputs import Outputs, Totals
-from checkpoint.engines.restart import Interruption, outside_critical_section
+from checkpoint.engines.restart import Interruption, outside_critical_section, undisturbed
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import abi, dirty, procfs, remote
 from checkpoint.linux.dirty import NONE, DigestTracker, PagemapTracker, SharedPages, SoftDirtyTracker, Tracker
+from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import MapsLine, MapsReader, Stat, Status
 from checkpoint.linux.remote import BorrowedPages
 from checkpoint.linux.tracee import Tracee
@@ -61,6 +62,9 @@ LIMIT_COUNT: Final = 16
 """RLIMIT numbers of Linux. Source: asm-generic/resource.h."""
 US_PER_NS: Final = 1000
 EMPTY_CONTENT: Final = bytearray()
+LEAVE_TIMEOUT_S: Final = 0.5
+"""How long a program may take to leave the code of a tracer that died in the middle: that waits 100 ms at most."""
+LEAVE_PAUSE_S: Final = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,13 +112,21 @@ class PtraceSession:
     acknowledged position; ``_table`` is the state at the last capture that was handed out.
     """
 
-    def __init__(self, pid: int, component: str, tracee: Tracee, pages_inside: BorrowedPages, tracker: Tracker) -> None:
+    def __init__(
+        self,
+        pid: int,
+        component: str,
+        tracee: Tracee,
+        borrowed: BorrowedPages,
+        tracker: Tracker,
+        interruption: Interruption,
+    ) -> None:
         self.pid = pid
         self.component = component
         self.notes: tuple[str, ...] = ()
         self.totals: Totals = (0, 0)
         self._tracee = tracee
-        self._borrowed = pages_inside
+        self._borrowed = borrowed
         self._tracker = tracker
         self._shared = SharedPages(pid)
         self._maps = MapsReader(pid)
@@ -122,9 +134,8 @@ class PtraceSession:
         self._flags: dict[int, tuple[str, ...]] = {}
         self._flags_of: tuple[MapsLine, ...] = ()
         self._identities = Identities(pid)
-        self._interruption = Interruption(tracee.memory)
+        self._interruption = interruption
         self._outputs: Outputs | None = None
-        self._close_inside = -1
         self._based = False
         self._table = PageTable.empty(abi.PAGE_SIZE)
         self._unacknowledged: list[Unacknowledged] = []
@@ -276,15 +287,12 @@ class PtraceSession:
     def _look(self, *, base: bool) -> Frozen:
         """Everything that needs the program to stand still."""
         tracee = self._tracee
-        registers, mask = tracee.registers(), tracee.signal_mask()
-        decoded = arch.decode_registers(registers)
+        pending, shared_pending = tracee.pending(shared=False), tracee.pending(shared=True)
+        mask, rseq = tracee.signal_mask(), tracee.rseq()
+        decoded = _where_it_stands(tracee, mask, (*pending, *shared_pending), rseq)
         if self._borrowed.holds(decoded[arch.INSTRUCTION_POINTER]):
             raise CaptureError(f"pid {self.pid} still stands in code of an earlier look; capture it again in a moment")
-        pending, shared_pending = tracee.pending(shared=False), tracee.pending(shared=True)
-        rseq = tracee.rseq()
-        if rseq and decoded[arch.CALL_NUMBER] >> 63:
-            decoded = outside_critical_section(decoded, tracee.memory, rseq.address)
-            registers = arch.encode_registers(decoded)
+        registers = arch.encode_registers(decoded)
         changed = self._maps.refresh()
         lines = self._private_lines()
         scan = self._tracker.scan(lines, changed=changed)
@@ -293,10 +301,9 @@ class PtraceSession:
         written, cleared = self._since_acknowledged(base=base)
         content = tracee.memory.read_pages(written) if len(written) else EMPTY_CONTENT
         status, timers = procfs.status(self.pid), procfs.parse_timers(procfs.read_text(self.pid, "timers"))
-        inquiry = Inquiry(self._borrowed.table, status, timers, self._close_inside)
+        inquiry = Inquiry(self._borrowed.table, status, timers)
         told = inquiry.read(self._borrowed.run(tracee, inquiry.batch, registers, mask))
-        self._close_inside = -1
-        settled, interrupted = self._interruption.settled(decoded, lambda: bool(_unblocked(pending + shared_pending, mask)))
+        settled, interrupted = self._interruption.settled(decoded)
         return Frozen(
             registers=registers,
             xstate=tracee.xstate(),
@@ -411,10 +418,10 @@ class PtraceSession:
             robust_list=told.robust_list,
             clear_tid=told.clear_tid,
             rseq=frozen.rseq,
-            policy=stat.policy,
+            policy=_policy(self.pid),
             priority=stat.priority,
             nice=stat.nice,
-            io_priority=0,
+            io_priority=abi.io_priority(self.pid),
             affinity=_affinity(self.pid),
             timer_slack_ns=told.timer_slack_ns,
             interrupted=frozen.interrupted,
@@ -455,32 +462,69 @@ class PtraceSession:
 
 def _entered(kind: type[PtraceSession], pid: int, component: str) -> PtraceSession:
     """Borrow pages, choose how to track, and let go again."""
-    tracee = Tracee(pid)
-    notes: tuple[str, ...] = ()
-    with _stopped(tracee):
-        registers, mask = tracee.registers(), tracee.signal_mask()
-        lines = procfs.parse_maps(procfs.read_text(pid, "maps"))
-        if rseq := tracee.rseq():
-            decoded = arch.decode_registers(registers)
-            if decoded[arch.CALL_NUMBER] >> 63:
-                registers = arch.encode_registers(outside_critical_section(decoded, tracee.memory, rseq.address))
-        entered = remote.enter(tracee, lines, registers, mask)
-        batch = remote.Batch(entered.pages.table)
-        if entered.inside >= 0:
-            batch.add("close", entered.inside)
-        entered.pages.run(tracee, batch, registers, mask)
-    tracker: Tracker
-    if entered.faults is not None:
-        try:
-            tracker = PagemapTracker(pid, entered.faults)
-        except OSError as error:
-            os.close(entered.faults)
-            tracker, notes = _without_write_protection(pid, str(error))
-    else:
-        tracker, notes = _without_write_protection(pid, os.strerror(entered.why_not))
-    session = kind(pid, component, tracee, entered.pages, tracker)
+    tracee, interruption = Tracee(pid), Interruption(Memory(pid))
+    deadline = time.perf_counter() + LEAVE_TIMEOUT_S
+    while (entered := _try_to_enter(tracee, interruption, last=time.perf_counter() > deadline)) is None:
+        time.sleep(LEAVE_PAUSE_S)
+    tracker, notes = _tracker_for(pid, entered)
+    session = kind(pid, component, tracee, entered.pages, tracker, interruption)
     session.notes = notes
     return session
+
+
+def _try_to_enter(tracee: Tracee, interruption: Interruption, *, last: bool) -> remote.Entered | None:
+    """Enter once; None while the program still stands in the code of a tracer that died.
+
+    Args:
+        last: waiting has helped nothing: pages that somebody was in are left to the program.
+    """
+    with _stopped(tracee):
+        mask = tracee.signal_mask()
+        pending = (*tracee.pending(shared=False), *tracee.pending(shared=True))
+        decoded = _where_it_stands(tracee, mask, pending, tracee.rseq())
+        lines = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
+        left = remote.leftovers(tracee.memory, lines)
+        place = decoded[arch.INSTRUCTION_POINTER]
+        stands_inside = remote.is_in_stub(place, tracee.memory, lines) or any(borrowed.holds(place) for borrowed in left)
+        if stands_inside or (not last and any(borrowed.state() == remote.ARMED for borrowed in left)):
+            if last:
+                raise CaptureError(f"pid {tracee.pid} does not leave the code of an earlier tracer; protect it again")
+            return None
+        interruption.settled(decoded)  # remembers the call that it stands in
+        registers = arch.encode_registers(decoded)
+        for borrowed in left:
+            if borrowed.state() == remote.ARMED:
+                borrowed.abandon()
+        free = [borrowed for borrowed in left if borrowed.state() != remote.ABANDONED]
+        if free:
+            entered = remote.reenter(tracee, free[0], registers, mask)
+        else:
+            entered = remote.enter(tracee, lines, registers, mask)
+        batch = remote.Batch(entered.pages.table)
+        batch.add("close", entered.inside)
+        entered.pages.run(tracee, batch, registers, mask)
+        return entered
+
+
+def _where_it_stands(tracee: Tracee, mask: int, pending: tuple[bytes, ...], rseq: Rseq | None) -> arch.Registers:
+    """The registers that the program is given back: as they are, but for what our stop alone has brought about."""
+    decoded = arch.decode_registers(tracee.registers())
+    if decoded[arch.CALL_NUMBER] >> 63:
+        return outside_critical_section(decoded, tracee.memory, rseq.address) if rseq else decoded
+    return undisturbed(decoded, bool(_unblocked(pending, mask)))
+
+
+def _tracker_for(pid: int, entered: remote.Entered) -> tuple[Tracker, tuple[str, ...]]:
+    """The best way to find written pages that this kernel has for this process, and what to say about it."""
+    why = os.strerror(entered.why_not)
+    if entered.faults is not None:
+        try:
+            return PagemapTracker(pid, entered.faults), ()
+        except OSError as error:
+            os.close(entered.faults)
+            why = str(error)
+    tracker: Tracker = SoftDirtyTracker(pid) if dirty.has_soft_dirty() else DigestTracker(pid)
+    return tracker, (f"written pages are found by {tracker.name}, which takes longer: no write protection ({why})",)
 
 
 @contextlib.contextmanager
@@ -493,11 +537,6 @@ def _stopped(tracee: Tracee) -> Iterator[None]:
     finally:
         with contextlib.suppress(ProcessGoneError):
             tracee.detach()
-
-
-def _without_write_protection(pid: int, why: str) -> tuple[Tracker, tuple[str, ...]]:
-    tracker: Tracker = SoftDirtyTracker(pid) if dirty.has_soft_dirty() else DigestTracker(pid)
-    return tracker, (f"written pages are found by {tracker.name}, which takes longer: no write protection ({why})",)
 
 
 # Pieces of a description
@@ -575,9 +614,27 @@ def _credentials(status: Status, told: Told) -> Credentials:
     )
 
 
+_LIMIT_LINE: Final = re.compile(r" (unlimited|[0-9]+) +(unlimited|[0-9]+) ")
+
+
 def _limits(pid: int) -> dict[int, tuple[int, int]]:
+    """Soft and hard limits from /proc/PID/limits, whose lines stand in the order of the numbers; -1 is infinity.
+
+    prlimit(2) would need CAP_SYS_RESOURCE for a process of another user.
+    """
+    lines = procfs.read_text(pid, "limits").splitlines()[1 : LIMIT_COUNT + 1]
+    found = (_LIMIT_LINE.search(line) for line in lines)
+    return {number: (_limit(match[1]), _limit(match[2])) for number, match in enumerate(found) if match}
+
+
+def _limit(word: str) -> int:
+    return -1 if word == "unlimited" else int(word)
+
+
+def _policy(pid: int) -> int:
+    """The scheduling policy with SCHED_RESET_ON_FORK, as sched_setscheduler(2) takes it."""
     try:
-        return {number: resource.prlimit(pid, number) for number in range(LIMIT_COUNT)}
+        return os.sched_getscheduler(pid)
     except ProcessLookupError as error:
         raise ProcessGoneError(f"pid {pid} ended while it was being described") from error
 

@@ -16,7 +16,6 @@ Source: ptrace(2), prctl(2), vdso(7); kernel/sys.c for PR_SET_MM_MAP.
 
 from __future__ import annotations
 
-import ctypes
 import os
 import resource
 import signal
@@ -42,8 +41,6 @@ OPTIONS: Final = abi.PTRACE_O_EXITKILL | PTRACE_O_TRACESYSGOOD | abi.PTRACE_O_TR
 
 REFUGE_SIZE: Final = 1 << 20
 """Bytes beside the area where vdso and its data stay while their old and new places are cleared."""
-
-PR_TIMER_CREATE_RESTORE_IDS_GET: Final = 2
 
 
 @dataclass(slots=True)
@@ -167,9 +164,7 @@ class _Restore:
         self._notes += restore_process.limits(table, process, vessel)
         self._notes += restore_process.rights(table, process, vessel)
         restore_process.pending_signals(table, process, thread, vessel.inner_pid)
-        restore_process.posix_timers(
-            table, process.posix_timers, vessel.inner_pid, elapsed_ns, chosen_ids=_timer_numbers_can_be_chosen()
-        )
+        restore_process.posix_timers(table, process, thread, vessel, elapsed_ns)
         restore_process.interval_timers(table, process.interval_timers, elapsed_ns)
         restore_process.last_marks(table, process)
         return table
@@ -271,9 +266,3 @@ def _write_oom_score(pid: int, score: int, notes: list[str]) -> None:
         Path(f"/proc/{pid}/oom_score_adj").write_bytes(str(score).encode())
     except PermissionError:
         notes.append(f"oom_score_adj {score} is not kept: lowering it needs CAP_SYS_RESOURCE")
-
-
-def _timer_numbers_can_be_chosen() -> bool:
-    """Whether the kernel lets timer numbers be chosen (Linux 6.15); asking changes nothing."""
-    option, get = restore_process.PR_TIMER_CREATE_RESTORE_IDS, PR_TIMER_CREATE_RESTORE_IDS_GET
-    return bool(ctypes.CDLL(None).prctl(option, get, 0, 0, 0) >= 0)

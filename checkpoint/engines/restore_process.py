@@ -8,6 +8,7 @@ Sources: prctl(2), rt_sigaction(2), timer_create(2), sched(7), credentials(7), c
 
 from __future__ import annotations
 
+import ctypes
 import os
 import struct
 from collections.abc import Iterable, Mapping
@@ -24,9 +25,11 @@ _SIGTRAP: Final = 5
 _UNCHANGEABLE: Final = (9, 19)
 """SIGKILL and SIGSTOP."""
 
+SI_TIMER: Final = -2
 SS_ONSTACK: Final = 1
 
 PR_TIMER_CREATE_RESTORE_IDS: Final = 77
+PR_TIMER_CREATE_RESTORE_IDS_GET: Final = 2
 TIMER_ID_LIMIT: Final = 1024
 """Largest timer number that is reached by creating and deleting timers, on kernels that cannot be told the number."""
 
@@ -130,13 +133,27 @@ def trap_action(actions: Iterable[SignalAction]) -> SignalAction:
 
 
 def pending_signals(table: CallTable, process: ProcessState, thread: ThreadState, inner_pid: int) -> None:
-    """Queue what was pending: every signal is blocked in the vessel, so they wait for the program."""
+    """Queue what was pending: every signal is blocked in the vessel, so they wait for the program.
+
+    The signal of a periodic timer is queued by the timer itself, which `posix_timers` lets expire at once.
+    """
+    periodic = {timer.timer_id for timer in process.posix_timers if timer.interval_ns}
     for siginfo in process.pending:
         number = struct.unpack_from("<i", siginfo)[0]
+        if timer_of(siginfo) in periodic:
+            continue
         table.call(f"queue signal {number}", "rt_sigqueueinfo", inner_pid, number, table.place(siginfo))
     for siginfo in thread.pending:
         number = struct.unpack_from("<i", siginfo)[0]
+        if timer_of(siginfo) in periodic:
+            continue
         table.call(f"queue signal {number}", "rt_tgsigqueueinfo", inner_pid, inner_pid, number, table.place(siginfo))
+
+
+def timer_of(siginfo: bytes) -> int | None:
+    """Number of the POSIX timer that sent a signal; None when something else did."""
+    _, _, code, _, timer_id = struct.unpack_from("<5i", siginfo)
+    return int(timer_id) if code == SI_TIMER else None
 
 
 # --- The thread ------------------------------------------------------------------------------------------------------
@@ -184,14 +201,16 @@ def interval_timers(table: CallTable, timers: Iterable[IntervalTimer], elapsed_n
         table.call(f"arm interval timer {timer.which}", "setitimer", timer.which, table.place(packed), 0)
 
 
-def posix_timers(table: CallTable, timers: tuple[PosixTimer, ...], inner_pid: int, elapsed_ns: int, *, chosen_ids: bool) -> None:
+def posix_timers(table: CallTable, process: ProcessState, thread: ThreadState, vessel: Vessel, elapsed_ns: int) -> None:
     """Make the timers of timer_create(2) again, with the numbers that they had, and arm them.
 
-    Args:
-        chosen_ids: the kernel lets us say the number (Linux 6.15); otherwise numbers are counted up to and the rest deleted.
+    A kernel that does not let us say the number (before Linux 6.15) counts up to it; what comes before is deleted.
     """
+    timers, inner_pid = process.posix_timers, vessel.inner_pid
     if not timers:
         return
+    chosen_ids = timer_numbers_can_be_chosen()
+    overdue = {timer_of(siginfo) for siginfo in (*process.pending, *thread.pending)}
     if chosen_ids:
         table.call("choose timer numbers", "prctl", PR_TIMER_CREATE_RESTORE_IDS, 1)
     next_id = 0
@@ -206,8 +225,14 @@ def posix_timers(table: CallTable, timers: tuple[PosixTimer, ...], inner_pid: in
         table.call("stop choosing timer numbers", "prctl", PR_TIMER_CREATE_RESTORE_IDS, 0)
     for timer in timers:
         if timer.value_ns:
-            packed = struct.pack("<4q", *divmod(timer.interval_ns, _NS_PER_S), *divmod(_left_of(timer, elapsed_ns), _NS_PER_S))
+            left_ns = 1 if timer.interval_ns and timer.timer_id in overdue else _left_of(timer, elapsed_ns)
+            packed = struct.pack("<4q", *divmod(timer.interval_ns, _NS_PER_S), *divmod(left_ns, _NS_PER_S))
             table.call(f"arm timer {timer.timer_id}", "timer_settime", timer.timer_id, 0, table.place(packed), 0)
+
+
+def timer_numbers_can_be_chosen() -> bool:
+    """Whether the kernel lets timer numbers be chosen (Linux 6.15); asking changes nothing."""
+    return bool(ctypes.CDLL(None).prctl(PR_TIMER_CREATE_RESTORE_IDS, PR_TIMER_CREATE_RESTORE_IDS_GET, 0, 0, 0) >= 0)
 
 
 def _create_timer(table: CallTable, timer: PosixTimer, inner_pid: int) -> None:

@@ -247,3 +247,15 @@ def kcmp(pid1: int, pid2: int, kind: int, index1: int = 0, index2: int = 0) -> i
     if result < 0 and ctypes.get_errno() in (errno.ENOSYS, errno.EPERM):
         return None
     return result
+
+
+NR_IOPRIO_GET: Final[dict[str, int]] = {"x86_64": 252, "aarch64": 31}
+IOPRIO_WHO_PROCESS: Final = 1
+
+
+def io_priority(pid: int) -> int:
+    """The I/O priority as ioprio_set(2) takes it; 0 (none of its own) where the kernel does not tell."""
+    number = NR_IOPRIO_GET.get(os.uname().machine)
+    if number is None:
+        return 0
+    return max(int(_syscall(number, ctypes.c_int(IOPRIO_WHO_PROCESS), ctypes.c_int(pid))), 0)

@@ -153,7 +153,7 @@ static void path_only(const char *go) {
 }
 
 static void beyond_end(const char *go) {
-    int file = make("out", O_RDWR);
+    int file = make("beyond", O_RDWR);
     lseek(file, 100000, SEEK_SET);
     ready(), wait_for_go(go);
     EXPECT_EQUAL("offset", lseek(file, 0, SEEK_CUR), 100000);

@@ -74,7 +74,6 @@ static void paint(int when) {
     add_file(when, "/proc/self/timerslack_ns");
     add_file(when, "/proc/self/personality");
     add_file(when, "/proc/self/coredump_filter");
-    add_file(when, "/proc/self/autogroup");
     add_status(when);
     add_layout(when);
     prctl(PR_GET_NAME, name);
