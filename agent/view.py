@@ -35,10 +35,6 @@ PRIMARY_STATES: Final = frozenset(
 )
 PEER_STATES: Final = {"alive": "live", "unheard": "unknown"}
 
-INSECURE: Final = (
-    "INSECURE: links are neither authenticated nor encrypted; anybody on the network can read memory and start programs here"
-)
-
 
 def version() -> str:
     """Of the installed package."""
@@ -54,7 +50,7 @@ def team_view(
     """The whole picture."""
     view = told.status
     notes = [*life.notes, *notices]
-    notes += [INSECURE] if settings.config.insecure else []
+
     notes += [told.ballot_trouble] if told.ballot_trouble else []
     beats = told.beats
     return {
