@@ -1,4 +1,4 @@
-"""The store's door to the disk: every operation that changes something, one method each, so that a test can cut between any two."""
+"""The store's door to the disk: every operation that changes something, one method each, so that a test can cut anywhere."""
 
 from __future__ import annotations
 

@@ -156,8 +156,8 @@ class Store:
         """Keep a snapshot; when this returns it survives a power cut.
 
         Args:
-            source: descriptor of the whole file; it stays the caller's. An unnamed file (O_TMPFILE) in ``root`` or a folder of the
-                same file system is taken as it is, any other is copied.
+            source: descriptor of the whole file; it stays the caller's. An unnamed file (O_TMPFILE) on the same file system as
+                ``root`` is taken as it is, any other is copied.
             prove: compare the state that it leads to with its digest. Not needed where the snapshot was made here.
 
         Returns:

@@ -1,0 +1,91 @@
+"""A base and its deltas add up to the state that the newest one names, or are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from checkpoint import chain
+from checkpoint.errors import ChainError
+from checkpoint.model import Position, Snapshot
+from tests.checkpoint.snapshots import history, page, pages_of, snapshot, vma
+
+STEPS = st.lists(
+    st.tuples(st.dictionaries(st.integers(0, 30), st.integers(0, 9), max_size=6), st.frozensets(st.integers(0, 30), max_size=6)),
+    max_size=6,
+)
+
+
+@settings(max_examples=100, deadline=None)
+@given(STEPS, st.integers(1, 31))
+def test_a_fold_is_what_a_dictionary_of_pages_would_hold(
+    steps: list[tuple[dict[int, int], frozenset[int]]], last_size: int
+) -> None:
+    state = {number: page(f"base {number}") for number in range(5)}
+    made = [snapshot(state)]
+    for sequence, (written, cleared) in enumerate(steps, 2):
+        size = last_size if sequence == len(steps) + 1 else 31
+        carried = {number: page(f"{sequence} {value}") for number, value in written.items() if number < size}
+        state = {number: content for number, content in state.items() if number not in cleared and number < size} | carried
+        made.append(
+            snapshot(state, carried=carried, cleared=cleared, parent=made[-1].position, sequence=sequence, vmas=(vma(0, size),))
+        )
+    folded = chain.fold(made)
+    assert pages_of(folded) == state
+    assert folded.is_base
+    assert folded.position == made[-1].position
+
+
+def test_output_of_all_snapshots_is_joined() -> None:
+    folded = chain.fold(history(4))
+    assert [(piece.stream, piece.offset, bytes(piece.content)) for piece in folded.output if piece.content] == [
+        (1, 0, b"ready\nline 2\nline 3\nline 4\n")
+    ]
+
+
+def refused(snapshots: tuple[Snapshot, ...], words: str) -> None:
+    with pytest.raises(ChainError, match=words):
+        chain.fold(snapshots)
+
+
+def test_a_missing_delta_is_found() -> None:
+    base, _, third, _ = history(4)
+    refused((base, third), "continues 1.2")
+
+
+def test_a_chain_without_base_is_refused() -> None:
+    refused(history(3)[1:], "not a base")
+    refused((), "no snapshot")
+
+
+def test_equal_numbers_with_unequal_digests_have_diverged() -> None:
+    base, second, third = history(3)
+    other = replace(third, parent=Position(1, 2, bytes(16)))
+    refused((base, second, other), "diverged")
+
+
+def test_pages_that_do_not_add_up_are_found() -> None:
+    base, second = history(2)
+    forged = bytearray(second.contents)
+    forged[0] ^= 1
+    refused((base, replace(second, contents=bytes(forged))), "do not add up")
+
+
+def test_a_changed_register_is_found() -> None:
+    base, second = history(2)
+    thread = replace(second.threads[0], signal_mask=4)
+    refused((base, replace(second, threads=(thread,))), "state is not that")
+
+
+def test_a_delta_of_another_component_is_refused() -> None:
+    base, second = history(2)
+    refused((base, replace(second, component="/other")), "/other")
+
+
+def test_a_delta_whose_siblings_were_never_acknowledged_replaces_them() -> None:
+    base, second, third = history(3)
+    other = replace(third, parent=base.position)
+    assert chain.append((base, second), other) == (base, other)

@@ -1,0 +1,199 @@
+"""A snapshot file holds exactly what was written, or is refused."""
+
+from __future__ import annotations
+
+import os
+import random
+import resource
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from checkpoint import format, layout
+from checkpoint.errors import FormatError
+from checkpoint.model import OutputPiece, PageRun, Resource, Snapshot
+from tests.checkpoint.snapshots import PAGE, START, history, page, snapshot, vma
+
+FACTS = st.recursive(
+    st.none() | st.booleans() | st.integers(-(1 << 63), (1 << 64) - 1) | st.text(max_size=8) | st.binary(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
+    max_leaves=6,
+)
+CONTENTS = st.one_of(
+    st.just(bytes(PAGE)),
+    st.integers(0, 255).map(lambda byte: bytes([byte]) * PAGE),
+    st.randoms().map(lambda dice: dice.randbytes(PAGE)),
+)
+
+
+@st.composite
+def snapshots(draw: st.DrawFn) -> Snapshot:
+    """Any snapshot that a capture could make of a small process."""
+    state = draw(st.dictionaries(st.integers(0, 63), CONTENTS, max_size=8))
+    made = snapshot(state, sequence=draw(st.integers(2, 1 << 40)), component=draw(st.text(min_size=1, max_size=20)))
+    facts = draw(st.dictionaries(st.text(max_size=6), FACTS, max_size=3))
+    pieces = (OutputPiece(1, draw(st.integers(0, 1 << 40)), draw(st.binary(max_size=50))),)
+    return replace(
+        made,
+        resources=(Resource("files", "fd 3", facts),),
+        output=pieces,
+        notes=tuple(draw(st.lists(st.text(max_size=10), max_size=2))),
+        epoch=draw(st.integers(0, 1 << 62)),
+        cleared=() if draw(st.booleans()) else (PageRun(START, START + PAGE),),
+    )
+
+
+@settings(max_examples=150, deadline=None)
+@given(snapshots())
+def test_what_was_written_is_what_is_read(made: Snapshot) -> None:
+    content = format.encode_bytes(made)
+    assert format.decode(content) == made
+    assert format.encode_bytes(made) == content
+    outline = format.read_outline(content)
+    assert replace(outline, contents=made.contents) == made
+    assert format.verify(content) == format.read_header(content)
+    assert format.read_header(content).position == made.position
+
+
+def test_a_file_of_several_frames_is_read_from_a_path_a_descriptor_and_memory(tmp_path: Path) -> None:
+    dice = random.Random(5)
+    state = {number: dice.randbytes(PAGE) if number % 3 else page(str(number)) for number in range(700)}
+    made = snapshot(state, vmas=(vma(0, 700),))
+    path = tmp_path / "snapshot"
+    with path.open("wb") as file:
+        size = format.encode(made, file)
+    assert size == path.stat().st_size
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        assert format.decode(path) == format.decode(descriptor) == format.decode(path.read_bytes()) == made
+    finally:
+        os.close(descriptor)
+
+
+@pytest.fixture(scope="module")
+def sample() -> bytes:
+    return format.encode_bytes(history(2)[1])
+
+
+def test_one_flipped_bit_anywhere_is_refused(sample: bytes) -> None:
+    altered = bytearray(sample)
+    for place in range(len(sample)):
+        for bit in range(8) if place < 2 * layout.PREAMBLE_SIZE else (place % 8,):
+            altered[place] ^= 1 << bit
+            with pytest.raises(FormatError):
+                format.decode(bytes(altered))
+            altered[place] ^= 1 << bit
+    assert bytes(altered) == sample
+
+
+def test_a_file_that_ends_anywhere_too_early_is_refused(sample: bytes) -> None:
+    for size in range(len(sample)):
+        with pytest.raises(FormatError):
+            format.decode(sample[:size])
+
+
+def test_a_file_that_something_follows_is_refused(sample: bytes) -> None:
+    with pytest.raises(FormatError, match="follow"):
+        format.decode(sample + b"\0")
+
+
+def test_another_version_is_named(sample: bytes) -> None:
+    altered = bytearray(sample)
+    altered[8] = 9
+    with pytest.raises(FormatError, match="version 9"):
+        format.decode(bytes(altered))
+
+
+@pytest.mark.parametrize("content", [b"", b"hello, world\n" * 100, bytes(5000)])
+def test_what_is_no_snapshot_is_said_so(content: bytes) -> None:
+    with pytest.raises(FormatError, match="not a snapshot"):
+        format.decode(content)
+
+
+BROKEN = {
+    "page size": lambda made: replace(made, machine=replace(made.machine, page_size=5000)),
+    "overlaps": lambda made: replace(made, vmas=made.vmas * 2),
+    "lies in no mapping": lambda made: replace(made, runs=(PageRun(PAGE, 5 * PAGE),)),
+    "where the runs need": lambda made: replace(made, contents=made.contents[:-1]),
+    "page sum": lambda made: replace(made, page_sum=b""),
+    "same id": lambda made: replace(made, threads=made.threads * 2),
+    "is not before": lambda made: replace(made, parent=replace(made.position, sequence=99)),
+    "cannot be": lambda made: replace(made, output=(OutputPiece(3, 0, b""),)),
+    "epoch": lambda made: replace(made, epoch=-1),
+}
+
+
+@pytest.mark.parametrize("words", [*BROKEN])
+def test_a_snapshot_that_does_not_hold_together_is_not_written(words: str) -> None:
+    with pytest.raises(FormatError, match=words):
+        format.encode_bytes(BROKEN[words](snapshot({n: page("x") for n in range(4)})))
+
+
+FUZZ = """
+import random, sys
+from checkpoint import format, layout
+from checkpoint.errors import FormatError
+sample = open(sys.argv[1], "rb").read()
+dice = random.Random(int(sys.argv[2]))
+def resealed(content):
+    # As a stranger could: every digest right, the content not.
+    try:
+        preamble = layout.Preamble.parse(sample)
+    except FormatError:
+        return content
+    body = bytearray(content[:layout.PREAMBLE_SIZE])
+    for index, section in enumerate(preamble.sections):
+        stored = content[section.offset:section.offset + section.stored_size]
+        entry = 32 + 64 * index
+        body[entry + 32:entry + 64] = layout.digest_of(stored)
+    body[-32:] = layout.digest_of(bytes(body[:-32]))
+    return bytes(body) + content[layout.PREAMBLE_SIZE:]
+for turn in range(int(sys.argv[3])):
+    content = bytearray(sample)
+    for _ in range(dice.randrange(1, 6)):
+        place = dice.randrange(len(content))
+        act = dice.randrange(4)
+        if act == 0:
+            content[place] = dice.randrange(256)
+        elif act == 1:
+            content[place:place + 8] = dice.choice((0, 1, 255, (1 << 63) - 1, (1 << 64) - 1)).to_bytes(8, "little")
+        elif act == 2:
+            content[place:place + dice.randrange(64)] = b""
+        else:
+            content[place:place] = dice.randbytes(dice.randrange(64))
+    content = bytes(content)
+    if turn % 2:
+        content = resealed(content)
+    if content == sample:
+        continue
+    try:
+        format.decode(content)
+    except FormatError:
+        continue
+    if format.decode(content) != format.decode(sample):
+        print("accepted", turn)  # a resealed state section may differ and be whole: it was rewritten, not damaged
+print("done")
+"""
+
+
+def test_no_input_makes_the_reader_crash_hang_or_allocate_without_bound(sample: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "sample"
+    path.write_bytes(sample)
+    seed = int(os.environ.get("FAILOVER_FUZZ_SEED", random.randrange(1 << 30)))
+    turns = os.environ.get("FAILOVER_FUZZ_TURNS", "4000")
+    print(f"FAILOVER_FUZZ_SEED={seed}")
+    limit = 1 << 30
+    done = subprocess.run(
+        [sys.executable, "-c", FUZZ, path, str(seed), turns],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
+    )
+    assert done.returncode == 0, f"seed {seed}: {done.stderr[-2000:]}"
+    assert done.stdout.endswith("done\n")
