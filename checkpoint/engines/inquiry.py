@@ -49,14 +49,11 @@ class Inquiry:
 
     Args:
         status: read while the process stands still: says which signals have an action of their own.
-        close_inside: a descriptor number to be closed in the process first, or -1.
     """
 
-    def __init__(self, table: int, status: Status, timers: Sequence[TimerLine], close_inside: int = -1) -> None:
+    def __init__(self, table: int, status: Status, timers: Sequence[TimerLine]) -> None:
         self.batch = Batch(table)
         self._timers = timers
-        if close_inside >= 0:
-            self.batch.add("close", close_inside)
         self._clocks = [self._writes(16, "clock_gettime", clock) for clock in (CLOCK_REALTIME, CLOCK_MONOTONIC, CLOCK_BOOTTIME)]
         special = status.caught | status.ignored | 1 << (SIGCHLD - 1)
         self._actions = [

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import ctypes
 import errno
-from collections.abc import Callable
 
 from checkpoint.arch import x86_64 as arch
 from checkpoint.errors import CaptureError
@@ -34,12 +33,8 @@ class Interruption:
         self._place: Place = ()
         self._number = -1
 
-    def settled(self, registers: arch.Registers, signals_wait: Callable[[], bool]) -> tuple[arch.Registers, str]:
-        """The registers that a snapshot goes on with, and the name of the call that is made again ("" if none).
-
-        Args:
-            signals_wait: tells whether a signal that is not blocked is pending: then EINTR is what the program must see.
-        """
+    def settled(self, registers: arch.Registers) -> tuple[arch.Registers, str]:
+        """The registers that a snapshot goes on with, and the name of the call that is made again ("" if none)."""
         number = ctypes.c_int64(registers[arch.CALL_NUMBER]).value
         result = ctypes.c_int64(registers[arch.RESULT]).value
         if number < 0:
@@ -48,8 +43,6 @@ class Interruption:
             return _again(registers, number)
         if result == arch.RESTART_BLOCK:
             return self._from_restart_block(registers, number)
-        if result == -errno.EINTR and _is_endless(registers, number) and not signals_wait():
-            return _again(registers, number)
         return registers, ""
 
     def _from_restart_block(self, registers: arch.Registers, number: int) -> tuple[arch.Registers, str]:
@@ -74,6 +67,19 @@ class Interruption:
             return -1
         found = arch.call_number_before(code)
         return -1 if found is None else found
+
+
+def undisturbed(registers: arch.Registers, signals_wait: bool) -> arch.Registers:
+    """The registers that the live program gets back: a call that returned EINTR merely because of our stop is made again.
+
+    Args:
+        signals_wait: a signal that is not blocked is pending: then EINTR is what the program must see.
+    """
+    number = ctypes.c_int64(registers[arch.CALL_NUMBER]).value
+    result = ctypes.c_int64(registers[arch.RESULT]).value
+    if number >= 0 and result == -errno.EINTR and not signals_wait and _is_endless(registers, number):
+        return _again(registers, number)[0]
+    return registers
 
 
 def _again(registers: arch.Registers, number: int) -> tuple[arch.Registers, str]:

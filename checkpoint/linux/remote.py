@@ -149,6 +149,14 @@ class BorrowedPages:
         """Whether an address lies inside."""
         return self.address <= address < self.end
 
+    def state(self) -> int:
+        """`IDLE`, `ARMED`, `ENDED` or `ABANDONED`, as it stands in the table."""
+        return int.from_bytes(self._memory.read(self._places.state, 8), "little")
+
+    def abandon(self) -> None:
+        """Leave the pages to the program as ordinary memory: something of its own may still lead there."""
+        self._memory.write(self._places.state, struct.pack("<Q", ABANDONED))
+
     def run(self, tracee: Tracee, batch: Batch, registers: bytes, mask: int) -> Answers:
         """Make the calls of a batch; afterwards the thread stands exactly as before.
 
@@ -250,6 +258,16 @@ class Entered:
     faults: int | None
     inside: int
     why_not: int = 0
+
+
+def reenter(tracee: Tracee, pages: BorrowedPages, registers: bytes, mask: int) -> Entered:
+    """Use pages again that an earlier tracer left; otherwise as `enter`."""
+    batch = Batch(pages.table)
+    index = batch.add("userfaultfd", abi.O_CLOEXEC | abi.O_NONBLOCK | abi.UFFD_USER_MODE_ONLY)
+    inside = pages.run(tracee, batch, registers, mask).results[index]
+    if inside < 0:
+        return Entered(pages, None, -1, -inside)
+    return Entered(pages, _taken(tracee.pid, inside), inside)
 
 
 def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int) -> Entered:
@@ -360,25 +378,32 @@ def vdso_tail(memory: Memory, maps: Sequence[MapsLine]) -> tuple[int, int]:
 
     Raises:
         CaptureError: the process has no vdso.
+    """
+    begin = vdso_image_end(memory, maps)
+    return begin, max(0, next(line.end for line in maps if line.name == "[vdso]") - begin)
+
+
+def vdso_image_end(memory: Memory, maps: Sequence[MapsLine]) -> int:
+    """Where the vdso's own content ends.
+
+    Raises:
+        CaptureError: the process has no vdso.
 
     Source: elf(5): the section headers are the last thing in the image.
     """
     for line in maps:
         if line.name == "[vdso]":
-            image = memory.read(line.start, line.size)
-            header = _ELF64_HEADER.unpack_from(image)
+            header = _ELF64_HEADER.unpack(memory.read(line.start, _ELF64_HEADER.size))
             sections_end = header[6] + header[11] * header[12]
-            used = max(sections_end, len(image.rstrip(b"\0")))
-            used = -(-used // _SPARE_ALIGNMENT) * _SPARE_ALIGNMENT
-            return line.start + used, max(0, line.size - used)
+            return line.start + -(-sections_end // _SPARE_ALIGNMENT) * _SPARE_ALIGNMENT
     raise CaptureError(f"cannot enter pid {memory.pid}: it has no vdso (the kernel was started with vdso=0, or it unmapped it)")
 
 
 # What an earlier tracer left
 
 
-def leftovers(memory: Memory, maps: Sequence[MapsLine]) -> list[tuple[BorrowedPages, int]]:
-    """Pages that an earlier tracer borrowed and could not give back, each with its state (`IDLE`, `ARMED` …)."""
+def leftovers(memory: Memory, maps: Sequence[MapsLine]) -> list[BorrowedPages]:
+    """Pages that earlier tracers borrowed and could not give back; those that were left to the program do not count."""
     found = []
     for code, table in itertools.pairwise(maps):
         alike = code.end == table.start and code.inode == table.inode == 0 and not (code.shared or table.shared)
@@ -386,11 +411,14 @@ def leftovers(memory: Memory, maps: Sequence[MapsLine]) -> list[tuple[BorrowedPa
             continue
         if table.size < TABLE_SIZE or memory.read(code.end - len(MAGIC), len(MAGIC)) != MAGIC:
             continue
-        magic, state, *_ = _HEAD.unpack(memory.read(table.start, _HEAD.size))
-        found.append((BorrowedPages(memory, code.start), state if magic in (MAGIC, bytes(32)) else ABANDONED))
+        pages = BorrowedPages(memory, code.start)
+        if pages.state() != ABANDONED:
+            found.append(pages)
     return found
 
 
-def abandon(pages: BorrowedPages) -> None:
-    """Leave pages to the program as ordinary memory: something of its own may still lead there."""
-    pages._memory.write(pages._places.state, struct.pack("<Q", ABANDONED))
+def is_in_stub(instruction_pointer: int, memory: Memory, maps: Sequence[MapsLine]) -> bool:
+    """Whether a thread stands in the stub of an earlier tracer's first entry: it leaves it by itself."""
+    return any(line.name == "[vdso]" and line.start <= instruction_pointer < line.end for line in maps) and (
+        instruction_pointer >= vdso_image_end(memory, maps)
+    )
