@@ -4,21 +4,38 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from random import Random
+from unittest.mock import patch
 
+from failover.core import speaker
 from failover.core.events import Handover
 from failover.core.types import MS, ComponentSpec, Launch, OnLoss, Rules, WhenAlone
-from tests.simulation.invariants import Invariants
+from tests.simulation.invariants import Broken, Invariants
 from tests.simulation.world import World, pair
 
-TROUBLE_NS = 4_000 * MS
+TROUBLE_NS = 3_000 * MS
 HEALING_NS = 4_000 * MS
+LOOK_NS = 250 * MS
+"""Between two looks whether a healed world is well."""
+
 CRASH = 11
+FINISHES = 0.3
+"""Of the occasions: a life whose programs have all ended shows little."""
+
+NARROW = 5
+"""Every so many-th seed has frames that hold one entry, so that components are told of in turn."""
+
+NARROW_BODY_SIZE = 130
 
 
 def life(seed: int) -> World:
     """Play one seed to its end; raises ``Broken`` when an invariant does not hold."""
     random = Random(seed ^ 0x5EED)
     specs = tuple(_spec(random, index) for index in range(random.choice((1, 1, 2, 3))))
+    with patch.object(speaker, "BODY_SIZE_MAX", speaker.BODY_SIZE_MAX if seed % NARROW else NARROW_BODY_SIZE):
+        return _live(seed, random, specs)
+
+
+def _live(seed: int, random: Random, specs: tuple[ComponentSpec, ...]) -> World:
     invariants = Invariants(safe={spec.name for spec in specs if spec.rules.when_alone is WhenAlone.FREEZE})
     world = World(seed, pair(specs), (invariants,))
     _weather(world, random)
@@ -28,9 +45,14 @@ def life(seed: int) -> World:
         world.at(random.randrange(TROUBLE_NS), _trouble(world, invariants, random, specs))
     world.run(TROUBLE_NS)
     _heal(world)
-    world.run(TROUBLE_NS + HEALING_NS)
-    invariants.ended_well(world)
-    return world
+    while True:
+        world.run(world.now_ns + LOOK_NS)
+        try:
+            invariants.ended_well(world)
+            return world
+        except Broken:
+            if world.now_ns >= TROUBLE_NS + HEALING_NS:
+                raise
 
 
 def _spec(random: Random, index: int) -> ComponentSpec:
@@ -69,6 +91,10 @@ def _trouble(world: World, invariants: Invariants, random: Random, specs: tuple[
         invariants.crashing.add((name, spec.name))
         world.program_ends(name, spec.name, CRASH)
 
+    def finish() -> None:
+        if random.random() < FINISHES:
+            world.program_ends(name, spec.name, 0)
+
     def full() -> None:
         world.robots[name].broken_store = True
         world.after(pause_ns, lambda: setattr(world.robots[name], "broken_store", False))
@@ -83,6 +109,7 @@ def _trouble(world: World, invariants: Invariants, random: Random, specs: tuple[
         lambda: world.jump(name, pause_ns),
         lambda: world.command(name, Handover(world.request(), spec.name)),
         crash,
+        finish,
         full,
     ]
     return random.choice(kinds)

@@ -31,6 +31,7 @@ class Invariants:
     epochs: dict[tuple[str, str], int] = field(default_factory=dict)
     acknowledged: dict[str, Position] = field(default_factory=dict)
     shipped: dict[str, Position] = field(default_factory=dict)
+    owners: dict[tuple[str, int], str] = field(default_factory=dict)
     last: set[str] = field(default_factory=set)
     crashing: set[tuple[str, str]] = field(default_factory=set)
 
@@ -50,19 +51,28 @@ class Invariants:
                 self.shipped[what.component] = what.position
             case acts.Acknowledge():
                 self._acknowledged(world, robot, what)
+            case acts.Start():
+                self._one_primary(world, robot, what)
             case acts.Restore():
+                self._one_primary(world, robot, what)
                 self._not_older(world, robot, what)
             case acts.ReportExit():
                 if what.acknowledged:
                     self.last.add(what.component)
 
     def _one_acts(self, world: World) -> None:
-        for component in {name for robot in world.robots.values() for name in robot.programs}:
+        copies = [name for robot in world.robots.values() for name in robot.programs]
+        for component in {name for name in copies if copies.count(name) > 1}:
             where = world.acting(component)
             if len(where) > 1:
                 self.split.add(component)
                 if component in self.safe:
                     raise _broken(world, f"{component} acts at {' and '.join(where)} at once")
+
+    def _one_primary(self, world: World, robot: str, act: acts.Start | acts.Restore) -> None:
+        owner = self.owners.setdefault((act.component, act.epoch), robot)
+        if owner != robot and act.component in self.safe:
+            raise _broken(world, f"epoch {act.epoch} of {act.component} is {owner}'s and {robot}'s")
 
     def _epochs_grow(self, world: World, robot: str, ballot: Ballot) -> None:
         kept = {record.name: record.epoch for record in ballot.records}
@@ -105,7 +115,7 @@ class Invariants:
     def ended_well(self, world: World) -> None:
         """After healing: each component that goes on acts at one robot, and the other protects it."""
         for component in sorted({record.name for robot in world.robots.values() for record in ballot_of(robot).records}):
-            states = {name: _state(world, name, component) for name in world.robots}
+            states = {name: state_at(world, name, component) for name in world.robots}
             if any(state in (State.FINISHED, State.FAILED, State.RELEASED) for state in states.values()):
                 if len(set(states.values())) > 1:
                     raise _broken(world, f"{component} has ended for some only: {states}")
@@ -125,9 +135,10 @@ class Invariants:
             )
 
 
-def _state(world: World, robot: str, component: str) -> State:
+def state_at(world: World, robot: str, component: str) -> State:
+    """How the component stands at a robot, as that robot says."""
     node = world.robots[robot].node
-    assert node is not None
+    assert node is not None, f"{robot} is down"
     views = node.status(world.local(world.robots[robot])).components
     return next((one.state for one in views if one.name == component), State.ABSENT)
 
