@@ -74,7 +74,7 @@ def snapshot(
     parent: Position | None = None,
     sequence: int = 1,
     generation: int = 1,
-    vmas: tuple[Vma, ...] = (vma(0, 64),),
+    vmas: tuple[Vma, ...] = (vma(0, 128),),
     output: tuple[OutputPiece, ...] = (),
     component: str = COMPONENT,
 ) -> Snapshot:
