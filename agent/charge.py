@@ -234,8 +234,8 @@ class Charge:
         try:
             self.figures.notes = await self.component.protect()
             self.figures.reasons = ()
-        except UnsupportedError as trouble:
-            self.figures.reasons = trouble.reasons
+        except (CheckpointError, KeeperLostError) as trouble:
+            self.figures.reasons = trouble.reasons if isinstance(trouble, UnsupportedError) else (str(trouble),)
             if refuse:
                 await self._let_go()
                 raise

@@ -1,0 +1,102 @@
+"""Two whole robots for a test: agents with keys, in PID and network namespaces of their own where this machine allows it.
+
+They are the demo's own robots (`failover.cli.demo.robots`), so that what people watch and what tests prove is the same thing.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from failover.cli.demo.robots import RobotMachine, Stage, ip_command, means
+from failover.client.control import Output, Result
+from failover.errors import LostAgentError, NoAgentError
+
+PATIENCE_S = 60.0
+"""A generous bound for whatever is waited for; the machine may be busy."""
+
+POLL_S = 0.01
+
+NO_ANSWER = (NoAgentError, LostAgentError)
+"""What a robot whose agent is being replaced says."""
+
+T = TypeVar("T")
+
+
+@contextmanager
+def two_robots(directory: Path) -> Iterator[tuple[RobotMachine, RobotMachine]]:
+    """robot1 and robot2, beating and connected."""
+    with Stage(directory / "stage", means()) as stage:
+        stage.directory.mkdir()
+        stage.start()
+        first, second = stage.robots
+        until(lambda: connected(first) and connected(second), "the robots to hear each other")
+        yield first, second
+
+
+def until(condition: Callable[[], T], what: str) -> T:
+    """The first true value of the condition; fails after `PATIENCE_S`."""
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        value = condition()
+        if value:
+            return value
+        assert time.monotonic() < deadline, f"waited {PATIENCE_S:.0f} s in vain for {what}"
+        time.sleep(POLL_S)
+
+
+def connected(robot: RobotMachine) -> bool:
+    """Whether it hears its peer's beats and has a bulk lane to it."""
+    (peer,) = robot.status()["peers"]
+    return bool(peer["state"] == "live" and peer["hears_us"] and peer["lane"] == "connected")
+
+
+def run(robot: RobotMachine, name: str, *argv: str, env: dict[str, str] | None = None, cwd: str = "/") -> dict[str, Any]:
+    """Start a program under protection; returns what `failover run` says at once."""
+    with robot.control() as link:
+        environment = {"PATH": "/usr/bin:/bin", "LC_ALL": "C", **(env or {})}
+        return link.ask("run", argv=list(argv), name=name, env=environment, cwd=cwd, wait=False)
+
+
+def component(robot: RobotMachine, name: str) -> dict[str, Any]:
+    """The component as that robot shows it; empty where it is unknown."""
+    return next((one for one in robot.status()["components"] if one["name"].endswith("/" + name)), {})
+
+
+def checkpoints(robot: RobotMachine, name: str) -> int:
+    """Snapshots of the component that came to, or were taken on, this robot."""
+    return int(component(robot, name).get("snapshots") or 0)
+
+
+def output(robot: RobotMachine, name: str) -> bytes:
+    """What the component wrote to its standard output, as far as no takeover takes it back."""
+    collected = bytearray()
+    with robot.control() as link:
+        for reply in link.stream("logs", name=name):
+            if isinstance(reply, Output) and reply.stream == 1:
+                assert reply.offset == len(collected), "the stream has a gap or a repetition"
+                collected += reply.content
+            elif isinstance(reply, Result):
+                break
+    return bytes(collected)
+
+
+def result(robot: RobotMachine, name: str) -> dict[str, Any]:
+    """Wait for the component's end and return what `failover logs --follow` ends with."""
+    with robot.control() as link:
+        return link.ask("logs", name=name, follow=True)
+
+
+def cable(robot: RobotMachine, state: str) -> None:
+    """Plug the network cable "up" or "down"; needs robots with networks of their own."""
+    enter = ["nsenter", "--net", f"--target={robot.process.pid}", ip_command() or "ip"]
+    subprocess.run([*enter, "link", "set", "wire", state], check=True)
+
+
+def has_cable() -> bool:
+    """Whether the robots have networks of their own here."""
+    return means().own_network

@@ -1,0 +1,114 @@
+"""Two robots, a program that nobody prepared, and what happens to them."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.e2e import robots
+from tests.e2e.robots import RobotMachine
+
+COUNT = "import time\ni = 0\nwhile i < {limit}:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.01)\n"
+SNAPSHOTS = 5
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> Iterator[tuple[RobotMachine, RobotMachine]]:
+    with robots.two_robots(tmp_path) as both:
+        yield both
+
+
+def start_counting(robot: RobotMachine, limit: int) -> None:
+    robots.run(robot, "count", "/usr/bin/python3", "-S", "-c", COUNT.format(limit=limit))
+
+
+def numbers(content: bytes) -> list[int]:
+    return [int(line) for line in content.split()]
+
+
+def test_a_program_outlives_its_robot_and_its_output_has_no_gap(pair: tuple[RobotMachine, RobotMachine]) -> None:
+    first, second = pair
+    start_counting(first, 1_000_000)
+    robots.until(lambda: robots.checkpoints(second, "count") >= SNAPSHOTS, "checkpoints at robot2")
+    before = len(numbers(robots.output(second, "count")))
+    first.cut_power()
+    robots.until(lambda: robots.component(second, "count").get("role") == "primary", "robot2 to take over")
+    robots.until(lambda: len(numbers(robots.output(second, "count"))) > before + 20, "the count to go on")
+    counted = numbers(robots.output(second, "count"))
+    assert counted == list(range(len(counted)))
+    shown = robots.component(second, "count")
+    assert (shown["restores"], shown["epoch"]) == (1, 2)
+    assert shown["outage_ms"] > 0
+
+
+def test_the_end_of_a_program_is_a_record_on_both_robots(pair: tuple[RobotMachine, RobotMachine]) -> None:
+    first, second = pair
+    robots.run(first, "brief", "/bin/sh", "-c", "echo out; echo err >&2; exit 7")
+    assert os.waitstatus_to_exitcode(robots.result(first, "brief")["exit_status"]) == 7
+    robots.until(lambda: robots.component(second, "brief").get("exit_status") == 7 << 8, "robot2 to know the end")
+    assert robots.output(first, "brief") == b"out\n"
+
+
+def test_a_program_that_crashes_goes_on_in_place(pair: tuple[RobotMachine, RobotMachine]) -> None:
+    first, second = pair
+    start_counting(first, 1_000_000)
+    robots.until(lambda: robots.checkpoints(second, "count") >= SNAPSHOTS, "checkpoints at robot2")
+    before = len(numbers(robots.output(first, "count")))
+    with first.control() as link:
+        inner = link.ask("status")["components"][0]["pid"]
+    victim = host_pid(first, inner)
+    os.kill(victim, signal.SIGSEGV)
+    robots.until(lambda: robots.component(first, "count").get("restores") == 1, "robot1 to resume it")
+    robots.until(lambda: len(numbers(robots.output(first, "count"))) > before + 20, "the count to go on")
+    counted = numbers(robots.output(first, "count"))
+    assert counted == list(range(len(counted)))
+
+
+def test_components_outlive_an_agent_that_is_killed(pair: tuple[RobotMachine, RobotMachine]) -> None:
+    first, second = pair
+    start_counting(first, 1_000_000)
+    robots.until(lambda: robots.checkpoints(second, "count") >= SNAPSHOTS, "checkpoints at robot2")
+    lanes = host_pid(first, first.status()["lanes_pid"])
+    pid = robots.component(first, "count")["pid"]
+    os.kill(lanes, signal.SIGKILL)
+    robots.until(lambda: answers(first) and robots.component(first, "count").get("pid") == pid, "the guard to be found again")
+    taken = robots.checkpoints(first, "count")
+    robots.until(lambda: robots.checkpoints(first, "count") > taken + SNAPSHOTS, "snapshots to go on")
+    counted = numbers(robots.output(second, "count"))
+    assert counted == list(range(len(counted)))
+    assert robots.component(first, "count")["restores"] == 0
+
+
+def answers(robot: RobotMachine) -> bool:
+    try:
+        robot.status()
+    except robots.NO_ANSWER:
+        return False
+    return True
+
+
+def host_pid(robot: RobotMachine, inner: int) -> int:
+    """The process that the robot itself calls ``inner``."""
+    for pid in robot.processes():
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        named = next(line for line in lines if line.startswith("NSpid:")).split()[1:]
+        base = len(os.readlink(f"/proc/{robot.process.pid}/ns/pid")) and 1
+        if (len(named) > base and int(named[base]) == inner) or (len(named) == 1 and int(named[0]) == inner):
+            return pid
+    raise AssertionError(f"{robot.name} has no process {inner}")
+
+
+@pytest.mark.root
+def test_a_cable_that_is_cut_is_noticed_and_one_that_is_back_too(pair: tuple[RobotMachine, RobotMachine]) -> None:
+    if not robots.has_cable():
+        pytest.skip("needs network namespaces: the robots share the loopback here")
+    first, second = pair
+    robots.cable(first, "down")
+    for robot in pair:
+        robots.until(lambda robot=robot: robot.status()["peers"][0]["state"] == "dead", "the silence to be noticed")  # type: ignore[misc]
+    robots.cable(first, "up")
+    robots.until(lambda: robots.connected(first) and robots.connected(second), "both to hear each other again")
