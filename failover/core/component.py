@@ -38,7 +38,6 @@ class Cause(enum.StrEnum):
     FINISH = "records its end"
     FAIL = "records its failure"
     RELEASE = "lets it go"
-    FORGET = "forgets it"
 
 
 _RUNNING = (State.STARTING, State.TAKING_OVER, State.PRIMARY, State.FROZEN, State.HANDING_OVER, State.RECOVERING)
@@ -66,7 +65,6 @@ TABLE: dict[tuple[State, Cause], State] = {
     **{(state, Cause.FINISH): State.FINISHED for state in (*_RUNNING, *_IDLE, State.CLAIMING)},
     **{(state, Cause.FAIL): State.FAILED for state in (*_RUNNING, *_IDLE, State.CLAIMING)},
     **{(state, Cause.RELEASE): State.RELEASED for state in (*_RUNNING, *_IDLE, State.CLAIMING)},
-    (State.STANDBY, Cause.FORGET): State.ABSENT,
 }
 """Every arrow there is. What is not here does not happen: ``Component.move`` asserts it."""
 

@@ -34,13 +34,15 @@ class Story:
     rules: Rules = field(default_factory=Rules)
     failures: list[str] = field(default_factory=list)
     world: World = field(init=False)
+    invariants: Invariants = field(init=False)
 
     def play(self, text: str) -> World:
         """Play the lines in order; raises AssertionError with the story when an expectation is not met."""
         lines = [words for line in text.splitlines() if (words := line.split("#")[0].split())]
         if lines[0][0] == "rule":
             self.rules = _rules(lines.pop(0)[1:])
-        self.world = World(1, pair(), (Invariants(safe={COMPONENT} if self.rules.when_alone == "freeze" else set()),))
+        self.invariants = Invariants(safe={COMPONENT} if self.rules.when_alone == "freeze" else set())
+        self.world = World(1, pair(), (self.invariants,))
         for at_ms, verb, *arguments in lines:
             self.world.run(int(at_ms) * MS)
             self._play(verb, arguments)
@@ -64,6 +66,7 @@ class Story:
             case "handover":
                 world.command(robot, Handover(world.request(), COMPONENT))
             case "exit":
+                self.invariants.crashing.add((robot, COMPONENT))
                 world.program_ends(robot, COMPONENT, int(arguments[1]))
             case "stall":
                 world.stall(robot, int(arguments[1]) * MS)

@@ -1,0 +1,145 @@
+"""Single rules of the node, one event at a time. Whole lives are in ``tests/simulation``."""
+
+from __future__ import annotations
+
+import pytest
+
+from checkpoint.model import Position
+from failover.core import acts, ballot
+from failover.core.component import TABLE, Cause
+from failover.core.events import Captured, CaptureFailed, Received, Release, Run, Started, Tick
+from failover.core.membership import Peer
+from failover.core.messages import Beat, Echo, Entry
+from failover.core.node import Node
+from failover.core.types import MS, Ballot, ComponentSpec, Config, Held, Launch, OnUnsupported, Record, Rules, State
+from failover.errors import RulesError
+
+SPEC = ComponentSpec("/lab/x", launch=Launch(("x",)))
+ALONE = Config("robot1", grace_ms=300)
+PAIR = Config("robot1", ("robot2",), grace_ms=300)
+
+
+def running(node: Node, spec: ComponentSpec = SPEC) -> acts.Ready:
+    """Start a component at a robot that is alone."""
+    node.step(Run(1, spec), 0)
+    return node.step(Started(spec.name, 1), 1 * MS)
+
+
+def only(ready: acts.Ready, kind: type[acts.Act]) -> list[acts.Act]:
+    return [act for act in ready.act if isinstance(act, kind)]
+
+
+def test_the_ballot_holds_the_claim_that_the_same_step_tells_of() -> None:
+    ready = Node(ALONE, 1, Ballot(), 0).step(Run(1, SPEC), 0)
+    assert ready.persist is not None and ready.persist.records[0].epoch == ready.send[0].entries[0].epoch == 1
+
+
+def test_a_ballot_survives_its_bytes() -> None:
+    written = Ballot((Record("/lab/x", 3, "robot1", State.PRIMARY, ("robot2",), spec=SPEC),))
+    assert ballot.decode(ballot.encode(written)) == written
+    assert ballot.decode(b"") == Ballot()
+    with pytest.raises(RulesError, match="cannot read the ballot"):
+        ballot.decode(b"{")
+
+
+def test_an_event_of_an_older_epoch_changes_nothing() -> None:
+    node = Node(ALONE, 1, Ballot(), 0)
+    running(node)
+    late = Captured("/lab/x", 0, Position(64, 1, b"d"), None)
+    assert not only(node.step(late, 2 * MS), acts.Acknowledge)
+
+
+def test_one_capture_is_in_flight_at_a_time() -> None:
+    node = Node(ALONE, 1, Ballot(), 0)
+    assert len(only(running(node), acts.Capture)) == 1
+    assert not any(only(node.step(Tick(), at * MS), acts.Capture) for at in range(2, 5_000, 20))
+
+
+def test_alone_a_capture_counts_from_this_robots_own_store() -> None:
+    node = Node(ALONE, 1, Ballot(), 0)
+    (capture,) = only(running(node), acts.Capture)
+    assert isinstance(capture, acts.Capture) and capture.base
+    position = Position(capture.generation, capture.sequence, b"d")
+    assert only(node.step(Captured("/lab/x", 1, position, None), 5 * MS), acts.Acknowledge)
+    (later,) = only(node.step(Tick(), 2_000 * MS), acts.Capture)
+    assert isinstance(later, acts.Capture) and not later.base
+
+
+def test_what_cannot_be_captured_degrades_and_names_the_reason() -> None:
+    node = Node(ALONE, 1, Ballot(), 0)
+    running(node)
+    node.step(CaptureFailed("/lab/x", 1, "fd 7 is a socket", unsupported=True), 5 * MS)
+    (seen,) = node.status(6 * MS).components
+    assert seen.protection == "degraded" and "fd 7 is a socket" in seen.notes[0]
+    assert only(node.step(Tick(), 2_000 * MS), acts.Capture)
+
+
+def test_stop_protecting_means_no_more_captures() -> None:
+    spec = ComponentSpec("/lab/x", launch=Launch(("x",)), rules=Rules(on_unsupported=OnUnsupported.STOP_PROTECTING))
+    node = Node(ALONE, 1, Ballot(), 0)
+    running(node, spec)
+    node.step(CaptureFailed("/lab/x", 1, "fd 7 is a socket", unsupported=True), 5 * MS)
+    assert not only(node.step(Tick(), 5_000 * MS), acts.Capture)
+    assert node.status(5_000 * MS).components[0].protection == "stopped"
+
+
+def test_a_beat_is_due_all_the_time() -> None:
+    node = Node(PAIR, 1, Ballot(), 0)
+    beats, now = 0, 0
+    while now < 1_000 * MS:
+        beats += len(node.step(Tick(), now).send)
+        now = node.next_deadline_ns()
+    assert beats == 1_000 // PAIR.beat_ms
+
+
+def test_a_late_own_loop_accuses_nobody() -> None:
+    node = Node(PAIR, 1, Ballot(), 0)
+    node.step(Received(Beat("robot2", 1, 1), "wire"), 1 * MS)
+    node.step(Tick(), 5_000 * MS)
+    assert node.status(5_000 * MS).peers[0].state != "dead"
+
+
+def test_unknown_states_and_strangers_change_nothing() -> None:
+    node = Node(PAIR, 1, Ballot(), 0)
+    mad = Beat("robot2", 1, 1, total=1, entries=(Entry("/lab/x", 99, 4, "robot2"),))
+    node.step(Received(mad, "wire"), 1 * MS)
+    node.step(Received(Beat("nobody", 1, 1, total=1, entries=(Entry("/lab/y", 3, 4, "nobody"),)), "wire"), 2 * MS)
+    assert [one.name for one in node.status(3 * MS).components] == []
+
+
+def test_a_restarted_robot_does_not_start_anew_what_it_gave_away() -> None:
+    record = Record("/lab/x", 3, "robot1", State.PRIMARY, ("robot2",), spec=SPEC)
+    node = Node(PAIR, 2, Ballot((record,)), 0, (Held("/lab/x", (Position(192, 5, b"d"),)),))
+    ready = node.step(Tick(), 100 * MS)
+    assert not only(ready, acts.Restore) and not only(ready, acts.Start)
+
+
+def test_an_entry_from_before_the_last_change_is_not_acted_on() -> None:
+    peer = Peer("robot2", 0)
+    own = ("robot1", 1)
+    peer.take(Beat("robot2", 1, 1, 1, 0, 2, (), (Entry("/lab/x", 9, 1, "robot1"),)), own, "wire", 0)
+    assert peer.entry("/lab/x") is not None
+    peer.take(Beat("robot2", 1, 2, 2, 0, 2, (), (Entry("/lab/y", 9, 1, "robot1"),)), own, "wire", 0)
+    assert peer.entry("/lab/x") is None and not peer.complete
+
+
+def test_an_echo_of_an_earlier_life_gives_no_lease() -> None:
+    peer = Peer("robot2", 0)
+    peer.take(Beat("robot2", 1, 1, echoes=(Echo("robot1", 1, 90),)), ("robot1", 2), "wire", 0)
+    assert peer.echoed == 0
+
+
+@pytest.mark.parametrize("settings", [{"beat_ms": 0}, {"lease_ms": 79}, {"margin_percent": 0}, {"peers": ("robot1",)}])
+def test_a_configuration_that_contradicts_itself_is_refused(settings: dict[str, object]) -> None:
+    with pytest.raises(RulesError):
+        Config("robot1", **settings)  # type: ignore[arg-type]
+
+
+def test_every_state_can_be_reached_and_every_cause_is_used() -> None:
+    assert set(TABLE.values()) == set(State) - {State.ABSENT}
+    assert {cause for _, cause in TABLE} == set(Cause)
+
+
+def test_a_command_about_an_unknown_component_is_answered() -> None:
+    (answer,) = Node(ALONE, 1, Ballot(), 0).step(Release(4, "/lab/z"), 0).act
+    assert isinstance(answer, acts.Answer) and not answer.ok and "failover status" in answer.sentence
