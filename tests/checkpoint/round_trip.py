@@ -54,12 +54,12 @@ class Program:
     @property
     def output(self) -> str:
         """All that it has written to its standard output so far."""
-        return (self.directory / "out").read_text()
+        return (self.directory / "out").read_text(errors="replace")
 
     @property
     def complaints(self) -> str:
         """All that it has written to its standard error so far."""
-        return (self.directory / "err").read_text()
+        return (self.directory / "err").read_text(errors="replace")
 
     def poll(self) -> int | None:
         """Its exit code if it has ended, negative for a signal."""
@@ -121,8 +121,12 @@ def start(argv: Sequence[str | Path], directory: Path, *, env: Mapping[str, str]
 
 
 def start_tracee(program: Path, directory: Path, *arguments: str) -> Program:
-    """Start a tracee and wait until it is ready; skips the test where the tracee says that it cannot."""
-    tracee = start([program, directory / "go", *arguments], directory)
+    """Start a tracee and wait until it is ready; skips the test where the tracee says that it cannot.
+
+    It looks for the go file by its relative name, so that it finds it as whatever user it has become.
+    """
+    directory.chmod(0o755)
+    tracee = start([program, "go", *arguments], directory)
     try:
         tracee.wait_for_line("ready")
     except EndedError:
