@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from checkpoint.linux import abi
-from checkpoint.linux.procfs import Status, TimerLine
+from checkpoint.linux.procfs import TimerLine
 from checkpoint.linux.remote import Answers, Batch
 from checkpoint.model import Clocks, IntervalTimer, PosixTimer, SignalAction
 
@@ -48,14 +48,14 @@ class Inquiry:
     """One set of questions; `read` understands the answers to exactly these.
 
     Args:
-        status: read while the process stands still: says which signals have an action of their own.
+        special: signals with an action of their own, bit 0 is signal 1.
     """
 
-    def __init__(self, table: int, status: Status, timers: Sequence[TimerLine]) -> None:
+    def __init__(self, table: int, special: int, timers: Sequence[TimerLine]) -> None:
         self.batch = Batch(table)
         self._timers = timers
         self._clocks = [self._writes(16, "clock_gettime", clock) for clock in (CLOCK_REALTIME, CLOCK_MONOTONIC, CLOCK_BOOTTIME)]
-        special = status.caught | status.ignored | 1 << (SIGCHLD - 1)
+        special |= 1 << (SIGCHLD - 1)
         self._actions = [
             (number, self._asks_action(number)) for number in range(1, abi.SIGNAL_COUNT + 1) if special >> (number - 1) & 1
         ]
@@ -145,3 +145,42 @@ def _posix(line: TimerLine, words: tuple[int, ...], overrun: int) -> PosixTimer:
         value_ns=value_s * NS_PER_S + value_ns,
         overrun=max(overrun, 0),
     )
+
+
+SI_TIMER: Final = -2
+SI_KERNEL: Final = 0x80
+INTERVAL_SIGNALS: Final = (14, 26, 27)
+"""SIGALRM, SIGVTALRM, SIGPROF: of the interval timers 0, 1, 2."""
+
+
+def rearmed(told: Told, before: Sequence[bytes], after: Sequence[bytes]) -> Told:
+    """Timers that went off while the batch ran are set to go off at once: their signal is not in the snapshot.
+
+    A periodic timer whose signal was pending before has its next period before it: the kernel winds it up only when the signal
+    is taken.
+
+    Args:
+        before, after: every pending siginfo, at the freeze and after the batch.
+    """
+    fresh = [siginfo for siginfo in after if siginfo not in before]
+    went_off = {number for number, code, _ in map(_origin, fresh) if code == SI_KERNEL}
+    expired = {timer for _, code, timer in map(_origin, fresh) if code == SI_TIMER}
+    intervals = [timer if timer.value_us else _wound(timer, went_off) for timer in told.interval_timers]
+    known = {timer.which for timer in intervals}
+    intervals += [
+        IntervalTimer(which, 0, 1) for which, number in enumerate(INTERVAL_SIGNALS) if number in went_off and which not in known
+    ]
+    posix = [
+        replace(timer, value_ns=1) if not timer.value_ns and timer.timer_id in expired else timer for timer in told.posix_timers
+    ]
+    return replace(told, interval_timers=tuple(intervals), posix_timers=tuple(posix))
+
+
+def _wound(timer: IntervalTimer, went_off: set[int]) -> IntervalTimer:
+    return replace(timer, value_us=1 if INTERVAL_SIGNALS[timer.which] in went_off else timer.interval_us)
+
+
+def _origin(siginfo: bytes) -> tuple[int, int, int]:
+    """Signal number, code and timer of a siginfo. Source: struct siginfo of asm-generic/siginfo.h."""
+    number, _, code, timer = struct.unpack_from("<iii4xi", siginfo)
+    return number, code, timer

@@ -34,7 +34,7 @@ from checkpoint.chain import position_of
 from checkpoint.engine import CaptureOrder, Streams
 from checkpoint.engines import probe as probing
 from checkpoint.engines.identities import Identities
-from checkpoint.engines.inquiry import Inquiry, Told
+from checkpoint.engines.inquiry import Inquiry, Told, rearmed
 from checkpoint.engines.outputs import Outputs, Totals
 from checkpoint.engines.restart import Interruption, outside_critical_section, undisturbed
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, UnsupportedError
@@ -62,6 +62,8 @@ LIMIT_COUNT: Final = 16
 """RLIMIT numbers of Linux. Source: asm-generic/resource.h."""
 US_PER_NS: Final = 1000
 EMPTY_CONTENT: Final = bytearray()
+BUFFER_SIZE: Final = 8 << 20
+"""Bytes that a freeze may copy without asking for memory first."""
 LEAVE_TIMEOUT_S: Final = 0.5
 """How long a program may take to leave the code of a tracer that died in the middle: that waits 100 ms at most."""
 LEAVE_PAUSE_S: Final = 0.01
@@ -72,7 +74,9 @@ class Frozen:
     """Everything that one freeze brought home; nothing in it needs the process any more.
 
     Attributes:
-        written, cleared: relative to the acknowledged position, see `dirty.Scan`; ``content`` are the bytes of ``written``.
+        written, cleared: relative to the acknowledged position, see `dirty.Scan`.
+        content: begins with the bytes of ``written``.
+        status, stat: of /proc, unparsed.
         freeze_us: how long the program stood still.
     """
 
@@ -85,8 +89,8 @@ class Frozen:
     settled: arch.Registers
     interrupted: str
     lines: tuple[MapsLine, ...]
-    status: Status
-    stat: Stat
+    status: bytes
+    stat: bytes
     told: Told
     opened: tuple[OpenFile, ...]
     totals: Totals
@@ -130,7 +134,13 @@ class PtraceSession:
         self._tracker = tracker
         self._shared = SharedPages(pid)
         self._maps = MapsReader(pid)
-        self._maps_seen: tuple[MapsLine, ...] = ()
+        self._lines: tuple[MapsLine, ...] = ()
+        self._private: list[MapsLine] = []
+        self._shared_lines: list[MapsLine] = []
+        self._had_shared = False
+        self._inquiry: Inquiry | None = None
+        self._inquiry_key: tuple[object, ...] = ()
+        self._buffer = bytearray(BUFFER_SIZE)
         self._flags: dict[int, tuple[str, ...]] = {}
         self._flags_of: tuple[MapsLine, ...] = ()
         self._identities = Identities(pid)
@@ -196,6 +206,16 @@ class PtraceSession:
             frozen = self._frozen_look(base=copied is not None, hold=order.hold)
         except ProcessGoneError as error:
             raise self._gone(error) from error
+        frozen = replace(frozen, content=frozen.content[: pages.total_size(frozen.written)])
+        try:
+            return self._described(order, parent, copied, frozen)
+        except (FileNotFoundError, ProcessLookupError) as error:
+            raise ProcessGoneError(f"{self.component} (pid {self.pid}) ended while it was being described") from error
+
+    def _described(
+        self, order: CaptureOrder, parent: Position | None, copied: tuple[Words, bytearray] | None, frozen: Frozen
+    ) -> Snapshot:
+        """The snapshot of what a freeze brought home, while the program runs."""
         held = look(frozen.opened, self._outputs.surroundings if self._outputs else Surroundings())
         reasons = (*held.reasons, *self._reasons_of(frozen))
         if reasons:
@@ -232,7 +252,8 @@ class PtraceSession:
         or is coming, and is then found by that scan, too.
         """
         self._maps.refresh()
-        lines = self._private_lines()
+        self._learn_mappings()
+        lines = self._private
         if not self._based:
             self._tracker.arm(lines)
             self._based = True
@@ -287,22 +308,23 @@ class PtraceSession:
     def _look(self, *, base: bool) -> Frozen:
         """Everything that needs the program to stand still."""
         tracee = self._tracee
-        pending, shared_pending = tracee.pending(shared=False), tracee.pending(shared=True)
+        status = procfs.read_bytes(self.pid, "status")
+        special, waits_here, waits_shared = procfs.signal_sets(status)
+        pending = tracee.pending(shared=False) if waits_here else ()
+        shared_pending = tracee.pending(shared=True) if waits_shared else ()
         mask, rseq = tracee.signal_mask(), tracee.rseq()
         decoded = _where_it_stands(tracee, mask, (*pending, *shared_pending), rseq)
         if self._borrowed.holds(decoded[arch.INSTRUCTION_POINTER]):
             raise CaptureError(f"pid {self.pid} still stands in code of an earlier look; capture it again in a moment")
         registers = arch.encode_registers(decoded)
         changed = self._maps.refresh()
-        lines = self._private_lines()
-        scan = self._tracker.scan(lines, changed=changed)
-        shared = self._shared.scan([line for line in self._maps.lines if line.shared])
-        self._remember(dirty.Scan(pages.union(scan.written, shared.written), pages.union(scan.cleared, shared.cleared)))
+        if changed:
+            self._learn_mappings()
+        self._remember(self._scan(changed=changed))
         written, cleared = self._since_acknowledged(base=base)
-        content = tracee.memory.read_pages(written) if len(written) else EMPTY_CONTENT
-        status, timers = procfs.status(self.pid), procfs.parse_timers(procfs.read_text(self.pid, "timers"))
-        inquiry = Inquiry(self._borrowed.table, status, timers)
-        told = inquiry.read(self._borrowed.run(tracee, inquiry.batch, registers, mask))
+        content = tracee.memory.read_pages(written, self._buffer) if len(written) else EMPTY_CONTENT
+        told = self._ask(special, registers, mask)
+        waiting = (*tracee.pending(shared=False), *tracee.pending(shared=True)) if self._has_signals() else ()
         settled, interrupted = self._interruption.settled(decoded)
         return Frozen(
             registers=registers,
@@ -313,10 +335,10 @@ class PtraceSession:
             rseq=rseq,
             settled=settled,
             interrupted=interrupted,
-            lines=tuple(line for line in self._maps.lines if not self._borrowed.holds(line.start)),
+            lines=self._lines,
             status=status,
-            stat=procfs.stat(self.pid),
-            told=told,
+            stat=procfs.read_bytes(self.pid, "stat"),
+            told=rearmed(told, (*pending, *shared_pending), waiting),
             opened=with_contents(gather(self.pid)),
             totals=self._outputs.totals() if self._outputs else (0, 0),
             written=written,
@@ -325,8 +347,30 @@ class PtraceSession:
             freeze_us=0,
         )
 
-    def _private_lines(self) -> list[MapsLine]:
-        return [line for line in self._maps.lines if dirty.is_private(line) and not self._borrowed.holds(line.start)]
+    def _learn_mappings(self) -> None:
+        """Sort the mappings, after they have changed."""
+        self._lines = tuple(line for line in self._maps.lines if not self._borrowed.holds(line.start))
+        self._private = [line for line in self._lines if dirty.is_private(line)]
+        self._shared_lines = [line for line in self._lines if line.shared and line.name not in dirty.NOT_CARRIED]
+
+    def _scan(self, *, changed: bool) -> dirty.Scan:
+        scan = self._tracker.scan(self._private, changed=changed)
+        if not self._shared_lines and not self._had_shared:
+            return scan
+        self._had_shared = bool(self._shared_lines)
+        shared = self._shared.scan(self._shared_lines)
+        return dirty.Scan(pages.union(scan.written, shared.written), pages.union(scan.cleared, shared.cleared))
+
+    def _ask(self, special: int, registers: bytes, mask: int) -> Told:
+        """Have the process say what only it can; the questions stay the same while its signals and timers do."""
+        timers = procfs.parse_timers(text) if (text := procfs.read_text(self.pid, "timers")) else ()
+        key = (special, timers)
+        if self._inquiry is None or self._inquiry_key != key:
+            self._inquiry, self._inquiry_key = Inquiry(self._borrowed.table, special, timers), key
+        return self._inquiry.read(self._borrowed.run(self._tracee, self._inquiry.batch, registers, mask))
+
+    def _has_signals(self) -> bool:
+        return any(procfs.signal_sets(procfs.read_bytes(self.pid, "status"))[1:])
 
     def _read_flags(self) -> None:
         """VmFlags cost a walk over all pages: read while the program runs, and only when the mappings changed."""
@@ -345,11 +389,13 @@ class PtraceSession:
     def _since_acknowledged(self, *, base: bool) -> tuple[Words, Words]:
         """What a delta must carry: the union of all scans since. A base needs the last scan alone."""
         scans = self._unacknowledged[-1:] if base else self._unacknowledged
+        if len(scans) == 1:
+            return scans[0].written, scans[0].cleared
         written, cleared = NONE, NONE
         for one in scans:
             written = pages.union(pages.difference(written, one.cleared), one.written) if len(written) else one.written
             cleared = pages.union(cleared, one.cleared) if len(cleared) else one.cleared
-        mapped = dirty.extents_of([line for line in self._maps.lines if line.name not in dirty.NOT_CARRIED])
+        mapped = dirty.extents_of([line for line in self._lines if line.name not in dirty.NOT_CARRIED])
         return pages.intersection(written, mapped), cleared
 
     # Describing, while the program runs
@@ -359,7 +405,7 @@ class PtraceSession:
         try:
             self._read_flags()
             of_mappings = (unsupported.refuse_mapping(line, self._foreign_flags(line)) for line in frozen.lines)
-            return (*unsupported.refuse_process(self.pid, frozen.status), *(reason for reason in of_mappings if reason))
+            return (*unsupported.refuse_process(self.pid, _status_of(frozen)), *(reason for reason in of_mappings if reason))
         except ProcessGoneError:
             return ()  # the picture was taken before it ended
 
@@ -407,10 +453,10 @@ class PtraceSession:
         )
 
     def _thread_state(self, frozen: Frozen) -> ThreadState:
-        told, stat = frozen.told, frozen.stat
+        told, stat, status = frozen.told, _stat_of(frozen), _status_of(frozen)
         return ThreadState(
-            tid=frozen.status.pids[-1],
-            name=frozen.status.name,
+            tid=status.pids[-1],
+            name=status.name,
             registers={"prstatus": arch.encode_registers(frozen.settled), "xstate": frozen.xstate},
             signal_mask=frozen.mask,
             pending=frozen.pending,
@@ -428,7 +474,7 @@ class PtraceSession:
         )
 
     def _process_state(self, frozen: Frozen) -> ProcessState:
-        status, told = frozen.status, frozen.told
+        status, told = _status_of(frozen), frozen.told
         return ProcessState(
             pid=status.pids[-1],
             ppid=status.ppid if len(status.pids) == 1 else 0,
@@ -436,7 +482,7 @@ class PtraceSession:
             sid=status.sids[-1] if status.sids else 0,
             executable=self._identities.executable(),
             arguments=tuple(os.fsdecode(procfs.read_bytes(self.pid, "cmdline")).split("\0")[:-1]),
-            layout=_layout(frozen.stat, told, procfs.read_bytes(self.pid, "auxv")),
+            layout=_layout(_stat_of(frozen), told, procfs.read_bytes(self.pid, "auxv")),
             working_directory=procfs.read_link(self.pid, "cwd"),
             root_directory=procfs.read_link(self.pid, "root"),
             umask=status.umask,
@@ -579,6 +625,14 @@ def _merged(copied: tuple[Words, bytearray], frozen: Frozen) -> Frozen:
         cleared=NONE,
         content=bytearray(rows.data.cast("B")),
     )
+
+
+def _status_of(frozen: Frozen) -> Status:
+    return procfs.parse_status(os.fsdecode(frozen.status))
+
+
+def _stat_of(frozen: Frozen) -> Stat:
+    return procfs.parse_stat(os.fsdecode(frozen.stat))
 
 
 def _unblocked(pending: tuple[bytes, ...], mask: int) -> list[int]:

@@ -321,15 +321,23 @@ class PagemapTracker:
         """Tell pages that hold something from holes and from a file's own: (to read, to clear)."""
         if not len(written):
             return NONE, NONE
-        doubtful = written[(written[:, 1] - written[:, 0]) > LONG_RUN]
-        of_files = pages.intersection(written, self._files) if len(self._files) else NONE
-        if len(of_files):
-            doubtful = pages.union(doubtful, of_files)
+        is_doubtful = (written[:, 1] - written[:, 0]) > LONG_RUN
+        if len(self._files):
+            is_doubtful |= touching(written, self._files)
+        doubtful = written[is_doubtful]
         if not len(doubtful):
             return written, NONE
         real = self._scanner.existing(doubtful)
         empty = pages.difference(doubtful, real)
         return pages.difference(written, empty), empty
+
+
+def touching(extents: Words, others: Words) -> pages.Flags:
+    """For each extent whether it shares a page with the other set."""
+    first = np.searchsorted(others[:, 1], extents[:, 0], side="right")
+    begin = others[np.minimum(first, len(others) - 1), 0]
+    touch: pages.Flags = (first < len(others)) & (begin < extents[:, 1])
+    return touch
 
 
 def _inside(existing: Words, line: MapsLine) -> Words:

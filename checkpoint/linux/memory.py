@@ -64,8 +64,11 @@ class Memory:
         """
         self._transfer(abi.process_vm_readv, "read", ranges, address_of(buffer))
 
-    def read_pages(self, extents: Ranges) -> bytearray:
+    def read_pages(self, extents: Ranges, buffer: bytearray | None = None) -> bytearray:
         """Read the pages of a set, rows ``[start, end)``, in order; pages that nobody may read are read all the same.
+
+        Args:
+            buffer: to be filled from its beginning, if it is long enough; otherwise a new one is made.
 
         Raises:
             ProcessGoneError: the process has ended.
@@ -73,8 +76,10 @@ class Memory:
         """
         ranges = extents.copy()
         ranges[:, 1] -= ranges[:, 0]
-        buffer = bytearray(int(ranges[:, 1].sum()))
-        if not buffer:
+        size = int(ranges[:, 1].sum())
+        if buffer is None or len(buffer) < size:
+            buffer = bytearray(size)
+        if not size:
             return buffer
         try:
             self.read_into(ranges, buffer)

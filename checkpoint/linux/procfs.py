@@ -258,6 +258,16 @@ def _five(words: tuple[int, ...]) -> tuple[int, int, int, int, int]:
     return first, second, third, fourth, fifth
 
 
+def signal_sets(text: bytes) -> tuple[int, int, int]:
+    """Of an unparsed /proc/PID/status: signals with an action of their own, pending for the thread, pending for the process."""
+
+    def mask(key: bytes) -> int:
+        begin = text.index(key) + len(key)
+        return int(text[begin : begin + 16], 16)
+
+    return mask(b"\nSigCgt:\t") | mask(b"\nSigIgn:\t"), mask(b"\nSigPnd:\t"), mask(b"\nShdPnd:\t")
+
+
 def status(pid: int) -> Status:
     """Read and parse /proc/PID/status."""
     return parse_status(read_text(pid, "status"))

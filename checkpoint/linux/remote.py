@@ -394,7 +394,7 @@ def vdso_image_end(memory: Memory, maps: Sequence[MapsLine]) -> int:
     for line in maps:
         if line.name == "[vdso]":
             header = _ELF64_HEADER.unpack(memory.read(line.start, _ELF64_HEADER.size))
-            sections_end = header[6] + header[11] * header[12]
+            sections_end = int(header[6] + header[11] * header[12])
             return line.start + -(-sections_end // _SPARE_ALIGNMENT) * _SPARE_ALIGNMENT
     raise CaptureError(f"cannot enter pid {memory.pid}: it has no vdso (the kernel was started with vdso=0, or it unmapped it)")
 
