@@ -7,6 +7,7 @@ program frozen, however long a capture takes; they go to the guard, which nothin
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import signal
@@ -150,7 +151,7 @@ class Charge:
             try:
                 await self._carry_out(act)
             except TROUBLE as trouble:
-                self._told_of(act, trouble)
+                await self._told_of(act, trouble)
 
     async def _carry_out(self, act: Act) -> None:
         match act:
@@ -180,7 +181,7 @@ class Charge:
             case acts.ReportExit():
                 await self._report(act)
 
-    def _told_of(self, act: Act, trouble: Exception) -> None:
+    async def _told_of(self, act: Act, trouble: Exception) -> None:
         """Say what went wrong, to the log and to the core where it waits for it."""
         message = str(trouble) or type(trouble).__name__
         log.warning("%s: %s: %s", self.name, type(act).__name__, message)
@@ -191,6 +192,9 @@ class Charge:
                 lost = isinstance(trouble, KeeperLostError)
                 self.around.tell(events.CaptureFailed(self.name, act.epoch, message, unsupported, lost))
             case acts.Start() | acts.Restore():
+                guest = isinstance(act, acts.Start) and act.spec.launch.pid != 0
+                with contextlib.suppress(*TROUBLE):
+                    await (self._let_go() if guest else self._stop())
                 self.figures.reasons = (*getattr(trouble, "reasons", ()),) or (message,)
                 self.around.tell(events.ActFailed(self.name, act.epoch, message))
 
@@ -206,15 +210,16 @@ class Charge:
             log.warning("%s: %s: %s", self.name, type(act).__name__, trouble)
 
     async def _start(self, act: acts.Start) -> None:
-        if self.component is None:
-            self.around.records.note(self.name, act.epoch)
-            self._settle(await self._begun(act.spec.launch))
-        assert self.component is not None
+        adopted = self.component is not None
         self.around.records.note(self.name, act.epoch)
+        if self.component is None:
+            self.component = await self._begun(act.spec.launch)
         await self.component.lease(act.lease_until_ns)
         await self._protect(refuse=act.spec.launch.pid != 0)
         self.started.set()
         self.around.tell(events.Started(self.name, act.epoch))
+        if not adopted:
+            self._watch_the_end()
 
     async def _begun(self, launch: Launch) -> Component:
         if launch.pid:
@@ -254,12 +259,13 @@ class Charge:
             close_all(tuple(descriptors))
         self.around.records.note(self.name, act.epoch)
         await component.resume()
-        self._settle(component)
+        self.component = component
         self.figures.restores += 1
         self.figures.reasons = ()
         self.figures.outage_ms = (silent_ns + clock.now_ns() - began_ns) / 1e6
         self.started.set()
         self.around.tell(events.Restored(self.name, act.epoch, act.position))
+        self._watch_the_end()
 
     async def _capture(self, act: acts.Capture) -> None:
         component = self._present()
@@ -370,9 +376,9 @@ class Charge:
             raise AgentError(f"{self.name} does not run on this robot")
         return self.component
 
-    def _settle(self, component: Component) -> None:
-        self.component = component
-        self._task(self._see_the_end(component))
+    def _watch_the_end(self) -> None:
+        """From now on, and not before the core knows that it runs, tell when it has ended."""
+        self._task(self._see_the_end(self._present()))
 
     async def _see_the_end(self, component: Component) -> None:
         try:
