@@ -351,7 +351,7 @@ class PtraceSession:
         """Sort the mappings, after they have changed."""
         self._lines = tuple(line for line in self._maps.lines if not self._borrowed.holds(line.start))
         self._private = [line for line in self._lines if dirty.is_private(line)]
-        self._shared_lines = [line for line in self._lines if line.shared and line.name not in dirty.NOT_CARRIED]
+        self._shared_lines = [line for line in self._lines if dirty.is_shared(line)]
 
     def _scan(self, *, changed: bool) -> dirty.Scan:
         scan = self._tracker.scan(self._private, changed=changed)

@@ -24,7 +24,7 @@ import numpy as np
 
 from checkpoint import pages
 from checkpoint.errors import CaptureError, ProcessGoneError
-from checkpoint.linux import abi
+from checkpoint.linux import abi, procfs
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.pages import PageMap, Words
@@ -90,6 +90,16 @@ class Tracker(Protocol):
 def is_private(line: MapsLine) -> bool:
     """Whether a mapping is one that trackers follow."""
     return not line.shared and line.name not in NOT_CARRIED
+
+
+def is_shared(line: MapsLine) -> bool:
+    """Whether its pages are shared memory that the snapshot carries: not those of a file that it may only read here.
+
+    Such a mapping (glibc's gconv-modules.cache is one in many programs) has nothing that its file does not have, and the
+    one that restores could not write to it.
+    """
+    from_its_file = line.has_file and not line.protection & abi.PROT_WRITE and not line.name.endswith(procfs.DELETED)
+    return line.shared and line.name not in NOT_CARRIED and not from_its_file
 
 
 def extents_of(lines: Sequence[MapsLine]) -> Words:
