@@ -243,6 +243,8 @@ class Component:
             await self._undo()
             raise
         self.notes = (*self.notes, *resumed.notes)
+        if any(note.startswith(channel.UNPROTECTED) for note in resumed.notes):
+            self._drop_keeper()  # the next capture tries with a new one
 
     # --- protection ---
 

@@ -137,7 +137,7 @@ class Keeper:
         try:
             self._session = self._tracer.protect(pid, component, streams)
         except CheckpointError as error:
-            return (f"it runs, unprotected: {error}",)
+            return (f"{channel.UNPROTECTED}: {error}",)
         return self._session.notes
 
     def _release(self, _: channel.Release, __: Descriptors) -> Answer:

@@ -275,8 +275,12 @@ class Restored(msgspec.Struct, frozen=True, tag=True):
     notes: tuple[str, ...] = ()
 
 
+UNPROTECTED: Final = "it runs, unprotected"
+"""Begins the note of a `Resumed` whose program could not be followed again: another keeper may."""
+
+
 class Resumed(msgspec.Struct, frozen=True, tag=True):
-    """The program goes on; ``notes`` as of `Protected`."""
+    """The program goes on; ``notes`` as of `Protected`, or `UNPROTECTED` and why."""
 
     notes: tuple[str, ...] = ()
 
