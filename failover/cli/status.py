@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from datetime import datetime
 
 from failover.cli import picture, render
 from failover.cli.agent import connect
 from failover.client.control import Update
 
-WATCH_EVERY_MS = 500
+COLUMNS = ("at", "robot", "component", "saw", "did")
+"""Of one line of the story, as the agent names them."""
 
 
 def status(arguments: argparse.Namespace) -> int:
@@ -44,10 +46,14 @@ def why(arguments: argparse.Namespace) -> int:
     if arguments.json:
         render.as_json(answer)
         return 0
-    columns = ("when", "robot", "component", "what was seen", "what was done")
-    lines = [tuple(str(entry.get(key) or "") for key in ("at", "robot", "component", "saw", "did")) for entry in answer["story"]]
+    lines = [(clock(entry.get("at")), *(str(entry.get(key) or "") for key in COLUMNS[1:])) for entry in answer["story"]]
     if lines:
-        render.table(columns, lines)
+        render.table(("when", "robot", "component", "what was seen", "what was done"), lines)
     else:
         print("no decisions yet" + (f" about {arguments.name}" if arguments.name else ""))
     return 0
+
+
+def clock(at: object) -> str:
+    """An instant (seconds since 1970) as this machine's wall clock shows it, to the millisecond."""
+    return datetime.fromtimestamp(at).astimezone().strftime("%H:%M:%S.%f")[:-3] if isinstance(at, int | float) else str(at or "")

@@ -31,7 +31,7 @@ SECONDS_BEFORE: Final = 3.0
 """Time to look on before the power is cut."""
 
 TAKEOVER_S: Final = 20.0
-END_S: Final = 60.0
+END_S: Final = 120.0
 """Bounds, far above what is usual, after which the demo says that it failed."""
 
 DRAW_S: Final = 0.1

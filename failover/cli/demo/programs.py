@@ -50,7 +50,7 @@ BC: Final = f"""\
 scale = 50
 x = 0.4
 for (i = 1; i <= {POINTS}; i++) {{
-  for (j = 0; j < 6000; j++) x = 3.99 * x * (1 - x)
+  for (j = 0; j < 3500; j++) x = 3.99 * x * (1 - x)
   print "chaos ", i, "  ", x, "\n"
 }}
 quit
