@@ -21,17 +21,19 @@ from tests.failover.cli.test_verbs import failover
 PYTHON = getattr(sys, "_base_executable", sys.executable)
 BOUND_S = 60.0
 
-COUNT = """\
-import hashlib, sys, time
+LINES = 800
+
+COUNT = f"""\
+import hashlib, os, sys, time
 digest = hashlib.sha256()
-for number in range(1, 301):
+for number in range(1, {LINES} + 1):
     digest.update(str(number).encode())
     print(number, digest.hexdigest(), flush=True)
-    time.sleep(0.005)
+    time.sleep(float(os.environ["PAUSE"]))
 sys.exit(7)
 """
 
-CHAOS = 'scale=50\nx=0.4\nfor(i=1;i<=300;i++){for(j=0;j<4000;j++)x=3.99*x*(1-x);print i," ",x,"\\n"}\nquit\n'
+CHAOS = 'scale=50\nx=0.4\nfor(i=1;i<=500;i++){for(j=0;j<4000;j++)x=3.99*x*(1-x);print i," ",x,"\\n"}\nquit\n'
 
 
 def wait_for(what: str, condition: Callable[[], bool]) -> None:
@@ -55,8 +57,8 @@ class Script:
         self.argv = argv
         (directory / "program").write_text(text)
 
-    def run(self, output: Path) -> subprocess.Popen[bytes]:
-        """Start it."""
+    def run(self, output: Path, pause: float = 0.01) -> subprocess.Popen[bytes]:
+        """Start it; what it writes does not depend on its pauses."""
         with output.open("ab") as file:
             return subprocess.Popen(
                 self.argv,
@@ -65,7 +67,7 @@ class Script:
                 stdout=file,
                 stderr=file,
                 start_new_session=True,
-                env={"PATH": os.environ["PATH"], "LANG": "C.UTF-8"},
+                env={"PATH": os.environ["PATH"], "LANG": "C.UTF-8", "PAUSE": str(pause)},
             )
 
 
@@ -86,7 +88,7 @@ def has_ended(pid: int) -> bool:
 
 def test_a_program_captured_and_restored_three_times_in_a_row_writes_what_an_undisturbed_one_writes(script: Script) -> None:
     expected, output = script.directory / "expected", script.directory / "output"
-    script.run(expected).wait()
+    script.run(expected, pause=0).wait()
     process = script.run(output)
     pid = process.pid
     for turn in range(1, 4):
@@ -112,12 +114,12 @@ def test_waiting_passes_on_the_exit_status_of_the_restored_program(tmp_path: Pat
     process.wait()
     ran = failover("restore", "--wait", str(tmp_path / "snapshot"))
     assert ran.returncode == 7, ran.stderr
-    assert lines(tmp_path / "output") == 300
+    assert lines(tmp_path / "output") == LINES
 
 
 def test_a_program_left_running_writes_what_an_undisturbed_one_writes(tmp_path: Path) -> None:
     script = Script(tmp_path, [PYTHON, "program"], COUNT)
-    script.run(tmp_path / "expected").wait()
+    script.run(tmp_path / "expected", pause=0).wait()
     process = script.run(tmp_path / "output")
     for turn in range(3):
         wait_for("some output", lambda turn=turn: lines(tmp_path / "output") >= 20 * (turn + 1))  # type: ignore[misc]
