@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import stat
 from collections.abc import Iterator
 
 from blake3 import blake3
@@ -115,21 +116,29 @@ def _of_descriptors(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
         if held.kind not in rebuild.KINDS:
             yield f"{held.name} is of kind {held.kind!r}, which this version does not know: use the version that captured it"
         elif held.kind == "files" and not held.facts.get("deleted") and path not in options.accept_changed:
-            yield from _of_open_file(held, path)
+            yield from _of_open_file(held, path, state.machine.boot_id == this_machine().boot_id)
 
 
-def _of_open_file(held: Resource, path: str) -> Iterator[str]:
-    """A file that was only read must be the same; one that was written to may have grown, and is cut back."""
+def _of_open_file(held: Resource, path: str, same_boot: bool) -> Iterator[str]:
+    """A file that was only read must be the same; one that was written at its end may have grown, and is cut back.
+
+    Args:
+        same_boot: it may be the very same file, and its times can be compared.
+    """
     try:
         about = os.stat(path)
     except OSError as error:
         yield f"{path}, open as {held.name}, cannot be used ({error.strerror}): {_FAR}"
         return
-    size, digest = rebuild.number_of(held.facts.get("size", 0)), held.facts.get("digest", b"")
-    if not os.path.isfile(path):
+    if not stat.S_ISREG(about.st_mode) or rebuild.number_of(held.facts["flags"]) & rebuild.O_PATH:
         return
-    grown = rebuild.has_grown(held)
-    if about.st_size != size and not grown:
-        yield f"{path}, open as {held.name}, has {about.st_size} bytes here and {size} there; {_FAR}, or accept it as shared"
-    elif digest and not grown and digest_of(path) != digest:
-        yield f"{path}, open as {held.name}, has another content here; {_FAR}, or accept it as shared"
+    facts, size = held.facts, rebuild.number_of(held.facts["size"])
+    named, shared = f"{path}, open as {held.name},", "accept it as shared if its content does not matter"
+    grows, digest = rebuild.grows_at_its_end(held), facts.get("digest", b"")
+    same_file = same_boot and (about.st_dev, about.st_ino) == (facts["device"], facts["inode"])
+    if about.st_size < size or (about.st_size > size and not grows):
+        yield f"{named} has {about.st_size} bytes here and {size} there; {_FAR}, or {shared}"
+    elif same_file and about.st_mtime_ns != facts["mtime_ns"] and rebuild.is_written(held) and not grows:
+        yield f"{named} was written to since the snapshot, and not only at its end; end the program with the capture, or {shared}"
+    elif digest and digest_of(path) != digest:
+        yield f"{named} has another content here; {_FAR}, or {shared}"

@@ -38,6 +38,9 @@ WINDOW: Final = 2 << 20
 """Larger ones are protected in windows of what one page table covers."""
 LONG_RUN: Final = 16 * abi.PAGE_SIZE
 """A written run longer than this is looked at for holes before it is read: reading a hole makes the kernel fill it."""
+MARKER_RUN: Final = 64 * abi.PAGE_SIZE
+"""Where nothing is swapped out, what looks so is a hole that we protected, or a page that the kernel moves just now: it moves 32
+at a time (COMPACT_CLUSTER_MAX), so a longer run is a hole."""
 READ_CHUNK: Final = 8 << 20
 NOT_CARRIED: Final = frozenset(("[vdso]", "[vvar]", "[vvar_vclock]", "[vsyscall]", "[uprobes]"))
 """Mappings of the kernel's own: made anew on restore."""
@@ -148,7 +151,7 @@ class PageScanner:
         order.flags = abi.PM_SCAN_CHECK_WPASYNC | abi.PM_SCAN_WP_MATCHING
         order.category_mask, order.category_inverted, order.category_anyof_mask = abi.PAGE_IS_WRITTEN, 0, 0
         order.return_mask = abi.PAGE_IS_WRITTEN
-        return self._collect(ranges)
+        return self._collect(ranges)[:, :2]
 
     def existing(self, ranges: Words, *, own: bool = True) -> Words:
         """Pages present or swapped out.
@@ -162,7 +165,11 @@ class PageScanner:
         order.category_mask = order.category_inverted = unwanted
         order.category_anyof_mask = abi.PAGE_IS_PRESENT | abi.PAGE_IS_SWAPPED
         order.return_mask = abi.PAGE_IS_PRESENT | abi.PAGE_IS_SWAPPED
-        return pages_joined(self._collect(ranges))
+        found = self._collect(ranges)
+        absent = found[:, 2] & np.uint64(abi.PAGE_IS_PRESENT) == 0
+        if absent.any() and not procfs.swapped_size(self._pid):
+            found = found[~(absent & (found[:, 1] - found[:, 0] >= MARKER_RUN))]
+        return pages_joined(found[:, :2])
 
     def _collect(self, ranges: Words) -> Words:
         order, found = self._order, []
@@ -177,10 +184,10 @@ class PageScanner:
                         f"cannot find written pages of pid {self._pid}: a mapping lost its protection; capture it again"
                     )
                 if count:
-                    found.append(self._regions[:count, :2].copy())
+                    found.append(self._regions[:count].copy())
                 start = int(order.walk_end)
         if not found:
-            return NONE
+            return np.empty((0, 3), dtype=np.uint64)
         return found[0] if len(found) == 1 else np.concatenate(found)
 
     def _refused(self, what: str) -> int:
@@ -193,11 +200,18 @@ class PageScanner:
 
 
 def pages_joined(found: Words) -> Words:
-    """Extents that touch, as one (categories that differ had kept them apart)."""
+    """Extents that touch or overlap, as one.
+
+    They touch where categories differ, and overlap where the program changed its pages under a scan (seen with xz, Linux 6.18).
+
+    Args:
+        found: in order of their starts.
+    """
     if len(found) < 2:
         return found
-    apart = found[1:, 0] != found[:-1, 1]
-    return np.stack((found[np.concatenate(([True], apart)), 0], found[np.concatenate((apart, [True])), 1]), axis=1)
+    ends = np.maximum.accumulate(found[:, 1])
+    apart = found[1:, 0] > ends[:-1]
+    return np.stack((found[np.concatenate(([True], apart)), 0], ends[np.concatenate((apart, [True]))]), axis=1)
 
 
 # Write protection

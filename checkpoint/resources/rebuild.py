@@ -162,11 +162,21 @@ def is_writable(flags: int) -> bool:
     return flags & os.O_ACCMODE in (os.O_WRONLY, os.O_RDWR) and not flags & O_PATH
 
 
+def is_written(held: Resource) -> bool:
+    """Whether the program may write to a file through this descriptor."""
+    return is_writable(number_of(held.facts["flags"]))
+
+
+def grows_at_its_end(held: Resource) -> bool:
+    """Whether the program writes to the end of a file, like a log: then all that came later lies beyond its size."""
+    flags, offset, size = (number_of(held.facts[name]) for name in ("flags", "offset", "size"))
+    return is_writable(flags) and (bool(flags & os.O_APPEND) or offset == size)
+
+
 def has_grown(held: Resource) -> bool:
-    """Whether a regular file that the program writes to is longer here than the program knows: that part is not written yet."""
+    """Whether a regular file is longer here than the program knows: what it wrote after the snapshot is to be cut off."""
     about = os.stat(str(held.facts["path"]))
-    writable = is_writable(number_of(held.facts["flags"]))
-    return writable and stat.S_ISREG(about.st_mode) and about.st_size > number_of(held.facts["size"])
+    return stat.S_ISREG(about.st_mode) and grows_at_its_end(held) and about.st_size > number_of(held.facts["size"])
 
 
 def number_of(fact: Fact) -> int:
