@@ -237,7 +237,8 @@ class PtraceSession:
     def _gone(self, error: ProcessGoneError) -> ProcessGoneError:
         """A process that executed another program is not the one that was protected."""
         with contextlib.suppress(ProcessGoneError, ProbeError):
-            procfs.status(self.pid)
+            if procfs.status(self.pid).state in "ZX":
+                return error
             self._based = False
             return ProcessGoneError(f"{self.component} (pid {self.pid}) has become another program (exec): protect it anew")
         return error

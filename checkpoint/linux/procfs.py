@@ -268,6 +268,12 @@ def signal_sets(text: bytes) -> tuple[int, int, int]:
     return mask(b"\nSigCgt:\t") | mask(b"\nSigIgn:\t"), mask(b"\nSigPnd:\t"), mask(b"\nShdPnd:\t")
 
 
+def swapped_size(pid: int) -> int:
+    """Bytes of a process that are swapped out."""
+    fields = parse_fields(read_text(pid, "status"))
+    return int((fields.get("VmSwap") or "0 kB").split()[0]) * 1024
+
+
 def status(pid: int) -> Status:
     """Read and parse /proc/PID/status."""
     return parse_status(read_text(pid, "status"))

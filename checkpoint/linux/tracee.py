@@ -19,7 +19,7 @@ from ptrace.binding.func import ptrace as _ptrace
 from ptrace.error import PtraceError
 
 from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError
-from checkpoint.linux import abi
+from checkpoint.linux import abi, procfs
 from checkpoint.linux.memory import Memory
 from checkpoint.model import Rseq
 
@@ -55,6 +55,14 @@ class Stop:
         return self.event == 0
 
 
+def _is_dead(pid: int) -> bool:
+    """Whether a process has ended, reaped or not."""
+    try:
+        return procfs.status(pid).state in "ZX"
+    except CheckpointError:
+        return True
+
+
 class Tracee:
     """One thread of another process, from `seize` to `detach`."""
 
@@ -84,7 +92,7 @@ class Tracee:
 
     def _failure(self, what: str, number: int) -> CheckpointError:
         on = f"cannot {what} pid {self.pid}"
-        if number == errno.ESRCH:
+        if number == errno.ESRCH or _is_dead(self.pid):
             return ProcessGoneError(f"{on}: it has ended, or is not stopped")
         if number == errno.EPERM:
             return ProbeError(
@@ -110,10 +118,14 @@ class Tracee:
     def freeze(self, timeout_s: float = STOP_TIMEOUT_S) -> Stop:
         """Stop it and return once it stands; a signal on its way is delivered first.
 
+        A program that stood still before it was seized (SIGSTOP) has reported that already, and is not interrupted once more.
+
         Raises:
             ProcessGoneError: it ended instead.
             CaptureError: it did not stop in time; it stops as soon as it can, call `freeze` again or `release`.
         """
+        if (stood := self._reported()) is not None and not stood.is_delivery:
+            return stood
         self.interrupt()
         while (stop := self.wait(timeout_s)).is_delivery:
             self.cont(stop.signal)
@@ -144,6 +156,14 @@ class Tracee:
                 os.sched_yield()
             else:
                 time.sleep(0.0001)
+
+    def _reported(self) -> Stop | None:
+        """The stop that it has reported already, if any."""
+        try:
+            pid, status = os.waitpid(self.pid, abi.WALL | os.WNOHANG)
+        except ChildProcessError as error:
+            raise ProcessGoneError(f"pid {self.pid} ended while it was being looked at") from error
+        return self._stop_of(status) if pid else None
 
     def _stop_of(self, status: int) -> Stop:
         if not os.WIFSTOPPED(status):

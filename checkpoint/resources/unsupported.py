@@ -161,7 +161,7 @@ def require_traceable(pid: int, status: Status) -> None:
         raise ProbeError(f"cannot protect pid {pid}: a process cannot trace itself; run failover from another one")
     if status.tracer not in (0, os.getpid()):
         raise ProbeError(
-            f"cannot protect pid {pid} ({status.name}): pid {status.tracer} traces it already; end that debugger or release it"
+            f"cannot protect pid {pid} ({status.name}): pid {status.tracer} is its tracer already; end that debugger"
         )
 
 

@@ -1,0 +1,175 @@
+"""A base and many deltas, taken at random instants, are the program: whatever it did to its memory in between.
+
+``tests/tracees/mutator.c`` changes its memory in every way that can hide a write, and its transcript is the same in every run
+with the same seed; so a restored mutator must go on with the very lines of an undisturbed one. The seed is in the test's
+name. FAILOVER_TEST_SEEDS=100 tries that many more.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from checkpoint.engine import CaptureOrder, Session
+from checkpoint.errors import UnsupportedError
+from checkpoint.model import Snapshot
+from tests.checkpoint.round_trip import Program, ended, protected, restored, start_tracee, transported
+
+pytestmark = [pytest.mark.compiler, pytest.mark.root]
+
+Compiled = Callable[..., Path]
+
+WAYS = {
+    "writes": "wpz",
+    "forgotten_pages": "dDp",
+    "mapped_again_at_the_same_address": "mMp",
+    "mapped_over": "op",
+    "moved_away_and_back": "rp",
+    "pages_that_change_places": "Sp",
+    "sealed_after_the_write": "jp",
+    "written_by_the_kernel": "xp",
+    "written_through_proc": "vj",
+    "short_lived_mappings": "cp",
+    "a_heap_that_grows_and_shrinks": "b",
+    "shared_memory": "s",
+    "huge_pages": "hH",
+    "a_private_file_mapping": "k",
+    "everything": "wpzdDmMorSjxvcbshHk",
+}
+SEEDS = range(1, 2 + int(os.environ.get("FAILOVER_TEST_SEEDS", "0")))
+DELTAS = 20
+NAP_US = "300"
+MORE_ROUNDS = 30
+
+
+def _undisturbed(program: Path, directory: Path, ways: str, seed: int, rounds: int) -> list[str]:
+    """The lines of a run that nobody looked at."""
+    argv = [str(program), "never", ways, str(seed), str(rounds), "0"]
+    return subprocess.run(argv, cwd=directory, capture_output=True, text=True, check=True).stdout.splitlines()
+
+
+def _rounds(program: Program) -> int:
+    return program.output.count("\n")
+
+
+def _nap(dice: random.Random) -> None:
+    """Let the program run for a moment of random length: the instant of the next capture is the point."""
+    time.sleep(dice.uniform(0, 0.008))
+
+
+def _captured(session: Session, order: CaptureOrder) -> Snapshot:
+    """A capture; where the program holds something unsupported for a moment (/proc/self/mem), the next one that works."""
+    while True:
+        try:
+            return session.capture(order)
+        except UnsupportedError:
+            continue
+
+
+def _chain(session: Session, dice: random.Random, *, lost: float) -> list[Snapshot]:
+    """A base and its deltas; a part of them is lost on the way and never acknowledged."""
+    base = _captured(session, CaptureOrder(base=True, sequence=1))
+    chain = [transported(base)]
+    session.acknowledge(base.position)
+    for sequence in range(2, DELTAS + 2):
+        _nap(dice)
+        delta = _captured(session, CaptureOrder(base=False, sequence=sequence))
+        last = sequence == DELTAS + 1
+        if dice.random() < lost and not last:
+            continue
+        assert delta.parent == chain[-1].position
+        session.acknowledge(delta.position)
+        chain.append(transported(delta))
+    return chain
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("lost", [0.0, 0.4], ids=["all_acknowledged", "some_lost"])
+@pytest.mark.parametrize("ways", WAYS)
+def test_a_base_and_its_deltas_are_the_program(ways: str, lost: float, seed: int, compiled: Compiled, tmp_path: Path) -> None:
+    program, dice = compiled("mutator", "-O2"), random.Random(seed)
+    with ended(start_tracee(program, tmp_path, WAYS[ways], str(seed), "1000000", NAP_US)) as tracee:
+        tracee.wait_for_output(len("ready\n"))
+        with protected(tracee) as session:
+            chain = _chain(session, dice, lost=lost)
+            tracee.kill()
+    _expect_the_same_story(program, tmp_path, chain, ["mutator", WAYS[ways], seed])
+
+
+def _expect_the_same_story(program: Path, directory: Path, chain: list[Snapshot], told: list[object]) -> None:
+    """Bring the chain back, let it do some more rounds, and compare its whole output with an undisturbed run's."""
+    with ended(restored(chain, directory)) as back:
+        known = _rounds(back)
+        back.wait_until(lambda: _rounds(back) > known + MORE_ROUNDS, f"{MORE_ROUNDS} more rounds")
+        back.tell()
+        status = back.finish()
+    lines = back.output.splitlines()
+    assert (status, lines[-1]) == (0, "ok"), lines[-20:]
+    quiet = directory / "quiet"
+    quiet.mkdir()
+    wanted = _undisturbed(program, quiet, str(told[1]), int(str(told[2])), len(lines) - 2)
+    assert lines == wanted
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_generated_code_survives_base_and_deltas(seed: int, compiled: Compiled, tmp_path: Path) -> None:
+    program, dice = compiled("jit", "-O2"), random.Random(seed)
+    with ended(start_tracee(program, tmp_path, "1000000", "1")) as tracee:
+        with protected(tracee) as session:
+            chain = _chain(session, dice, lost=0.3)
+            tracee.kill()
+    with ended(restored(chain, tmp_path)) as back:
+        known = _rounds(back)
+        back.wait_until(lambda: _rounds(back) > known + MORE_ROUNDS, f"{MORE_ROUNDS} more rounds")
+        back.tell()
+        assert back.finish() == 0, back.output[-2000:]
+    lines = back.output.splitlines()
+    wanted = subprocess.run([program, "never", str(len(lines) - 2), "0"], capture_output=True, text=True, check=True).stdout
+    assert lines == wanted.splitlines()
+
+
+def test_generations_follow_one_another(compiled: Compiled, tmp_path: Path) -> None:
+    """Four lives: each is a base with deltas, and each goes on where the last one stood."""
+    program, dice, ways = compiled("mutator", "-O2"), random.Random(5), WAYS["everything"]
+    tracee = start_tracee(program, tmp_path, ways, "5", "1000000", NAP_US)
+    for _ in range(3):
+        with ended(tracee), protected(tracee) as session:
+            chain = _chain(session, dice, lost=0.2)
+            tracee.kill()
+        tracee = restored(chain, tmp_path)
+    with ended(tracee), protected(tracee) as session:
+        chain = _chain(session, dice, lost=0.2)
+        tracee.kill()
+    _expect_the_same_story(program, tmp_path, chain, ["mutator", ways, 5])
+
+
+def test_the_pages_of_a_quiet_program_are_not_sent_again(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("bss", "-O2"), tmp_path)) as tracee, protected(tracee) as session:
+        base = session.capture(CaptureOrder(sequence=1))
+        session.acknowledge(base.position)
+        for sequence in range(2, 8):
+            delta = _captured(session, CaptureOrder(base=False, sequence=sequence))
+            session.acknowledge(delta.position)
+            assert len(delta.contents) <= 64 * 4096 < len(base.contents)
+        tracee.tell()
+        assert tracee.finish() == 0
+
+
+def test_a_sparse_mapping_costs_its_populated_pages_only(compiled: Compiled, tmp_path: Path) -> None:
+    """The kernel calls every page of a fresh registration written, and makes page tables for 64 GiB if asked carelessly."""
+    with ended(start_tracee(compiled("sparse", "-O2"), tmp_path)) as tracee, protected(tracee) as session:
+        base = session.capture(CaptureOrder(sequence=1))
+        session.acknowledge(base.position)
+        delta = session.capture(CaptureOrder(base=False, sequence=2))
+        assert len(base.contents) < 4 << 20
+        assert len(delta.contents) < 1 << 20
+        tables = next(line for line in Path(f"/proc/{tracee.pid}/status").read_text().splitlines() if line.startswith("VmPTE"))
+        assert int(tables.split()[1]) < 8192, tables
+        tracee.tell()
+        assert tracee.finish() == 0

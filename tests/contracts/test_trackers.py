@@ -1,0 +1,199 @@
+"""The contract of ``checkpoint.linux.dirty.Tracker``, on every implementation that this kernel has.
+
+A child of ours obeys one-letter orders about one mapping; we follow it from outside. It stands still whenever we look,
+because it waits for the next order.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from checkpoint import pages
+from checkpoint.linux import abi, dirty
+from checkpoint.linux.dirty import DigestTracker, PagemapTracker, Scan, SoftDirtyTracker, Tracker
+from checkpoint.linux.memory import Memory
+from checkpoint.linux.procfs import MapsReader
+
+PAGE = abi.PAGE_SIZE
+COUNT = 256
+"""Pages of the child's mapping: more than what may be a page on the move (`dirty.MARKER_RUN`)."""
+
+CHILD = r"""
+import ctypes, os, sys
+libc = ctypes.CDLL(None, use_errno=True)
+libc.mmap.restype = ctypes.c_void_p
+libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, ctypes.c_long]
+for name in ("madvise", "mprotect"):
+    getattr(libc, name).argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
+libc.munmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t]
+count = int(sys.argv[1])
+hole = libc.mmap(None, (count + 2) * 4096, 0, 0x22, -1, 0)
+place = hole + 4096
+def make():
+    assert libc.mmap(place, count * 4096, 3, 0x32, -1, 0) == place
+    libc.madvise(place, count * 4096, 15)  # MADV_NOHUGEPAGE
+make()
+faults = libc.syscall(323, os.O_CLOEXEC | os.O_NONBLOCK | 1)
+print(place, faults, flush=True)
+for order in sys.stdin:
+    verb, *numbers = order.split()
+    first, size = [int(number) for number in numbers] + [1] * (2 - len(numbers))
+    if verb == "write":
+        for page in range(first, first + size):
+            ctypes.memset(place + page * 4096, 1 + (page + ctypes.string_at(place + page * 4096)[0:1].__len__()) % 200, 64)
+            value = int.from_bytes(ctypes.string_at(place + page * 4096 + 8, 8), "little") + 1
+            ctypes.memmove(place + page * 4096 + 8, value.to_bytes(8, "little"), 8)
+    elif verb == "forget":
+        libc.madvise(place + first * 4096, size * 4096, 4)
+    elif verb == "again":
+        libc.munmap(place, count * 4096); make()
+    elif verb == "seal":
+        libc.mprotect(place, count * 4096, 1)
+    elif verb == "open":
+        libc.mprotect(place, count * 4096, 3)
+    print("done", flush=True)
+"""
+
+
+@dataclass
+class Child:
+    """The process that is followed, and our tracker on it."""
+
+    process: subprocess.Popen[str]
+    place: int
+    tracker: Tracker
+    maps: MapsReader
+
+    def order(self, words: str) -> None:
+        """Have it do one thing, and wait until it is done."""
+        assert self.process.stdin and self.process.stdout
+        self.process.stdin.write(words + "\n")
+        self.process.stdin.flush()
+        assert self.process.stdout.readline() == "done\n"
+
+    def scan(self) -> Scan:
+        """Look, at its mapping alone."""
+        changed = self.maps.refresh()
+        return self.tracker.scan(self.lines(), changed=changed)
+
+    def lines(self) -> list[dirty.MapsLine]:
+        """The lines of its mapping."""
+        return [line for line in self.maps.lines if self.place <= line.start < self.place + COUNT * PAGE]
+
+    def numbers(self, found: pages.Words) -> set[int]:
+        """Which of its pages a set holds."""
+        return {(address - self.place) // PAGE for address in pages.addresses_of(found, PAGE).tolist()}
+
+
+@pytest.fixture(params=["pagemap", "soft-dirty", "digest"])
+def child(request: pytest.FixtureRequest) -> Iterator[Child]:
+    """A child with pages 0 to 9 written, followed from then on."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(COUNT)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    tracker: Tracker | None = None
+    try:
+        assert process.stdout
+        place, faults = map(int, process.stdout.readline().split())
+        tracker = _tracker(request.param, process.pid, faults)
+        found = Child(process, place, tracker, MapsReader(process.pid))
+        found.order("write 0 10")
+        found.maps.refresh()
+        tracker.arm(found.lines())
+        found.scan()
+        yield found
+    finally:
+        if tracker:
+            tracker.close()
+        process.kill()
+        process.communicate()
+
+
+def _tracker(kind: str, pid: int, faults: int) -> Tracker:
+    if kind == "digest":
+        return DigestTracker(pid)
+    if kind == "soft-dirty":
+        if not dirty.has_soft_dirty():
+            pytest.skip("this kernel has no soft-dirty bit (CONFIG_MEM_SOFT_DIRTY)")
+        return SoftDirtyTracker(pid)
+    if faults < 0:
+        pytest.skip("this kernel gives no userfaultfd (vm.unprivileged_userfaultfd)")
+    pidfd = os.pidfd_open(pid)
+    try:
+        ours = abi.pidfd_getfd(pidfd, faults)
+        return PagemapTracker(pid, ours)
+    except OSError as error:
+        pytest.skip(f"this kernel has no asynchronous write protection: {error}")
+    finally:
+        os.close(pidfd)
+
+
+def test_nothing_is_reported_while_nothing_is_written(child: Child) -> None:
+    found = child.scan()
+    assert not child.numbers(found.written) and not child.numbers(found.cleared)
+
+
+def test_exactly_the_written_pages_are_reported_once(child: Child) -> None:
+    child.order("write 3")
+    child.order("write 5 2")
+    assert child.numbers(child.scan().written) == {3, 5, 6}
+    assert child.numbers(child.scan().written) == set()
+
+
+def test_pages_that_did_not_exist_are_reported_when_they_come(child: Child) -> None:
+    child.order("write 40 3")
+    assert {40, 41, 42} <= child.numbers(child.scan().written)
+
+
+def test_forgotten_pages_are_cleared_or_read_as_zeros(child: Child) -> None:
+    child.order("forget 2 4")
+    found = child.scan()
+    told = child.numbers(found.written) | child.numbers(found.cleared)
+    assert {2, 3, 4, 5} <= told
+    content = Memory(child.process.pid).read(child.place + 2 * PAGE, 4 * PAGE)
+    assert not any(content)
+
+
+def test_a_mapping_made_again_at_the_same_address_is_fresh(child: Child) -> None:
+    child.order("again")
+    child.order("write 4")
+    child.order("write 4")  # otherwise it is the content that it had
+    found = child.scan()
+    assert 4 in child.numbers(found.written)
+    gone = child.numbers(found.cleared) | child.numbers(found.written)
+    assert set(range(10)) <= gone
+    child.order("write 7")
+    assert child.numbers(child.scan().written) == {7}
+
+
+def test_a_page_that_is_sealed_after_the_write_is_reported(child: Child) -> None:
+    child.order("seal")
+    child.scan()
+    child.order("open")
+    child.order("write 1")
+    child.order("seal")
+    assert 1 in child.numbers(child.scan().written)
+
+
+def test_existing_pages_are_those_with_content(child: Child) -> None:
+    assert child.numbers(child.tracker.existing(child.lines())) == set(range(10))
+
+
+def test_large_mappings_are_protected_around_what_exists() -> None:
+    line = dirty.MapsLine(0, 64 << 30, 3, False, 0, 0, 0, "")
+    existing = np.array([[1 << 30, (1 << 30) + PAGE], [(1 << 30) + (4 << 20), (1 << 30) + (4 << 20) + PAGE]], dtype=np.uint64)
+    windows = dirty.windows_of(line, existing)
+    assert pages.total_size(windows) <= 4 * dirty.WINDOW + dirty.WINDOW
+    assert not len(pages.difference(existing, windows))
+
+
+def test_the_scan_structure_is_as_the_kernel_has_it() -> None:
+    assert ctypes.sizeof(abi.PageScan) == 96
