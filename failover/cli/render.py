@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from failover.cli import picture
@@ -135,7 +137,8 @@ def save_picture(path: str, command: str, lines: Sequence[str], columns: Sequenc
     for line in lines:
         console.print(Text(line))
     console.print(_rich_table(columns, [(line, "") for line in cells]))
-    console.save_svg(path, title=command)
+    picture_text = re.sub(r"@font-face \{.*?\}\s*", "", console.export_svg(title=command), flags=re.DOTALL)  # no fonts from afar
+    Path(path).write_text(picture_text)
 
 
 def _console() -> Console:

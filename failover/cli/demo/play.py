@@ -34,6 +34,9 @@ TAKEOVER_S: Final = 20.0
 END_S: Final = 120.0
 """Bounds, far above what is usual, after which the demo says that it failed."""
 
+PLACE_LIMIT: Final = 45
+"""Characters: a unix socket's path has at most 107 (unix(7)), and the longest of ours adds some 55."""
+
 DRAW_S: Final = 0.1
 COLUMNS: Final = ("program", "runs on", "state", "snapshots", "lag", "freeze", "output", "newest line")
 RESULT_COLUMNS: Final = ("program", "outage", "lag at the cut", "freeze median", "freeze max", "output", "equal")
@@ -69,7 +72,7 @@ def demo(arguments: argparse.Namespace) -> int:
     live = render.is_terminal() and not arguments.json
     screen = _LiveScreen() if live else _PlainScreen(quiet=arguments.json)
     with _ending_well():
-        directory = Path(tempfile.mkdtemp(prefix="failover-demo-"))
+        directory = Path(tempfile.mkdtemp(prefix="failover-demo-", dir=short_place()))
         with screen, Stage(directory, robots.means()) as stage:
             play = Play(stage, screen)
             try:
@@ -77,6 +80,12 @@ def demo(arguments: argparse.Namespace) -> int:
             finally:
                 play.end_references()
     return _conclude(arguments, play, screen)
+
+
+def short_place() -> str:
+    """Where the demo makes its directory: the usual place, unless the robots' sockets would have too long a name there."""
+    usual = tempfile.gettempdir()
+    return usual if len(usual) <= PLACE_LIMIT else "/tmp"
 
 
 @contextmanager
