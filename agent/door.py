@@ -122,6 +122,8 @@ class BeatCounts(msgspec.Struct, frozen=True):
     Attributes:
         refused: frames not believed, by reason.
         late_us_max: the longest that a turn of the loop came after its deadline.
+        gap_us_max: the longest between two beats of one peer.
+        gaps: how many were longer than `agent.loop.GAP_BEATS` periods.
     """
 
     sent: int = 0
@@ -129,6 +131,8 @@ class BeatCounts(msgspec.Struct, frozen=True):
     unsent: int = 0
     refused: dict[str, int] = {}
     late_us_max: int = 0
+    gap_us_max: int = 0
+    gaps: int = 0
 
 
 class Told(msgspec.Struct, frozen=True, tag=True):

@@ -44,6 +44,9 @@ SLEEP_LIMIT_S: Final = 0.5
 PERSIST_PATIENCE_S: Final = 2.0
 """How long an orderly end waits for the disk."""
 
+GAP_BEATS: Final = 3
+"""Periods of silence that count as a gap: one lost beat is none, and a lease is longer."""
+
 LANES_TRIES: Final = 5
 """Lanes processes that may die before their first word; then something is wrong that no restart cures."""
 
@@ -80,7 +83,8 @@ class Heart:
         self._ending = False
         self._lanes_deaths = 0
         self._refused: Counter[str] = Counter()
-        self._sent = self._heard = self._late_us_max = 0
+        self._sent = self._heard = self._late_us_max = self._gap_us_max = self._gaps = 0
+        self._heard_at: dict[str, int] = {}
         self._notes: tuple[str, ...] = ()
 
     def run(self) -> None:
@@ -156,10 +160,19 @@ class Heart:
         for frame in self._beats.receive(descriptor):
             opened = self._hearing.open(frame)
             if isinstance(opened, Beat):
-                self._heard += 1
+                self._count(opened.sender)
                 self._step(Received(opened))
             else:
                 self._refused[str(opened.reason)] += 1
+
+    def _count(self, peer: str) -> None:
+        """Note how long the peer was silent before this beat."""
+        now_ns = clock.now_ns()
+        gap_us = (now_ns - self._heard_at.get(peer, now_ns)) // 1_000
+        self._heard_at[peer] = now_ns
+        self._heard += 1
+        self._gap_us_max = max(self._gap_us_max, gap_us)
+        self._gaps += gap_us > GAP_BEATS * self._settings.config.beat_ms * 1_000
 
     def _note_persisted(self) -> None:
         for number, ballot in self._persister.finished():
@@ -233,7 +246,15 @@ class Heart:
 
     def _told(self, question: door.Ask) -> ToLanes:
         now_ns = clock.now_ns()
-        counts = BeatCounts(self._sent, self._heard, self._beats.unsent, dict(self._refused), self._late_us_max)
+        counts = BeatCounts(
+            self._sent,
+            self._heard,
+            self._beats.unsent,
+            dict(self._refused),
+            self._late_us_max,
+            self._gap_us_max,
+            self._gaps,
+        )
         trouble = self._persister.trouble
         if self._node is None:
             return Told(question.number, now_ns, beats=counts, ballot_trouble=trouble)

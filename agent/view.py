@@ -74,6 +74,8 @@ def team_view(
             "unsent": beats.unsent,
             "refused": dict(beats.refused),
             "late_us_max": beats.late_us_max,
+            "gap_us_max": beats.gap_us_max,
+            "gaps": beats.gaps,
         },
         "lanes_pid": os.getpid(),
     }

@@ -112,3 +112,27 @@ def test_a_cable_that_is_cut_is_noticed_and_one_that_is_back_too(pair: tuple[Rob
         robots.until(lambda robot=robot: robot.status()["peers"][0]["state"] == "dead", "the silence to be noticed")  # type: ignore[misc]
     robots.cable(first, "up")
     robots.until(lambda: robots.connected(first) and robots.connected(second), "both to hear each other again")
+
+
+BIG = (
+    "import os, time\n"
+    "memory = bytearray()\n"
+    "for _ in range({megabytes}):\n    memory += os.urandom(1 << 20)\n"
+    "print('ready', flush=True)\n"
+    "while True:\n    time.sleep(1)\n"
+)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_no_beat_is_delayed_by_a_snapshot_of_500_megabytes(pair: tuple[RobotMachine, RobotMachine]) -> None:
+    first, second = pair
+    if not (first.status()["realtime"] and second.status()["realtime"]):
+        pytest.skip("needs real-time priority: without it a busy machine delays beats by itself")
+    before = second.status()["beats"]["heard"]
+    robots.run(first, "big", "/usr/bin/python3", "-S", "-c", BIG.format(megabytes=500))
+    robots.until(lambda: robots.output(second, "big") == b"ready\n", "a checkpoint of the whole program")
+    for robot in pair:
+        beats = robot.status()["beats"]
+        assert beats["gaps"] == 0, f"{robot.name}: silent for up to {beats['gap_us_max']} us"
+    assert second.status()["beats"]["heard"] > before
