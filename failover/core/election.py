@@ -4,7 +4,7 @@ A primacy is an epoch and the robot that all who know of it name as its primary.
 
 * A robot claims a *vacant* component: no living robot holds it, and everybody is either heard or dead.
 * Naming the claimant at its epoch is consent; hearing a claim raises the hearer's own epoch before it answers.
-* Of two claims the higher epoch wins; at the same epoch one that runs already, then the lesser name W.
+* Of two claims the higher epoch wins; at the same epoch the one that acts already, then the lesser name W.
 * Under ``when_alone = freeze`` a robot starts a component only with everybody's consent, or with the *right to act alone*: it was
   entrusted by the primary that has gone silent, or it was the primary itself and had entrusted nobody. One robot has that right.
 """
@@ -18,6 +18,10 @@ from failover.core.consent import grants, state_of
 from failover.core.messages import HOLDS, UNPROTECTED, Entry
 from failover.core.names import weight
 from failover.core.types import ENDED, HOLDING, MS, PEERS_MAX, State
+
+ACTS_FULLY = 2
+_ACTS = {State.CLAIMING: 0, State.FROZEN: 1}
+"""At one epoch: a claim yields to a copy that stands still, and that one to a copy that acts."""
 
 _RUNS_HERE = frozenset({State.PRIMARY, State.FROZEN, State.HANDING_OVER})
 _END_CAUSES = {State.FINISHED: Cause.FINISH, State.FAILED: Cause.FAIL, State.RELEASED: Cause.RELEASE}
@@ -109,6 +113,11 @@ def open_line(component: Component, turn: Turn) -> None:
     names = sorted((turn.me, *turn.config.peers), key=weight)
     component.generation = component.epoch * (PEERS_MAX + 1) + names.index(turn.me)
     component.sequence = max((held.sequence for held in component.held if held.generation == component.generation), default=0)
+    restart_line(component, turn)
+
+
+def restart_line(component: Component, turn: Turn) -> None:
+    """The program is another process now: the next snapshot is a base, and no number is used twice."""
     component.parent = component.flight = None
     component.base_wanted = True
     component.due_ns = turn.now_ns
@@ -203,9 +212,9 @@ def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry, t
 
 
 def _stronger(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> bool:
-    """Whether their hold on the component beats ours."""
-    their_claim = (entry.epoch, theirs is not State.CLAIMING)
-    our_claim = (component.epoch, component.state is not State.CLAIMING)
+    """Whether their hold on the component beats ours: the later epoch, then the one that acts, then the lesser name."""
+    their_claim = (entry.epoch, _ACTS.get(theirs, ACTS_FULLY))
+    our_claim = (component.epoch, _ACTS.get(component.state, ACTS_FULLY))
     return their_claim > our_claim or (their_claim == our_claim and weight(sender) < weight(turn.me))
 
 
@@ -228,7 +237,7 @@ def lose(component: Component, turn: Turn, winner: str, entry: Entry) -> None:
     """Our primacy is over: keep our copy's state aside, stop it, and follow."""
     handing = component.handing
     tidy = handing is not None and handing.yielded and winner == handing.to
-    if handing is not None:
+    if handing is not None and handing.request:
         turn.order(acts.Answer(handing.request, tidy, f"{winner} {'takes' if tidy else 'has claimed'} {component.name}"))
     if component.state is State.CLAIMING:
         component.move(Cause.YIELD_CLAIM)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from failover.core import acts
 from failover.core.component import Cause, Component, Turn
 from failover.core.consent import state_of
-from failover.core.election import open_line, refuse_request
+from failover.core.election import refuse_request, restart_line
 from failover.core.events import ActFailed, Exited
 from failover.core.types import ENDED, MS, OnCrash, State
 
@@ -110,24 +110,25 @@ def _recover(component: Component, turn: Turn, status: int) -> None:
         return
     position = component.held[-back]
     component.move(Cause.CRASH)
-    component.handing = None
-    component.epoch += 1
-    component.born = component.epoch
-    open_line(component, turn)
+    _end_handover(component, turn, f"{component.name} crashed meanwhile and is resumed at {turn.me}")
+    restart_line(component, turn)
     component.until_ns = turn.now_ns + turn.config.restore_ms * MS
     component.told_ns = component.lease_ns
     turn.order(acts.Restore(component.name, component.epoch, position, component.spec, component.lease_ns))
-    turn.say(
-        component, f"{turn.me} saw it crash (wait status {status}, {count} in the window) and resumes it from {position.sequence}"
-    )
+    turn.say(component, f"{turn.me} saw it crash, {count} in the window, and resumes it from {position.sequence}")
+
+
+def _end_handover(component: Component, turn: Turn, why: str) -> None:
+    if component.handing is not None and component.handing.request:
+        turn.order(acts.Answer(component.handing.request, False, why))
+    component.handing = None
 
 
 def _end(component: Component, turn: Turn, cause: Cause, status: int, reason: str) -> None:
-    if component.handing is not None:
-        turn.order(acts.Answer(component.handing.request, False, f"{component.name} ended meanwhile"))
+    _end_handover(component, turn, f"{component.name} ended meanwhile")
     component.move(cause)
     component.status, component.reason = status, reason
-    component.handing = component.flight = None
+    component.flight = None
     component.reported = False
     if reason:
         turn.say(component, f"{turn.me} {cause}: {reason}")
