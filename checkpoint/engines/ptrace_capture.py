@@ -383,7 +383,7 @@ class PtraceSession:
         """Keep what a scan found until it is acknowledged; a scan whose capture failed is joined with the next."""
         if self._unacknowledged and self._unacknowledged[-1].position is None:
             last = self._unacknowledged.pop()
-            still = pages.difference(last.written, scan.cleared)
+            still = pages.intersection(pages.difference(last.written, scan.cleared), self._mapped())
             scan = dirty.Scan(pages.union(still, scan.written), pages.union(last.cleared, scan.cleared))
         self._unacknowledged.append(Unacknowledged(None, scan.written, scan.cleared))
 
@@ -396,8 +396,11 @@ class PtraceSession:
         for one in scans:
             written = pages.union(pages.difference(written, one.cleared), one.written) if len(written) else one.written
             cleared = pages.union(cleared, one.cleared) if len(cleared) else one.cleared
-        mapped = dirty.extents_of([line for line in self._lines if line.name not in dirty.NOT_CARRIED])
-        return pages.intersection(written, mapped), cleared
+        return pages.intersection(written, self._mapped()), cleared
+
+    def _mapped(self) -> Words:
+        """Everything that a snapshot may carry pages of."""
+        return dirty.extents_of([line for line in self._lines if line.name not in dirty.NOT_CARRIED])
 
     # Describing, while the program runs
 

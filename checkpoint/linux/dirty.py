@@ -251,6 +251,7 @@ class PagemapTracker:
         self._open: Words = NONE
         self._protect: Words = NONE
         self._files: Words = NONE
+        self._owned: Words = NONE
         self._stubborn: set[tuple[int, int]] = set()
         enable_write_protection(faults)
 
@@ -259,9 +260,11 @@ class PagemapTracker:
         self._stubborn.clear()
         for line in lines:
             self._register(line)
+        existing = self._scanner.existing(extents_of(lines))
         with contextlib.suppress(MappingLostError):
-            self._protect_windows(lines, self._scanner.existing(extents_of(lines)))
+            self._protect_windows(lines, existing)
         self._learn(lines)
+        self._owned = pages.intersection(self._scanner.existing(self._files), self._files)
 
     def scan(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
         """See `Tracker.scan`."""
@@ -290,6 +293,8 @@ class PagemapTracker:
         written, emptied = self._sift(written)
         if len(copied):
             written = pages.union(written, copied)
+        if len(given_back := self._given_back(written)):
+            emptied = pages.union(emptied, given_back)
         if len(emptied):
             cleared = pages.union(cleared, emptied)
         return Scan(written, cleared)
@@ -340,6 +345,20 @@ class PagemapTracker:
     def _register(self, line: MapsLine) -> bool:
         order = abi.UffdRegister(line.start, line.size, abi.UFFDIO_REGISTER_MODE_WP, 0)
         return int(abi.ioctl(self._faults, abi.UFFDIO_REGISTER, ctypes.addressof(order))) == 0
+
+    def _given_back(self, written: Words) -> Words:
+        """Private copies of a file's pages that the program has dropped (MADV_DONTNEED): the file shows again.
+
+        The kernel leaves such a page protected (zap_install_uffd_wp_if_needed() in mm/memory.c), so that no scan tells.
+        """
+        if not len(self._files):
+            return NONE
+        now = self._scanner.existing(self._owned)
+        gone = pages.difference(self._owned, now)
+        came = written[touching(written, self._files)]
+        if len(came) or len(gone):
+            self._owned = pages.union(now, pages.intersection(came, self._files))
+        return gone
 
     def _sift(self, written: Words) -> tuple[Words, Words]:
         """Tell pages that hold something from holes and from a file's own: (to read, to clear)."""
