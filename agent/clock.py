@@ -17,9 +17,10 @@ def now_ns() -> int:
     return time.monotonic_ns()
 
 
-def wall_time_s() -> float:
-    """Calendar time, for a person's eyes only; nothing is decided by it."""
-    return time.time()
+def calendar(instant_ns: int, reading_ns: int) -> str:
+    """An instant of the monotonic clock as local time, given that clock's present reading; for a person's eyes only."""
+    at_s = time.time() - (reading_ns - instant_ns) / 1e9
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(at_s)) + f".{int(at_s % 1 * 1_000):03d}"
 
 
 def become_realtime() -> tuple[str, ...]:

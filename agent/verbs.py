@@ -30,8 +30,6 @@ LOG_POLL_S: Final = 0.02
 START_PATIENCE_S: Final = 30.0
 """How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
 
-NANOSECONDS_A_SECOND: Final = 1_000_000_000
-
 T = TypeVar("T")
 
 
@@ -150,10 +148,9 @@ class Verbs:
         wanted = _read(NameArguments, "why", arguments)
         name = await self._known(wanted.name) if wanted.name else ""
         told = await self._lanes.ask("why", name)
-        wall_s = clock.wall_time_s()
         story = [
             {
-                "at": wall_s - (told.now_ns - decision.at_ns) / NANOSECONDS_A_SECOND,
+                "at": clock.calendar(decision.at_ns, told.now_ns),
                 "robot": self._lanes.settings.config.robot,
                 "component": decision.component,
                 "saw": "",

@@ -38,14 +38,14 @@ def two_robots(directory: Path) -> Iterator[tuple[RobotMachine, RobotMachine]]:
         yield first, second
 
 
-def until(condition: Callable[[], T], what: str) -> T:
-    """The first true value of the condition; fails after `PATIENCE_S`."""
-    deadline = time.monotonic() + PATIENCE_S
+def until(condition: Callable[[], T], what: str, patience_s: float = PATIENCE_S) -> T:
+    """The first true value of the condition; fails after ``patience_s``."""
+    deadline = time.monotonic() + patience_s
     while True:
         value = condition()
         if value:
             return value
-        assert time.monotonic() < deadline, f"waited {PATIENCE_S:.0f} s in vain for {what}"
+        assert time.monotonic() < deadline, f"waited {patience_s:.0f} s in vain for {what}"
         time.sleep(POLL_S)
 
 

@@ -114,6 +114,7 @@ def test_a_cable_that_is_cut_is_noticed_and_one_that_is_back_too(pair: tuple[Rob
     robots.until(lambda: robots.connected(first) and robots.connected(second), "both to hear each other again")
 
 
+BIG_S = 240.0
 BIG = (
     "import os, time\n"
     "memory = bytearray()\n"
@@ -131,7 +132,7 @@ def test_no_beat_is_delayed_by_a_snapshot_of_500_megabytes(pair: tuple[RobotMach
         pytest.skip("needs real-time priority: without it a busy machine delays beats by itself")
     before = second.status()["beats"]["heard"]
     robots.run(first, "big", "/usr/bin/python3", "-S", "-c", BIG.format(megabytes=500))
-    robots.until(lambda: robots.output(second, "big") == b"ready\n", "a checkpoint of the whole program")
+    robots.until(lambda: robots.output(second, "big") == b"ready\n", "a checkpoint of the whole program", BIG_S)
     for robot in pair:
         beats = robot.status()["beats"]
         assert beats["gaps"] == 0, f"{robot.name}: silent for up to {beats['gap_us_max']} us"
