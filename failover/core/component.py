@@ -108,6 +108,7 @@ class Component:
         claim_counter: beat of ours that first carried the present epoch.
         generation, sequence: of the next snapshot; ``parent``: newest position that the keeper may count from.
         born: epoch under which the present process was started or restored.
+        crashed: wait status of a program that died while it was held still; it is resumed when it may act.
         due_ns: next capture; ``until_ns``: when the present claim, start or restore is overdue.
     """
 
@@ -145,6 +146,7 @@ class Component:
     lease_ns: int = 0
     told_ns: int = 0
     crashes: deque[int] = field(default_factory=lambda: deque(maxlen=128))
+    crashed: int = 0
     handing: Handing | None = None
     ending: bool = False
     needs_base: bool = False

@@ -75,6 +75,7 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str) -> 
     component.until_ns = turn.now_ns + turn.config.loyalty_ns
     component.unprotected, component.degraded, component.needs_base = False, "", False
     component.handing, component.ending, component.reported = None, False, False
+    component.crashed = 0
     component.lease_ns = component.told_ns = 0
     open_line(component, turn)
     start = "its newest checkpoint" if plan else "the beginning"
@@ -88,7 +89,7 @@ def advance(component: Component, turn: Turn) -> None:
     entrust_holder(component, turn)
     component.until_ns = turn.now_ns + turn.config.restore_ms * MS
     component.born = component.epoch
-    lease_ns = lease.counted_ns(component, turn)
+    lease_ns = lease.first_ns(component, turn)
     if component.plan is None:
         assert component.spec is not None, f"{component.name}: claimed without knowing what to start"
         component.move(Cause.START)
@@ -252,6 +253,7 @@ def lose(component: Component, turn: Turn, winner: str, entry: Entry) -> None:
         turn.order(acts.Stop(component.name, entry.epoch))
     component.handing = component.flight = None
     component.standby, component.lease_ns, component.told_ns = "", 0, 0
+    component.crashed = 0
     _accept(component, turn, winner, entry.epoch)
     component.trusted = entry.standby == turn.me
     admit(component, turn, winner)

@@ -5,7 +5,7 @@ Invariants: an end is a record before anybody is told of it; crashes make no end
 
 from __future__ import annotations
 
-from failover.core import acts
+from failover.core import acts, lease
 from failover.core.component import Cause, Component, Turn
 from failover.core.consent import state_of
 from failover.core.election import refuse_request, restart_line
@@ -36,7 +36,14 @@ def exited(component: Component, turn: Turn, event: Exited) -> None:
     elif component.rules.on_crash is OnCrash.STOP:
         _end(component, turn, Cause.FAIL, event.status, f"it died by signal {signal}; on_crash = stop")
     else:
-        _recover(component, turn, event.status)
+        crashed(component, turn, event.status)
+
+
+def crashed(component: Component, turn: Turn, status: int) -> None:
+    """Resume it here; a copy that is held still, once this robot knows that it may act."""
+    component.crashed = status if component.state is State.FROZEN else 0
+    if not component.crashed:
+        _recover(component, turn, status)
 
 
 def failed(component: Component, turn: Turn, event: ActFailed) -> None:
@@ -113,7 +120,7 @@ def _recover(component: Component, turn: Turn, status: int) -> None:
     _end_handover(component, turn, f"{component.name} crashed meanwhile and is resumed at {turn.me}")
     restart_line(component, turn)
     component.until_ns = turn.now_ns + turn.config.restore_ms * MS
-    component.told_ns = component.lease_ns
+    component.lease_ns = component.told_ns = lease.first_ns(component, turn)
     turn.order(acts.Restore(component.name, component.epoch, position, component.spec, component.lease_ns))
     turn.say(component, f"{turn.me} saw it crash, {count} in the window, and resumes it from {position.sequence}")
 

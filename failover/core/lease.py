@@ -58,6 +58,11 @@ def counted_ns(component: Component, turn: Turn) -> int:
     return max(component.lease_ns, min(_granted_ns(component, turn, robot) for robot in component.entrusted))
 
 
+def first_ns(component: Component, turn: Turn) -> int:
+    """The lease that a program begins with: 0 only where it needs none; one that is over holds it still from the start."""
+    return max(counted_ns(component, turn), 1) if component.entrusted else 0
+
+
 def _granted_ns(component: Component, turn: Turn, robot: str) -> int:
     peer = turn.team.peers.get(robot)
     return turn.team.lease_ns(robot) if peer is not None and grants(component, peer, turn.me) else 0

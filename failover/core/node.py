@@ -296,6 +296,8 @@ def _review_idle(component: Component, turn: Turn) -> None:
 
 def _review_held(component: Component, turn: Turn) -> None:
     lease.watch(component, turn)
+    if component.crashed:
+        endings.crashed(component, turn, component.crashed)
     replication.overdue(component, turn)
     if component.state is State.PRIMARY:
         replication.choose_standby(component, turn)
