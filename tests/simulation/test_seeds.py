@@ -15,7 +15,7 @@ BLOCK = 50
 SEEDS_TO_CATCH = 150
 
 ONCE_BROKEN = (72, 79, 1554, 1572, 1753, 2737, 4440)
-"""Each found a mistake: numbers used twice, a lease lost on the way, an epoch opened without consent, no lease taken for a free one."""
+"""Each found a mistake: numbers used twice, a lease lost on the way, an epoch without consent, no lease taken for a free one."""
 
 
 @pytest.mark.parametrize("first", range(0, SEEDS, BLOCK))
