@@ -130,6 +130,29 @@ def with_registers(registers: bytes, **values: int) -> bytes:
     return x86_64.encode_registers(x86_64.decode_registers(registers) | {x86_64.CALL_NUMBER: _NO_CALL, **values})
 
 
+ERESTARTSYS: Final = -512
+ERESTARTNOHAND: Final = -514
+ALWAYS_INTERRUPTED: Final = frozenset(
+    ("pause", "rt_sigsuspend", "select", "pselect6", "ppoll", *x86_64.RESTART_BLOCK_USERS, *x86_64.ENDLESS_TIMEOUT)
+)
+"""Calls that return EINTR after any signal handler; the others are made again after one with SA_RESTART. Source: signal(7)."""
+
+
+def in_interrupted_call(registers: bytes, interrupted: str) -> bytes:
+    """Registers that go on as a snapshot's do, unless a signal handler comes first: then an interrupted call returns EINTR.
+
+    Args:
+        registers: set to make the interrupted call again.
+        interrupted: that call's name; "" when there is none.
+    """
+    if not interrupted:
+        return with_registers(registers)
+    values = x86_64.decode_registers(registers)
+    result = ERESTARTNOHAND if interrupted in ALWAYS_INTERRUPTED else ERESTARTSYS
+    after = values["rip"] + len(x86_64.SYSCALL)
+    return with_registers(registers, rip=after, rax=result, orig_rax=values["rax"])
+
+
 def at_call(registers: bytes, instruction: int, number: int, arguments: tuple[int, ...]) -> bytes:
     """Registers that make one system call with the syscall instruction at an address."""
     return with_registers(registers, rip=instruction, rax=number, **dict(zip(x86_64.ARGUMENTS, arguments, strict=False)))

@@ -181,7 +181,10 @@ class _Restore:
         self._single(instruction, "munmap", self._stub.base, -(-self._area_size // abi.PAGE_SIZE) * abi.PAGE_SIZE)
         self._restore_rseq_section()
         tracee.set_xstate(self._thread.registers["xstate"][: self._xstate_size].ljust(self._xstate_size, b"\0"))
-        tracee.set_registers(x86_64_stub.with_registers(self._thread.registers["prstatus"]))
+        tracee.interrupt()  # a signal that comes from now on finds the thread where the kernel decides about interrupted calls
+        tracee.cont()
+        tracee.wait(call_table.RUN_TIMEOUT_S)
+        tracee.set_registers(x86_64_stub.in_interrupted_call(self._thread.registers["prstatus"], self._thread.interrupted))
         tracee.set_signal_mask(self._thread.signal_mask)
 
     def _restore_rseq_section(self) -> None:

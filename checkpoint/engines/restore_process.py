@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import os
 import struct
+import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -36,6 +37,9 @@ TIMER_ID_LIMIT: Final = 1024
 _NS_PER_US: Final = 1000
 _US_PER_S: Final = 1_000_000
 _NS_PER_S: Final = 1_000_000_000
+
+CLOCK_MONOTONIC_COARSE: Final = 6
+"""Its resolution is the kernel's tick."""
 
 _CPU_TIME_CLOCKS: Final = (2, 3)
 """CLOCK_PROCESS_CPUTIME_ID and CLOCK_THREAD_CPUTIME_ID; a negative clock counts some process's CPU time too."""
@@ -192,11 +196,17 @@ def scheduling(table: CallTable, thread: ThreadState, vessel: Vessel) -> None:
 
 
 def interval_timers(table: CallTable, timers: Iterable[IntervalTimer], elapsed_ns: int) -> None:
-    """Arm the alarms of setitimer(2) again. Real time went on meanwhile; the program's CPU time did not."""
+    """Arm the alarms of setitimer(2) again. Real time went on meanwhile; the program's CPU time did not.
+
+    The kernel adds a tick to a CPU time that it is given, and tells it when asked. Source: set_cpu_itimer in kernel/time/itimer.c.
+    """
+    tick_us = round(time.clock_getres(CLOCK_MONOTONIC_COARSE) * _US_PER_S)
     for timer in timers:
         value_us = timer.value_us
         if timer.which == 0 and value_us:
             value_us = max(value_us - elapsed_ns // _NS_PER_US, 1)
+        elif value_us:
+            value_us = max(value_us - tick_us, 1)
         packed = struct.pack("<4q", *divmod(timer.interval_us, _US_PER_S), *divmod(value_us, _US_PER_S))
         table.call(f"arm interval timer {timer.which}", "setitimer", timer.which, table.place(packed), 0)
 
