@@ -198,7 +198,7 @@ def scheduling(table: CallTable, thread: ThreadState, vessel: Vessel) -> None:
 def interval_timers(table: CallTable, timers: Iterable[IntervalTimer], elapsed_ns: int) -> None:
     """Arm the alarms of setitimer(2) again. Real time went on meanwhile; the program's CPU time did not.
 
-    The kernel adds a tick to a CPU time that it is given, and tells it when asked. Source: set_cpu_itimer in kernel/time/itimer.c.
+    The kernel adds a tick to a CPU time that it is given, and tells it when asked. Source: set_cpu_itimer, kernel/time/itimer.c.
     """
     tick_us = round(time.clock_getres(CLOCK_MONOTONIC_COARSE) * _US_PER_S)
     for timer in timers:
