@@ -75,7 +75,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return f"{what}, a view of this machine's kernel: let the program close it after reading"
     if first.target.startswith("/secretmem"):
         return f"{what}: secret memory cannot be read, that is its purpose; run the program without it"
-    if "QSIZE" in first.fields or not (is_deleted(first) or _is_found(held)):
+    if not (_was_found(held) if is_deleted(first) else _is_found(held)):
         return f"{what}, which no path leads to from here (a message queue, for one): that is not kept; run without it"
     return _refuse_deleted(held) if is_deleted(first) else None
 
@@ -109,6 +109,15 @@ def _is_found(held: OpenFile) -> bool:
     except OSError:
         return False
     return (about.st_dev, about.st_ino) == (held.first.device, held.first.inode)
+
+
+def _was_found(held: OpenFile) -> bool:
+    """Whether a deleted file lies on the file system of the directory where its name was; a message queue does not."""
+    try:
+        about = os.stat(f"/proc/{held.pid}/root{os.path.dirname(held.first.target)}")
+    except OSError:
+        return True  # the directory has gone too; the content is what counts
+    return about.st_dev == held.first.device
 
 
 def is_only_read(one: Descriptor) -> bool:
