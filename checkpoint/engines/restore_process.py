@@ -16,6 +16,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from checkpoint.errors import RestoreError
 from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Credentials, IntervalTimer, PosixTimer, ProcessState, SignalAction, ThreadState
@@ -220,6 +221,11 @@ def posix_timers(table: CallTable, process: ProcessState, thread: ThreadState, v
     if not timers:
         return
     chosen_ids = timer_numbers_can_be_chosen()
+    highest = max(timer.timer_id for timer in timers)
+    if not chosen_ids and highest > TIMER_ID_LIMIT:
+        raise RestoreError(
+            f"cannot restore: it has a timer number {highest}, and this kernel counts up to it; use Linux 6.15 or later"
+        )
     overdue = {timer_of(siginfo) for siginfo in (*process.pending, *thread.pending)}
     if chosen_ids:
         table.call("choose timer numbers", "prctl", PR_TIMER_CREATE_RESTORE_IDS, 1)
