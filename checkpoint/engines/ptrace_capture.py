@@ -19,11 +19,12 @@ import functools
 import gc
 import os
 import re
+import signal
 import socket
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from blake3 import blake3
@@ -152,6 +153,7 @@ class PtraceSession:
         self._acknowledged: Position | None = None
         self._totals_at: dict[Position, Totals] = {}
         self._held = False
+        self._before_hold: Any = signal.SIG_DFL
         self._closed = False
 
     # Opening and closing
@@ -180,8 +182,7 @@ class PtraceSession:
             return
         self._closed = True
         if self._held:
-            with contextlib.suppress(CaptureError):
-                self._tracee.detach()
+            self._thaw()
         self._tracker.close()
         self._shared.close()
         if self._outputs:
@@ -285,7 +286,7 @@ class PtraceSession:
             self._thaw()
             raise
         if hold:
-            self._held = True
+            self._hold()
         else:
             self._thaw()
         return replace(look_, freeze_us=(time.perf_counter_ns() - began) // US_PER_NS if tracee else 0)
@@ -300,7 +301,18 @@ class PtraceSession:
         self._tracee.freeze()
         return began
 
+    def _hold(self) -> None:
+        """Leave it standing; should it be killed meanwhile, its parent hears of it only after we have taken note."""
+        self._held = True
+        self._before_hold = signal.signal(signal.SIGCHLD, lambda *_: self._take_note())
+
+    def _take_note(self) -> None:
+        with contextlib.suppress(ChildProcessError):
+            os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG)
+
     def _thaw(self) -> None:
+        if self._held:
+            signal.signal(signal.SIGCHLD, self._before_hold)
         self._held = False
         with contextlib.suppress(ProcessGoneError):
             self._tracee.detach()
