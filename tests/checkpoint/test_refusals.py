@@ -1,0 +1,261 @@
+"""What cannot be preserved is refused by name before the program is touched; the program goes on as if nobody had looked."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from checkpoint.engine import CaptureOrder
+from checkpoint.errors import ProbeError, UnsupportedError
+from tests.checkpoint.round_trip import ENGINE, captured, ended, expect_ok, protected, start, start_tracee
+
+pytestmark = [pytest.mark.compiler, pytest.mark.root]
+
+Compiled = Callable[..., Path]
+
+REFUSED = {
+    "thread": "thread",
+    "child": "child",
+    "zombie_child": "child",
+    "shared_files_child": "child",
+    "traced_child": "child",
+    "fifo": "fifo|pipe",
+    "unix_socket": "socket",
+    "tcp_socket": "socket",
+    "udp_socket": "socket",
+    "netlink_socket": "socket",
+    "epoll": "epoll",
+    "eventfd": "eventfd",
+    "timerfd": "timerfd",
+    "signalfd": "signalfd",
+    "inotify": "inotify",
+    "fanotify": "fanotify",
+    "io_uring": "io_uring",
+    "io_uring_mapped": "io_uring",
+    "aio": "aio|asynchronous",
+    "userfaultfd": "userfaultfd",
+    "userfaultfd_registered": "userfaultfd",
+    "pseudo_terminal": "terminal|/dev/pt",
+    "seccomp": "seccomp",
+    "huge_pages": "huge",
+    "lock": "lock",
+    "record_lock": "lock",
+    "description_lock": "lock",
+    "lease": "lease|lock",
+    "kernel_log": "/dev/kmsg",
+    "tun": "tun",
+    "fuse": "fuse",
+    "terminal_multiplexer": "ptmx|terminal",
+    "device_memory": "/dev/mem",
+    "system_v_memory": "sysv|system v|shared memory",
+    "message_queue": "queue",
+    "bpf_map": "bpf",
+    "perf_event": "perf",
+    "pidfd": "pidfd",
+    "namespace": "namespace|net:",
+    "proc_file": "/proc",
+    "proc_directory": "/proc",
+    "secret_memory": "secret",
+    "protection_key": "protection key",
+    "deleted_directory": "directory",
+    "root": "root",
+    "own_namespace": "namespace",
+}
+"""What each kind of ``tests/tracees/refused.c`` must be called in the refusal: one of the words, in any case."""
+
+
+def _facts(pid: int) -> tuple[str, str, list[str]]:
+    """What a touch would change: mappings, open descriptors, blocked and pending signals."""
+    status = Path(f"/proc/{pid}/status").read_text().splitlines()
+    signals = [line for line in status if line.startswith(("Sig", "ShdPnd", "TracerPid"))]
+    return Path(f"/proc/{pid}/maps").read_text(), " ".join(sorted(os.listdir(f"/proc/{pid}/fd"))), signals
+
+
+@pytest.mark.parametrize("kind", [*REFUSED])
+def test_what_cannot_be_preserved_is_refused_by_name_and_not_touched(kind: str, compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("refused", "-O2"), tmp_path, kind)) as tracee:
+        before = _facts(tracee.pid)
+        report = ENGINE.probe(tracee.pid)
+        with pytest.raises(UnsupportedError) as refusal:
+            ENGINE.protect(tracee.pid, "/test/tracee", None).close()
+        assert _facts(tracee.pid) == before
+        text = " ".join(refusal.value.reasons).lower()
+        assert any(word in text for word in REFUSED[kind].split("|")), text
+        assert not report.supported
+        assert report.reasons == refusal.value.reasons
+        if kind == "deleted_directory":
+            return  # it cannot see a go file any more
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_a_program_that_holds_nothing_special_is_not_refused(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("refused", "-O2"), tmp_path, "nothing")) as tracee:
+        report = ENGINE.probe(tracee.pid)
+        assert report.supported, report.reasons
+        captured(tracee)
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_a_program_of_32_bits_is_refused(tmp_path: Path) -> None:
+    source = tmp_path / "small.c"
+    source.write_text('void _start(void) { for (;;) { int r; __asm__ volatile("int $0x80" : "=a"(r) : "a"(29) : "memory"); } }\n')
+    build = ["gcc", "-m32", "-nostdlib", "-static", "-fno-pie", "-no-pie", "-o", tmp_path / "small", source]
+    if subprocess.run(build, capture_output=True, check=False).returncode:
+        pytest.skip("this compiler cannot build for 32 bits")
+    with ended(start([tmp_path / "small"], tmp_path)) as program:
+        program.wait_until(lambda: os.readlink(f"/proc/{program.pid}/exe").endswith("small"), "its executable")
+        with pytest.raises((UnsupportedError, ProbeError)) as refusal:
+            ENGINE.protect(program.pid, "/test/small", None).close()
+        assert "32" in str(refusal.value) + " ".join(getattr(refusal.value, "reasons", ()))
+
+
+def test_no_such_pid_is_said_so() -> None:
+    child = subprocess.Popen(["/bin/true"])
+    child.wait()
+    with pytest.raises(ProbeError, match=str(child.pid)):
+        ENGINE.probe(child.pid)
+    with pytest.raises(ProbeError, match=str(child.pid)):
+        ENGINE.protect(child.pid, "/test/gone", None)
+
+
+@pytest.mark.parametrize("pid", [0, -1, 1 << 40])
+def test_a_number_that_is_no_pid_is_said_so(pid: int) -> None:
+    with pytest.raises(ProbeError):
+        ENGINE.probe(pid)
+
+
+def test_a_kernel_thread_is_refused() -> None:
+    kthreadd = next((pid for pid in (2,) if Path(f"/proc/{pid}/comm").exists()), 0)
+    if not kthreadd or Path(f"/proc/{kthreadd}/comm").read_text().strip() != "kthreadd":
+        pytest.skip("no kernel thread is visible here")
+    with pytest.raises(ProbeError, match="kernel"):
+        ENGINE.probe(kthreadd)
+
+
+def test_a_zombie_is_refused() -> None:
+    child = os.fork()
+    if child == 0:
+        os._exit(0)
+    os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)
+    try:
+        with pytest.raises(ProbeError, match=r"zombie|ended|dead"):
+            ENGINE.probe(child)
+    finally:
+        os.waitpid(child, 0)
+
+
+def test_ourselves_is_refused() -> None:
+    with pytest.raises((ProbeError, UnsupportedError)):
+        ENGINE.protect(os.getpid(), "/test/self", None)
+
+
+@pytest.mark.command("strace")
+def test_a_program_that_somebody_else_traces_is_refused(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("refused", "-O2"), tmp_path, "nothing")) as tracee:
+        strace = subprocess.Popen(["strace", "-o", "/dev/null", "-p", str(tracee.pid)], stderr=subprocess.PIPE)
+        try:
+            tracee.wait_until(lambda: _tracer(tracee.pid) == strace.pid, "the other tracer")
+            with pytest.raises(ProbeError, match=r"traced|tracer"):
+                ENGINE.protect(tracee.pid, "/test/traced", None)
+        finally:
+            strace.send_signal(signal.SIGINT)
+            strace.communicate()
+        tracee.wait_until(lambda: _tracer(tracee.pid) == 0, "no tracer")
+        captured(tracee)
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def _tracer(pid: int) -> int:
+    status = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in status if line.startswith("TracerPid:"))
+
+
+def test_a_stranger_is_not_let_in(compiled: Compiled, tmp_path: Path) -> None:
+    """An ordinary user and a process of root's."""
+    with ended(start_tracee(compiled("refused", "-O2"), tmp_path, "nothing")) as tracee:
+        read_end, write_end = os.pipe()
+        child = os.fork()
+        if child == 0:
+            try:
+                os.setgroups([])
+                os.setresgid(65534, 65534, 65534)
+                os.setresuid(65534, 65534, 65534)
+                ENGINE.protect(tracee.pid, "/test/stranger", None)
+                os.write(write_end, b"let in")
+            except ProbeError as error:
+                os.write(write_end, f"refused: {error}".encode())
+            except BaseException as error:  # noqa: BLE001 - whatever it was, the parent must hear of it
+                os.write(write_end, repr(error).encode())
+            finally:
+                os._exit(0)
+        os.close(write_end)
+        with os.fdopen(read_end) as answer:
+            text = answer.read()
+        os.waitpid(child, 0)
+        assert text.startswith("refused:"), text
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_a_program_that_turns_into_something_unsupported_runs_on_and_can_be_captured_again(tmp_path: Path) -> None:
+    program = start([sys.executable, "-c", TURNCOAT, tmp_path], tmp_path)
+    with ended(program):
+        program.wait_for_line("ready")
+        with protected(program) as session:
+            first = session.capture(CaptureOrder(sequence=1))
+            session.acknowledge(first.position)
+            (tmp_path / "fork").touch()
+            program.wait_for_line("a child")
+            with pytest.raises(UnsupportedError, match=r"(?i)child|support"):
+                session.capture(CaptureOrder(base=False, sequence=2))
+            (tmp_path / "end").touch()
+            program.wait_for_line("no child")
+            again = session.capture(CaptureOrder(base=False, sequence=3))
+            assert again.position.sequence == 3
+        (tmp_path / "go").touch()
+        assert program.finish() == 0
+
+
+TURNCOAT = """
+import os, sys, time
+def wait_for(name):
+    while not os.path.exists(os.path.join(sys.argv[1], name)):
+        time.sleep(0.002)
+print("ready", flush=True)
+wait_for("fork")
+child = os.fork()
+if child == 0:
+    wait_for("end")
+    os._exit(0)
+print("a child", flush=True)
+os.waitpid(child, 0)
+print("no child", flush=True)
+wait_for("go")
+"""
+
+
+def test_a_stopped_program_is_still_stopped_after_a_capture(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("refused", "-O2"), tmp_path, "nothing")) as tracee:
+        os.kill(tracee.pid, signal.SIGSTOP)
+        tracee.wait_until(lambda: _state(tracee.pid) == "T", "it stopped")
+        captured(tracee)
+        deadline = time.monotonic() + 0.1
+        while time.monotonic() < deadline:
+            assert _state(tracee.pid) in "Tt"
+        tracee.tell()
+        os.kill(tracee.pid, signal.SIGCONT)
+        expect_ok(tracee)
+
+
+def _state(pid: int) -> str:
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
