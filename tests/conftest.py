@@ -20,6 +20,9 @@ PR_SET_CHILD_SUBREAPER = 36  # linux/prctl.h
 LEAVE_S = 5.0
 """How long a process that a test has told to end may take for it."""
 
+signal.signal(signal.SIGINT, signal.default_int_handler)
+"""In the background of a shell we are started with Ctrl-C ignored, and so would be every program that a test interrupts."""
+
 
 # --- Skip rules ------------------------------------------------------------------------------------------------------
 
