@@ -1,0 +1,190 @@
+"""A keeper that is killed at any instant leaves the program unharmed, and an unfinished restore leaves nothing.
+
+``FAILOVER_KILLS`` says how often each is tried (20 unless set; 200 for a long look).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from checkpoint import channel
+from checkpoint.channel import Channel, ChannelError, Reply
+from checkpoint.linux.vessel import Birth, Born, spawn_vessel
+from tests.checkpoint.round_trip import PATIENCE_S, Program, ended, start
+
+KILLS = int(os.environ.get("FAILOVER_KILLS", "20"))
+
+WORKER = """
+import hashlib, sys, time
+digest, heap = b"", [bytes([n % 251]) * 4096 for n in range(800)]
+print("ready", flush=True)
+for turn in range(1 << 30):
+    heap[turn % len(heap)] = bytes([turn % 251]) * 4096
+    digest = hashlib.blake2b(digest + heap[turn * 7 % len(heap)]).digest()
+    if turn % 50 == 0:
+        with open("turn", "w") as file:
+            file.write(str(turn))
+        time.sleep(0.0005)
+    if turn % 1000 == 0:
+        import os
+        if os.path.exists("go"):
+            print(turn, digest.hex(), flush=True)
+            break
+"""
+
+
+def expected_end(turns: int) -> str:
+    """What an undisturbed run prints when it is told to stop at this turn."""
+    import hashlib
+
+    digest, heap = b"", [bytes([n % 251]) * 4096 for n in range(800)]
+    for turn in range(turns + 1):
+        heap[turn % len(heap)] = bytes([turn % 251]) * 4096
+        digest = hashlib.blake2b(digest + heap[turn * 7 % len(heap)]).digest()
+    return f"{turns} {digest.hex()}"
+
+
+class Keeper:
+    """A keeper process, and our end of its channel."""
+
+    def __init__(self) -> None:
+        ours, theirs = channel.pair()
+        with theirs:
+            command = [sys.executable, "-m", "checkpoint", "keeper", str(theirs.fileno())]
+            self.process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL)
+        self.link: Channel[Reply] = Channel(ours, Reply)
+
+    def ask(self, request: channel.Request, descriptors: tuple[int, ...] = ()) -> tuple[Reply, tuple[int, ...]]:
+        self.link.send(request, descriptors)
+        return self.link.receive()
+
+    def kill_after(self, seconds: float) -> threading.Timer:
+        timer = threading.Timer(seconds, self.process.kill)
+        timer.start()
+        return timer
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self.link.close()
+
+
+@contextlib.contextmanager
+def keeping() -> Iterator[Keeper]:
+    keeper = Keeper()
+    try:
+        keeper.ask(channel.Probe(os.getpid()))  # it has imported everything now
+        yield keeper
+    finally:
+        keeper.end()
+
+
+def a_keepers_life(keeper: Keeper, pid: int) -> None:
+    """Protect, a base, two deltas, release: every step that touches the program."""
+    keeper.ask(channel.Protect(pid, "/test/worker"))
+    for sequence in (1, 2, 3):
+        answer, descriptors = keeper.ask(channel.Capture(sequence == 1, 1, sequence))
+        channel.close_all(descriptors)
+        if isinstance(answer, channel.Captured):
+            keeper.link.send(channel.Acknowledge(answer.position))
+    keeper.ask(channel.Release())
+
+
+def goes_on(worker: Program) -> bool:
+    before = (worker.directory / "turn").read_text()
+    worker.wait_until(lambda: (worker.directory / "turn").read_text() not in ("", before), "the next turn")
+    return True
+
+
+@pytest.fixture
+def worker(tmp_path: Path) -> Iterator[Program]:
+    with ended(start([sys.executable, "-c", WORKER], tmp_path)) as program:
+        program.wait_for_line("ready")
+        program.wait_until((tmp_path / "turn").exists, "its first turn")
+        yield program
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_keeper_killed_at_any_instant_leaves_the_program_unharmed(worker: Program) -> None:
+    seed = random.randrange(1 << 30)
+    print(f"seed {seed}")
+    dice = random.Random(seed)
+    with keeping() as keeper:
+        began = time.perf_counter()
+        a_keepers_life(keeper, worker.pid)
+        life_s = time.perf_counter() - began
+    for attempt in range(KILLS):
+        with keeping() as keeper:
+            timer = keeper.kill_after(life_s * (attempt + dice.random()) / KILLS)
+            with contextlib.suppress(ChannelError):
+                a_keepers_life(keeper, worker.pid)
+            timer.join()
+            keeper.process.wait()
+        assert goes_on(worker), f"attempt {attempt}"
+        descriptors = {number for number in os.listdir(f"/proc/{worker.pid}/fd") if int(number) > 3}
+        assert len(descriptors) <= 1, f"attempt {attempt}: left open {descriptors}"  # the file that it is writing
+    with keeping() as keeper:
+        a_keepers_life(keeper, worker.pid)  # and it can be protected again
+    worker.tell()
+    assert worker.finish() == 0
+    turns = int(worker.output.split()[1])
+    assert worker.output.splitlines() == ["ready", expected_end(turns)]
+
+
+def vessel_gone(born: Born) -> bool:
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        pid, status = os.waitpid(born.pid, os.WNOHANG)
+        if pid:
+            return os.WIFSIGNALED(status)
+        time.sleep(0.002)
+    return False
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_keeper_killed_in_the_middle_of_a_restore_leaves_nothing(worker: Program, tmp_path: Path) -> None:
+    with keeping() as keeper:
+        keeper.ask(channel.Protect(worker.pid, "/test/worker"))
+        _, (snapshot,) = keeper.ask(channel.Capture(True, 1, 1, hold=True))
+        worker.kill()
+    null = os.open("/dev/null", os.O_RDWR)
+    birth = Birth(stdio=(null, null, null))
+    with keeping() as keeper:
+        born = spawn_vessel(birth)
+        began = time.perf_counter()
+        answer, _ = keeper.ask(channel.Restore(born.pid, "/test/worker"), (snapshot,))
+        assert isinstance(answer, channel.Restored), answer
+        restore_s = time.perf_counter() - began
+    assert vessel_gone(born), "a restore that was not resumed dies with its keeper"
+    dice = random.Random(11)
+    fresh = spawn_vessel(birth)
+    untouched = Path(f"/proc/{fresh.pid}/maps").read_text().splitlines()
+    os.kill(fresh.pid, 9)
+    assert vessel_gone(fresh)
+    for attempt in range(KILLS):
+        with keeping() as keeper:
+            born = spawn_vessel(birth)
+            timer = keeper.kill_after(restore_s * (attempt + dice.random()) / KILLS)
+            with contextlib.suppress(ChannelError):
+                keeper.ask(channel.Restore(born.pid, "/test/worker"), (snapshot,))
+            timer.join()
+            keeper.process.wait()
+        mappings = Path(f"/proc/{born.pid}/maps").read_text().splitlines()  # of a dead one: none
+        assert len(mappings) <= len(untouched), f"attempt {attempt}: a half restored program is still there: {mappings}"
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(born.pid, 9)  # one that had not been seized yet still waits for us, its parent
+        assert vessel_gone(born), f"attempt {attempt}"
+    os.close(snapshot)
+    os.close(null)
