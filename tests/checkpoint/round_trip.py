@@ -13,17 +13,22 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
 from checkpoint import chain, format
 from checkpoint.engine import CaptureOrder, RestoreOptions, Session, engine_named
+from checkpoint.errors import CheckpointError
+from checkpoint.linux.namespaces import prctl
 from checkpoint.linux.vessel import Birth, Born, discard, spawn_program, spawn_vessel
 from checkpoint.model import Snapshot
 
 ENGINE = engine_named("ptrace")
 PATIENCE_S = 60.0
 """How long anything awaited here may take; generous, because the machine may be busy with other tests."""
+
+PR_SET_DUMPABLE = 4
 
 CANNOT = 77
 """Exit status of a tracee that this machine does not let set its stage."""
@@ -199,6 +204,38 @@ def restored(
         discard(born)
         raise
     return Program(born, directory)
+
+
+NOBODY = 65534
+
+
+def as_nobody(act: Callable[[], str]) -> str:
+    """Run ``act`` in a child of ours that is an ordinary user; what it returned, or the error that it ended with."""
+    read_end, write_end = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(read_end)
+        _answer_as_nobody(act, write_end)
+    os.close(write_end)
+    with os.fdopen(read_end) as answer:
+        text = answer.read()
+    os.waitpid(child, 0)
+    return text
+
+
+def _answer_as_nobody(act: Callable[[], str], write_end: int) -> NoReturn:
+    text = "it broke: see the captured standard error"
+    try:
+        os.setgroups([])
+        os.setresgid(NOBODY, NOBODY, NOBODY)
+        os.setresuid(NOBODY, NOBODY, NOBODY)
+        prctl(PR_SET_DUMPABLE, 1)  # the change of user made our own /proc/self unreadable for us
+        text = act()
+    except (AssertionError, CheckpointError, OSError) as error:
+        text = f"{type(error).__name__}: {error}"
+    finally:
+        os.write(write_end, text.encode())
+        os._exit(0)
 
 
 @contextlib.contextmanager
