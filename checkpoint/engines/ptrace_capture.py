@@ -153,7 +153,7 @@ class PtraceSession:
         self._acknowledged: Position | None = None
         self._totals_at: dict[Position, Totals] = {}
         self._held = False
-        self._before_hold: Any = signal.SIG_DFL
+        self._before_hold: Any = None
         self._closed = False
 
     # Opening and closing
@@ -304,16 +304,17 @@ class PtraceSession:
     def _hold(self) -> None:
         """Leave it standing; should it be killed meanwhile, its parent hears of it only after we have taken note."""
         self._held = True
-        self._before_hold = signal.signal(signal.SIGCHLD, lambda *_: self._take_note())
+        if procfs.status(self.pid).ppid != os.getpid():  # a parent takes note by itself
+            self._before_hold = signal.signal(signal.SIGCHLD, lambda *_: self._take_note())
 
     def _take_note(self) -> None:
         with contextlib.suppress(ChildProcessError):
             os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG)
 
     def _thaw(self) -> None:
-        if self._held:
+        if self._before_hold is not None:
             signal.signal(signal.SIGCHLD, self._before_hold)
-        self._held = False
+        self._held, self._before_hold = False, None
         with contextlib.suppress(ProcessGoneError):
             self._tracee.detach()
         gc.enable()
