@@ -7,7 +7,6 @@ and what does not hold together is refused with FormatError, whatever the bytes.
 
 from __future__ import annotations
 
-import errno
 import io
 import mmap
 import os
@@ -129,10 +128,7 @@ def _write_all(file: Sink, content: bytes | memoryview) -> None:
     """Write all of it: an unbuffered file may take less at a time."""
     rest = memoryview(content)
     while rest:
-        written = file.write(rest)
-        if not written:
-            raise BlockingIOError(errno.EAGAIN, "the file takes nothing")
-        rest = rest[written:]
+        rest = rest[file.write(rest) or 0 :]
 
 
 def _pack_runs(cleared: tuple[PageRun, ...], runs: tuple[PageRun, ...]) -> bytes:

@@ -80,7 +80,7 @@ class Shelf:
         if floor is None:
             return ()
         needed = {entry for kept in restorable if kept.order >= floor for entry in self.chain_to(kept.position)}
-        return tuple(entry for entry in self.entries if entry not in needed)
+        return tuple(entry for entry in self.entries if entry not in needed and entry.order <= restorable[-1].order)
 
     def _restorable(self) -> list[Entry]:
         """One file for every position whose chain is whole, oldest first."""

@@ -71,7 +71,6 @@ class Store:
         self._lock = threading.RLock()
         self._shelves: dict[str, Shelf] = {}
         self._proved: dict[str, _Proved] = {}
-        self._unusable: dict[str, list[Path]] = {}  # by folder name: damaged files, removed when they are pruned
         self._serial = count()
         self.notices: list[str] = []
         """What was found damaged or left over: one sentence each."""
@@ -236,8 +235,6 @@ class Store:
             self.fold(component, oldest)
         with self._lock:
             self._remove(component, self._shelf(component).unneeded_for(oldest))
-            if self._shelf(component).chain_to(oldest):
-                self._remove_unusable(component)
 
     def keep_newest(self, component: str, positions: int) -> None:
         """Forget all but the newest positions; as ``prune``."""
@@ -294,9 +291,7 @@ class Store:
         """Forget everything of a component; what was set aside stays."""
         with self._lock:
             self._remove(component, self._shelf(component).entries)
-            self._remove_unusable(component)
             self._shelves.pop(component, None)
-            self._proved.pop(component, None)
 
     def close(self) -> None:
         """Let another process have the store; nothing else may be called afterwards."""
@@ -349,16 +344,10 @@ class Store:
                 self._shelves[component] = self._shelf(component).without((entry,))
                 self._disk.remove(entry.path)
 
-    def _remove_unusable(self, component: str) -> None:
-        with self._disk_trouble(f"remove damaged snapshots of {component}"):
-            for path in self._unusable.pop(folder_name(component), []):
-                self._disk.remove(path)
-
     def _set_out_of_use(self, component: str, entry: Entry, why: str) -> None:
         """Never offer this file again; it stays where it is, for whoever wants to look, until it is pruned."""
         with self._lock:
             self._shelves[component] = self._shelf(component).without((entry,))
-            self._unusable.setdefault(entry.path.parent.name, []).append(entry.path)
             self._proved.pop(component, None)
             newest = self.newest(component)
             self._notice(f"{why}; going back to position {place(newest)}" if newest else f"{why}; nothing older is intact")
@@ -400,7 +389,6 @@ class Store:
         try:
             header = format.verify(path)
         except FormatError as error:
-            self._unusable.setdefault(path.parent.name, []).append(path)
             self._notice(f"{error}; it is not used")
             return
         if (path.parent.name, path.name) != (folder_name(header.component), file_name(header)):
@@ -443,11 +431,14 @@ def _entry_of(path: Path, snapshot: Snapshot, size: int) -> Entry:
 def _newest_output(output: tuple[OutputPiece, ...]) -> tuple[OutputPiece, ...]:
     """The end of each stream, so that a base that was folded a thousand times does not carry all that was ever written."""
     ends = {piece.stream: piece.offset + len(piece.content) for piece in output}
-    cut = (_cut(piece, ends[piece.stream] - FOLDED_OUTPUT_SIZE) for piece in output)
-    return tuple(piece for piece in cut if piece.content or piece.offset == ends[piece.stream])
+    return tuple(
+        _cut(piece, ends[piece.stream] - FOLDED_OUTPUT_SIZE)
+        for piece in output
+        if piece.offset + len(piece.content) >= ends[piece.stream] - FOLDED_OUTPUT_SIZE
+    )
 
 
 def _cut(piece: OutputPiece, first: int) -> OutputPiece:
     """The part of a piece from an offset of its stream on."""
-    skipped = min(max(0, first - piece.offset), len(piece.content))
+    skipped = max(0, first - piece.offset)
     return replace(piece, offset=piece.offset + skipped, content=piece.content[skipped:])
