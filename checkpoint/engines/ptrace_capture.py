@@ -135,6 +135,7 @@ class PtraceSession:
         self._tracker = tracker
         self._shared = SharedPages(pid)
         self._maps = MapsReader(pid)
+        self._has_moved = False
         self._lines: tuple[MapsLine, ...] = ()
         self._private: list[MapsLine] = []
         self._shared_lines: list[MapsLine] = []
@@ -253,8 +254,7 @@ class PtraceSession:
         What changes meanwhile is written once more by the scan that follows. A page that cannot be read now has gone
         or is coming, and is then found by that scan, too.
         """
-        self._maps.refresh()
-        self._learn_mappings()
+        self._refresh_mappings()
         lines = self._private
         if not self._based:
             self._tracker.arm(lines)
@@ -331,10 +331,8 @@ class PtraceSession:
         if self._borrowed.holds(decoded[arch.INSTRUCTION_POINTER]):
             raise CaptureError(f"pid {self.pid} still stands in code of an earlier look; capture it again in a moment")
         registers = arch.encode_registers(decoded)
-        changed = self._maps.refresh()
-        if changed:
-            self._learn_mappings()
-        self._remember(self._scan(changed=changed))
+        self._refresh_mappings()
+        self._remember(self._scan())
         written, cleared = self._since_acknowledged(base=base)
         content = tracee.memory.read_pages(written, self._buffer) if len(written) else EMPTY_CONTENT
         told = self._ask(special, registers, mask)
@@ -361,19 +359,33 @@ class PtraceSession:
             freeze_us=0,
         )
 
-    def _learn_mappings(self) -> None:
-        """Sort the mappings, after they have changed."""
+    def _refresh_mappings(self) -> None:
+        """Read and sort the mappings; that they have changed is kept until a scan has been told."""
+        if not self._maps.refresh():
+            return
+        self._has_moved = True
         self._lines = tuple(line for line in self._maps.lines if not self._borrowed.holds(line.start))
         self._private = [line for line in self._lines if dirty.is_private(line)]
         self._shared_lines = [line for line in self._lines if dirty.is_shared(line)]
 
-    def _scan(self, *, changed: bool) -> dirty.Scan:
-        scan = self._tracker.scan(self._private, changed=changed)
+    def _scan(self) -> dirty.Scan:
+        """What was written since the last scan. One that fails half-way has protected pages that it tells nobody of."""
+        try:
+            scan = self._tracker.scan(self._private, changed=self._has_moved)
+        except CaptureError:
+            self._start_over()
+            raise
+        self._has_moved = False
         if not self._shared_lines and not self._had_shared:
             return scan
         self._had_shared = bool(self._shared_lines)
         shared = self._shared.scan(self._shared_lines)
         return dirty.Scan(pages.union(scan.written, shared.written), pages.union(scan.cleared, shared.cleared))
+
+    def _start_over(self) -> None:
+        """Make the next snapshot a base, with everything armed anew: what was written is not known any more."""
+        self._based, self._acknowledged = False, None
+        self._unacknowledged.clear()
 
     def _ask(self, special: int, registers: bytes, mask: int) -> Told:
         """Have the process say what only it can; the questions stay the same while its signals and timers do."""

@@ -80,6 +80,7 @@ UFFDIO_API: Final = 0xC018AA3F
 UFFDIO_REGISTER: Final = 0xC020AA00
 UFFDIO_UNREGISTER: Final = 0x8010AA01
 UFFDIO_REGISTER_MODE_WP: Final = 2
+UFFDIO_WRITEPROTECT: Final = 0xC018AA06
 
 # linux/fs.h: PAGEMAP_SCAN
 PAGEMAP_SCAN: Final = 0xC0606610
@@ -161,6 +162,12 @@ class UffdRegister(ctypes.Structure):
         ("mode", ctypes.c_uint64),
         ("ioctls", ctypes.c_uint64),
     )
+
+
+class UffdWriteProtect(ctypes.Structure):
+    """struct uffdio_writeprotect of ioctl_userfaultfd(2); mode 0 takes the protection away."""
+
+    _fields_ = (("start", ctypes.c_uint64), ("length", ctypes.c_uint64), ("mode", ctypes.c_uint64))
 
 
 class PageRegion(ctypes.Structure):

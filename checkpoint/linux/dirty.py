@@ -343,8 +343,17 @@ class PagemapTracker:
             self._scanner.written(windows)
 
     def _register(self, line: MapsLine) -> bool:
+        """Register a mapping, and forget what an earlier registration has marked; whether the kernel agreed.
+
+        A registration that mremap(2) has ended leaves its marks in the page tables (userfaultfd_reset_ctx() in
+        fs/userfaultfd.c drops the mapping's, not the pages'). A page written afterwards keeps its mark and is writable: it
+        would count as unwritten for ever.
+        """
         order = abi.UffdRegister(line.start, line.size, abi.UFFDIO_REGISTER_MODE_WP, 0)
-        return int(abi.ioctl(self._faults, abi.UFFDIO_REGISTER, ctypes.addressof(order))) == 0
+        if abi.ioctl(self._faults, abi.UFFDIO_REGISTER, ctypes.addressof(order)) != 0:
+            return False
+        unmark = abi.UffdWriteProtect(line.start, line.size, 0)
+        return int(abi.ioctl(self._faults, abi.UFFDIO_WRITEPROTECT, ctypes.addressof(unmark))) == 0
 
     def _given_back(self, written: Words) -> Words:
         """Private copies of a file's pages that the program has dropped (MADV_DONTNEED): the file shows again.

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import random
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +20,7 @@ import pytest
 from checkpoint.engine import CaptureOrder, Session
 from checkpoint.errors import UnsupportedError
 from checkpoint.model import Snapshot
-from tests.checkpoint.round_trip import Program, ended, protected, restored, start_tracee, transported
+from tests.checkpoint.round_trip import Program, ended, protected, restored, start, start_tracee, transported
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
@@ -89,13 +90,9 @@ def _chain(session: Session, dice: random.Random, *, lost: float) -> list[Snapsh
     return chain
 
 
-MOVED = pytest.mark.xfail(reason="a write to memory that mremap moved can be lost: its old marks stay", strict=False)
-"""Found late, and not mended yet: what ended it made large growing mappings impossible to capture."""
-
-
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("lost", [0.0, 0.4], ids=["all_acknowledged", "some_lost"])
-@pytest.mark.parametrize("ways", [pytest.param(ways, marks=MOVED if {"r", "S"} & {*WAYS[ways]} else ()) for ways in WAYS])
+@pytest.mark.parametrize("ways", WAYS)
 def test_a_base_and_its_deltas_are_the_program(ways: str, lost: float, seed: int, compiled: Compiled, tmp_path: Path) -> None:
     program, dice = compiled("mutator", "-O2"), random.Random(seed)
     with ended(start_tracee(program, tmp_path, WAYS[ways], str(seed), "1000000", NAP_US)) as tracee:
@@ -177,3 +174,45 @@ def test_a_sparse_mapping_costs_its_populated_pages_only(compiled: Compiled, tmp
         assert int(tables.split()[1]) < 8192, tables
         tracee.tell()
         assert tracee.finish() == 0
+
+
+NEWCOMER = """
+import os, sys, time
+def step(name):
+    print(name, flush=True)
+    while not os.path.exists(os.path.join(sys.argv[1], "after " + name)):
+        time.sleep(0.002)
+step("ready")
+late = bytearray(8 << 20)
+step("mapped")
+late[5 << 20] = 1
+step("written")
+late[6 << 20] = 2
+step("written again")
+print(late[5 << 20], late[6 << 20], flush=True)
+"""
+
+
+def test_a_mapping_that_came_before_a_second_base_is_followed(tmp_path: Path) -> None:
+    """The first base was lost on its way, so that another is taken while a mapping is there that the first did not have."""
+
+    def go_on(program: Program, done: str, expected: str) -> None:
+        (tmp_path / f"after {done}").touch()
+        program.wait_for_line(expected)
+
+    with ended(start([sys.executable, "-c", NEWCOMER, tmp_path], tmp_path)) as program, protected(program) as session:
+        program.wait_for_line("ready")
+        session.capture(CaptureOrder(base=True, sequence=1))
+        go_on(program, "ready", "mapped")
+        chain = [transported(session.capture(CaptureOrder(base=True, sequence=2)))]
+        session.acknowledge(chain[0].position)
+        go_on(program, "mapped", "written")
+        chain.append(transported(session.capture(CaptureOrder(base=False, sequence=3))))
+        session.acknowledge(chain[1].position)
+        go_on(program, "written", "written again")
+        chain.append(transported(session.capture(CaptureOrder(base=False, sequence=4))))
+        program.kill()
+    with ended(restored(chain, tmp_path)) as back:
+        (tmp_path / "after written again").touch()
+        assert back.finish() == 0, back.complaints
+        assert back.output.splitlines()[-1] == "1 2"

@@ -125,7 +125,6 @@ BIG = (
 
 
 @pytest.mark.slow
-@pytest.mark.skipif("FAILOVER_LONG" not in os.environ, reason="minutes on a busy machine: set FAILOVER_LONG to run it")
 @pytest.mark.timeout(300)
 def test_no_beat_is_delayed_by_a_snapshot_of_500_megabytes(pair: tuple[RobotMachine, RobotMachine]) -> None:
     first, second = pair
