@@ -130,6 +130,9 @@ def _of_open_file(held: Resource, path: str, same_boot: bool) -> Iterator[str]:
     except OSError as error:
         yield f"{path}, open as {held.name}, cannot be used ({error.strerror}): {_FAR}"
         return
+    if stat.S_IFMT(about.st_mode) != stat.S_IFMT(rebuild.number_of(held.facts["mode"])):
+        yield f"{path}, open as {held.name}, is of another type here (a directory, a device …); {_FAR}"
+        return
     if not stat.S_ISREG(about.st_mode) or rebuild.number_of(held.facts["flags"]) & rebuild.O_PATH:
         return
     facts, size = held.facts, rebuild.number_of(held.facts["size"])

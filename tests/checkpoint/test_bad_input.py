@@ -1,0 +1,104 @@
+"""Snapshots that must not be restored: each refused with a clear sentence within a moment, and nothing is started."""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from checkpoint import chain, format
+from checkpoint.errors import ChainError, CheckpointError, FormatError
+from checkpoint.model import Resource, Snapshot
+from tests.checkpoint.round_trip import captured_and_killed, ended, restored, start_tracee
+from tests.conftest import children
+
+pytestmark = [pytest.mark.compiler, pytest.mark.root]
+
+FLIPS = int(os.environ.get("FAILOVER_TEST_FLIPS", "150"))
+"""Bits of a real snapshot that are flipped, one at a time."""
+
+
+@pytest.fixture
+def snapshot(compiled: Callable[..., Path], tmp_path: Path) -> Snapshot:
+    """A real one."""
+    with ended(start_tracee(compiled("heap", "-O2"), tmp_path)) as tracee:
+        return captured_and_killed(tracee)
+
+
+def _expect_nothing_started(snapshot: Snapshot, directory: Path, sentence: str) -> None:
+    before = children()
+    with pytest.raises(CheckpointError, match=sentence):
+        restored(snapshot, directory).kill()
+    assert children() == before
+
+
+@pytest.mark.parametrize("architecture", ["aarch64", "riscv64", ""])
+def test_a_foreign_architecture_is_said_so(snapshot: Snapshot, tmp_path: Path, architecture: str) -> None:
+    foreign = replace(snapshot, machine=replace(snapshot.machine, architecture=architecture))
+    _expect_nothing_started(foreign, tmp_path, "x86_64")
+
+
+def test_a_processor_that_lacks_a_feature_is_said_so(snapshot: Snapshot, tmp_path: Path) -> None:
+    if "avx512f" in snapshot.machine.features:
+        pytest.skip("this processor has AVX-512")
+    richer = replace(snapshot, machine=replace(snapshot.machine, features=(*snapshot.machine.features, "avx512f")))
+    _expect_nothing_started(richer, tmp_path, "avx512f")
+
+
+def test_a_foreign_vdso_is_said_so(snapshot: Snapshot, tmp_path: Path) -> None:
+    other = replace(snapshot, machine=replace(snapshot.machine, vdso_digest=bytes(32), kernel="2.6.18"))
+    _expect_nothing_started(other, tmp_path, r"vdso.*2\.6\.18")
+
+
+def test_two_threads_are_said_to_be_too_many(snapshot: Snapshot, tmp_path: Path) -> None:
+    (thread,) = snapshot.threads
+    _expect_nothing_started(replace(snapshot, threads=(thread, replace(thread, tid=thread.tid + 1))), tmp_path, "2 threads")
+
+
+def test_a_resource_of_an_unknown_kind_is_named(snapshot: Snapshot, tmp_path: Path) -> None:
+    newer = replace(snapshot, resources=(*snapshot.resources, Resource("teleporters", "fd 9", {})))
+    _expect_nothing_started(newer, tmp_path, "teleporters")
+
+
+def test_pages_altered_and_written_anew_do_not_add_up(snapshot: Snapshot) -> None:
+    """The file's own digests are right: the state's digest is not."""
+    contents = bytearray(snapshot.contents)
+    contents[len(contents) // 2] ^= 1
+    altered = format.decode(format.encode_bytes(replace(snapshot, contents=bytes(contents))))
+    with pytest.raises(ChainError):
+        chain.fold([altered])
+
+
+def test_registers_altered_and_written_anew_do_not_add_up(snapshot: Snapshot) -> None:
+    (thread,) = snapshot.threads
+    registers = {**thread.registers, "prstatus": bytes(len(thread.registers["prstatus"]))}
+    altered = format.decode(format.encode_bytes(replace(snapshot, threads=(replace(thread, registers=registers),))))
+    with pytest.raises(ChainError):
+        chain.fold([altered])
+
+
+def test_flipped_bits_anywhere_in_a_real_snapshot_are_refused(snapshot: Snapshot) -> None:
+    whole, dice = format.encode_bytes(snapshot), random.Random(11)
+    for place in (dice.randrange(len(whole) * 8) for _ in range(FLIPS)):
+        damaged = bytearray(whole)
+        damaged[place // 8] ^= 1 << place % 8
+        with pytest.raises(FormatError):
+            format.decode(bytes(damaged))
+
+
+def test_a_real_snapshot_that_ends_too_early_is_refused(snapshot: Snapshot) -> None:
+    whole, dice = format.encode_bytes(snapshot), random.Random(12)
+    for size in (0, 1, len(whole) - 1, *(dice.randrange(len(whole)) for _ in range(50))):
+        with pytest.raises(FormatError):
+            format.decode(whole[:size])
+
+
+def test_a_directory_an_empty_file_and_a_missing_one_are_no_snapshots(tmp_path: Path) -> None:
+    (tmp_path / "empty").touch()
+    for path in (tmp_path, tmp_path / "empty", tmp_path / "missing"):
+        with pytest.raises((CheckpointError, OSError)):
+            format.decode(path)
