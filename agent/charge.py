@@ -246,23 +246,33 @@ class Charge:
                 raise
 
     async def _restore(self, act: acts.Restore) -> None:
-        began_ns = clock.now_ns()
+        began_ns, laps = clock.now_ns(), clock.Laps()
         silent_ns = await self.around.silence_ns(self.name)
         await self._stop()
+        laps.lap("asking and clearing away")
         descriptors = await asyncio.to_thread(self.around.store.open_chain, self.name, act.position)
+        laps.lap(f"opening {len(descriptors)} snapshots")
         try:
             outage_ns = clock.age_ns(descriptors[-1])
             component = await Component.restore(
-                self.name, descriptors, self.around.places, outage_ns=outage_ns, lease_until_ns=act.lease_until_ns
+                self.name, descriptors, self.around.places, outage_ns=outage_ns, lease_until_ns=act.lease_until_ns, laps=laps
             )
         finally:
             close_all(tuple(descriptors))
         self.around.records.note(self.name, act.epoch)
         await component.resume()
+        laps.lap("letting it go")
         self.component = component
         self.figures.restores += 1
         self.figures.reasons = ()
         self.figures.outage_ms = (silent_ns + clock.now_ns() - began_ns) / 1e6
+        log.info(
+            "%s: resumed %.1f ms after its robot fell silent: silence %.1f ms, %s",
+            self.name,
+            self.figures.outage_ms,
+            silent_ns / 1e6,
+            laps,
+        )
         self.started.set()
         self.around.tell(events.Restored(self.name, act.epoch, act.position))
         self._watch_the_end()

@@ -4,12 +4,30 @@ from __future__ import annotations
 
 import os
 import time
+from dataclasses import dataclass, field
 from typing import Final
 
 from agent import kernel
 
 HEART_PRIORITY: Final = 60
 """SCHED_FIFO priority of the heart: just above the interrupt threads of a PREEMPT_RT kernel (50), below its watchdogs (99)."""
+
+
+@dataclass(slots=True)
+class Laps:
+    """How long each stage of something took: for the log, and for whoever wants to shorten it."""
+
+    last_ns: int = field(default_factory=time.monotonic_ns)
+    stages: list[tuple[str, int]] = field(default_factory=list)
+
+    def lap(self, stage: str) -> None:
+        """The stage of that name ends now; the next one begins."""
+        now = time.monotonic_ns()
+        self.stages.append((stage, now - self.last_ns))
+        self.last_ns = now
+
+    def __str__(self) -> str:
+        return ", ".join(f"{stage} {took_ns / 1e6:.1f} ms" for stage, took_ns in self.stages)
 
 
 def now_ns() -> int:

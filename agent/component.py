@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from agent import guard_messages
+from agent.clock import Laps
 from agent.errors import GuardError, GuardLostError, KeeperLostError
 from agent.guard_messages import Described, Exited, Refused
 from agent.nursery import GuardLink, KeeperLink, Nursery, connect
@@ -167,21 +168,32 @@ class Component:
 
     @classmethod
     async def restore(
-        cls, name: str, chain: Sequence[int], places: Places, *, outage_ns: int, lease_until_ns: int = 0
+        cls,
+        name: str,
+        chain: Sequence[int],
+        places: Places,
+        *,
+        outage_ns: int,
+        lease_until_ns: int = 0,
+        laps: Laps | None = None,
     ) -> Component:
         """Rebuild a component from a chain (descriptors of encoded snapshots, oldest first), stopped, committed to nothing.
 
         Whatever fails, and whoever dies before `resume`: nothing of it is left.
 
         Args:
+            laps: told how long each stage took.
             outage_ns: added to the program's monotonic and boot time: how long ago the newest snapshot was taken.
 
         Raises:
             checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
         """
+        laps = laps or Laps()
         outline = await asyncio.to_thread(format.read_outline, chain[-1])
+        laps.lap("reading the newest")
         component = cls(name, await places.nursery.guard(), places)
         component._keeper = keeper = places.nursery.keeper()
+        laps.lap("guard and keeper")
         request = guard_messages.MakeVessel(
             component=name,
             inner_pid=outline.process.pid,
@@ -195,8 +207,10 @@ class Component:
         pidfd = os.pidfd_open(keeper.process.pid)
         try:
             await component._born(request, (pidfd,))
+            laps.lap("vessel")
             order = channel.Restore(component.pid, name, outage_ns, streams=True, robot=places.robot)
             restored, _ = await component._ask_keeper(order, (*chain, *component._streams))
+            laps.lap("restore")
             if lease_until_ns:
                 await component.lease(lease_until_ns)
         except (CheckpointError, GuardError, KeeperLostError):

@@ -40,6 +40,7 @@ class Deposit:
     def admit(self, act: Admit) -> None:
         """From now on take this component's snapshots from this sender alone."""
         self._admitted[act.component] = act
+        self._places.nursery.expect(sum(bool(known.sender) for known in self._admitted.values()))
 
     def sender(self, component: str) -> str:
         """From whom its snapshots come; "" from nobody."""

@@ -1,4 +1,7 @@
-"""Guards and keepers are born here; one of each waits in advance: a takeover does not wait for an interpreter to start."""
+"""Guards and keepers are born here, in advance: a takeover does not wait for an interpreter to start.
+
+As many pairs wait as there are components that this robot may have to take over, up to `SPARES_MAX`, and always one.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ import os
 import socket
 import subprocess
 import sys
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -23,6 +27,12 @@ BIRTH_S: Final = 20.0
 """How long a guard may take until it listens; a tenth of a second is usual."""
 
 POLL_S: Final = 0.005
+
+SPARES_MAX: Final = 8
+"""Pairs that wait at most; each holds about 60 MB. Whatever is taken over beyond that waits for interpreters to start."""
+
+REFILL_S: Final = 1.0
+"""How long after one was used its successor is started: a takeover has the processor for itself."""
 
 log = logging.getLogger("failover.component")
 
@@ -58,16 +68,24 @@ class Nursery:
         self._sockets = sockets
         self._launcher = launcher
         self._numbers = itertools.count(1)
-        self._spare_guard: asyncio.Task[GuardLink] | None = None
-        self._spare_keeper: KeeperLink | None = None
+        self._wanted = 1
+        self._guards: deque[asyncio.Task[GuardLink]] = deque()
+        self._keepers: deque[KeeperLink] = deque()
         self._children: list[subprocess.Popen[bytes]] = []
+        self._closed = False
+
+    def expect(self, components: int) -> None:
+        """This robot may have to take over so many components."""
+        self._wanted = max(1, min(components, SPARES_MAX))
+        self._prepare_if_possible()
 
     def prepare(self) -> None:
-        """Have one of each wait."""
-        if self._spare_guard is None:
-            self._spare_guard = asyncio.create_task(self._guard_born())
-        if self._spare_keeper is None or not self._spare_keeper.dialogue.open:
-            self._spare_keeper = self._keeper_born()
+        """Have as many wait as are wanted."""
+        self._keepers = deque(keeper for keeper in self._keepers if keeper.dialogue.open)
+        while len(self._guards) < self._wanted:
+            self._guards.append(asyncio.create_task(self._guard_born()))
+        while len(self._keepers) < self._wanted:
+            self._keepers.append(self._keeper_born())
 
     async def guard(self) -> GuardLink:
         """A guard that guards nothing yet.
@@ -75,12 +93,13 @@ class Nursery:
         Raises:
             GuardError: it cannot be started.
         """
-        spare, self._spare_guard = self._spare_guard, None
-        link = await spare if spare is not None else await self._guard_born()
-        if not link.dialogue.open:
-            link = await self._guard_born()
-        asyncio.get_running_loop().call_later(1.0, self.prepare)
-        return link
+        self._refill()
+        while self._guards:
+            with contextlib.suppress(GuardError):
+                link = await self._guards.popleft()
+                if link.dialogue.open:
+                    return link
+        return await self._guard_born()
 
     def keeper(self) -> KeeperLink:
         """A keeper that follows nothing yet.
@@ -88,18 +107,34 @@ class Nursery:
         Raises:
             KeeperLostError: it cannot be started.
         """
-        spare, self._spare_keeper = self._spare_keeper, None
-        asyncio.get_running_loop().call_later(1.0, self.prepare)
-        return spare if spare is not None and spare.dialogue.open else self._keeper_born()
+        self._refill()
+        while self._keepers:
+            link = self._keepers.popleft()
+            if link.dialogue.open:
+                return link
+        return self._keeper_born()
 
     async def close(self) -> None:
         """End the ones that wait; they guard nothing. Those in use live on."""
-        if self._spare_guard is not None:
+        self._closed = True
+        for born in self._guards:
             with contextlib.suppress(GuardError):
-                (await self._spare_guard).dialogue.close()
-        if self._spare_keeper is not None:
-            self._spare_keeper.end()
+                (await born).dialogue.close()
+        for keeper in self._keepers:
+            keeper.end()
         self._reap()
+
+    def _refill(self) -> None:
+        asyncio.get_running_loop().call_later(REFILL_S, self._prepare_if_possible)
+
+    def _prepare_if_possible(self) -> None:
+        """A machine without memory or processes left is not made to fail by what only waits."""
+        if self._closed:
+            return
+        try:
+            self.prepare()
+        except (GuardError, KeeperLostError) as error:
+            log.warning("no guard and keeper wait in advance, a takeover will take longer: %s", error)
 
     async def _guard_born(self) -> GuardLink:
         path = self._sockets / f"{os.getpid()}-{next(self._numbers)}.guard"
