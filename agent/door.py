@@ -55,6 +55,7 @@ EVENTS: Final[dict[str, Any]] = {
         events.Run,
         events.Release,
         events.Stop,
+        events.Failback,
         events.Handover,
         events.Prefer,
     )

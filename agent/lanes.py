@@ -29,6 +29,7 @@ from agent.control import ControlServer
 from agent.deposit import Deposit
 from agent.dispatch import Dispatch
 from agent.door import Ask, Farewell, HearKey, Inventory, Life, Order, SpeakKey, ToLanes, Told
+from agent.errands import Errands
 from agent.errors import AgentError, GuardLostError
 from agent.journal import set_up_log
 from agent.nursery import Nursery
@@ -45,7 +46,20 @@ from checkpoint.store import Store, open_store
 from failover.client.control import SOCKET_NAME
 from failover.core import acts, events
 from failover.core.events import Event
-from failover.core.messages import VERSION, Bulk, Cancel, Chunk, Credit, Goodbye, Hello, Offer, Refuse, Taken
+from failover.core.messages import (
+    VERSION,
+    Bulk,
+    Cancel,
+    Chunk,
+    Credit,
+    Errand,
+    ErrandDone,
+    Goodbye,
+    Hello,
+    Offer,
+    Refuse,
+    Taken,
+)
 from failover.core.types import HISTORY_MAX, Found, Held
 
 BEAT_KEY_SIZE: Final = 32
@@ -91,6 +105,8 @@ class Lanes:
         bulks = {name: robot.bulk for name, robot in settings.peers.items()}
         self._lane = BulkLane(config.robot, settings.me.bulk, bulks, keys, self._hear, self._link_changed)
         self._shipper = Shipper(self._lane, config.link_mbit_s * BYTES_A_MEGABIT)
+        self._verbs = Verbs(self)
+        self.errands = Errands(self._lane.say, self._verbs.orders())
 
     async def run(self) -> None:
         """From the heart's first word to its last.
@@ -113,13 +129,14 @@ class Lanes:
         self._nursery.prepare()
         self._say(Inventory(_held(store), found))
         self._lane.open()
-        server = ControlServer(self._runtime / SOCKET_NAME, self.settings.config.group, Verbs(self).table())
+        server = ControlServer(self._runtime / SOCKET_NAME, self.settings.config.group, self._verbs.table())
         await server.open()
         try:
             await self._end.wait()
         finally:
             loop.remove_reader(self._heart.fileno())
             await server.close()
+            await self.errands.close()
             await self._dispatch.close()
             await asyncio.gather(*(charge.close() for charge in self.charges.values()))
             await self._lane.close()
@@ -271,6 +288,7 @@ class Lanes:
             self._say(SpeakKey(peer, key))
         else:
             self._shipper.lost(peer)
+            self.errands.lost(peer)
 
     def _hear(self, peer: str, message: Bulk) -> None:
         match message:
@@ -288,6 +306,10 @@ class Lanes:
                 self._receiver.cancelled(peer, message)
             case Credit() | Taken() | Refuse():
                 self._shipper.heard(peer, message)
+            case Errand():
+                self.errands.received(peer, message)
+            case ErrandDone():
+                self.errands.done(peer, message)
 
     def _greeted(self, peer: str, hello: Hello) -> None:
         reason = ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import os
 from collections.abc import Callable
 from typing import Any, Final, Protocol, TypeVar
@@ -15,6 +16,7 @@ from agent.component import Places, log_directory
 from agent.config import Settings
 from agent.control import Conversation, Verb
 from agent.door import Told
+from agent.errands import Errands, Order
 from agent.errors import RefusedError
 from agent.rules import rules_for
 from agent.streams import STREAMS, OutputLogs
@@ -39,6 +41,7 @@ class Lanes(Protocol):
     settings: Settings
     places: Places
     charges: dict[str, Charge]
+    errands: Errands
 
     async def ask(self, what: Any, component: str = "") -> Told: ...
     async def command(self, make: Callable[[int], events.Command]) -> acts.Answer: ...
@@ -81,7 +84,7 @@ class LogsArguments(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class NameArguments(msgspec.Struct, forbid_unknown_fields=True):
-    """Of ``release`` and ``why``."""
+    """Of ``release``, ``failback`` and ``why``."""
 
     name: str = ""
 
@@ -120,13 +123,31 @@ class Verbs:
             "status": self.status,
             "run": self.run,
             "protect": self.protect,
-            "release": self.release,
-            "stop": self.stop,
             "logs": self.logs,
             "why": self.why,
-            "handover": self.handover,
-            "prefer": self.prefer,
+            **{name: functools.partial(self._order, name) for name in self.orders()},
         }
+
+    def orders(self) -> dict[str, Order]:
+        """Those that are carried out where the component runs, wherever they are given."""
+        return {
+            "handover": self.handover,
+            "failback": self.failback,
+            "prefer": self.prefer,
+            "release": self.release,
+            "stop": self.stop,
+        }
+
+    async def _order(self, verb: str, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Carry an order out here, or have the robot do it where the component runs."""
+        name = await self._known(str(arguments.get("name", "")))
+        arguments = {**arguments, "name": name}
+        primary = (await self._view(name)).get("primary", "")
+        told = await self._lanes.ask("status")
+        living = {peer.robot for peer in told.status.peers if peer.state in ("alive", "suspect")} if told.status else set()
+        if primary in living:
+            return await self._lanes.errands.send(primary, verb, arguments)
+        return await self.orders()[verb](arguments)
 
     async def ping(self, _say: Conversation, _arguments: dict[str, Any]) -> dict[str, Any]:
         """Who are you?"""
@@ -187,7 +208,7 @@ class Verbs:
         charge = await self._begin(name, Launch(pid=wanted.pid))
         return {"name": name, "pid": wanted.pid, "notes": list(charge.figures.notes)}
 
-    async def release(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+    async def release(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """Let a component run on unprotected."""
         name = await self._known(_read(NameArguments, "release", arguments).name)
         charge = self._lanes.charge(name)
@@ -195,7 +216,7 @@ class Verbs:
         await self._command(lambda number: events.Release(number, name))
         return {"name": name, "pid": pid}
 
-    async def stop(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+    async def stop(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """End a component."""
         wanted = _read(StopArguments, "stop", arguments)
         name = await self._known(wanted.name)
@@ -204,18 +225,25 @@ class Verbs:
         report = await asyncio.shield(end)
         return {"name": name, "exit_status": report.status}
 
-    async def handover(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+    async def handover(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """Move a component."""
         wanted = _read(HandoverArguments, "handover", arguments)
         name = await self._known(wanted.name)
-        began_ns = clock.now_ns()
-        answer = await self._command(lambda number: events.Handover(number, name, wanted.to))
-        view = await self._view(name)
-        took_ms = (clock.now_ns() - began_ns) / 1e6
-        told = {"name": name, "to": view.get("primary", wanted.to), "epoch": view.get("epoch")}
-        return {**told, "outage_ms": took_ms, "sentence": answer.sentence}
+        return await self._moved(name, lambda number: events.Handover(number, name, wanted.to))
 
-    async def prefer(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+    async def failback(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Move a component back to the robot that is preferred, or where it was started."""
+        name = await self._known(_read(NameArguments, "failback", arguments).name)
+        return await self._moved(name, lambda number: events.Failback(number, name))
+
+    async def _moved(self, name: str, make: Callable[[int], events.Command]) -> dict[str, Any]:
+        began_ns = clock.now_ns()
+        answer = await self._command(make)
+        took_ms = (clock.now_ns() - began_ns) / 1e6
+        view = await self._view(name)
+        return {"name": name, "to": view["primary"], "epoch": view["epoch"], "took_ms": took_ms, "sentence": answer.sentence}
+
+    async def prefer(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """Say where a component should run."""
         wanted = _read(PreferArguments, "prefer", arguments)
         name = await self._known(wanted.name)

@@ -1,4 +1,4 @@
-"""run, protect, release, stop, logs, handover, prefer: what is done with one component."""
+"""run, protect, release, stop, logs, handover, failback, prefer: what is done with one component."""
 
 from __future__ import annotations
 
@@ -216,7 +216,18 @@ def handover(arguments: argparse.Namespace) -> int:
     """Move a component to another robot, planned: nothing is lost."""
     with connect(arguments) as agent:
         answer = agent.ask("handover", name=arguments.name, to=arguments.to or "")
-    return _tell(arguments, answer, f"{answer['name']} runs on {answer['to']} now; it stood still for {answer['outage_ms']} ms")
+    return _tell(arguments, answer, _moved(answer))
+
+
+def failback(arguments: argparse.Namespace) -> int:
+    """Move a component back to where it belongs."""
+    with connect(arguments) as agent:
+        answer = agent.ask("failback", name=arguments.name)
+    return _tell(arguments, answer, _moved(answer))
+
+
+def _moved(answer: dict[str, Any]) -> str:
+    return f"{answer['name']} runs on {answer['to']} now; the move took {answer['took_ms']:.0f} ms"
 
 
 def prefer(arguments: argparse.Namespace) -> int:

@@ -152,6 +152,11 @@ def _handover(room: argparse.ArgumentParser) -> None:
     _agent(room)
 
 
+def _failback(room: argparse.ArgumentParser) -> None:
+    _name(room)
+    _agent(room)
+
+
 def _prefer(room: argparse.ArgumentParser) -> None:
     _name(room)
     room.add_argument("robot", metavar="ROBOT", help="the robot that should run it whenever it can")
@@ -351,6 +356,17 @@ VERBS: Final = (
         """,
         _handover,
         "failover.cli.components:handover",
+    ),
+    Verb(
+        "failback",
+        "move a component back to where it belongs",
+        """
+        To the robot that is preferred, or else to the one that it was started on; planned, as a handover.
+
+          failover failback /lab/robot1/mapper
+        """,
+        _failback,
+        "failover.cli.components:failback",
     ),
     Verb(
         "prefer",

@@ -7,7 +7,7 @@ from dataclasses import replace
 from failover.core import acts, handover
 from failover.core.component import Cause, Component, Turn
 from failover.core.election import claim, drop, vacant
-from failover.core.events import Command, Handover, Prefer, Release, Run, Stop
+from failover.core.events import Command, Failback, Handover, Prefer, Release, Run, Stop
 from failover.core.types import ENDED, State
 
 _RUNNING = frozenset({State.PRIMARY, State.FROZEN})
@@ -29,6 +29,8 @@ def obey(component: Component, turn: Turn, command: Command) -> None:
                 handover.resume_here(component, turn, command.request)
             else:
                 handover.begin(component, turn, command.to, command.request)
+        case Failback():
+            _fail_back(component, turn, command)
 
 
 def _run(component: Component, turn: Turn, command: Run) -> None:
@@ -88,7 +90,19 @@ def _prefer(component: Component, turn: Turn, command: Prefer) -> None:
         _elsewhere(component, turn, command.request, "prefer a robot for")
     else:
         component.spec = replace(component.spec, rules=replace(component.spec.rules, prefer=command.robot))
+        component.retry_ns = turn.now_ns
         turn.order(acts.Answer(command.request, True, f"{component.name} prefers {command.robot or 'to stay where it is'}"))
+
+
+def _fail_back(component: Component, turn: Turn, command: Failback) -> None:
+    home = component.rules.prefer or (component.spec.home if component.spec else "")
+    if home == turn.me and component.state in _RUNNING:
+        turn.order(acts.Answer(command.request, True, f"{component.name} runs at {home}, where it belongs"))
+    elif not home:
+        refusal = f"nobody knows where {component.name} belongs; failover handover {component.name} --to ROBOT moves it"
+        turn.order(acts.Answer(command.request, False, refusal))
+    else:
+        handover.begin(component, turn, home, command.request)
 
 
 def _elsewhere(component: Component, turn: Turn, request: int, verb: str) -> None:

@@ -178,6 +178,14 @@ class Handover:
 
 
 @dataclass(frozen=True, slots=True)
+class Failback:
+    """Operator: move the component back to the robot that is preferred, or else to where it was started."""
+
+    request: int
+    component: str
+
+
+@dataclass(frozen=True, slots=True)
 class Prefer:
     """Operator: robot ``robot`` runs the component whenever it can ("" for no preference)."""
 
@@ -186,7 +194,7 @@ class Prefer:
     robot: str
 
 
-Command = Run | Release | Stop | Handover | Prefer
+Command = Run | Release | Stop | Handover | Failback | Prefer
 
 Event = (
     Tick

@@ -169,4 +169,34 @@ class Cancel(msgspec.Struct, frozen=True, tag="cancel"):
     transfer: int
 
 
-Bulk = Hello | Goodbye | Offer | Credit | Chunk | Taken | Refuse | Cancel
+class Errand(msgspec.Struct, frozen=True, tag="errand"):
+    """An operator's order, given at the sender and meant for the robot where the component runs. Answered by ErrandDone.
+
+    Attributes:
+        number: chosen by the sender, never used twice in one life of it.
+        verb: as on the control socket (`failover.client.control`).
+        arguments: its arguments, a msgpack map.
+    """
+
+    number: int
+    verb: str
+    arguments: bytes
+
+
+class ErrandDone(msgspec.Struct, frozen=True, tag="errand_done"):
+    """What became of an order.
+
+    Attributes:
+        content: the result, a msgpack map; empty when it was refused.
+        refusal: why not, a sentence; "" when it was done.
+        kind: class of the refusal, as on the control socket.
+    """
+
+    number: int
+    content: bytes
+    refusal: str = ""
+    kind: str = "RefusedError"
+    reasons: tuple[str, ...] = ()
+
+
+Bulk = Hello | Goodbye | Offer | Credit | Chunk | Taken | Refuse | Cancel | Errand | ErrandDone

@@ -13,8 +13,10 @@ from failover.core.events import (
     ActFailed,
     Captured,
     CaptureFailed,
+    Command,
     Event,
     Exited,
+    Failback,
     Handover,
     Prefer,
     Received,
@@ -147,7 +149,7 @@ class Node:
         name = event.spec.name if isinstance(event, Run) else event.component
         component = self._known(name) if isinstance(event, Run | Stored) else self._components.get(name)
         if component is None:
-            if isinstance(event, Run | Release | Stop | Handover | Prefer):
+            if isinstance(event, Command):
                 turn.order(acts.Answer(event.request, False, f"{name} is not known at {turn.me}; failover status lists what is"))
             return []
         _tell(component, turn, event)
@@ -254,7 +256,7 @@ def _tell(component: Component, turn: Turn, event: Event) -> None:
         case Stopped():
             if component.state is State.STOPPING:
                 component.move(Cause.CLEARED)
-        case Run() | Release() | Stop() | Handover() | Prefer():
+        case Run() | Release() | Stop() | Handover() | Failback() | Prefer():
             commands.obey(component, turn, event)
 
 

@@ -100,3 +100,14 @@ def cable(robot: RobotMachine, state: str) -> None:
 def has_cable() -> bool:
     """Whether the robots have networks of their own here."""
     return means().own_network
+
+
+def host_pid(robot: RobotMachine, inner: int) -> int:
+    """The process that the robot itself calls ``inner``."""
+    own_pids = int(means().own_pids)
+    for pid in robot.processes():
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        named = next(line for line in lines if line.startswith("NSpid:")).split()[1:]
+        if len(named) > own_pids and int(named[own_pids]) == inner:
+            return pid
+    raise AssertionError(f"{robot.name} has no process {inner}")

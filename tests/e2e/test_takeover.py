@@ -60,7 +60,7 @@ def test_a_program_that_crashes_goes_on_in_place(pair: tuple[RobotMachine, Robot
     before = len(numbers(robots.output(first, "count")))
     with first.control() as link:
         inner = link.ask("status")["components"][0]["pid"]
-    victim = host_pid(first, inner)
+    victim = robots.host_pid(first, inner)
     os.kill(victim, signal.SIGSEGV)
     robots.until(lambda: robots.component(first, "count").get("restores") == 1, "robot1 to resume it")
     robots.until(lambda: len(numbers(robots.output(first, "count"))) > before + 20, "the count to go on")
@@ -72,7 +72,7 @@ def test_components_outlive_an_agent_that_is_killed(pair: tuple[RobotMachine, Ro
     first, second = pair
     start_counting(first, 1_000_000)
     robots.until(lambda: robots.checkpoints(second, "count") >= SNAPSHOTS, "checkpoints at robot2")
-    lanes = host_pid(first, first.status()["lanes_pid"])
+    lanes = robots.host_pid(first, first.status()["lanes_pid"])
     pid = robots.component(first, "count")["pid"]
     os.kill(lanes, signal.SIGKILL)
     robots.until(lambda: answers(first) and robots.component(first, "count").get("pid") == pid, "the guard to be found again")
@@ -89,17 +89,6 @@ def answers(robot: RobotMachine) -> bool:
     except robots.NO_ANSWER:
         return False
     return True
-
-
-def host_pid(robot: RobotMachine, inner: int) -> int:
-    """The process that the robot itself calls ``inner``."""
-    for pid in robot.processes():
-        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-        named = next(line for line in lines if line.startswith("NSpid:")).split()[1:]
-        base = len(os.readlink(f"/proc/{robot.process.pid}/ns/pid")) and 1
-        if (len(named) > base and int(named[base]) == inner) or (len(named) == 1 and int(named[0]) == inner):
-            return pid
-    raise AssertionError(f"{robot.name} has no process {inner}")
 
 
 @pytest.mark.root

@@ -1,0 +1,110 @@
+"""Orders that are given on one robot and carried out on another: where the component runs.
+
+An order travels as an `Errand` on the bulk lane, which says who the sender is; every robot of the team may give one. It is
+carried out as if it had been given there, and its answer travels back. It is carried out once or not at all: when the connection
+is lost in between, whoever gave it is told that nobody knows.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import Awaitable, Callable
+from typing import Any, Final
+
+import msgspec
+
+from agent.charge import TROUBLE, end_lanes_on_mistake
+from agent.errors import RefusedError
+from failover.core.messages import Bulk, Errand, ErrandDone
+from failover.errors import FailoverError
+
+PATIENCE_S: Final = 75.0
+"""How long an answer may take; the other robot gives its own orders up sooner."""
+
+UNDER_WAY_MAX: Final = 64
+"""Errands of one peer that are carried out at a time; more are refused."""
+
+Order = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
+"""Carries one verb out on this robot: its arguments → its result."""
+
+
+class Errands:
+    """Both ends: what was sent from here, and what came from others. Lives in the lanes' loop."""
+
+    def __init__(self, say: Callable[[str, Bulk], None], orders: dict[str, Order]) -> None:
+        """
+        Args:
+            orders: by name, those that another robot may give.
+        """
+        self._say = say
+        self._orders = orders
+        self._numbers = itertools.count(1)
+        self._waiting: dict[tuple[str, int], asyncio.Future[ErrandDone]] = {}
+        self._under_way: dict[str, set[asyncio.Task[None]]] = {}
+
+    async def send(self, peer: str, verb: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Have a peer carry an order out.
+
+        Raises:
+            RefusedError: it refused, with its reasons; or its answer did not come.
+        """
+        number = next(self._numbers)
+        answer: asyncio.Future[ErrandDone] = asyncio.get_running_loop().create_future()
+        self._waiting[peer, number] = answer
+        try:
+            self._say(peer, Errand(number, verb, msgspec.msgpack.encode(arguments)))
+            done = await asyncio.wait_for(answer, PATIENCE_S)
+        except TimeoutError:
+            raise RefusedError(
+                f"{peer} did not answer to {verb} in {PATIENCE_S:.0f} s; failover status tells how it stands"
+            ) from None
+        finally:
+            self._waiting.pop((peer, number), None)
+        if done.refusal:
+            raise RefusedError(f"{peer}: {done.refusal}", done.kind, done.reasons)
+        return msgspec.msgpack.decode(done.content, type=dict[str, Any])
+
+    def done(self, peer: str, message: ErrandDone) -> None:
+        """A peer has answered."""
+        waiting = self._waiting.get((peer, message.number))
+        if waiting is not None and not waiting.done():
+            waiting.set_result(message)
+
+    def lost(self, peer: str) -> None:
+        """The connection has gone: nobody knows whether the order arrived."""
+        for (robot, number), waiting in self._waiting.items():
+            if robot == peer and not waiting.done():
+                sentence = "the connection was lost before its answer; failover status tells whether it was done"
+                waiting.set_result(ErrandDone(number, b"", sentence))
+
+    def received(self, peer: str, message: Errand) -> None:
+        """A peer gives an order."""
+        under_way = self._under_way.setdefault(peer, set())
+        if len(under_way) >= UNDER_WAY_MAX:
+            self._say(peer, ErrandDone(message.number, b"", f"{UNDER_WAY_MAX} orders of {peer} are under way; wait for them"))
+            return
+        task = asyncio.create_task(self._carry_out(peer, message))
+        under_way.add(task)
+        task.add_done_callback(under_way.discard)
+        task.add_done_callback(end_lanes_on_mistake)
+
+    async def close(self) -> None:
+        """Give up what is under way."""
+        tasks = [task for under_way in self._under_way.values() for task in under_way]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _carry_out(self, peer: str, message: Errand) -> None:
+        try:
+            order = self._orders.get(message.verb)
+            if order is None:
+                raise RefusedError(f"no order {message.verb!r} can be given from another robot")
+            arguments = msgspec.msgpack.decode(message.arguments, type=dict[str, Any])
+            done = ErrandDone(message.number, msgspec.msgpack.encode(await order(arguments)))
+        except RefusedError as refusal:
+            done = ErrandDone(message.number, b"", str(refusal), refusal.kind, tuple(refusal.reasons))
+        except (*TROUBLE, FailoverError, msgspec.DecodeError) as trouble:
+            done = ErrandDone(message.number, b"", str(trouble) or type(trouble).__name__)
+        self._say(peer, done)
