@@ -203,8 +203,8 @@ def test_a_detached_run_prints_the_name(agent: Start) -> None:
         (["stop", "/a"], {"name": "/a", "exit_status": 15}, "/a has ended: signal 15"),
         (
             ["handover", "/a"],
-            {"name": "/a", "to": "r2", "epoch": 4, "outage_ms": 12},
-            "/a runs on r2 now; it stood still for 12 ms",
+            {"name": "/a", "to": "r2", "epoch": 4, "took_ms": 12},
+            "/a runs on r2 now; the move took 12 ms",
         ),
         (["prefer", "/a", "r1"], {"name": "/a", "robot": "r1"}, "/a prefers r1"),
     ],
