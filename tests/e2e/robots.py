@@ -5,6 +5,7 @@ They are the demo's own robots (`failover.cli.demo.robots`), so that what people
 
 from __future__ import annotations
 
+import os
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -12,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from failover.cli.demo.robots import RobotMachine, Stage, ip_command, means
+from failover.cli.demo.robots import RobotMachine, Stage, agent_command, ip_command, means
 from failover.client.control import Output, Result
 from failover.errors import LostAgentError, NoAgentError
 
@@ -28,9 +29,9 @@ T = TypeVar("T")
 
 
 @contextmanager
-def two_robots(directory: Path) -> Iterator[tuple[RobotMachine, RobotMachine]]:
-    """robot1 and robot2, beating and connected."""
-    with Stage(directory / "stage", means()) as stage:
+def two_robots(directory: Path, settings: str = "") -> Iterator[tuple[RobotMachine, RobotMachine]]:
+    """robot1 and robot2, beating and connected; ``settings`` are lines added to their configurations."""
+    with Stage(directory / "stage", means(), settings) as stage:
         stage.directory.mkdir()
         stage.start()
         first, second = stage.robots
@@ -89,6 +90,23 @@ def result(robot: RobotMachine, name: str) -> dict[str, Any]:
     """Wait for the component's end and return what `failover logs --follow` ends with."""
     with robot.control() as link:
         return link.ask("logs", name=name, follow=True)
+
+
+def start_agent(robot: RobotMachine) -> None:
+    """Start the robot's agent again, as its service would."""
+    script = f'"$@" </dev/null >>{robot.log} 2>&1 &'
+    inside = ["nsenter", f"--target={robot.processes()[0]}", "--all"] if means().own_pids and os.geteuid() == 0 else []
+    command = agent_command(robot.directory / "agent.toml")
+    subprocess.run([*inside, "setsid", "sh", "-c", script, "sh", *command], check=True)
+
+
+def answers(robot: RobotMachine) -> bool:
+    """Whether its agent answers now."""
+    try:
+        robot.status()
+    except NO_ANSWER:
+        return False
+    return True
 
 
 def cable(robot: RobotMachine, state: str) -> None:

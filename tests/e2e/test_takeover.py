@@ -75,20 +75,14 @@ def test_components_outlive_an_agent_that_is_killed(pair: tuple[RobotMachine, Ro
     lanes = robots.host_pid(first, first.status()["lanes_pid"])
     pid = robots.component(first, "count")["pid"]
     os.kill(lanes, signal.SIGKILL)
-    robots.until(lambda: answers(first) and robots.component(first, "count").get("pid") == pid, "the guard to be found again")
+    robots.until(
+        lambda: robots.answers(first) and robots.component(first, "count").get("pid") == pid, "the guard to be found again"
+    )
     taken = robots.checkpoints(first, "count")
     robots.until(lambda: robots.checkpoints(first, "count") > taken + SNAPSHOTS, "snapshots to go on")
     counted = numbers(robots.output(second, "count"))
     assert counted == list(range(len(counted)))
     assert robots.component(first, "count")["restores"] == 0
-
-
-def answers(robot: RobotMachine) -> bool:
-    try:
-        robot.status()
-    except robots.NO_ANSWER:
-        return False
-    return True
 
 
 @pytest.mark.root

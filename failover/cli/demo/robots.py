@@ -174,8 +174,13 @@ class RobotMachine:
 class Stage:
     """Both robots and the place where they stand. A context manager: leaving it ends them and removes the place."""
 
-    def __init__(self, directory: Path, allowed: Means) -> None:
+    def __init__(self, directory: Path, allowed: Means, settings: str = "") -> None:
+        """
+        Args:
+            settings: lines of TOML added to each robot's configuration.
+        """
         self.directory = directory
+        self._settings = settings
         self.means = allowed
         self.robots: list[RobotMachine] = []
 
@@ -223,9 +228,9 @@ class Stage:
             f'team_directory = "{directory / "team"}"\n'
             f'state_directory = "{directory / "state"}"\n'
             f'runtime_directory = "{directory / "run"}"\n'
-            f"beat_ms = {BEAT_MS}\nlease_ms = {LEASE_MS}\n"
+            f"beat_ms = {BEAT_MS}\nlease_ms = {LEASE_MS}\n{self._settings}"
         )
-        command = host_command(self.means.own_pids, [sys.executable, "-m", "agent.main", "--config", str(config)])
+        command = host_command(self.means.own_pids, agent_command(config))
         if self.means.own_network:
             assert shutil.which("unshare")
             command = ["unshare", "--net", "--", *command]
@@ -246,6 +251,11 @@ class Stage:
             run([*enter, "address", "add", ADDRESS.format(index) + "/24", "dev", "wire"])
             run([*enter, "link", "set", "lo", "up"])
             run([*enter, "link", "set", "wire", "up"])
+
+
+def agent_command(config: Path) -> list[str]:
+    """The command line of an agent."""
+    return [sys.executable, "-m", "agent.main", "--config", str(config)]
 
 
 def wait_for_network(robot: RobotMachine) -> None:
