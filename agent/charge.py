@@ -36,6 +36,9 @@ KILLED: Final = 9
 TROUBLE: Final = (CheckpointError, AgentError, OSError)
 """What can go wrong with a program, its processes or a disk, and is told; anything else is our mistake and ends the lanes."""
 
+REASONS_TOLD: Final = 3
+"""Of the reasons why it cannot be captured, in one sentence of the core; ``status --json`` has them all."""
+
 log = logging.getLogger("failover.component")
 
 
@@ -184,18 +187,20 @@ class Charge:
     async def _told_of(self, act: Act, trouble: Exception) -> None:
         """Say what went wrong, to the log and to the core where it waits for it."""
         message = str(trouble) or type(trouble).__name__
-        log.warning("%s: %s: %s", self.name, type(act).__name__, message)
+        reasons = tuple(getattr(trouble, "reasons", ())) or (message,)
+        if not isinstance(act, acts.Capture) or reasons != self.figures.reasons:  # a capture is tried again every second
+            log.warning("%s: %s: %s", self.name, type(act).__name__, message)
         match act:
             case acts.Capture():
                 unsupported = isinstance(trouble, UnsupportedError)
-                self.figures.reasons = trouble.reasons if isinstance(trouble, UnsupportedError) else (message,)
+                self.figures.reasons = reasons
                 lost = isinstance(trouble, KeeperLostError)
-                self.around.tell(events.CaptureFailed(self.name, act.epoch, message, unsupported, lost))
+                self.around.tell(events.CaptureFailed(self.name, act.epoch, shortened(reasons), unsupported, lost))
             case acts.Start() | acts.Restore():
                 guest = isinstance(act, acts.Start) and act.spec.launch.pid != 0
                 with contextlib.suppress(*TROUBLE):
                     await (self._let_go() if guest else self._stop())
-                self.figures.reasons = (*getattr(trouble, "reasons", ()),) or (message,)
+                self.figures.reasons = reasons
                 self.around.tell(events.ActFailed(self.name, act.epoch, message))
 
     async def _at_once(self, act: acts.SetLease | acts.Freeze) -> None:
@@ -253,7 +258,7 @@ class Charge:
         descriptors = await asyncio.to_thread(self.around.store.open_chain, self.name, act.position)
         laps.lap(f"opening {len(descriptors)} snapshots")
         try:
-            outage_ns = clock.age_ns(descriptors[-1])
+            outage_ns, read_ns = clock.age_ns(descriptors[-1]), clock.now_ns()
             component = await Component.restore(
                 self.name, descriptors, self.around.places, outage_ns=outage_ns, lease_until_ns=act.lease_until_ns, laps=laps
             )
@@ -274,7 +279,7 @@ class Charge:
             laps,
         )
         self.started.set()
-        self.around.tell(events.Restored(self.name, act.epoch, act.position))
+        self.around.tell(events.Restored(self.name, act.epoch, act.position, outage_ns + clock.now_ns() - read_ns))
         self._watch_the_end()
 
     async def _capture(self, act: acts.Capture) -> None:
@@ -399,6 +404,12 @@ class Charge:
         if self.component is component and not self._stopping:
             self.figures.crashes += bool(status and os.WIFSIGNALED(status))
             self.around.tell(events.Exited(self.name, self.epoch, status or 0))
+
+
+def shortened(reasons: tuple[str, ...]) -> str:
+    """The first reasons as one sentence, and how many there are besides."""
+    more = len(reasons) - REASONS_TOLD
+    return "; ".join(reasons[:REASONS_TOLD]) + (f"; and {more} more" if more > 0 else "")
 
 
 def end_lanes_on_mistake(task: asyncio.Task[Any]) -> None:

@@ -444,6 +444,7 @@ class Component:
     def _guard_lost(self) -> None:
         if not self.ended.done():
             self.ended.set_exception(GuardLostError(f"the guard of {self.name} ended, and its program with it"))
+            self.ended.exception()  # noted: after a release nobody waits for the end
 
 
 def _failure(failed: Failed) -> CheckpointError:

@@ -16,7 +16,7 @@ import msgspec
 
 from agent.charge import TROUBLE, end_lanes_on_mistake
 from agent.errors import RefusedError
-from failover.core.messages import Bulk, Errand, ErrandDone
+from failover.core.messages import CHUNK_SIZE_MAX, Bulk, Errand, ErrandDone
 from failover.errors import FailoverError
 
 PATIENCE_S: Final = 75.0
@@ -25,6 +25,9 @@ PATIENCE_S: Final = 75.0
 UNDER_WAY_MAX: Final = 64
 """Errands of one peer that are carried out at a time; more are refused."""
 
+CONTENT_MAX: Final = CHUNK_SIZE_MAX
+"""Bytes of an answer: the lane takes no larger message than a chunk of a snapshot."""
+
 Order = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
 """Carries one verb out on this robot: its arguments → its result."""
 
@@ -32,32 +35,36 @@ Order = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
 class Errands:
     """Both ends: what was sent from here, and what came from others. Lives in the lanes' loop."""
 
-    def __init__(self, say: Callable[[str, Bulk], None], orders: dict[str, Order]) -> None:
+    def __init__(self, say: Callable[[str, Bulk], None], hindrance: Callable[[str], str], orders: dict[str, Order]) -> None:
         """
         Args:
+            hindrance: why nothing can be said to a peer now; "" when it can.
             orders: by name, those that another robot may give.
         """
         self._say = say
+        self._hindrance = hindrance
         self._orders = orders
         self._numbers = itertools.count(1)
         self._waiting: dict[tuple[str, int], asyncio.Future[ErrandDone]] = {}
         self._under_way: dict[str, set[asyncio.Task[None]]] = {}
 
-    async def send(self, peer: str, verb: str, arguments: dict[str, Any]) -> dict[str, Any]:
-        """Have a peer carry an order out.
+    async def send(self, peer: str, verb: str, arguments: dict[str, Any], patience_s: float = PATIENCE_S) -> dict[str, Any]:
+        """Have a peer carry an order out, or answer a question.
 
         Raises:
-            RefusedError: it refused, with its reasons; or its answer did not come.
+            RefusedError: it cannot be reached; it refused, with its reasons; or its answer did not come.
         """
+        if hindrance := self._hindrance(peer):
+            raise RefusedError(f"cannot ask {peer}, where it runs: {hindrance}; ask there, or try again")
         number = next(self._numbers)
         answer: asyncio.Future[ErrandDone] = asyncio.get_running_loop().create_future()
         self._waiting[peer, number] = answer
         try:
             self._say(peer, Errand(number, verb, msgspec.msgpack.encode(arguments)))
-            done = await asyncio.wait_for(answer, PATIENCE_S)
+            done = await asyncio.wait_for(answer, patience_s)
         except TimeoutError:
             raise RefusedError(
-                f"{peer} did not answer to {verb} in {PATIENCE_S:.0f} s; failover status tells how it stands"
+                f"{peer} did not answer to {verb} in {patience_s:g} s; failover status tells how it stands"
             ) from None
         finally:
             self._waiting.pop((peer, number), None)
@@ -107,4 +114,6 @@ class Errands:
             done = ErrandDone(message.number, b"", str(refusal), refusal.kind, tuple(refusal.reasons))
         except (*TROUBLE, FailoverError, msgspec.DecodeError) as trouble:
             done = ErrandDone(message.number, b"", str(trouble) or type(trouble).__name__)
+        if len(done.content) > CONTENT_MAX:
+            done = ErrandDone(message.number, b"", f"its answer of {len(done.content)} bytes is too long to travel; ask there")
         self._say(peer, done)

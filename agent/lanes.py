@@ -106,7 +106,7 @@ class Lanes:
         self._lane = BulkLane(config.robot, settings.me.bulk, bulks, keys, self._hear, self._link_changed)
         self._shipper = Shipper(self._lane, config.link_mbit_s * BYTES_A_MEGABIT)
         self._verbs = Verbs(self)
-        self.errands = Errands(self._lane.say, self._verbs.orders())
+        self.errands = Errands(self._lane.say, self._hindrance, self._verbs.errands())
 
     async def run(self) -> None:
         """From the heart's first word to its last.
@@ -289,6 +289,13 @@ class Lanes:
         else:
             self._shipper.lost(peer)
             self.errands.lost(peer)
+
+    def _hindrance(self, peer: str) -> str:
+        """Why nothing can be said to a peer on the bulk lane now; "" when it can."""
+        link = self._lane.links.get(peer)
+        if link is None or link.state is LinkState.CONNECTED:
+            return "" if link else "it is no robot of this team"
+        return f"the bulk lane is {link.state}" + (f", {link.reason}" if link.reason else "")
 
     def _hear(self, peer: str, message: Bulk) -> None:
         match message:

@@ -26,6 +26,12 @@ from failover.core.names import check_component
 from failover.core.types import ENDED, ComponentSpec, Launch
 from failover.errors import NameFormatError
 
+STANDING_POLL_S: Final = 0.01
+"""Between two questions to the robot that a component moves to: what an operator reads as the move's time."""
+
+SIGHT_PATIENCE_S: Final = 0.5
+"""How long a status waits for the other robots' own sight of their components."""
+
 LOG_POLL_S: Final = 0.02
 """How soon new output is passed on to whoever watches."""
 
@@ -108,6 +114,7 @@ class StatusArguments(msgspec.Struct, forbid_unknown_fields=True):
 
     watch: bool = False
     every_ms: int = 500
+    team: bool = False
 
 
 class Verbs:
@@ -127,6 +134,10 @@ class Verbs:
             "why": self.why,
             **{name: functools.partial(self._order, name) for name in self.orders()},
         }
+
+    def errands(self) -> dict[str, Order]:
+        """What another robot may ask of this one: the orders, and how things stand here."""
+        return {**self.orders(), "standing": self.standing, "picture": self.picture}
 
     def orders(self) -> dict[str, Order]:
         """Those that are carried out where the component runs, wherever they are given."""
@@ -160,9 +171,31 @@ class Verbs:
         """How does the team stand?"""
         wanted = _read(StatusArguments, "status", arguments)
         while wanted.watch:
-            await say.update(self._lanes.picture(await self._lanes.ask("status")))
+            await say.update(await self._sight(wanted.team))
             await asyncio.sleep(max(wanted.every_ms, 10) / 1_000)
-        return self._lanes.picture(await self._lanes.ask("status"))
+        return await self._sight(wanted.team)
+
+    async def _sight(self, team: bool) -> dict[str, Any]:
+        """This robot's picture; with ``team`` each component also as the other living robots see it."""
+        mine = self._lanes.picture(await self._lanes.ask("status"))
+        for component in mine["components"]:
+            component["elsewhere"] = {}
+        if team:
+            living = [peer["name"] for peer in mine["peers"] if peer["state"] == "live" and peer["lane"] == "connected"]
+            theirs = await asyncio.gather(*(self._sight_of(peer) for peer in living))
+            for robot, picture in zip(living, theirs, strict=True):
+                known = {one["name"]: one for one in picture.get("components", ())}
+                for component in mine["components"]:
+                    if component["name"] in known:
+                        component["elsewhere"][robot] = known[component["name"]]
+        return mine
+
+    async def _sight_of(self, peer: str) -> dict[str, Any]:
+        """A peer's own picture; empty when it does not answer soon."""
+        try:
+            return await self._lanes.errands.send(peer, "picture", {}, SIGHT_PATIENCE_S)
+        except RefusedError:
+            return {}
 
     async def why(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """What was decided, when and why?"""
@@ -204,6 +237,9 @@ class Verbs:
     async def protect(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """Take a running process under protection."""
         wanted = _read(ProtectArguments, "protect", arguments)
+        for known in self._lanes.charges.values():
+            if known.component is not None and known.component.pid == wanted.pid:
+                raise RefusedError(f"pid {wanted.pid} is protected already, as {known.name}; failover release lets it go")
         name = await self._fresh_name(wanted.name, "")
         charge = await self._begin(name, Launch(pid=wanted.pid))
         return {"name": name, "pid": wanted.pid, "notes": list(charge.figures.notes)}
@@ -239,9 +275,39 @@ class Verbs:
     async def _moved(self, name: str, make: Callable[[int], events.Command]) -> dict[str, Any]:
         began_ns = clock.now_ns()
         answer = await self._command(make)
-        took_ms = (clock.now_ns() - began_ns) / 1e6
         view = await self._view(name)
+        if view["primary"] != self._lanes.settings.config.robot:
+            view = await self._running_at(view["primary"], name)
+        took_ms = (clock.now_ns() - began_ns) / 1e6
         return {"name": name, "to": view["primary"], "epoch": view["epoch"], "took_ms": took_ms, "sentence": answer.sentence}
+
+    async def _running_at(self, robot: str, name: str) -> dict[str, Any]:
+        """Wait until the robot that took a component runs it; its view of it.
+
+        Raises:
+            RefusedError: it does not, or has not said so in time; the component stays the team's.
+        """
+        deadline_ns = clock.now_ns() + int(START_PATIENCE_S * 1e9)
+        while True:
+            view = await self._lanes.errands.send(robot, "standing", {"name": name})
+            if view.get("role") == "primary" and view["state"] in ("running", "degraded"):
+                return view
+            if view.get("state") in ("ended", "failed") or view.get("primary") not in (robot, None):
+                sentence = "; ".join((*view.get("reasons", ()), *view.get("notes", ()))) or "failover why tells the story"
+                raise RefusedError(f"{robot} took {name} and does not run it: {sentence}")
+            if clock.now_ns() > deadline_ns:
+                raise RefusedError(
+                    f"{robot} took {name} and has not begun to run it in {START_PATIENCE_S:.0f} s; see failover status"
+                )
+            await asyncio.sleep(STANDING_POLL_S)
+
+    async def standing(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        """How one component stands on this robot; empty where it is unknown."""
+        return await self._view(_read(NameArguments, "standing", arguments).name)
+
+    async def picture(self, _arguments: dict[str, Any]) -> dict[str, Any]:
+        """All of this robot's own sight, for another robot's status."""
+        return self._lanes.picture(await self._lanes.ask("status"))
 
     async def prefer(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """Say where a component should run."""
@@ -273,7 +339,10 @@ class Verbs:
         charge.started.clear()
         charge.ended = None
         end = charge.end()
-        await self._command(lambda number: events.Run(number, ComponentSpec(name, config.robot, launch, rules)))
+        try:
+            await self._command(lambda number: events.Run(number, ComponentSpec(name, config.robot, launch, rules)))
+        except RefusedError as refusal:
+            raise RefusedError(str(refusal), refusal.kind, charge.figures.reasons) from refusal
         begun = asyncio.ensure_future(charge.started.wait())
         try:
             both: set[asyncio.Future[Any]] = {begun, end}

@@ -89,5 +89,5 @@ def _memory_findings(pid: int) -> Iterator[Finding]:
 
 def _command(pid: int, status: Status) -> str:
     words = procfs.read_text(pid, "cmdline").rstrip("\0").split("\0")
-    command = " ".join(words).strip() or f"[{status.name}]"
+    command = " ".join(" ".join(words).split()) or f"[{status.name}]"
     return command if len(command) <= COMMAND_LENGTH else command[: COMMAND_LENGTH - 1] + "…"

@@ -202,7 +202,7 @@ def _refuse_places(pid: int) -> Iterator[str]:
 
 
 def _refuse_namespaces(pid: int) -> Iterator[str]:
-    """Namespaces of its own, except those that `failover run` gives: PID and time, and with them mount and user."""
+    """Namespaces of its own, except those that we give: `failover run` PID and time, a restore time; with them mount and user."""
 
     def differs(kind: str) -> bool:
         try:
@@ -211,6 +211,7 @@ def _refuse_namespaces(pid: int) -> Iterator[str]:
             return False  # a kernel without this kind
 
     isolated = differs("pid")
-    for kind in ("net", "ipc", "uts", "cgroup", *(() if isolated else ("mnt", "user", "time"))):
-        if differs(kind):
+    allowed = ("mnt", "user", "time") if isolated else ("user", "time") if differs("time") else ()
+    for kind in ("net", "ipc", "uts", "cgroup", "mnt", "user", "time"):
+        if kind not in allowed and differs(kind):
             yield f"it lives in a {kind} namespace of its own, which is not kept yet: run it, and failover, in the same one"

@@ -164,7 +164,7 @@ def _notes(answer: dict[str, Any]) -> None:
 
 def protect(arguments: argparse.Namespace) -> int:
     """Protect a process that runs already."""
-    name = arguments.name or f"/pid/{arguments.pid}"
+    name = arguments.name or f"pid-{arguments.pid}"
     with connect(arguments) as agent:
         answer = agent.ask("protect", pid=arguments.pid, name=name)
     return _tell(arguments, answer, f"pid {answer['pid']} is protected as {answer['name']}")
@@ -174,7 +174,8 @@ def release(arguments: argparse.Namespace) -> int:
     """Let a component go; its program runs on, unprotected."""
     with connect(arguments) as agent:
         answer = agent.ask("release", name=arguments.name)
-    return _tell(arguments, answer, f"{answer['name']} runs on as pid {answer['pid']}, unprotected")
+    what = "is forgotten" if answer["pid"] is None else f"runs on as pid {answer['pid']}, unprotected"
+    return _tell(arguments, answer, f"{answer['name']} {what}")
 
 
 def stop(arguments: argparse.Namespace) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import io
 import os
 import signal
 import sys
@@ -19,11 +20,16 @@ FAILED: Final = 1
 USAGE: Final = 2
 NO_AGENT: Final = 3
 
+REASONS_SHOWN: Final = 8
+
 INTERRUPTED: Final = 128 + signal.SIGINT
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command line; returns its exit status. Errors are told on standard error, never as a traceback."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a name in other letters than the terminal's must not end in an error
     room = parser.build()
     arguments = room.parse_args(argv)
     try:
@@ -60,9 +66,15 @@ def tell(error: Exception, arguments: argparse.Namespace, status: int) -> int:
 
         print(json.dumps({"error": kind, "message": str(error), "reasons": list(reasons)}))
     else:
-        print(f"failover: {error}", file=sys.stderr)
-        for reason in reasons:
+        sentence = str(error)
+        if len(reasons) > 1:  # they follow, one a line
+            sentence = sentence.removesuffix("; ".join(reasons)).rstrip(": ")
+        print(f"failover: {sentence}", file=sys.stderr)
+        listed = [reason for reason in reasons if reason not in sentence]
+        for reason in listed[:REASONS_SHOWN]:
             print(f"  - {reason}", file=sys.stderr)
+        if len(listed) > REASONS_SHOWN:
+            print(f"  - and {len(listed) - REASONS_SHOWN} more; --json has them all", file=sys.stderr)
     return status
 
 

@@ -113,7 +113,7 @@ def _run(room: argparse.ArgumentParser) -> None:
 
 def _protect(room: argparse.ArgumentParser) -> None:
     _pid(room)
-    room.add_argument("--name", metavar="NAME", help="its name (default: /pid/PID)")
+    room.add_argument("--name", metavar="NAME", help="its name (default: /TEAM/ROBOT/pid-PID)")
     _agent(room)
 
 

@@ -14,6 +14,8 @@ Mood = Literal["good", "warning", "bad", "quiet"]
 COLUMNS: Final = ("", "role", "state", "epoch", "lag", "freeze", "standby", "links")
 
 BAD_STATES: Final = frozenset({"degraded", "failed"})
+OVER_STATES: Final = frozenset({"ended", "released"})
+"""Nobody expects anything of these any more."""
 UNSETTLED_STATES: Final = frozenset({"starting", "restoring", "held", "frozen"})
 
 
@@ -53,7 +55,7 @@ def size(value: float | None) -> str:
 def rows(status: Mapping[str, Any]) -> tuple[Row, ...]:
     """The team's tree, from one agent's answer: robots, below each the components that it is primary of."""
     robots = [(status["robot"], None), *((peer["name"], peer) for peer in status["peers"])]
-    components = list(status["components"])
+    components = [sight(component) for component in status["components"] if component.get("state") != "released"]
     found: list[Row] = []
     for name, peer in sorted(robots, key=lambda robot: robot[1] is not None):
         found.append(_robot_row(status, name, peer))
@@ -64,6 +66,17 @@ def rows(status: Mapping[str, Any]) -> tuple[Row, ...]:
         found.append(Row(("nobody", *[""] * 7), "bad"))
         found += _branch(orphans, "")
     return tuple(found)
+
+
+def sight(component: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The component as the robot sees it that runs it, where that one was asked; otherwise as the asked robot does."""
+    seen: Mapping[str, Any] = (component.get("elsewhere") or {}).get(component.get("primary"), {})
+    return seen if seen.get("role") == "primary" else component
+
+
+def is_unprotected(component: Mapping[str, Any]) -> bool:
+    """It runs, and nobody could go on with what it does now."""
+    return component.get("role") == "primary" and component.get("protection") in ("none", "stopped")
 
 
 def _robot_row(status: Mapping[str, Any], name: str, peer: Mapping[str, Any] | None) -> Row:
@@ -112,6 +125,8 @@ def _state(component: Mapping[str, Any]) -> str:
     status = component.get("exit_status")
     if component.get("state") == "ended" and status is not None:
         return f"ended ({ending(status)})"
+    if component.get("state") == "running" and is_unprotected(component):
+        return "running, unprotected"
     return str(component.get("state") or "")
 
 
@@ -126,23 +141,45 @@ def mood_of(component: Mapping[str, Any]) -> Mood:
     state = component.get("state")
     if state in BAD_STATES:
         return "bad"
-    if state == "ended":
+    if state in OVER_STATES:
         return "quiet"
-    return "warning" if state in UNSETTLED_STATES or not component.get("standby") else "good"
+    return "warning" if state in UNSETTLED_STATES or not component.get("standby") or is_unprotected(component) else "good"
 
 
 def remarks(status: Mapping[str, Any]) -> tuple[str, ...]:
-    """What stands below the tree: reasons and notes, each a sentence."""
-    found = [f"{component['name']}: {line}" for component in status["components"] for line in component.get("reasons") or ()]
-    found += [f"{component['name']}: {line}" for component in status["components"] for line in component.get("notes") or ()]
+    """What stands below the tree: reasons, promises that do not hold, and notes, each a sentence said once."""
+    found: list[str] = []
+    for component in status["components"]:
+        if component.get("state") != "released":
+            found += _remarks_on(component)
     found += [f"{peer['name']}: {line}" for peer in status["peers"] for line in peer.get("notes") or ()]
     if status.get("insecure"):
         found.append("links are neither authenticated nor encrypted (insecure = true)")
     return tuple(found) + tuple(status.get("notes") or ())
 
 
+def _remarks_on(component: Mapping[str, Any]) -> list[str]:
+    """Of one component, from every robot that was asked; a reason that a note contains is not said again."""
+    sights = {"": component, **(component.get("elsewhere") or {})}
+    lines: list[str] = []
+    for robot, seen in sights.items():
+        notes = [str(line) for line in seen.get("notes") or ()]
+        reasons = [str(line) for line in seen.get("reasons") or ()]
+        said = notes + lines
+        lines += [f"{robot}: {line}" if robot else line for line in notes if line not in lines]
+        lines += [line for line in reasons[:REASONS_SHOWN] if not any(line in other for other in said)]
+    seen = sight(component)
+    if seen.get("promise") and (seen.get("state") == "degraded" or is_unprotected(seen)):
+        lines.append(str(seen["promise"]))
+    return [f"{component['name']}: {line}" for line in lines]
+
+
+REASONS_SHOWN: Final = 8
+"""Of a component that cannot be captured; ``--json`` has them all."""
+
+
 def is_healthy(status: Mapping[str, Any]) -> bool:
-    """Whether everything that should be protected is: no component degraded, failed or without standby, no peer dead."""
-    living = [component for component in status["components"] if component.get("state") != "ended"]
-    unwell = any(component.get("state") in BAD_STATES or not component.get("standby") for component in living)
+    """Whether all that should be protected is: no component degraded, failed, unprotected or without standby, no peer dead."""
+    living = [sight(component) for component in status["components"] if component.get("state") not in OVER_STATES]
+    unwell = any(one.get("state") in BAD_STATES or not one.get("standby") or is_unprotected(one) for one in living)
     return not unwell and all(peer["state"] != "dead" for peer in status["peers"])

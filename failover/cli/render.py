@@ -25,6 +25,19 @@ GAP: Final = "  "
 """Between two columns of a plain table."""
 
 
+NARROW: Final = 80
+"""Columns of a terminal below which a table's cells would be torn apart; the tree is told line by line then."""
+
+ASCII: Final = str.maketrans({"└": "`", "├": "|", "─": "-", "–": "-", "…": "~"})
+"""For a terminal or a file that is not in UTF-8."""
+
+
+def spoken(text: str) -> str:
+    """The text in characters that standard output has."""
+    encoding = (getattr(sys.stdout, "encoding", None) or "ascii").lower().replace("-", "")
+    return text if encoding.startswith("utf") else text.translate(ASCII).encode(encoding, "replace").decode(encoding)
+
+
 def is_terminal() -> bool:
     """Whether standard output is looked at by a person."""
     return sys.stdout.isatty()
@@ -65,7 +78,7 @@ def tree(status: dict[str, Any]) -> None:
     if is_terminal():
         _console().print(_rich_tree(status))
     else:
-        print(plain_tree(status))
+        print(spoken(plain_tree(status)))
 
 
 def plain_tree(status: dict[str, Any]) -> str:
@@ -80,7 +93,7 @@ def live_tree() -> AbstractContextManager[Callable[[dict[str, Any]], None]]:
     """A picture that is drawn again and again: in place on a terminal, one below the other elsewhere."""
     if is_terminal():
         return _LiveTree()
-    return nullcontext(lambda status: print(plain_tree(status), end="\n\n", flush=True))
+    return nullcontext(lambda status: print(spoken(plain_tree(status)), end="\n\n", flush=True))
 
 
 class _LiveTree:
@@ -151,11 +164,20 @@ def _rich_tree(status: dict[str, Any]) -> Any:
     from rich.console import Group
     from rich.text import Text
 
-    lines = [(row.cells, COLOURS[row.mood]) for row in picture.rows(status)]
-    parts: list[Any] = [_rich_table(picture.COLUMNS, lines, f"team {status.get('team') or ''}".strip())]
+    lines = [(tuple(map(spoken, row.cells)), COLOURS[row.mood]) for row in picture.rows(status)]
+    if _console().width < NARROW:
+        parts: list[Any] = [Text(line, style=style) for cells, style in lines for line in _stacked(cells)]
+    else:
+        parts = [_rich_table(picture.COLUMNS, lines, f"team {status.get('team') or ''}".strip())]
     if status.get("promise"):
-        parts.append(Text(f"promise: {status['promise']}", style="bold"))
-    return Group(*parts, *(Text(line, style="yellow") for line in picture.remarks(status)))
+        parts.append(Text(spoken(f"promise: {status['promise']}"), style="bold"))
+    return Group(*parts, *(Text(spoken(line), style="yellow") for line in picture.remarks(status)))
+
+
+def _stacked(cells: Sequence[str]) -> list[str]:
+    """One row of the tree for a narrow terminal: its name, and below it what is known, with the columns' names."""
+    told = [f"{column} {cell}" for column, cell in zip(picture.COLUMNS[1:], cells[1:], strict=True) if cell.strip(" -–")]
+    return [cells[0], *([f"     {', '.join(told)}"] if told else [])]
 
 
 def _rich_table(columns: Sequence[str], lines: Sequence[tuple[Sequence[str], str]], title: str = "") -> Table:

@@ -18,7 +18,7 @@ def status(arguments: argparse.Namespace) -> int:
     if arguments.watch:
         return _watch(arguments)
     with connect(arguments) as agent:
-        answer = agent.ask("status")
+        answer = agent.ask("status", team=True)
     if arguments.json:
         render.as_json(answer)
     else:
@@ -30,7 +30,7 @@ def _watch(arguments: argparse.Namespace) -> int:
     healthy = True
     with connect(arguments) as agent, render.live_tree() as draw:
         try:
-            for reply in agent.stream("status", watch=True, every_ms=arguments.every_ms):
+            for reply in agent.stream("status", watch=True, every_ms=arguments.every_ms, team=True):
                 if isinstance(reply, Update):
                     healthy = picture.is_healthy(reply.value)
                     (render.as_json if arguments.json else draw)(reply.value)

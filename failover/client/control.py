@@ -10,7 +10,7 @@ Verbs, their arguments and what ``Result.value`` holds (every argument has a def
 verb           arguments                                                result, updates
 =============  =======================================================  ========================================================
 ``ping``                                                                ``robot team pid version insecure``
-``status``     ``watch`` false, ``every_ms`` 500                        see `STATUS`; with ``watch`` each picture is an Update
+``status``     ``watch`` false, ``every_ms`` 500, ``team`` false        see `STATUS`; with ``watch`` each picture is an Update
 ``run``        ``argv`` *must*, ``name`` = argv[0]'s, ``env``, ``cwd``,  Update ``{"started": {name, pid, inner_pid, isolated,
                ``umask`` 18, ``isolate`` true, ``wait`` true            notes}}``; with ``wait`` Output … and Result
                                                                         ``{name, exit_status}`` (a wait status); else at once
@@ -49,8 +49,10 @@ peers: [{name, state, last_heard_ms, beats_lost, lane, rtt_us, notes}]
     state: unknown | live | suspect | dead; lane: connected | connecting | refused | down
 components: [{name, role, primary, state, epoch, generation, sequence, engine, pid, inner_pid, isolated, standby,
     standby_sequence, lag_ms, period_ms, freeze_us, freeze_us_max, snapshot_size, dirty_bytes, snapshots, restores, crashes,
-    exit_status, reasons, notes}]
-    role: primary | standby | none; state: starting | running | frozen | held | restoring | ended | degraded | failed
+    exit_status, reasons, notes, elsewhere}]
+    role: primary | standby | none
+    state: starting | running | frozen | held | restoring | ended | degraded | failed | released
+    elsewhere: with ``team``: {robot: the same fields, as that robot sees the component}
 """
 """What ``status`` answers, field by field. A value that is not known is None."""
 

@@ -64,6 +64,7 @@ def _release(component: Component, turn: Turn, command: Release) -> None:
     elif component.holding or component.state is State.STOPPING or not (component.state in ENDED or vacant(component, turn)):
         _elsewhere(component, turn, command.request, "release")
         return
+    component.reason = "" if component.state in ENDED else "released: it runs on, unprotected"
     component.move(Cause.RELEASE)
     component.primary = turn.me
     component.flight = None

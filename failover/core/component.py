@@ -110,6 +110,9 @@ class Component:
         born: epoch under which the present process was started or restored.
         crashed: wait status of a program that died while it was held still; it is resumed when it may act.
         due_ns: next capture; ``until_ns``: when the present claim, start or restore is overdue.
+        resumed_ns: when the state was captured that this primacy began with, -1 for a fresh start; ``resumed_age_ns``: how old
+            it was then.
+        undelivered: why the last snapshot did not become a checkpoint; ``unstored``: on a standby, why it was not stored.
     """
 
     name: str
@@ -142,6 +145,10 @@ class Component:
     acked_ns: int = -1
     freeze_us: int = 0
     degraded: str = ""
+    undelivered: str = ""
+    unstored: str = ""
+    resumed_ns: int = -1
+    resumed_age_ns: int = -1
     unprotected: bool = False
     lease_ns: int = 0
     told_ns: int = 0

@@ -74,6 +74,8 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str) -> 
     component.claim_counter = turn.next_counter
     component.until_ns = turn.now_ns + turn.config.loyalty_ns
     component.unprotected, component.degraded, component.needs_base = False, "", False
+    component.undelivered = component.unstored = ""
+    component.resumed_ns = component.resumed_age_ns = -1
     component.handing, component.ending, component.reported = None, False, False
     component.crashed = 0
     component.lease_ns = component.told_ns = 0
@@ -271,7 +273,8 @@ def _heard_end(component: Component, turn: Turn, sender: str, entry: Entry, thei
         if entry.epoch > component.epoch:
             lose(component, turn, sender, entry)
         return
-    if component.state is State.STOPPING or (component.state in ENDED and entry.epoch == component.epoch):
+    forgotten = theirs is State.RELEASED and component.state is not State.RELEASED
+    if component.state is State.STOPPING or (component.state in ENDED and entry.epoch == component.epoch and not forgotten):
         return
     component.epoch, component.primary, component.status = entry.epoch, entry.primary, entry.status
     component.entrusted, component.trusted = (), False

@@ -51,8 +51,9 @@ def failed(component: Component, turn: Turn, event: ActFailed) -> None:
     if event.epoch != component.epoch:
         return
     if component.state is State.STARTING:
+        told = bool(component.request)  # whoever asked for it is told; then nothing of it needs to be remembered
         refuse_request(component, turn, event.message)
-        _end(component, turn, Cause.FAIL, 0, event.message)
+        _end(component, turn, Cause.RELEASE if told else Cause.FAIL, 0, event.message)
     elif component.state is State.RECOVERING:
         turn.say(component, f"{turn.me} could not resume it: {event.message}")
         _recover(component, turn, component.status)

@@ -110,11 +110,12 @@ class StoreFailed:
 
 @dataclass(frozen=True, slots=True)
 class Restored:
-    """The act Restore is done: the program runs from ``position``."""
+    """The act Restore is done: the program runs from ``position``, which was captured ``age_ns`` ago (-1: not known)."""
 
     component: str
     epoch: int
     position: Position
+    age_ns: int = -1
 
 
 @dataclass(frozen=True, slots=True)

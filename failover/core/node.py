@@ -36,6 +36,8 @@ from failover.core.messages import HOLDS, Beat, Echo, Entry
 from failover.core.speaker import Speaker, entry_of
 from failover.core.types import COMPONENTS_MAX, ENDED, MS, Ballot, Config, Decision, Found, Held, State, StatusView
 
+NS_PER_S = 1_000 * MS
+
 URGENT_GAP_NS = 2 * MS
 """Between a beat and the next one that carries a change: a flurry of changes makes no flood of beats."""
 
@@ -265,6 +267,9 @@ def _runs(component: Component, turn: Turn, event: Started | Restored) -> None:
     if not expected or event.epoch != component.epoch:
         return
     how = "it runs" if isinstance(event, Started) else f"it goes on from checkpoint {event.position.sequence}"
+    if isinstance(event, Restored) and event.age_ns >= 0:
+        component.resumed_ns, component.resumed_age_ns = turn.now_ns - event.age_ns, event.age_ns
+        how += f", {event.age_ns / NS_PER_S:.1f} s old,"
     component.move(Cause.RUNS)
     component.tries = 0
     component.due_ns = turn.now_ns

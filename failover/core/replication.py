@@ -129,6 +129,7 @@ def _safe(component: Component, turn: Turn, position: Position) -> None:
     assert flight is not None
     alone = not flight.to or not turn.alive(component.standby)
     turn.order(acts.Acknowledge(component.name, component.epoch, position))
+    component.undelivered = ""
     component.parent = component.acked = position
     component.acked_ns = flight.started_ns
     period_ms = turn.config.alone_period_ms if alone else component.rules.period_ms
@@ -146,6 +147,7 @@ def _give_up(component: Component, turn: Turn, why: str = "") -> None:
     component.flight = None
     component.due_ns = turn.now_ns + turn.config.retry_ms * MS
     if why:
+        component.undelivered = why
         turn.say(component, f"a snapshot did not arrive: {why}")
 
 
@@ -178,7 +180,7 @@ def stored(component: Component, turn: Turn, event: Stored) -> None:
     supersede(component, turn, event.position)
     component.hold(event.position)
     component.spec = event.spec
-    component.needs_base, component.unable, component.tries = False, "", 0
+    component.needs_base, component.unable, component.tries, component.unstored = False, "", 0, ""
     if event.position.sequence % HISTORY_MAX == 0:
         turn.order(acts.Prune(component.name, component.epoch, component.held[0]))
 
@@ -188,6 +190,7 @@ def store_failed(component: Component, turn: Turn, event: StoreFailed) -> None:
     if (event.sender, event.epoch) != component.admitted or component.holding:
         return
     component.needs_base = component.needs_base or event.needs_base
+    component.unstored = event.message
     turn.say(component, f"a snapshot from {event.sender} was not stored: {event.message}")
 
 

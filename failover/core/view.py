@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from failover.core.component import Component, Turn
-from failover.core.types import ENDED, ComponentView, Protection, State, StatusView
+from failover.core.types import ENDED, MS, ComponentView, Protection, State, StatusView
 
 NS_PER_S = 10**9
+
+STALE_NS = 2 * NS_PER_S
+"""A checkpoint that is older is not what was promised: the protection is degraded while the next one does not arrive."""
 
 
 def status(components: dict[str, Component], turn: Turn, boot: int) -> StatusView:
@@ -66,10 +69,30 @@ def _protection(component: Component, turn: Turn) -> Protection:
         return Protection.STOPPED
     if not component.holding:
         return Protection.NONE
-    if component.degraded:
+    if component.degraded or _overdue(component, turn):
         return Protection.DEGRADED
     protected = component.acked is not None and component.standby in component.entrusted and turn.alive(component.standby)
     return Protection.PROTECTED if protected else Protection.NONE
+
+
+def _overdue(component: Component, turn: Turn) -> bool:
+    """Snapshots are taken and do not become checkpoints."""
+    limit_ns = max(STALE_NS, 2 * component.rules.period_ms * MS)
+    return bool(component.undelivered) and turn.now_ns - _state_ns(component) > limit_ns
+
+
+def _state_ns(component: Component) -> int:
+    """When the newest state was captured from which another robot, or this one, could go on; -1 if there is none."""
+    return max(component.acked_ns, component.resumed_ns)
+
+
+def _age(component: Component, turn: Turn) -> str:
+    state_ns = _state_ns(component)
+    return (
+        f"the last checkpoint is {(turn.now_ns - state_ns) / NS_PER_S:.1f} s old"
+        if state_ns >= 0
+        else "there is no checkpoint yet"
+    )
 
 
 def _promise(component: Component, turn: Turn, protection: Protection) -> str:
@@ -88,9 +111,15 @@ def _promise(component: Component, turn: Turn, protection: Protection) -> str:
 def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
     notes = []
     if component.degraded:
-        age_s = (turn.now_ns - component.acked_ns) / NS_PER_S
-        age = f"the last checkpoint is {age_s:.1f} s old" if component.acked_ns >= 0 else "there is no checkpoint yet"
-        notes.append(f"not captured: {component.degraded}; {age}")
+        notes.append(f"not captured: {component.degraded}; {_age(component, turn)}")
+    elif component.holding and _overdue(component, turn):
+        notes.append(f"snapshots do not arrive: {component.undelivered}; {_age(component, turn)}")
+    if component.holding and component.resumed_age_ns >= STALE_NS:
+        notes.append(f"it went on at {turn.me} from a checkpoint that was {component.resumed_age_ns / NS_PER_S:.1f} s old")
+    if component.unstored and component.state is State.STANDBY:
+        notes.append(f"a snapshot was not stored at {turn.me}: {component.unstored}")
+    if component.unprotected:
+        notes.append("protected no longer, as on_unsupported = stop_protecting says; failover release, then protect, begins anew")
     if component.unable:
         notes.append(f"{turn.me} cannot run it: {component.unable}")
     if component.state is State.FROZEN:
