@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -61,6 +62,12 @@ def run(robot: RobotMachine, name: str, *argv: str, env: dict[str, str] | None =
     with robot.control() as link:
         environment = {"PATH": "/usr/bin:/bin", "LC_ALL": "C", **(env or {})}
         return link.ask("run", argv=list(argv), name=name, env=environment, cwd=cwd, wait=False)
+
+
+def failover(robot: RobotMachine, verb: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """A command as a person gives it at that robot."""
+    command = [sys.executable, "-m", "failover.cli.main", verb, "--socket", str(robot.socket), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
 
 
 def component(robot: RobotMachine, name: str) -> dict[str, Any]:

@@ -1,0 +1,140 @@
+"""Protection that is not whole: each way it can fail is named by `failover status`, at either robot, and mends itself."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.e2e import robots
+from tests.e2e.robots import RobotMachine
+
+CHANGING = """
+import os, socket, sys, time
+flag, number, held = sys.argv[1], 0, None
+while True:
+    print(number, flush=True)
+    number += 1
+    time.sleep(0.01)
+    if os.path.exists(flag) and held is None:
+        held = socket.socketpair()
+    elif held is not None and not os.path.exists(flag):
+        for end in held:
+            end.close()
+        held = None
+"""
+"""Counts, and holds sockets for as long as a file exists."""
+
+STOPPING = '[components."/demo/robot1/count"]\non_unsupported = "stop_protecting"\n'
+
+Pair = tuple[RobotMachine, RobotMachine]
+
+
+@pytest.fixture
+def pair(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Pair]:
+    with robots.two_robots(tmp_path, getattr(request, "param", "")) as both:
+        yield both
+
+
+@pytest.fixture
+def flag(pair: Pair, tmp_path: Path) -> Path:
+    """A protected program at robot1 that turns unsupported while this file exists."""
+    path = tmp_path / "flag"
+    robots.run(pair[0], "count", "/usr/bin/python3", "-S", "-c", CHANGING, str(path))
+    until_protected(pair[0])
+    return path
+
+
+def until_protected(robot: RobotMachine) -> None:
+    robots.until(lambda: robots.component(robot, "count").get("protection") == "protected", "a checkpoint at the standby")
+
+
+def until_status(robot: RobotMachine, returncode: int, *words: str) -> str:
+    """What `failover status` shows there, once it ends with this exit status and says all the words."""
+    shown: subprocess.CompletedProcess[str] | None = None
+
+    def says() -> bool:
+        nonlocal shown
+        shown = robots.failover(robot, "status")
+        return shown.returncode == returncode and all(word in shown.stdout for word in words)
+
+    try:
+        robots.until(says, f"status {returncode} and {words}")
+    except AssertionError as error:
+        raise AssertionError(f"{error}; it shows {shown}") from error
+    assert shown is not None
+    return shown.stdout
+
+
+def numbers(robot: RobotMachine) -> list[int]:
+    return [int(line) for line in robots.output(robot, "count").split()]
+
+
+def test_a_program_that_opens_a_socket_is_degraded_by_name_and_recovers(pair: Pair, flag: Path) -> None:
+    flag.touch()
+    for robot in pair:
+        shown = until_status(robot, 1, "degraded", "not captured: fd ", "a socket", "the last checkpoint is")
+        assert shown.count("is a socket") <= 2, "each reason is said once"
+    flag.unlink()
+    for robot in pair:
+        until_status(robot, 0)
+    until_protected(pair[0])
+
+
+def test_a_takeover_from_an_old_checkpoint_says_how_old_it_is(pair: Pair, flag: Path) -> None:
+    first, second = pair
+    flag.touch()
+    robots.until(lambda: robots.component(first, "count").get("state") == "degraded", "robot1 to notice")
+    robots.until(lambda: robots.component(first, "count")["lag_ms"] > 2_500, "the checkpoint to grow old")
+    first.cut_power()
+    robots.until(lambda: robots.component(second, "count").get("role") == "primary", "robot2 to take over")
+    until_status(second, 1, "from a checkpoint that was ", " s old")
+    told = robots.failover(second, "why", "count").stdout
+    assert "s old, at robot2" in told, told
+    counted = numbers(second)
+    assert counted == list(range(len(counted)))
+
+
+@pytest.mark.parametrize("pair", [STOPPING], indirect=True, ids=["stop_protecting"])
+def test_protection_that_was_given_up_is_said_and_nothing_is_taken_over(pair: Pair, flag: Path) -> None:
+    first, second = pair
+    flag.touch()
+    until_status(first, 1, "protected no longer", "a socket")
+    robots.until(lambda: robots.component(second, "count").get("standby") == "", "robot2 to forget its checkpoints")
+    flag.unlink()
+    assert robots.component(first, "count")["protection"] == "stopped"
+    released = robots.failover(first, "release", "count")
+    assert released.returncode == 0, released
+    robots.until(lambda: robots.failover(second, "status").returncode == 0, "nothing to be amiss any more")
+
+
+def lanes_of(robot: RobotMachine) -> int:
+    return robots.host_pid(robot, robot.status()["lanes_pid"])
+
+
+def test_a_standby_that_cannot_write_is_named_at_both_robots(pair: Pair, flag: Path) -> None:
+    lanes = lanes_of(pair[1])
+    before = resource.prlimit(lanes, resource.RLIMIT_FSIZE)
+    resource.prlimit(lanes, resource.RLIMIT_FSIZE, (1, before[1]))
+    for robot in pair:
+        until_status(robot, 1, "degraded", "snapshots do not arrive", "was not stored at robot2")
+    resource.prlimit(lanes, resource.RLIMIT_FSIZE, before)
+    for robot in pair:
+        until_status(robot, 0)
+
+
+def test_a_standby_that_falls_silent_leaves_its_primary_unprotected_and_said_so(pair: Pair, flag: Path) -> None:
+    first, second = pair
+    for pid in second.processes():
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGSTOP)
+    shown = until_status(first, 1, "dead", "running, unprotected")
+    assert "hears nobody" in shown
+    before = len(robots.output(first, "count"))
+    robots.until(lambda: len(robots.output(first, "count")) > before, "the program to run on")
