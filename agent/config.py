@@ -8,16 +8,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Literal
+from typing import Literal
 
 from agent.errors import ConfigError
 from failover.client import strict_toml
 from failover.client import team as team_directory
 from failover.client.team import Robot, Team
-from failover.errors import FailoverError
-
-MISSED_BEATS_TO_DEATH: Final = 3
-"""A lease shorter than this many beats would take one lost frame for a dead robot."""
+from failover.core.names import check_component
+from failover.core.types import BEATS_IN_LEASE_MIN
+from failover.errors import FailoverError, NameFormatError
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +53,8 @@ class Config:
         group: unix group that may use the control socket besides its owner; "" for nobody.
         beat_ms: period of beats to each peer.
         lease_ms: how long a primary acts without being heard, and how long a standby stays loyal to a silent one.
-        rule: pair: of two voters the survivor takes over; majority: three or more voters.
-        when_alone: under the pair rule: run on, or freeze, when the other is silent.
+        when_alone: when no other robot is heard, what is started here runs on, or is held still.
         snapshot_period_ms: between two snapshots of a component; grows by itself when link or standby is slower.
-        keep_chains: chains (a base and its deltas) kept for each component.
         realtime: ask for SCHED_FIFO and locked memory.
         link_mbit_s: cap on snapshot traffic; 0 for none.
     """
@@ -70,10 +67,8 @@ class Config:
     group: str = ""
     beat_ms: int = 20
     lease_ms: int = 200
-    rule: Literal["pair", "majority"] = "pair"
     when_alone: Literal["run", "freeze"] = "run"
     snapshot_period_ms: int = 100
-    keep_chains: int = 2
     realtime: bool = True
     link_mbit_s: int = 0
     log_level: Literal["debug", "info", "warning", "error"] = "info"
@@ -87,14 +82,14 @@ class Config:
         """
         if self.beat_ms < 1:
             raise ValueError(f"beat_ms is {self.beat_ms}; it must be at least 1")
-        if self.lease_ms < MISSED_BEATS_TO_DEATH * self.beat_ms:
-            least = MISSED_BEATS_TO_DEATH * self.beat_ms
+        if self.lease_ms < BEATS_IN_LEASE_MIN * self.beat_ms:
+            least = BEATS_IN_LEASE_MIN * self.beat_ms
             raise ValueError(
                 f"lease_ms is {self.lease_ms}: one lost beat would count as a death; with beat_ms {self.beat_ms} "
                 f"give at least {least}"
             )
-        if self.snapshot_period_ms < 1 or self.keep_chains < 1:
-            raise ValueError("snapshot_period_ms and keep_chains must be at least 1")
+        if self.snapshot_period_ms < 1:
+            raise ValueError("snapshot_period_ms must be at least 1")
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +133,7 @@ def load(path: Path) -> Settings:
     except FailoverError as error:
         raise ConfigError(str(error)) from error
     _check_keys(path, config, members)
+    _check_components(path, config, members)
     return Settings(path, config, members, secret)
 
 
@@ -149,3 +145,19 @@ def _check_keys(path: Path, config: Config, members: Team) -> None:
             f"{path}: {', '.join(without)} in {config.team_directory} have no public key; enrol them with failover team enrol, "
             "or set insecure = true on every robot"
         )
+
+
+def _check_components(path: Path, config: Config, members: Team) -> None:
+    """A table for a name that no component can have, or for a robot that nobody knows, would be obeyed by nobody."""
+    for name, component in config.components.items():
+        where = f"{path}:{strict_toml.line_of(path.read_text(), ('components', name))}"
+        try:
+            check_component(name)
+        except NameFormatError as error:
+            raise ConfigError(f"{where}: {error}") from error
+        for key, robot in (("prefer", component.prefer), ("standby", component.standby)):
+            if robot not in ("", *members.robots):
+                known = ", ".join(sorted(members.robots))
+                raise ConfigError(f"{where}: {key} = {robot!r}: the team knows {known}")
+        if component.snapshot_period_ms < 0:
+            raise ConfigError(f"{where}: snapshot_period_ms is {component.snapshot_period_ms}; 0 means the agent's own")

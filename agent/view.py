@@ -62,7 +62,7 @@ def team_view(
         "life": life.boot,
         "insecure": settings.config.insecure,
         "realtime": not life.notes,
-        "rule": view.rule if view else settings.config.rule,
+        "rule": view.rule if view else None,
         "promise": view.promise if view else "not decided yet: the agent is starting",
         "healthy": view.healthy if view else False,
         "notes": notes,

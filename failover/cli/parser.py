@@ -227,7 +227,6 @@ def _team(room: argparse.ArgumentParser) -> None:
     enrol.add_argument(
         "--bulk", metavar="HOST[:PORT]", help="where it takes snapshots, on the wired link (default: first HOST, port 7421)"
     )
-    enrol.add_argument("--role", choices=("robot", "server", "witness"), default="robot", help="what it does (default: robot)")
     enrol.add_argument("--public-key", metavar="KEY", help="the public half of a key made on the robot itself")
     enrol.add_argument("--replace", action="store_true", help="give a known robot new addresses and a new key")
     enrol.set_defaults(function="failover.cli.teams:enrol")

@@ -34,8 +34,8 @@ def enrol(arguments: argparse.Namespace) -> int:
     beats = tuple(_with_port(address, DEFAULT_BEAT_PORT) for address in arguments.address)
     bulk = _with_port(arguments.bulk or beats[0].rpartition(":")[0], DEFAULT_BULK_PORT)
     public, secret = (arguments.public_key, "") if arguments.public_key else keys.new_pair()
-    enrolled = team.enrol(members, arguments.name, Robot(beats, bulk, arguments.role, public))
-    answer = {"robot": arguments.name, "role": arguments.role, "beats": beats, "bulk": bulk, "public_key": public}
+    enrolled = team.enrol(members, arguments.name, Robot(beats, bulk, public_key=public))
+    answer = {"robot": arguments.name, "role": "robot", "beats": beats, "bulk": bulk, "public_key": public}
     sentence = f"{arguments.name} is enrolled; carry {directory / team.TEAM_FILE} to every robot"
     if secret:
         if arguments.replace:

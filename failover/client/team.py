@@ -21,7 +21,8 @@ from typing import Final, Literal
 from failover.client import strict_toml
 from failover.errors import TeamFileError
 
-Role = Literal["robot", "server", "witness"]
+Role = Literal["robot"]
+"""Servers (they store and vote) and witnesses (they vote) are not offered yet; the key stands in team files for them."""
 
 TEAM_FILE: Final = "team.toml"
 KEY_CHARACTERS: Final = 40
@@ -38,7 +39,7 @@ class Robot:
     """One member.
 
     Attributes:
-        role: robot runs components, server stores and votes, witness only votes.
+        role: robot: runs components and protects those of others.
         beats: "host:port" for each of its links; beats go to all of them.
         bulk: "host:port" on the wired link, for snapshots.
         public_key: Z85, or "" in a team without keys.

@@ -57,7 +57,11 @@ def test_a_whole_configuration_is_read(directory: Path) -> None:
     [
         (("baet_ms = 10",), 4, "did you mean 'beat_ms'"),
         (("# fine", 'beat_ms = "often"'), 5, "Expected `int`"),
-        (('rule = "trio"',), 4, "Invalid enum value 'trio'"),
+        (('when_alone = "panic"',), 4, "Invalid enum value 'panic'"),
+        (('rule = "majority"',), 4, "unknown key 'rule'"),
+        (("keep_chains = 2",), 4, "unknown key 'keep_chains'"),
+        (('[components."mapper"]', 'on_loss = "hold"'), 4, "mapper"),
+        (('[components."/lab/a"]', 'prefer = "robot7"'), 4, "the team knows robot1, robot2"),
         (('[components."/lab/a"]', 'on_lost = "hold"'), 5, "did you mean 'on_loss'"),
         (('[components."/lab/a"]', 'on_loss = "give up"'), 5, "Invalid enum value 'give up'"),
     ],

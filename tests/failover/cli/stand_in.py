@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import struct
 import threading
@@ -43,7 +44,8 @@ class StandIn:
             threading.Thread(target=self._serve, args=(link,), daemon=True).start()
 
     def _serve(self, link: socket.socket) -> None:
-        with link, link.makefile("rb") as incoming:
+        # A command that has ended in the middle of an answer resets the connection.
+        with contextlib.suppress(ConnectionError), link, link.makefile("rb") as incoming:
             while head := incoming.read(LENGTH.size):
                 request = msgspec.msgpack.decode(incoming.read(*LENGTH.unpack(head)), type=Request)
                 self.asked.append(request)
