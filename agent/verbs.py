@@ -6,20 +6,29 @@ import asyncio
 import functools
 import os
 from collections.abc import Callable
-from typing import Any, Final, Protocol, TypeVar
-
-import msgspec
+from typing import Any, Final, Protocol
 
 from agent import clock
+from agent.arguments import (
+    HandoverArguments,
+    LogsArguments,
+    NameArguments,
+    PreferArguments,
+    ProtectArguments,
+    RunArguments,
+    StatusArguments,
+    StopArguments,
+    arguments_of,
+)
 from agent.charge import Charge
-from agent.component import Places, log_directory
+from agent.component import Places
 from agent.config import Settings
 from agent.control import Conversation, Verb
 from agent.door import Told
 from agent.errands import Errands, Order
 from agent.errors import RefusedError
+from agent.outflow import Outflow
 from agent.rules import rules_for
-from agent.streams import STREAMS, OutputLogs
 from agent.view import version
 from failover.core import acts, events
 from failover.core.names import check_component
@@ -32,13 +41,8 @@ STANDING_POLL_S: Final = 0.01
 SIGHT_PATIENCE_S: Final = 0.5
 """How long a status waits for the other robots' own sight of their components."""
 
-LOG_POLL_S: Final = 0.02
-"""How soon new output is passed on to whoever watches."""
-
 START_PATIENCE_S: Final = 30.0
 """How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
-
-T = TypeVar("T")
 
 
 class Lanes(Protocol):
@@ -55,73 +59,12 @@ class Lanes(Protocol):
     def picture(self, told: Told) -> dict[str, Any]: ...
 
 
-class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
-    """Of ``run``."""
-
-    argv: list[str]
-    name: str = ""
-    env: dict[str, str] = {}
-    cwd: str = "/"
-    umask: int = 0o022
-    isolate: bool = True
-    wait: bool = True
-
-
-class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):
-    """Of ``protect``."""
-
-    pid: int
-    name: str
-
-
-class StopArguments(msgspec.Struct, forbid_unknown_fields=True):
-    """Of ``stop``."""
-
-    name: str
-    signal: int = 15
-
-
-class LogsArguments(msgspec.Struct, forbid_unknown_fields=True):
-    """Of ``logs``."""
-
-    name: str
-    follow: bool = False
-    offsets: tuple[int, int] = (0, 0)
-
-
-class NameArguments(msgspec.Struct, forbid_unknown_fields=True):
-    """Of ``release``, ``failback`` and ``why``."""
-
-    name: str = ""
-
-
-class HandoverArguments(msgspec.Struct, forbid_unknown_fields=True):
-    """Of ``handover``."""
-
-    name: str
-    to: str = ""
-
-
-class PreferArguments(msgspec.Struct, forbid_unknown_fields=True):
-    """Of ``prefer``."""
-
-    name: str
-    robot: str
-
-
-class StatusArguments(msgspec.Struct, forbid_unknown_fields=True):
-    """Of ``status``."""
-
-    watch: bool = False
-    every_ms: int = 500
-    team: bool = False
-
-
 class Verbs:
     """Every verb of the control socket."""
 
     def __init__(self, lanes: Lanes) -> None:
         self._lanes = lanes
+        self._outflow = Outflow(lanes)
 
     def table(self) -> dict[str, Verb]:
         """By name, as the client says them."""
@@ -137,7 +80,7 @@ class Verbs:
 
     def errands(self) -> dict[str, Order]:
         """What another robot may ask of this one: the orders, and how things stand here."""
-        return {**self.orders(), "standing": self.standing, "picture": self.picture}
+        return {**self.orders(), "standing": self.standing, "picture": self.picture, "piece": self._outflow.piece}
 
     def orders(self) -> dict[str, Order]:
         """Those that are carried out where the component runs, wherever they are given."""
@@ -169,7 +112,7 @@ class Verbs:
 
     async def status(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """How does the team stand?"""
-        wanted = _read(StatusArguments, "status", arguments)
+        wanted = arguments_of(StatusArguments, "status", arguments)
         while wanted.watch:
             await say.update(await self._sight(wanted.team))
             await asyncio.sleep(max(wanted.every_ms, 10) / 1_000)
@@ -199,7 +142,7 @@ class Verbs:
 
     async def why(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """What was decided, when and why?"""
-        wanted = _read(NameArguments, "why", arguments)
+        wanted = arguments_of(NameArguments, "why", arguments)
         name = await self._known(wanted.name) if wanted.name else ""
         told = await self._lanes.ask("why", name)
         story = [
@@ -216,7 +159,7 @@ class Verbs:
 
     async def run(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """Start a program under protection; with ``wait`` pass its output on until it has ended."""
-        wanted = _read(RunArguments, "run", arguments)
+        wanted = arguments_of(RunArguments, "run", arguments)
         if not wanted.argv:
             raise RefusedError("run needs a command: failover run -- COMMAND …")
         name = await self._fresh_name(wanted.name, wanted.argv[0])
@@ -230,13 +173,16 @@ class Verbs:
         if not wanted.wait:
             return started
         await say.update({"started": started})
-        await self._pass_output_on(say, charge, (0, 0), committed=False, follow=True)
-        report = await asyncio.shield(charge.end())
-        return {"name": name, "exit_status": report.status, "failed": report.failed, "reason": report.reason}
+        await self._outflow.pass_on(say, name, (0, 0), committed=False, follow=True)
+        if charge.ended is not None and charge.ended.done():
+            report = charge.ended.result()
+            return {"name": name, "exit_status": report.status, "failed": report.failed, "reason": report.reason}
+        view = await self._view(name)  # it ended on another robot
+        return {"name": name, "exit_status": view.get("exit_status"), "failed": view["state"] == "failed", "reason": ""}
 
     async def protect(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """Take a running process under protection."""
-        wanted = _read(ProtectArguments, "protect", arguments)
+        wanted = arguments_of(ProtectArguments, "protect", arguments)
         for known in self._lanes.charges.values():
             if known.component is not None and known.component.pid == wanted.pid:
                 raise RefusedError(f"pid {wanted.pid} is protected already, as {known.name}; failover release lets it go")
@@ -246,7 +192,7 @@ class Verbs:
 
     async def release(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """Let a component run on unprotected."""
-        name = await self._known(_read(NameArguments, "release", arguments).name)
+        name = await self._known(arguments_of(NameArguments, "release", arguments).name)
         charge = self._lanes.charge(name)
         pid = charge.component.pid if charge.component is not None else None
         await self._command(lambda number: events.Release(number, name))
@@ -254,7 +200,7 @@ class Verbs:
 
     async def stop(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """End a component."""
-        wanted = _read(StopArguments, "stop", arguments)
+        wanted = arguments_of(StopArguments, "stop", arguments)
         name = await self._known(wanted.name)
         end = self._lanes.charge(name).end()
         await self._command(lambda number: events.Stop(number, name, wanted.signal))
@@ -263,13 +209,13 @@ class Verbs:
 
     async def handover(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """Move a component."""
-        wanted = _read(HandoverArguments, "handover", arguments)
+        wanted = arguments_of(HandoverArguments, "handover", arguments)
         name = await self._known(wanted.name)
         return await self._moved(name, lambda number: events.Handover(number, name, wanted.to))
 
     async def failback(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """Move a component back to the robot that is preferred, or where it was started."""
-        name = await self._known(_read(NameArguments, "failback", arguments).name)
+        name = await self._known(arguments_of(NameArguments, "failback", arguments).name)
         return await self._moved(name, lambda number: events.Failback(number, name))
 
     async def _moved(self, name: str, make: Callable[[int], events.Command]) -> dict[str, Any]:
@@ -303,7 +249,7 @@ class Verbs:
 
     async def standing(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """How one component stands on this robot; empty where it is unknown."""
-        return await self._view(_read(NameArguments, "standing", arguments).name)
+        return await self._view(arguments_of(NameArguments, "standing", arguments).name)
 
     async def picture(self, _arguments: dict[str, Any]) -> dict[str, Any]:
         """All of this robot's own sight, for another robot's status."""
@@ -311,17 +257,16 @@ class Verbs:
 
     async def prefer(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """Say where a component should run."""
-        wanted = _read(PreferArguments, "prefer", arguments)
+        wanted = arguments_of(PreferArguments, "prefer", arguments)
         name = await self._known(wanted.name)
         await self._command(lambda number: events.Prefer(number, name, wanted.robot))
         return {"name": name, "robot": wanted.robot}
 
     async def logs(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """The component's output as far as no takeover can take it back; all of it once it has ended."""
-        wanted = _read(LogsArguments, "logs", arguments)
+        wanted = arguments_of(LogsArguments, "logs", arguments)
         name = await self._known(wanted.name)
-        charge = self._lanes.charge(name)
-        totals = await self._pass_output_on(say, charge, wanted.offsets, committed=True, follow=wanted.follow)
+        totals = await self._outflow.pass_on(say, name, wanted.offsets, committed=True, follow=wanted.follow)
         view = await self._view(name)
         return {"name": name, "totals": list(totals), "exit_status": view.get("exit_status")}
 
@@ -401,41 +346,3 @@ class Verbs:
             return check_component(name)
         except NameFormatError as error:
             raise RefusedError(str(error), "NameFormatError") from error
-
-    async def _pass_output_on(
-        self, say: Conversation, charge: Charge, offsets: tuple[int, int], *, committed: bool, follow: bool
-    ) -> tuple[int, int]:
-        """Send the streams' bytes from the offsets on; with ``follow`` until the component's end is a record."""
-        logs = OutputLogs(log_directory(charge.name, self._lanes.places))
-        at = dict(zip(STREAMS, offsets, strict=True))
-        try:
-            while True:
-                ended = await self._is_over(charge, follow)
-                sent = False
-                for stream in STREAMS:
-                    piece = logs.read(stream, at[stream], committed=committed and not ended)
-                    if piece.content:
-                        await say.output(stream, piece.offset, piece.content)
-                        at[stream] = piece.offset + len(piece.content)
-                        sent = True
-                if not sent and (ended or not follow):
-                    return at[1], at[2]
-                if not sent:
-                    await asyncio.sleep(LOG_POLL_S)
-        finally:
-            logs.close()
-
-    async def _is_over(self, charge: Charge, follow: bool) -> bool:
-        """Whether its end is a record: known here, or heard of from the robot where it ran."""
-        if charge.ended is not None and charge.ended.done():
-            return True
-        if charge.component is not None and follow:
-            return False
-        return (await self._names()).get(charge.name, False)
-
-
-def _read(kind: type[T], verb: str, arguments: dict[str, Any]) -> T:
-    try:
-        return msgspec.convert(arguments, kind)
-    except msgspec.ValidationError as error:
-        raise RefusedError(f"{verb}: its arguments are not right: {error}") from error
