@@ -366,7 +366,7 @@ class Charge:
 
     async def _report(self, act: acts.ReportExit) -> None:
         """The end is a record now: tell who waits, and let the guard go."""
-        self.figures.exit_status = act.status
+        self.figures.exit_status, self.figures.reasons = act.status, ()
         self.started.set()
         ended = self.end()
         if not ended.done():

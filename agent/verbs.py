@@ -32,7 +32,7 @@ from agent.rules import rules_for
 from agent.view import version
 from failover.core import acts, events
 from failover.core.names import check_component
-from failover.core.types import ENDED, ComponentSpec, Launch
+from failover.core.types import ComponentSpec, Launch, State
 from failover.errors import NameFormatError
 
 STANDING_POLL_S: Final = 0.01
@@ -219,13 +219,14 @@ class Verbs:
         return await self._moved(name, lambda number: events.Failback(number, name))
 
     async def _moved(self, name: str, make: Callable[[int], events.Command]) -> dict[str, Any]:
-        began_ns = clock.now_ns()
+        began_ns, before = clock.now_ns(), await self._view(name)
         answer = await self._command(make)
         view = await self._view(name)
         if view["primary"] != self._lanes.settings.config.robot:
             view = await self._running_at(view["primary"], name)
         took_ms = (clock.now_ns() - began_ns) / 1e6
-        return {"name": name, "to": view["primary"], "epoch": view["epoch"], "took_ms": took_ms, "sentence": answer.sentence}
+        told = {"name": name, "to": view["primary"], "epoch": view["epoch"], "took_ms": took_ms, "sentence": answer.sentence}
+        return {**told, "moved": view["primary"] != before["primary"]}
 
     async def _running_at(self, robot: str, name: str) -> dict[str, Any]:
         """Wait until the robot that took a component runs it; its view of it.
@@ -311,10 +312,10 @@ class Verbs:
         picture = self._lanes.picture(await self._lanes.ask("status"))
         return next((one for one in picture["components"] if one["name"] == name), {})
 
-    async def _names(self) -> dict[str, bool]:
-        """Every component that the team knows → whether its end is a record."""
+    async def _names(self) -> dict[str, State]:
+        """Every component that this robot has heard of, and how it stands here."""
         told = await self._lanes.ask("status")
-        return {one.name: one.state in ENDED for one in told.status.components} if told.status else {}
+        return {one.name: one.state for one in told.status.components} if told.status else {}
 
     async def _known(self, wanted: str) -> str:
         """The component that a person means: its whole name, or an end of it that fits one alone.
@@ -330,7 +331,7 @@ class Verbs:
             return fitting[0]
         if fitting:
             raise RefusedError(f"{wanted!r} could be {', '.join(sorted(fitting))}; give the whole name", "UnknownComponentError")
-        known = ", ".join(sorted(names)) or "nothing"
+        known = ", ".join(sorted(name for name, state in names.items() if state is not State.RELEASED)) or "nothing"
         raise RefusedError(f"no component is called {wanted!r}; this team protects {known}", "UnknownComponentError")
 
     async def _fresh_name(self, wanted: str, command: str) -> str:

@@ -84,6 +84,8 @@ class _Follower:
             elif isinstance(reply, Update):
                 self._begin(reply.value.get("started", {}))
             else:
+                if reply.value.get("reason"):
+                    print(f"failover: {self._name}: {reply.value['reason']}", file=sys.stderr)
                 status: int | None = reply.value.get("exit_status")
                 return status
         return None
@@ -228,6 +230,8 @@ def failback(arguments: argparse.Namespace) -> int:
 
 
 def _moved(answer: dict[str, Any]) -> str:
+    if not answer.get("moved", True):
+        return str(answer["sentence"])
     return f"{answer['name']} runs on {answer['to']} now; the move took {answer['took_ms']:.0f} ms"
 
 

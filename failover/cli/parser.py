@@ -263,7 +263,12 @@ VERBS: Final = (
         "start a program under protection; its output and exit status become ours",
         """
         Start a program as a component of this robot. Snapshots of it go to its standby; when this robot dies, it goes on there.
-        Ctrl-C is passed on to the program. --json prints how it was started, and how it ended, on standard error.
+        Ctrl-C is passed on to the program. Its exit status becomes ours (128 + N if signal N ended it). --json prints how it was
+        started on standard error.
+
+        Its standard output and error are pipes that belong to it, not to this terminal, and its standard input is empty: it does
+        not see a terminal even where you have one. Many programs then write by the block and not by the line; python3 -u, or
+        stdbuf -oL before other commands, shows their output at once.
 
           failover run -- python3 mapper.py --map hall.yaml
           failover run --name /lab/robot1/mapper --detach -- ./mapper
@@ -275,8 +280,9 @@ VERBS: Final = (
         "protect",
         "protect a process that runs already",
         """
-        Take a running process under protection. It keeps its standard streams; what cannot be preserved is refused by name,
-        and the process is not touched then (failover check PID shows the whole list).
+        Take a running process under protection. It keeps its standard streams: where they are files, they go on at the other
+        robot; what it writes to a terminal or a pipe is not kept, and its exit status will not be known. What cannot be preserved
+        is refused by name, and the process is not touched then (failover check PID shows the whole list).
 
           failover protect 4711 --name /lab/robot1/mapper
         """,
@@ -287,7 +293,8 @@ VERBS: Final = (
         "release",
         "let a component go: its program runs on, unprotected",
         """
-        End protection. The program is not touched; its snapshots on the standby are no longer taken over.
+        End protection. The program is not touched and runs on; its checkpoints are forgotten at every robot, so that nobody takes
+        it over. A component that has ended or failed is forgotten, and status shows it no more. May be given at any robot.
 
           failover release /lab/robot1/mapper
         """,
@@ -298,7 +305,8 @@ VERBS: Final = (
         "stop",
         "end a component's program; no robot runs it again",
         """
-        Send the program a signal and wait for its end, which is recorded on its standby too.
+        Send the program a signal and wait for its end, which is recorded on its standby too; after 10 seconds it is killed.
+        May be given at any robot.
 
           failover stop /lab/robot1/mapper
           failover stop /lab/robot1/mapper --signal INT
@@ -311,7 +319,9 @@ VERBS: Final = (
         "the team as a tree: role, epoch, lag, freeze, standby, links, and what is promised now",
         """
         Show every robot, its components, how old their newest checkpoint is (lag), how long a snapshot stops them (freeze), and
-        in one sentence what holds if this robot dies now. Exit status 1 says that something is degraded.
+        in one sentence what holds if this robot dies now. Exit status 1 says that something is degraded: a program that cannot be
+        captured, checkpoints that do not arrive, a component without protection, a robot that is silent. Each is named below the
+        tree. Colours go with NO_COLOR=1; a narrow terminal gets a list instead of a table.
 
           failover status
           failover status --watch
@@ -324,7 +334,8 @@ VERBS: Final = (
         "logs",
         "what a component wrote, without gap or repetition, from any robot",
         """
-        Show standard output and standard error of a component from its beginning.
+        Show standard output and standard error of a component from its beginning (at most the last 256 MB of each), as far as no
+        takeover can take it back; all of it once it has ended. May be given at any robot; --follow goes on through a takeover.
 
           failover logs /lab/robot1/mapper
           failover logs --follow --stream 2 /lab/robot1/mapper
@@ -348,7 +359,8 @@ VERBS: Final = (
         "handover",
         "move a component to another robot, planned: nothing is lost",
         """
-        The last changes are sent, then the other robot goes on where this one stopped.
+        The last changes are sent, then the other robot goes on where this one stopped; answered when it runs there. Only the
+        standby can take it: it has the checkpoints. Whatever goes wrong, it stays where it is. May be given at any robot.
 
           failover handover /lab/robot1/mapper
           failover handover /lab/robot1/mapper --to robot2
@@ -361,6 +373,7 @@ VERBS: Final = (
         "move a component back to where it belongs",
         """
         To the robot that is preferred, or else to the one that it was started on; planned, as a handover.
+        May be given at any robot.
 
           failover failback /lab/robot1/mapper
         """,
@@ -371,7 +384,8 @@ VERBS: Final = (
         "prefer",
         "which robot should run a component",
         """
-        The component goes there when that robot is able to run it.
+        The component goes there as soon as that robot holds its checkpoints, and again after each takeover, once it keeps up.
+        An empty ROBOT ('') leaves it where it runs. May be given at any robot.
 
           failover prefer /lab/robot1/mapper robot1
         """,

@@ -69,9 +69,10 @@ def rows(status: Mapping[str, Any]) -> tuple[Row, ...]:
 
 
 def sight(component: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The component as the robot sees it that runs it, where that one was asked; otherwise as the asked robot does."""
-    seen: Mapping[str, Any] = (component.get("elsewhere") or {}).get(component.get("primary"), {})
-    return seen if seen.get("role") == "primary" else component
+    """The component as the robot sees it that runs or ran it, where that one was asked; otherwise as the asked robot does."""
+    primary = component.get("primary")
+    seen: Mapping[str, Any] = (component.get("elsewhere") or {}).get(primary, {})
+    return seen if seen.get("primary") == primary else component
 
 
 def is_unprotected(component: Mapping[str, Any]) -> bool:
@@ -161,6 +162,8 @@ def remarks(status: Mapping[str, Any]) -> tuple[str, ...]:
 def _remarks_on(component: Mapping[str, Any]) -> list[str]:
     """Of one component, from every robot that was asked; a reason that a note contains is not said again."""
     sights = {"": component, **(component.get("elsewhere") or {})}
+    if component.get("state") in ("ended", "failed"):
+        sights = {"": sight(component)}
     lines: list[str] = []
     for robot, seen in sights.items():
         notes = [str(line) for line in seen.get("notes") or ()]

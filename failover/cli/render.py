@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import re
 import sys
@@ -34,7 +35,7 @@ ASCII: Final = str.maketrans({"└": "`", "├": "|", "─": "-", "–": "-", "�
 
 def spoken(text: str) -> str:
     """The text in characters that standard output has."""
-    encoding = (getattr(sys.stdout, "encoding", None) or "ascii").lower().replace("-", "")
+    encoding = codecs.lookup(getattr(sys.stdout, "encoding", None) or "ascii").name
     return text if encoding.startswith("utf") else text.translate(ASCII).encode(encoding, "replace").decode(encoding)
 
 

@@ -19,7 +19,7 @@ verb           arguments                                                result, 
 ``stop``       ``name`` *must*, ``signal`` 15                           ``{name, exit_status}`` once it has ended
 ``logs``       ``name`` *must*, ``follow`` false, ``offsets`` [0, 0]     Output …, Result ``{name, totals, exit_status}``
 ``why``        ``name`` ""                                              ``{"story": [{at, robot, component, saw, did}, …]}``
-``handover``   ``name`` *must*, ``to`` ""                               ``{name, to, epoch, took_ms, sentence}``
+``handover``   ``name`` *must*, ``to`` ""                               ``{name, to, epoch, took_ms, moved, sentence}``
 ``failback``   ``name`` *must*                                          as ``handover``
 ``prefer``     ``name`` *must*, ``robot`` *must*                        ``{name, robot}``
 =============  =======================================================  ========================================================

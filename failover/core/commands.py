@@ -48,7 +48,8 @@ def _run(component: Component, turn: Turn, command: Run) -> None:
 def _why_not_run(component: Component, turn: Turn) -> str:
     name = component.name
     if component.holding or component.state is State.STOPPING:
-        return f"cannot run {name}: it is {component.state} here; failover stop or release it first, or choose another name"
+        how = "it runs here" if component.state is State.PRIMARY else f"here it is {component.state}"
+        return f"cannot run {name}: {how}; failover stop or release it first, or choose another name"
     for peer in turn.team.living(turn.now_ns):
         entry = peer.entry(name)
         if entry is not None and not vacant(component, turn) and component.state not in ENDED:
@@ -108,5 +109,6 @@ def _fail_back(component: Component, turn: Turn, command: Failback) -> None:
 
 def _elsewhere(component: Component, turn: Turn, request: int, verb: str) -> None:
     where = component.primary if component.primary not in ("", turn.me) else ""
-    cure = f"; ask at {where}, which runs it" if where else ""
+    over = "; failover run starts it anew" if component.state in ENDED else ""
+    cure = over or (f"; ask at {where}, which runs it" if where else "")
     turn.order(acts.Answer(request, False, f"cannot {verb} {component.name}: here it is {component.state}{cure}"))

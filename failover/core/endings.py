@@ -114,7 +114,7 @@ def _recover(component: Component, turn: Turn, status: int) -> None:
     back = 1 if count <= limit else 2
     if count > limit + 1 or len(component.held) < back:
         why = "no checkpoint to resume it from" if len(component.held) < back else f"{count} crashes in {window_ns // 10**9} s"
-        _end(component, turn, Cause.FAIL, status, f"{why}; look at its logs, then run it again")
+        _end(component, turn, Cause.FAIL, status, f"{why}; look at its logs, then run it again, or release it to forget it")
         return
     position = component.held[-back]
     component.move(Cause.CRASH)

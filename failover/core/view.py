@@ -110,7 +110,7 @@ def _promise(component: Component, turn: Turn, protection: Protection) -> str:
 
 def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
     notes = []
-    if component.degraded:
+    if component.degraded and component.holding:
         notes.append(f"not captured: {component.degraded}; {_age(component, turn)}")
     elif component.holding and _overdue(component, turn):
         notes.append(f"snapshots do not arrive: {component.undelivered}; {_age(component, turn)}")
