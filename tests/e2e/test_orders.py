@@ -1,10 +1,9 @@
-"""What an operator orders, on two real robots: handover and back, prefer, protect, release, stop."""
+"""What an operator orders, on two real robots: handover and back, prefer, release, stop."""
 
 from __future__ import annotations
 
 import os
 import signal
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -122,27 +121,3 @@ def test_a_released_component_runs_on_unprotected(pair: Pair) -> None:
     robots.until(lambda: robots.component(second, "count").get("state") == "released", "robot2 to forget it")
     state = Path(f"/proc/{victim}/stat").read_text().rpartition(")")[2].split()[0]
     assert state in "SR", state
-
-
-def stranger(robot: RobotMachine, written: Path) -> int:
-    """Start a program of the robot that nobody protects; returns its PID there. It ends with the robot."""
-    enter = ["nsenter", f"--target={robot.processes()[0]}", "--all"]
-    script = f'exec "$@" </dev/null >{written} 2>&1 & echo $!'
-    ran = subprocess.run([*enter, "setsid", "sh", "-c", script, "sh", *COUNTING], capture_output=True, text=True, check=True)
-    robots.until(lambda: written.stat().st_size > 0, "the stranger to count")
-    return int(ran.stdout)
-
-
-@pytest.mark.root
-def test_a_running_process_is_taken_under_protection_and_outlives_its_robot(pair: Pair, tmp_path: Path) -> None:
-    first, second = pair
-    written = tmp_path / "stranger.out"
-    pid = stranger(first, written)
-    assert order(first, "protect", pid=pid, name="count")["pid"] == pid
-    robots.until(lambda: robots.component(first, "count").get("protection") == "protected", "a checkpoint at robot2")
-    first.cut_power()
-    robots.until(lambda: robots.component(second, "count").get("role") == "primary", "robot2 to take over")
-    before = len(written.read_bytes().split())
-    robots.until(lambda: len(written.read_bytes().split()) > before + MORE, "the count to go on in its file")
-    numbers = [int(line) for line in written.read_bytes().split()]
-    assert numbers == list(range(len(numbers)))

@@ -1,0 +1,88 @@
+"""protect and release: a program that somebody else started is taken in, lets itself be moved on, and is let go unharmed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.e2e import robots
+from tests.e2e.robots import RobotMachine
+
+COUNT = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.01)\n"
+HOLDING_A_SOCKET = "import socket\nkept = socket.socketpair()\n" + COUNT
+
+Pair = tuple[RobotMachine, RobotMachine]
+
+pytestmark = pytest.mark.root
+"""A process is put into a robot's namespaces from outside; a robot of an ordinary user has its own door, `failover run`."""
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> Iterator[Pair]:
+    with robots.two_robots(tmp_path) as both:
+        yield both
+
+
+def stranger(robot: RobotMachine, script: str, written: Path) -> int:
+    """Start a program of the robot that nobody protects; returns its PID there. It ends with the robot."""
+    enter = ["nsenter", f"--target={robot.processes()[0]}", "--all", "setsid", "sh", "-c"]
+    begin = f'exec "$@" </dev/null >{written} 2>&1 & echo $!'
+    command = [*enter, begin, "sh", "/usr/bin/python3", "-S", "-c", script]
+    ran = subprocess.run(command, capture_output=True, text=True, check=True)
+    robots.until(lambda: written.stat().st_size > 0, "the stranger to count")
+    return int(ran.stdout)
+
+
+def counted(written: Path) -> list[int]:
+    return [int(line) for line in written.read_bytes().rpartition(b"\n")[0].split()]
+
+
+def expect_more(written: Path) -> None:
+    """It counts on, and its file as a whole has no gap and no repetition."""
+    before = len(counted(written))
+    robots.until(lambda: len(counted(written)) > before + 20, "the count to go on in its file")
+    assert counted(written) == list(range(len(counted(written))))
+
+
+def test_a_stranger_is_protected_again_by_the_robot_that_took_it_over(pair: Pair, tmp_path: Path) -> None:
+    first, second = pair
+    written = tmp_path / "stranger.out"
+    pid = stranger(first, COUNT, written)
+    assert robots.failover(first, "protect", str(pid), "--name", "count").returncode == 0
+    robots.until(lambda: robots.component(first, "count").get("protection") == "protected", "a checkpoint at robot2")
+    assert robots.failover(second, "handover", "count").returncode == 0  # ordered at the robot that is to have it
+    expect_more(written)
+    robots.until(lambda: robots.component(second, "count").get("protection") == "protected", "a checkpoint at robot1")
+    second.cut_power()
+    robots.until(lambda: robots.component(first, "count").get("role") == "primary", "robot1 to take it back")
+    expect_more(written)
+
+
+def test_a_stranger_that_cannot_be_kept_is_refused_by_name_and_not_touched(pair: Pair, tmp_path: Path) -> None:
+    written = tmp_path / "stranger.out"
+    pid = stranger(pair[0], HOLDING_A_SOCKET, written)
+    ran = robots.failover(pair[0], "protect", str(pid))
+    assert ran.returncode == 1
+    assert "is a socket (unix" in ran.stderr
+    assert "protect the program while it has none" in ran.stderr
+    expect_more(written)
+    assert robots.failover(pair[0], "status").returncode == 0, "a refusal leaves nothing behind"
+
+
+def test_a_stranger_that_is_released_runs_on_and_can_be_protected_again(pair: Pair, tmp_path: Path) -> None:
+    first, second = pair
+    written = tmp_path / "stranger.out"
+    pid = stranger(first, COUNT, written)
+    for giver in (first, second):
+        assert robots.failover(first, "protect", str(pid), "--name", "count").returncode == 0
+        robots.until(lambda: robots.component(first, "count").get("protection") == "protected", "a checkpoint at robot2")
+        released = robots.failover(giver, "release", "count")
+        assert released.returncode == 0, released
+        assert f"runs on as pid {pid}, unprotected" in released.stdout
+        expect_more(written)
+    os.kill(robots.host_pid(first, pid), signal.SIGKILL)
