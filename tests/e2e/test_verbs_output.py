@@ -90,7 +90,7 @@ def test_run_stays_with_its_program_when_that_is_handed_over(pair: Pair, tmp_pat
     until_protected(first)
     moved = robots.failover(first, "handover", "both")
     assert moved.returncode == 0, moved
-    assert robots.component(second, "both")["role"] == "primary", "the move is over when its answer comes"
+    assert robots.component(second, "both")["state"] == "running", "the move is over when its answer comes"
     assert running.wait(timeout=robots.PATIENCE_S) == 7
     assert lines(out) == list(range(BRIEF))
     assert lines(err) == [-number for number in range(BRIEF)]
