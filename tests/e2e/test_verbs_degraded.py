@@ -16,20 +16,29 @@ from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 
 CHANGING = """
-import os, socket, sys, time
-flag, number, held = sys.argv[1], 0, None
+import os, socket, sys, threading, time
+flag, kind, number, held = sys.argv[1], sys.argv[2], 0, None
+
+class Thread:
+    def __init__(self):
+        self.over = threading.Event()
+        self.thread = threading.Thread(target=self.over.wait)
+        self.thread.start()
+    def close(self):
+        self.over.set()
+        self.thread.join()
+
 while True:
     print(number, flush=True)
     number += 1
     time.sleep(0.01)
     if os.path.exists(flag) and held is None:
-        held = socket.socketpair()
+        held = socket.socket() if kind == "socket" else Thread()
     elif held is not None and not os.path.exists(flag):
-        for end in held:
-            end.close()
+        held.close()
         held = None
 """
-"""Counts, and holds sockets for as long as a file exists."""
+"""Counts, and holds a socket, or a second thread, for as long as a file exists."""
 
 STOPPING = '[components."/demo/robot1/count"]\non_unsupported = "stop_protecting"\n'
 
@@ -44,9 +53,13 @@ def pair(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Pair]:
 
 @pytest.fixture
 def flag(pair: Pair, tmp_path: Path) -> Path:
-    """A protected program at robot1 that turns unsupported while this file exists."""
+    """A protected program at robot1 that holds a socket while this file exists."""
+    return start(pair, tmp_path, "socket")
+
+
+def start(pair: Pair, tmp_path: Path, kind: str) -> Path:
     path = tmp_path / "flag"
-    robots.run(pair[0], "count", "/usr/bin/python3", "-S", "-c", CHANGING, str(path))
+    robots.run(pair[0], "count", "/usr/bin/python3", "-S", "-c", CHANGING, str(path), kind)
     until_protected(pair[0])
     return path
 
@@ -76,11 +89,13 @@ def numbers(robot: RobotMachine) -> list[int]:
     return [int(line) for line in robots.output(robot, "count").split()]
 
 
-def test_a_program_that_opens_a_socket_is_degraded_by_name_and_recovers(pair: Pair, flag: Path) -> None:
+@pytest.mark.parametrize(("kind", "named"), [("socket", "is a socket"), ("thread", "it has 2 threads")])
+def test_what_a_program_turned_into_is_named_and_it_recovers(pair: Pair, tmp_path: Path, kind: str, named: str) -> None:
+    flag = start(pair, tmp_path, kind)
     flag.touch()
     for robot in pair:
-        shown = until_status(robot, 1, "degraded", "not captured: fd ", "a socket", "the last checkpoint is")
-        assert shown.count("is a socket") <= 2, "each reason is said once"
+        shown = until_status(robot, 1, "degraded", "not captured: ", named, "the last checkpoint is")
+        assert shown.count(named) <= 2, "each robot says it once"
     flag.unlink()
     for robot in pair:
         until_status(robot, 0)
@@ -118,13 +133,28 @@ def lanes_of(robot: RobotMachine) -> int:
     return robots.host_pid(robot, robot.status()["lanes_pid"])
 
 
-def test_a_standby_that_cannot_write_is_named_at_both_robots(pair: Pair, flag: Path) -> None:
-    lanes = lanes_of(pair[1])
+@contextlib.contextmanager
+def full_disk(robot: RobotMachine) -> Iterator[None]:
+    """Nothing that the robot's agent writes gets beyond a file's first byte: what a full disk is to it, without root."""
+    lanes = robots.host_pid(robot, robot.status()["lanes_pid"])
     before = resource.prlimit(lanes, resource.RLIMIT_FSIZE)
     resource.prlimit(lanes, resource.RLIMIT_FSIZE, (1, before[1]))
-    for robot in pair:
-        until_status(robot, 1, "degraded", "snapshots do not arrive", "was not stored at robot2")
+    yield
     resource.prlimit(lanes, resource.RLIMIT_FSIZE, before)
+
+
+def test_a_standby_that_cannot_write_is_named_at_both_robots(pair: Pair, flag: Path) -> None:
+    with full_disk(pair[1]):
+        for robot in pair:
+            until_status(robot, 1, "degraded", "snapshots do not arrive", "was not stored at robot2")
+    for robot in pair:
+        until_status(robot, 0)
+
+
+def test_a_primary_that_cannot_write_is_named_at_both_robots(pair: Pair, flag: Path) -> None:
+    with full_disk(pair[0]):
+        for robot in pair:
+            until_status(robot, 1, "degraded", "not captured: ", "the last checkpoint is")
     for robot in pair:
         until_status(robot, 0)
 
