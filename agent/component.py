@@ -190,6 +190,7 @@ class Component:
         """
         laps = laps or Laps()
         outline = await asyncio.to_thread(format.read_outline, chain[-1])
+        await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
         laps.lap("reading the newest")
         component = cls(name, await places.nursery.guard(), places)
         component._keeper = keeper = places.nursery.keeper()
@@ -234,6 +235,7 @@ class Component:
             with contextlib.suppress(FileNotFoundError):
                 socket_path.unlink()
             raise GuardLostError(f"the guard of {socket_path.name} has gone: {error.strerror}") from error
+        guard.dialogue.heard = lambda message: isinstance(message, guard_messages.Event)  # the end is told by the answer, too
         described, streams = await guard.dialogue.ask(guard_messages.Describe())
         if described.state == "none":
             guard.dialogue.close()
@@ -453,6 +455,26 @@ def _failure(failed: Failed) -> CheckpointError:
     if issubclass(kind, errors.UnsupportedError | errors.MismatchError):
         return kind(failed.message, failed.reasons)
     return kind(failed.message) if issubclass(kind, CheckpointError) else RestoreError(failed.message)
+
+
+def complete_logs(directory: Path, chain: Sequence[int]) -> bool:
+    """Bring output logs as far as the newest snapshot of a chain says; returns whether they were shorter.
+
+    They are where a robot died, or was killed, between storing a snapshot and extending its logs.
+
+    Args:
+        chain: descriptors of encoded snapshots, oldest first.
+    """
+    logs = OutputLogs(directory)
+    try:
+        told = total_of(format.read_outline(chain[-1]).output)
+        short = any(has < total for has, total in zip(logs.totals(), told, strict=True))
+        if short:
+            for descriptor in chain:
+                logs.apply(format.read_outline(descriptor).output)
+        return short
+    finally:
+        logs.close()
 
 
 def guard_sockets(places: Places) -> tuple[Path, ...]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
-from agent.component import Places, log_directory
+from agent.component import Places, complete_logs, log_directory
 from agent.shipping import Refusal
 from agent.streams import OutputLogs
 from checkpoint import format
+from checkpoint.channel import close_all
 from checkpoint.errors import ChainError, CheckpointError, FormatError
 from checkpoint.model import Snapshot
 from checkpoint.store import Store
@@ -75,6 +76,24 @@ class Deposit:
                 return
         self._kept(offer.component, snapshot, offer.size)
         self._tell(Stored(offer.component, offer.epoch, snapshot.position, peer, offer.spec))
+
+    def mend_logs(self, running: Collection[str]) -> None:
+        """Bring each stream as far as the newest checkpoint says: an earlier life, or a power cut, may have come in between.
+
+        Args:
+            running: components whose program runs here; their guards write their logs, which are ahead of any checkpoint.
+        """
+        for name in self._store.components():
+            if name not in running:
+                self._mend_logs_of(name)
+
+    def _mend_logs_of(self, name: str) -> None:
+        descriptors = self._store.open_chain(name)
+        try:
+            if complete_logs(log_directory(name, self._places), descriptors):
+                log.info("%s: its output was completed from its checkpoints", name)
+        finally:
+            close_all(tuple(descriptors))
 
     def _put(self, offer: Offer, descriptor: int) -> Snapshot:
         header = format.read_header(descriptor)

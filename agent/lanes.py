@@ -126,6 +126,7 @@ class Lanes:
         self._dispatch = Dispatch(store, self._shipper, self.tell)
         self._receiver = Receiver(self._lane, self._store_path, self._deposit)
         found = await self._find_guards(around.records)
+        await self._mend_logs(found)
         self._nursery.prepare()
         self._say(Inventory(_held(store), found))
         self._lane.open()
@@ -275,6 +276,12 @@ class Lanes:
             found.append(Found(component.name, epoch, running, standing.exit_status or 0))
             log.info("%s: found again, pid %d, %s", component.name, component.pid, standing.state)
         return tuple(found)
+
+    async def _mend_logs(self, found: tuple[Found, ...]) -> None:
+        try:
+            await asyncio.to_thread(self._deposit.mend_logs, {one.component for one in found})
+        except (CheckpointError, OSError) as error:
+            log.warning("the output of earlier checkpoints is not complete here: %s", error)
 
     # --- peers ---
 

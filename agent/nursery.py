@@ -85,7 +85,9 @@ class Nursery:
         while len(self._guards) < self._wanted:
             self._guards.append(asyncio.create_task(self._guard_born()))
         while len(self._keepers) < self._wanted:
-            self._keepers.append(self._keeper_born())
+            keeper = self._keeper_born()
+            keeper.dialogue.ended = self._refill
+            self._keepers.append(keeper)
 
     async def guard(self) -> GuardLink:
         """A guard that guards nothing yet.
@@ -110,6 +112,7 @@ class Nursery:
         self._refill()
         while self._keepers:
             link = self._keepers.popleft()
+            link.dialogue.ended = lambda: None
             if link.dialogue.open:
                 return link
         return self._keeper_born()

@@ -36,14 +36,18 @@ CUT_FLOOR: Final = TRIM_STEP
 
 
 class Counters:
-    """Four u64 in a memfd that the keeper maps too: busy 1, count 1, busy 2, count 2. One writer: the pump's thread."""
+    """Six u64 in a memfd that the keeper maps too: busy 1, count 1, busy 2, count 2, first 1, first 2. One writer: the pump.
 
-    def __init__(self, totals: tuple[int, int]) -> None:
+    The last two never change: the first byte of each stream that this robot's log had when its pump began.
+    """
+
+    def __init__(self, totals: tuple[int, int], firsts: tuple[int, int] = (0, 0)) -> None:
         self.descriptor = os.memfd_create("failover-streams", os.MFD_CLOEXEC)
         os.ftruncate(self.descriptor, COUNTERS_SIZE)
         self._mapping = mmap.mmap(self.descriptor, COUNTERS_SIZE)
         self._words = memoryview(self._mapping).cast("Q")  # an item is stored by one eight-byte move, never in parts
         self._words[1], self._words[3] = totals
+        self._words[4], self._words[5] = firsts
 
     def count(self, stream: int) -> int:
         """Bytes of the stream that have left the pipe, since the component's first."""
@@ -74,7 +78,7 @@ class Pump:
 
     def __init__(self, logs: OutputLogs, totals: tuple[int, int]) -> None:
         self.logs = logs
-        self.counters = Counters(totals)
+        self.counters = Counters(totals, (logs.bounds(1).start, logs.bounds(2).start))
         self.blocked = ""
         """Why output is not being written now; "" while it is."""
         self.read_ends: dict[int, int] = {}

@@ -19,7 +19,9 @@ from checkpoint.errors import CaptureError
 from checkpoint.model import OutputPiece
 from checkpoint.resources import Surroundings, pipes_of
 
-COUNTERS: Final = struct.Struct("<QQQQ")
+COUNTERS: Final = struct.Struct("<QQQQQQ")
+FIRSTS: Final = 4
+"""Place of the first bytes that the logs had when the guard began."""
 STREAM_NUMBERS: Final = (1, 2)
 COUNT_TIMEOUT_S: Final = 0.05
 """How long the guard may be between taking bytes and counting them: microseconds, unless it was preempted."""
@@ -37,6 +39,7 @@ class Outputs:
     def __init__(self, streams: Streams) -> None:
         self._streams = streams
         self._counters = mmap.mmap(streams.counters, COUNTERS.size, prot=mmap.PROT_READ)
+        self._firsts = COUNTERS.unpack(self._counters[: COUNTERS.size])[FIRSTS:]
         self.surroundings = Surroundings(pipes_of(streams.outputs))
 
     def totals(self) -> Totals:
@@ -61,13 +64,13 @@ class Outputs:
             os.sched_yield()
 
     def pieces(self, since: Totals, until: Totals) -> tuple[OutputPiece, ...]:
-        """The bytes between two totals, one piece for each stream, empty where nothing was written.
+        """The bytes between two totals, as far as they are here; one piece for each stream, empty where nothing was written.
 
         Raises:
             CaptureError: the guard's log does not get as far.
         """
         return tuple(
-            self._piece(index, max(begin, end - BACKLOG_LIMIT), end)
+            self._piece(index, min(max(begin, end - BACKLOG_LIMIT, self._firsts[index]), end), end)
             for index, (begin, end) in enumerate(zip(since, until, strict=True))
         )
 

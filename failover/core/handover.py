@@ -36,10 +36,17 @@ def advance(component: Component, turn: Turn) -> None:
     handing = component.handing
     if handing is None or component.state is not State.HANDING_OVER:
         return
-    if turn.now_ns >= handing.until_ns or (not turn.alive(handing.to) and not handing.yielded):
+    if turn.now_ns >= handing.until_ns or _has_gone(component, turn, handing):
         _call_off(component, turn, handing)
     elif not handing.yielded:
         replication.capture(component, turn, final=True)
+
+
+def _has_gone(component: Component, turn: Turn, handing: Handing) -> bool:
+    """Whether nothing is to be waited for: once it may have claimed, a silent robot counts as gone only where silence decides."""
+    if not handing.yielded:
+        return not turn.alive(handing.to)
+    return turn.dead(handing.to) and not component.freezes
 
 
 def _call_off(component: Component, turn: Turn, handing: Handing) -> None:

@@ -133,7 +133,7 @@ class Node:
             found = self._found.pop(component.name, None)
             if component.state is State.PRIMARY:
                 _take_up(component, turn, found)
-            elif found is not None and found.running:
+            elif found is not None and component.state not in ENDED:
                 component.state = State.STOPPING
                 turn.order(acts.Stop(component.name, component.epoch))
         for stray in self._found.values():

@@ -23,6 +23,9 @@ PATIENCE_S = 60.0
 
 POLL_S = 0.01
 
+LOG_LINES = 80
+"""Of each agent's log, shown with a test that fails."""
+
 NO_ANSWER = (NoAgentError, LostAgentError)
 """What a robot whose agent is being replaced says."""
 
@@ -36,8 +39,12 @@ def two_robots(directory: Path, settings: str = "") -> Iterator[tuple[RobotMachi
         stage.directory.mkdir()
         stage.start()
         first, second = stage.robots
-        until(lambda: connected(first) and connected(second), "the robots to hear each other")
-        yield first, second
+        try:
+            until(lambda: connected(first) and connected(second), "the robots to hear each other")
+            yield first, second
+        finally:
+            for robot in stage.robots:  # shown by pytest where a test fails
+                print(f"--- {robot.name} said:", *robot.log.read_text(errors="replace").splitlines()[-LOG_LINES:], sep="\n")
 
 
 def until(condition: Callable[[], T], what: str, patience_s: float = PATIENCE_S) -> T:
@@ -99,12 +106,21 @@ def result(robot: RobotMachine, name: str) -> dict[str, Any]:
         return link.ask("logs", name=name, follow=True)
 
 
-def start_agent(robot: RobotMachine) -> None:
-    """Start the robot's agent again, as its service would."""
+def start_inside(robot: RobotMachine, *command: str) -> None:
+    """Start a process of the robot that nobody there is the parent of; it ends with the robot at the latest."""
     script = f'"$@" </dev/null >>{robot.log} 2>&1 &'
     inside = ["nsenter", f"--target={robot.processes()[0]}", "--all"] if means().own_pids and os.geteuid() == 0 else []
-    command = agent_command(robot.directory / "agent.toml")
     subprocess.run([*inside, "setsid", "sh", "-c", script, "sh", *command], check=True)
+
+
+def keep_on(robot: RobotMachine) -> None:
+    """Let the robot live on when its agent has ended and there is no program: its host ends with its last process."""
+    start_inside(robot, "sleep", "1000000")
+
+
+def start_agent(robot: RobotMachine) -> None:
+    """Start the robot's agent again, as its service would."""
+    start_inside(robot, *agent_command(robot.directory / "agent.toml"))
 
 
 def answers(robot: RobotMachine) -> bool:

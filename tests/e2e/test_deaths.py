@@ -10,12 +10,14 @@ import contextlib
 import os
 import random
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from failover.errors import AgentRefusedError
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 
@@ -25,6 +27,9 @@ KILLS = int(os.environ.get("FAILOVER_KILLS", "4"))
 COUNT = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.005)\n"
 SPREAD_S = 0.15
 """Instants of death lie in here: a capture begins every 0.1 s."""
+
+RESTORE_S = 0.25
+"""A handover, its restore included, takes about so long."""
 
 NAMES = {"heart": b"agent.main", "lanes": b"agent.lanes", "keeper": b"checkpoint"}
 """Module of each part of an agent: the third word of its command line."""
@@ -44,6 +49,8 @@ Pair = tuple[RobotMachine, RobotMachine]
 def pair(tmp_path: Path) -> Iterator[Pair]:
     settings = '[components."/demo/robot1/count"]\non_loss = "hold"\n'
     with robots.two_robots(tmp_path, settings) as both:
+        for robot in both:
+            robots.keep_on(robot)
         yield both
 
 
@@ -59,8 +66,9 @@ def parts(robot: RobotMachine, name: str) -> list[int]:
 
 def kill(robot: RobotMachine, names: tuple[str, ...]) -> None:
     """Freeze these parts, then kill them at once: nobody sees another one die."""
+    for name in names:
+        robots.until(lambda name=name: parts(robot, name), f"a {name} to kill")  # type: ignore[misc]
     victims = [pid for name in names for pid in parts(robot, name)]
-    assert victims, names
     for number in (signal.SIGSTOP, signal.SIGKILL):
         for pid in victims:
             with contextlib.suppress(ProcessLookupError):
@@ -105,4 +113,52 @@ def test_whoever_is_killed_the_program_runs_on(pair: Pair, way: str) -> None:
     with first.control() as link:
         assert os.WTERMSIG(link.ask("stop", name="count")["exit_status"]) == signal.SIGTERM
     counted = numbers(robots.output(first, "count"))
+    assert counted == list(range(len(counted)))
+
+
+def order_handover(source: RobotMachine, target: RobotMachine) -> None:
+    """Ask for it; that it is refused or that nobody answers is no concern here."""
+    with contextlib.suppress(AgentRefusedError, *robots.NO_ANSWER), source.control() as link:
+        link.ask("handover", name="count", to=target.name)
+
+
+def settled(pair: Pair) -> RobotMachine | None:
+    """The robot that runs it, once both agree and the other one holds a checkpoint of this epoch."""
+    for one, other in (pair, pair[::-1]):
+        here, there = robots.component(one, "count"), robots.component(other, "count")
+        agreed = here.get("primary") == there.get("primary") == one.name
+        if agreed and here["state"] == "running" and here["protection"] == "protected":
+            return one
+    return None
+
+
+def copies(robot: RobotMachine) -> tuple[int, int]:
+    """How many processes of the program there are, and how many of ours around it: vessels, and first processes of namespaces."""
+    programs = ours = 0
+    for pid in robot.processes():
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            programs += Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"/usr/bin/python3\0-S\0-c\0")
+            ours += Path(f"/proc/{pid}/exe").readlink().name.startswith("memfd:")
+    return programs, ours
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_restore_that_is_broken_off_leaves_nothing_behind(pair: Pair, way: str) -> None:
+    """The robot that is to go on with the program loses a part of its agent in the middle of it, again and again."""
+    dice = random.Random(f"restore {way}")
+    robots.run(pair[0], "count", "/usr/bin/python3", "-S", "-c", COUNT)
+    for _ in range(KILLS):
+        source = robots.until(lambda: settled(pair), "one robot to run it and the other to protect it")
+        target = pair[1] if source is pair[0] else pair[0]
+        death = threading.Timer(dice.uniform(0, RESTORE_S), kill, (target, WAYS[way]))
+        death.start()
+        order_handover(source, target)
+        death.join()
+        revived(target, WAYS[way])
+    primary = robots.until(lambda: settled(pair), "one robot to run it and the other to protect it")
+    other = pair[1] if primary is pair[0] else pair[0]
+    robots.until(lambda: copies(other) == (0, 0), f"no copy to be left at {other.name}")
+    robots.until(lambda: copies(primary) == (1, 1), f"one copy at {primary.name}")
+    expect_checkpoints(other)
+    counted = numbers(robots.output(other, "count"))
     assert counted == list(range(len(counted)))
