@@ -6,8 +6,6 @@ from agent.config import ComponentConfig, Config, Settings
 from failover.core import types
 from failover.core.types import OnCrash, OnLoss, OnUnsupported, Rules, WhenAlone
 
-ON_CRASH = {"resume": OnCrash.RESTORE, "leave": OnCrash.STOP}
-
 
 def node_config(settings: Settings) -> types.Config:
     """What the node is told at birth.
@@ -29,7 +27,7 @@ def rules_for(config: Config, component: ComponentConfig) -> Rules:
     return Rules(
         period_ms=component.snapshot_period_ms or config.snapshot_period_ms,
         on_loss=OnLoss(component.on_loss),
-        on_crash=ON_CRASH[component.on_crash],
+        on_crash=OnCrash(component.on_crash),
         when_alone=WhenAlone(config.when_alone),
         on_unsupported=OnUnsupported(component.on_unsupported),
         prefer=component.prefer,

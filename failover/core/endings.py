@@ -33,8 +33,8 @@ def exited(component: Component, turn: Turn, event: Exited) -> None:
         _end(component, turn, Cause.FINISH, event.status, "")
         how = f"signal {signal}" if signal else f"exit code {event.status >> 8}"
         turn.say(component, f"{turn.me} {Cause.FINISH}: {how}")
-    elif component.rules.on_crash is OnCrash.STOP:
-        _end(component, turn, Cause.FAIL, event.status, f"it died by signal {signal}; on_crash = stop")
+    elif component.rules.on_crash is OnCrash.LEAVE:
+        _end(component, turn, Cause.FAIL, event.status, f"it died by signal {signal}; on_crash = leave")
     else:
         crashed(component, turn, event.status)
 

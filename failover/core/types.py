@@ -26,8 +26,8 @@ class OnLoss(enum.StrEnum):
 class OnCrash(enum.StrEnum):
     """What happens when the program dies by a signal while its robot lives."""
 
-    RESTORE = "restore"
-    STOP = "stop"
+    RESUME = "resume"
+    LEAVE = "leave"
 
 
 class WhenAlone(enum.StrEnum):
@@ -123,7 +123,7 @@ class Rules:
 
     period_ms: int = 100
     on_loss: OnLoss = OnLoss.TAKEOVER
-    on_crash: OnCrash = OnCrash.RESTORE
+    on_crash: OnCrash = OnCrash.RESUME
     crash_limit: int = 3
     crash_window_ms: int = 60_000
     when_alone: WhenAlone = WhenAlone.RUN
