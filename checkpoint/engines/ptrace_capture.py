@@ -229,7 +229,7 @@ class PtraceSession:
         snapshot = replace(
             snapshot,
             resources=held.resources,
-            output=self._outputs.pieces(self._output_since(), frozen.totals) if self._outputs else (),
+            output=self._outputs.pieces(self._output_since(parent), frozen.totals) if self._outputs else (),
         )
         snapshot = replace(snapshot, position=position_of(snapshot, order.generation, order.sequence))
         self._unacknowledged[-1] = replace(self._unacknowledged[-1], position=snapshot.position)
@@ -245,8 +245,9 @@ class PtraceSession:
             return ProcessGoneError(f"{self.component} (pid {self.pid}) has become another program (exec): protect it anew")
         return error
 
-    def _output_since(self) -> Totals:
-        return self._totals_at.get(self._acknowledged, (0, 0)) if self._acknowledged else (0, 0)
+    def _output_since(self, parent: Position | None) -> Totals:
+        """Where a snapshot's output begins: a base may go to a robot that has nothing yet."""
+        return self._totals_at.get(parent, (0, 0)) if parent else (0, 0)
 
     def _copy_running(self) -> tuple[Words, bytearray]:
         """Copy everything that exists while the program runs: the set of pages, and their bytes.

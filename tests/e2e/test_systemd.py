@@ -1,0 +1,174 @@
+"""The agent as a service of a real systemd that is PID 1, with the units as they are shipped; its components outlive it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from failover.client.control import Control, Output, Result
+from tests.e2e import machines, robots
+from tests.e2e.machines import CHECKOUT, Machine
+
+pytestmark = [
+    pytest.mark.root,
+    pytest.mark.slow,
+    pytest.mark.skipif(bool(machines.why_not()), reason=machines.why_not() or "-"),
+]
+
+SERVICE = "failover-agent.service"
+COUNT = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.01)\n"
+MORE = 20
+
+
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
+    """A robot with the service installed as README says, and started."""
+    with machines.booted(tmp_path_factory.mktemp("machines"), "robot1") as booted:
+        install(booted)
+        booted.run("systemctl", "start", SERVICE)
+        yield booted
+        print(booted.run("journalctl", "--unit", SERVICE, "--no-pager", "--lines=100", check=False).stdout)
+
+
+def install(machine: Machine) -> None:
+    """What a package would do, and then a team of one."""
+    units, binaries = CHECKOUT / "systemd", Path(sys.prefix) / "bin"
+    for name in ("failover", "failover-agent"):
+        machine.run("ln", "-s", str(binaries / name), f"/usr/bin/{name}")
+    machine.run("install", "-m644", "-t", "/etc/systemd/system", str(units / SERVICE), str(units / "failover.slice"))
+    machine.run("install", "-Dm644", str(units / "failover.sysusers"), "/usr/lib/sysusers.d/failover.conf")
+    machine.run("install", "-Dm644", str(units / "failover.tmpfiles"), "/usr/lib/tmpfiles.d/failover.conf")
+    machine.run("systemd-sysusers")
+    machine.run("systemd-tmpfiles", "--create", "/usr/lib/tmpfiles.d/failover.conf")
+    machine.run("install", "-m644", str(units / "agent.toml"), "/etc/failover/agent.toml")
+    machine.run("failover", "team", "create", "lab")
+    machine.run("failover", "team", "enrol", "robot1", "127.0.0.1")
+    machine.run("systemctl", "daemon-reload")
+
+
+def control(machine: Machine) -> Control:
+    return Control.open(machine.root / "run" / "failover" / "control.sock")
+
+
+def status(machine: Machine) -> dict[str, Any]:
+    with control(machine) as link:
+        return link.ask("status")
+
+
+def component(machine: Machine, name: str) -> dict[str, Any]:
+    """As ``failover status`` shows it; empty where it is unknown, or nobody answers."""
+    try:
+        return next((one for one in status(machine)["components"] if one["name"].endswith("/" + name)), {})
+    except robots.NO_ANSWER:
+        return {}
+
+
+def started(machine: Machine, name: str) -> int:
+    """A counting component; the PID of its program, there."""
+    with control(machine) as link:
+        argv = ["/usr/bin/python3", "-S", "-c", COUNT]
+        return int(link.ask("run", argv=argv, name=name, env={"PATH": "/usr/bin"}, cwd="/", wait=False)["pid"])
+
+
+def counted(machine: Machine, name: str) -> list[int]:
+    collected = bytearray()
+    with control(machine) as link:
+        for reply in link.stream("logs", name=name):
+            if isinstance(reply, Output) and reply.stream == 1:
+                assert reply.offset == len(collected)
+                collected += reply.content
+            elif isinstance(reply, Result):
+                break
+    return [int(line) for line in collected.split()]
+
+
+def expect_it_to_count_on(machine: Machine, name: str, pid: int) -> None:
+    """The agent has found it again, it is the same process, and its output has no gap."""
+    robots.until(lambda: component(machine, name).get("pid") == pid, "the agent to find its component again")
+    assert component(machine, name)["restores"] == 0
+    before = len(counted(machine, name))
+    robots.until(lambda: len(counted(machine, name)) > before + MORE, "the count to go on")
+    numbers = counted(machine, name)
+    assert numbers == list(range(len(numbers)))
+
+
+def main_pid(machine: Machine) -> int:
+    return int(machine.property(SERVICE, "MainPID"))
+
+
+def test_the_units_are_right(machine: Machine) -> None:
+    said = machine.run("systemd-analyze", "verify", f"/etc/systemd/system/{SERVICE}", "/etc/systemd/system/failover.slice")
+    assert not said.stderr
+
+
+def test_the_service_is_ready_when_it_protects(machine: Machine) -> None:
+    assert machine.property(SERVICE, "ActiveState") == "active"
+    assert machine.property(SERVICE, "StatusText") == "protecting this robot and its neighbours"
+    assert json.loads(machine.run("failover", "status", "--json").stdout)["robot"] == "robot1"
+    assert status(machine)["realtime"]
+
+
+def test_a_component_lives_outside_the_service(machine: Machine) -> None:
+    pid = started(machine, "outside")
+    cgroup = Path(f"/proc/{machine.outer(pid)}/cgroup").read_text()
+    assert "failover.slice" in cgroup and SERVICE not in cgroup, cgroup
+
+
+def test_components_outlive_a_restart_of_the_service(machine: Machine) -> None:
+    pid = started(machine, "restarted")
+    first = main_pid(machine)
+    machine.run("systemctl", "restart", SERVICE)
+    assert main_pid(machine) != first
+    expect_it_to_count_on(machine, "restarted", pid)
+
+
+def test_components_outlive_a_killed_service_and_systemd_starts_it_anew(machine: Machine) -> None:
+    pid = started(machine, "killed")
+    first = main_pid(machine)
+    machine.run("systemctl", "kill", "--signal=SIGKILL", SERVICE)
+    robots.until(lambda: main_pid(machine) not in (0, first), "systemd to start it anew")
+    expect_it_to_count_on(machine, "killed", pid)
+
+
+def test_a_heart_that_stands_still_is_found_by_the_watchdog(machine: Machine) -> None:
+    pid = started(machine, "watched")
+    first = main_pid(machine)
+    os.kill(machine.outer(first), signal.SIGSTOP)
+    robots.until(lambda: main_pid(machine) not in (0, first), "the watchdog to bite")
+    expect_it_to_count_on(machine, "watched", pid)
+
+
+def test_components_run_on_while_the_service_is_stopped(machine: Machine) -> None:
+    pid = started(machine, "stopped")
+    machine.run("systemctl", "stop", SERVICE)
+    assert machine.property(SERVICE, "ActiveState") == "inactive"
+    outer = machine.outer(pid)
+    spent = cpu_ticks(outer)
+    robots.until(lambda: cpu_ticks(outer) > spent, "the program to run on")
+    machine.run("systemctl", "start", SERVICE)
+    expect_it_to_count_on(machine, "stopped", pid)
+
+
+def cpu_ticks(pid: int) -> int:
+    """Processor time that a process has used, in ticks."""
+    words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return int(words[11]) + int(words[12])
+
+
+def test_the_program_ends_by_its_own_status_after_all_that(machine: Machine) -> None:
+    with control(machine) as link:
+        argv = ["/bin/sh", "-c", "sleep 1; exit 7"]
+        link.ask("run", argv=argv, name="brief", env={"PATH": "/usr/bin:/bin"}, cwd="/", wait=False)
+    machine.run("systemctl", "restart", SERVICE)
+    deadline = time.monotonic() + robots.PATIENCE_S
+    while component(machine, "brief").get("exit_status") is None and time.monotonic() < deadline:
+        time.sleep(robots.POLL_S)
+    assert os.waitstatus_to_exitcode(component(machine, "brief")["exit_status"]) == 7
