@@ -193,6 +193,10 @@ class SignalFreezer:
         return found
 
 
+CGROUP_PREFIX: Final = "failover-"
+"""Of the names of our cgroups; what follows is random: PIDs of two namespaces can be equal."""
+
+
 def own_cgroup() -> Path | None:
     """The cgroup v2 directory that this process is in; None where no such filesystem is mounted."""
     mounts = Path("/proc/self/mountinfo").read_text(encoding="utf-8", errors="surrogateescape").splitlines()

@@ -15,6 +15,7 @@ Invariant: while a lease is over, a committed program is frozen, whatever anybod
 from __future__ import annotations
 
 import os
+import secrets
 import signal
 import time
 from collections.abc import Callable
@@ -106,7 +107,7 @@ class Ward:
         logs = OutputLogs(Path(order.log_directory))
         logs.truncate(totals)
         pump = Pump(logs, totals)
-        hold, notes = freezing.choose(order.cgroup, f"failover-{os.getpid()}")
+        hold, notes = freezing.choose(order.cgroup, f"{freezing.CGROUP_PREFIX}{secrets.token_hex(8)}")
         try:
             with open(os.devnull, "rb") as nothing, hold.birthplace():
                 ends = pump.write_ends

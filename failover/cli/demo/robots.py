@@ -39,6 +39,9 @@ POLL_S: Final = 0.005
 LAST_LINES: Final = 5
 """Of an agent's log, shown when something goes wrong."""
 
+GUARDS_CGROUP: Final = "failover-"
+"""How the names of the guards' cgroups begin (`agent.freezer`)."""
+
 GO: Final = b"g"
 """What a host waits for before it starts its agent."""
 
@@ -154,7 +157,8 @@ class RobotMachine:
         return len(frozen)
 
     def end(self) -> None:
-        """Kill whatever is left, and wait until nothing is."""
+        """Kill whatever is left, wait until nothing is, and remove the cgroups that only its guards would have removed."""
+        cgroups = {place for pid in self.processes() if (place := cgroup_of(pid)) is not None}
         while left := self.processes():
             for pid in left:
                 with contextlib.suppress(ProcessLookupError):
@@ -163,12 +167,25 @@ class RobotMachine:
         with contextlib.suppress(ProcessLookupError):
             self.process.kill()
         self.process.wait()
+        for place in cgroups:
+            with contextlib.suppress(OSError):  # somebody else's as well, or the guard was quicker
+                place.rmdir()
 
     def last_words(self) -> str:
         """The end of its agent's log, for a message."""
         with contextlib.suppress(OSError):
             return " / ".join(self.log.read_text(errors="replace").strip().splitlines()[-LAST_LINES:]) or "it said nothing"
         return "it left no log"
+
+
+def cgroup_of(pid: int) -> Path | None:
+    """The cgroup that a guard has made for a process; None where it stands in another one."""
+    with contextlib.suppress(OSError):
+        points = [line.split()[1] for line in Path("/proc/self/mounts").read_text().splitlines() if line.split()[2] == "cgroup2"]
+        paths = [line[3:] for line in Path(f"/proc/{pid}/cgroup").read_text().splitlines() if line.startswith("0::")]
+        if points and paths and Path(paths[0]).name.startswith(GUARDS_CGROUP):
+            return Path(points[0], paths[0].lstrip("/"))
+    return None
 
 
 class Stage:
