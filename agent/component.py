@@ -32,7 +32,7 @@ from agent.clock import Laps
 from agent.errors import GuardError, GuardLostError, KeeperLostError
 from agent.guard_messages import Described, Exited, Refused
 from agent.nursery import GuardLink, KeeperLink, Nursery, connect
-from agent.streams import OutputLogs, total_of
+from agent.streams import OutputLogs, discard, total_of
 from checkpoint import channel, errors, format
 from checkpoint.channel import Failed, close_all
 from checkpoint.errors import CheckpointError, RestoreError
@@ -142,7 +142,13 @@ class Component:
         Raises:
             GuardError: it could not be started; nothing is left of it.
         """
-        component = cls(name, await places.nursery.guard(), places)
+        guard = await places.nursery.guard()
+        try:
+            discard(log_directory(name, places))  # a namesake that was let go may still write to its own
+        except OSError as error:
+            guard.dialogue.close()
+            raise GuardError(f"{name}: cannot begin its output anew in {error.filename}: {error.strerror}") from error
+        component = cls(name, guard, places)
         request = guard_messages.Start(
             component=name,
             argv=program.argv,

@@ -125,6 +125,7 @@ class BeatCounts(msgspec.Struct, frozen=True):
         late_us_max: the longest that a turn of the loop came after its deadline.
         gap_us_max: the longest between two beats of one peer.
         gaps: how many were longer than `agent.loop.GAP_BEATS` periods.
+        lost: beats of each peer that did not arrive, in this life of ours.
     """
 
     sent: int = 0
@@ -134,6 +135,7 @@ class BeatCounts(msgspec.Struct, frozen=True):
     late_us_max: int = 0
     gap_us_max: int = 0
     gaps: int = 0
+    lost: dict[str, int] = {}
 
 
 class Told(msgspec.Struct, frozen=True, tag=True):

@@ -104,10 +104,9 @@ class Guard:
 
     def _wait(self) -> list[Callable[[], None]]:
         """Sleep until something is to be done, or a deadline passes; returns what is to be done."""
-        watched: dict[int, Callable[[], None]] = {
-            self._listener.fileno(): self._accept,
-            self._children_ended.fileno(): self._reap,
-        }
+        watched: dict[int, Callable[[], None]] = {self._children_ended.fileno(): self._reap}
+        if self._listener.fileno() >= 0:  # it was not let go
+            watched[self._listener.fileno()] = self._accept
         if self._agent is not None:
             watched[self._agent.fileno()] = self._receive
         if self._keeper is not None:
@@ -231,8 +230,14 @@ class Guard:
         if ward.frozen_by:
             ward.thaw()
         ward.let_go = self._ends_with_ward = True
+        self._stop_listening()  # no later agent may find it, and take it for a component
         self._over = ward.pidfd is not None or ward.exited is not None
         self._reply(Done())
+
+    def _stop_listening(self) -> None:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(self._listener.getsockname())
+        self._listener.close()
 
     def _forget(self, _: Forget, __: tuple[int, ...]) -> None:
         if self._ward is not None and self._ward.exited is None:
@@ -295,7 +300,8 @@ def main(arguments: list[str]) -> int:
     try:
         Guard(listener, _settle()).run()
     finally:
-        os.unlink(path)
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(path)
     return 0
 
 

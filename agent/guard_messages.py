@@ -92,7 +92,7 @@ class Describe(Message, frozen=True):
 
 
 class LetGo(Message, frozen=True):
-    """Protection ends, the program runs on: no lease any more; the guard keeps its streams and ends when it ends."""
+    """Protection ends, the program runs on: no lease any more; the guard keeps its streams, is found no more, ends with it."""
 
 
 class Forget(Message, frozen=True):

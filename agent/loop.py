@@ -85,6 +85,8 @@ class Heart:
         self._refused: Counter[str] = Counter()
         self._sent = self._heard = self._late_us_max = self._gap_us_max = self._gaps = 0
         self._heard_at: dict[str, int] = {}
+        self._newest_beat: dict[str, tuple[int, int]] = {}
+        self._lost: Counter[str] = Counter()
         self._notes: tuple[str, ...] = ()
 
     def run(self) -> None:
@@ -160,14 +162,19 @@ class Heart:
         for frame in self._beats.receive(descriptor):
             opened = self._hearing.open(frame)
             if isinstance(opened, Beat):
-                self._count(opened.sender)
+                self._count(opened)
                 self._step(Received(opened))
             else:
                 self._refused[str(opened.reason)] += 1
 
-    def _count(self, peer: str) -> None:
-        """Note how long the peer was silent before this beat."""
-        now_ns = clock.now_ns()
+    def _count(self, beat: Beat) -> None:
+        """Note how long the peer was silent before this beat, and how many were lost in between."""
+        now_ns, peer = clock.now_ns(), beat.sender
+        boot, counter = self._newest_beat.get(peer, (beat.boot, beat.counter - 1))
+        missing = beat.counter - counter - 1 if beat.boot == boot else 0
+        self._lost[peer] += max(missing, -1)  # one that comes late was counted as lost
+        if beat.boot != boot or missing >= 0:
+            self._newest_beat[peer] = (beat.boot, beat.counter)
         gap_us = (now_ns - self._heard_at.get(peer, now_ns)) // 1_000
         self._heard_at[peer] = now_ns
         self._heard += 1
@@ -254,6 +261,7 @@ class Heart:
             self._late_us_max,
             self._gap_us_max,
             self._gaps,
+            dict(self._lost),
         )
         trouble = self._persister.trouble
         if self._node is None:

@@ -161,6 +161,16 @@ class OutputLogs:
         os.pwrite(self._offsets, _OFFSET.pack(value), _place(stream, which))
 
 
+def discard(directory: Path) -> None:
+    """Begin anew: the next `OutputLogs` of this directory opens empty files; whoever has the old ones open keeps them.
+
+    Raises:
+        OSError: the directory cannot be written.
+    """
+    for name in (OFFSETS_NAME, *LOG_NAMES.values()):
+        (directory / name).unlink(missing_ok=True)
+
+
 def total_of(pieces: Iterable[OutputPiece]) -> tuple[int, int]:
     """Where the streams end after ``pieces``: the totals that a restore from their snapshot continues at."""
     totals = {1: 0, 2: 0}

@@ -39,7 +39,7 @@ STANDING_POLL_S: Final = 0.01
 """Between two questions to the robot that a component moves to: what an operator reads as the move's time."""
 
 SIGHT_PATIENCE_S: Final = 0.5
-"""How long a status waits for the other robots' own sight of their components."""
+"""How long a status, or a story, waits for the other robots' own."""
 
 START_PATIENCE_S: Final = 30.0
 """How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
@@ -80,7 +80,13 @@ class Verbs:
 
     def errands(self) -> dict[str, Order]:
         """What another robot may ask of this one: the orders, and how things stand here."""
-        return {**self.orders(), "standing": self.standing, "picture": self.picture, "piece": self._outflow.piece}
+        return {
+            **self.orders(),
+            "standing": self.standing,
+            "picture": self.picture,
+            "piece": self._outflow.piece,
+            "story": self.story,
+        }
 
     def orders(self) -> dict[str, Order]:
         """Those that are carried out where the component runs, wherever they are given."""
@@ -124,8 +130,8 @@ class Verbs:
         for component in mine["components"]:
             component["elsewhere"] = {}
         if team:
-            living = [peer["name"] for peer in mine["peers"] if peer["state"] == "live" and peer["lane"] == "connected"]
-            theirs = await asyncio.gather(*(self._sight_of(peer) for peer in living))
+            living = await self._reachable()
+            theirs = await asyncio.gather(*(self._asked(peer, "picture", {}) for peer in living))
             for robot, picture in zip(living, theirs, strict=True):
                 known = {one["name"]: one for one in picture.get("components", ())}
                 for component in mine["components"]:
@@ -133,24 +139,35 @@ class Verbs:
                         component["elsewhere"][robot] = known[component["name"]]
         return mine
 
-    async def _sight_of(self, peer: str) -> dict[str, Any]:
-        """A peer's own picture; empty when it does not answer soon."""
+    async def _reachable(self) -> list[str]:
+        """The robots that live and can be asked."""
+        peers = self._lanes.picture(await self._lanes.ask("status"))["peers"]
+        return [peer["name"] for peer in peers if peer["state"] == "live" and peer["lane"] == "connected"]
+
+    async def _asked(self, peer: str, question: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        """A peer's answer; empty when it does not come soon."""
         try:
-            return await self._lanes.errands.send(peer, "picture", {}, SIGHT_PATIENCE_S)
+            return await self._lanes.errands.send(peer, question, arguments, SIGHT_PATIENCE_S)
         except RefusedError:
             return {}
 
     async def why(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
-        """What was decided, when and why?"""
+        """What was decided, when and by whom: this robot's story and those of the robots that it hears, in one."""
         wanted = arguments_of(NameArguments, "why", arguments)
         name = await self._known(wanted.name) if wanted.name else ""
-        told = await self._lanes.ask("why", name)
+        mine = await self.story({"name": name})
+        theirs = await asyncio.gather(*(self._asked(peer, "story", {"name": name}) for peer in await self._reachable()))
+        whole = [*mine["story"], *(line for story in theirs for line in story.get("story", ()))]
+        return {"story": sorted(whole, key=lambda line: str(line["at"]))}
+
+    async def story(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        """What this robot decided; of one component, or all."""
+        told = await self._lanes.ask("why", arguments_of(NameArguments, "story", arguments).name)
         story = [
             {
                 "at": clock.calendar(decision.at_ns, told.now_ns),
                 "robot": self._lanes.settings.config.robot,
                 "component": decision.component,
-                "saw": "",
                 "did": decision.sentence,
             }
             for decision in told.story

@@ -90,8 +90,7 @@ def _peer(peer: PeerView, link: Link | None, told: Told) -> dict[str, Any]:
         "hears_us": peer.hears_us,
         "load": peer.load,
         "lane": str(link.state if link is not None else LinkState.DOWN),
-        "beats_lost": None,
-        "rtt_us": None,
+        "beats_lost": told.beats.lost.get(peer.robot, 0),
         "notes": reason,
     }
 

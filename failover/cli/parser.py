@@ -347,7 +347,7 @@ VERBS: Final = (
         "why",
         "the story of the last decisions",
         """
-        Tell what was seen, by whom, when, and what was done about it.
+        Tell what was seen, by whom, when, and what was done about it: the stories of all robots that answer, in one.
 
           failover why
           failover why /lab/robot1/mapper

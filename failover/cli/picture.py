@@ -84,14 +84,10 @@ def _robot_row(status: Mapping[str, Any], name: str, peer: Mapping[str, Any] | N
     if peer is None:
         return Row((f"{name} (here)", str(status.get("role") or ""), "live", "", "", "", "", _lanes(status["peers"])), "good")
     state = peer["state"]
-    links = ", ".join(part for part in (peer.get("lane") or "", _round_trip(peer)) if part)
+    lost = peer.get("beats_lost")
+    links = ", ".join(part for part in (peer.get("lane") or "", f"{lost} beats lost" if lost else "") if part)
     mood: Mood = "good" if state == "live" else "bad" if state == "dead" else "warning"
     return Row((name, "", state, "", "", "", "", links), mood)
-
-
-def _round_trip(peer: Mapping[str, Any]) -> str:
-    value = peer.get("rtt_us")
-    return "" if value is None else f"{value / 1000:.1f} ms"
 
 
 def _lanes(peers: Sequence[Mapping[str, Any]]) -> str:

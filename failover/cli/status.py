@@ -9,7 +9,7 @@ from failover.cli import picture, render
 from failover.cli.agent import connect
 from failover.client.control import Update
 
-COLUMNS = ("at", "robot", "component", "saw", "did")
+COLUMNS = ("at", "robot", "component", "did")
 """Of one line of the story, as the agent names them."""
 
 
@@ -48,7 +48,7 @@ def why(arguments: argparse.Namespace) -> int:
         return 0
     lines = [(clock(entry.get("at")), *(str(entry.get(key) or "") for key in COLUMNS[1:])) for entry in answer["story"]]
     if lines:
-        render.table(("when", "robot", "component", "what was seen", "what was done"), lines)
+        render.table(("when", "robot", "component", "what was seen and done"), lines)
     else:
         print("no decisions yet" + (f" about {arguments.name}" if arguments.name else ""))
     return 0

@@ -18,7 +18,7 @@ verb           arguments                                                result, 
 ``release``    ``name`` *must*                                          ``{name, pid}``; the program runs on, unprotected
 ``stop``       ``name`` *must*, ``signal`` 15                           ``{name, exit_status}`` once it has ended
 ``logs``       ``name`` *must*, ``follow`` false, ``offsets`` [0, 0]     Output …, Result ``{name, totals, exit_status}``
-``why``        ``name`` ""                                              ``{"story": [{at, robot, component, saw, did}, …]}``
+``why``        ``name`` ""                                              ``{"story": [{at, robot, component, did}, …]}``
 ``handover``   ``name`` *must*, ``to`` ""                               ``{name, to, epoch, took_ms, moved, sentence}``
 ``failback``   ``name`` *must*                                          as ``handover``
 ``prefer``     ``name`` *must*, ``robot`` *must*                        ``{name, robot}``
@@ -40,17 +40,19 @@ import msgspec
 from failover.errors import AgentRefusedError, LostAgentError, NoAgentError
 
 STATUS: Final = """
-robot, team, role, pid, version, uptime_ms: of this agent
+robot, team, role, pid, lanes_pid, version: of this agent; life: count of its starts
 insecure: links are neither authenticated nor encrypted
 realtime: the heart runs at real-time priority with its memory locked
-promise: one sentence: what holds if this robot dies now
+rule, promise: by which rule the team decides, and one sentence: what holds if this robot dies now
+healthy: nothing is degraded, nothing has failed, nobody is silent, as far as this robot knows
 notes: [sentence, …]: what is missing or degraded on this robot
-peers: [{name, state, last_heard_ms, beats_lost, lane, rtt_us, notes}]
+beats: {sent, heard, unsent, refused, late_us_max, gap_us_max, gaps}: of this life; refused: {reason: count}
+peers: [{name, state, last_heard_ms, hears_us, load, beats_lost, lane, notes}]
     state: unknown | live | suspect | dead; lane: connected | connecting | refused | down
-components: [{name, role, primary, state, epoch, generation, sequence, engine, pid, inner_pid, isolated, standby,
-    standby_sequence, lag_ms, period_ms, freeze_us, freeze_us_max, snapshot_size, dirty_bytes, snapshots, restores, crashes,
-    exit_status, reasons, notes, elsewhere}]
-    role: primary | standby | none
+components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
+    isolated, standby, standby_sequence, lag_ms, period_ms, freeze_us, freeze_us_max, snapshot_size, dirty_bytes, snapshots,
+    restores, crashes, outage_ms, exit_status, promise, reasons, notes, elsewhere}]
+    role: primary | standby | none; protection: none | protected | degraded | stopped
     state: starting | running | frozen | held | restoring | ended | degraded | failed | released
     elsewhere: with ``team``: {robot: the same fields, as that robot sees the component}
 """

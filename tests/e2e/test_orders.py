@@ -121,3 +121,18 @@ def test_a_released_component_runs_on_unprotected(pair: Pair) -> None:
     robots.until(lambda: robots.component(second, "count").get("state") == "released", "robot2 to forget it")
     state = Path(f"/proc/{victim}/stat").read_text().rpartition(")")[2].split()[0]
     assert state in "SR", state
+
+
+def test_a_released_program_outlives_an_agent_restart_and_a_namesake(pair: Pair) -> None:
+    first, _ = pair
+    protected_count(pair)
+    inner = robots.component(first, "count")["pid"]
+    released = robots.host_pid(first, inner)
+    order(first, "release", name="count")
+    lanes = first.status()["lanes_pid"]
+    os.kill(robots.host_pid(first, lanes), signal.SIGKILL)
+    robots.until(lambda: robots.answers(first) and first.status()["lanes_pid"] != lanes, "the agent's other half to be back")
+    protected_count(pair)  # the same name again, while the released one still writes
+    expect_more(first)
+    assert Path(f"/proc/{released}/stat").read_text().rpartition(")")[2].split()[0] in "SR"
+    assert robots.component(first, "count")["pid"] != inner

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from failover.cli import main, status
+from failover.client.control import STATUS
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 
@@ -221,3 +222,19 @@ def test_two_robots_that_start_one_name_at_once_run_it_once(pair: Pair) -> None:
     assert 0 in [one.returncode for one in running], told
     assert robots.failover(loser, "stop", "one").returncode == HEALTHY
     assert robots.failover(winner, "release", "one").returncode == HEALTHY
+
+
+def test_the_story_of_both_robots_is_told_at_either(pair: Pair) -> None:
+    for robot in pair:
+        told = json.loads(robots.failover(robot, "why", "sleeper", "--json").stdout)["story"]
+        assert {line["robot"] for line in told} == {"robot1", "robot2"}
+        assert [line["at"] for line in told] == sorted(line["at"] for line in told)
+
+
+def test_every_field_of_a_status_is_documented(pair: Pair) -> None:
+    documented = set(re.findall(r"\w+", STATUS))
+    shown = json.loads(robots.failover(pair[0], "status", "--json").stdout)
+    for part in (shown, shown["beats"], *shown["peers"], *shown["components"]):
+        assert set(part) <= documented, set(part) - documented
+    sleeper = next(one for one in shown["components"] if one["name"].endswith("/sleeper"))
+    assert sleeper["elsewhere"]["robot2"]["role"] == "standby"

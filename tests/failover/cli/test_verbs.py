@@ -28,10 +28,10 @@ COMPONENT = {
     "snapshots": 41, "restores": 0, "crashes": 0, "exit_status": None, "reasons": [], "notes": [],
 }  # fmt: skip
 PEER = {
-    "name": "robot2", "state": "live", "last_heard_ms": 12, "beats_lost": 0, "lane": "connected", "rtt_us": 120, "notes": [],
+    "name": "robot2", "state": "live", "last_heard_ms": 12, "beats_lost": 0, "lane": "connected", "notes": [],
 }  # fmt: skip
 STATUS = {
-    "robot": "robot1", "team": "lab", "role": "robot", "pid": 4, "version": "0.1.0", "uptime_ms": 9, "insecure": False,
+    "robot": "robot1", "team": "lab", "role": "robot", "pid": 4, "version": "0.1.0", "insecure": False,
     "realtime": True, "promise": "If robot1 dies now, robot2 goes on.", "notes": [], "peers": [PEER], "components": [COMPONENT],
 }  # fmt: skip
 
