@@ -132,7 +132,10 @@ def test_a_released_program_outlives_an_agent_restart_and_a_namesake(pair: Pair)
     lanes = first.status()["lanes_pid"]
     os.kill(robots.host_pid(first, lanes), signal.SIGKILL)
     robots.until(lambda: robots.answers(first) and first.status()["lanes_pid"] != lanes, "the agent's other half to be back")
-    protected_count(pair)  # the same name again, while the released one still writes
-    expect_more(first)
+    backwards = COUNT.replace("print(i,", "print(-i,")  # the same name again, while the released one still writes
+    robots.run(first, "count", "/usr/bin/python3", "-S", "-c", backwards)
+    robots.until(lambda: len(counted(first)) > MORE, "the namesake to count")
+    numbers = counted(first)
+    assert numbers == [-number for number in range(len(numbers))]
     assert Path(f"/proc/{released}/stat").read_text().rpartition(")")[2].split()[0] in "SR"
     assert robots.component(first, "count")["pid"] != inner
