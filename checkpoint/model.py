@@ -229,6 +229,8 @@ class ProcessState:
         pid: as the program itself sees it (innermost PID namespace).
         ppid, pgid, sid: likewise; 0 where they lie outside its namespace.
         limits: RLIMIT number → (soft, hard); -1 is infinity.
+        switches: calls of prctl(2) that set again what it has switched, see `checkpoint.engines.switches`.
+        coredump_filter: which mappings a core dump holds (core(5)); -1 where the kernel makes none.
         pending: signals pending for the process, each a whole siginfo (128 bytes).
         isolated: it lives in PID and time namespaces of its own.
     """
@@ -252,6 +254,8 @@ class ProcessState:
     child_subreaper: bool = False
     parent_death_signal: int = 0
     thp_disabled: bool = False
+    switches: tuple[tuple[int, int, int], ...] = ()
+    coredump_filter: int = -1
     signal_actions: tuple[SignalAction, ...] = ()
     pending: tuple[bytes, ...] = ()
     interval_timers: tuple[IntervalTimer, ...] = ()

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+from checkpoint.engines.switches import Questions, Switch
 from checkpoint.linux import abi
 from checkpoint.linux.procfs import TimerLine
 from checkpoint.linux.remote import Answers, Batch
@@ -42,6 +43,7 @@ class Told:
     thp_disabled: bool
     securebits: int
     timer_slack_ns: int
+    switches: tuple[Switch, ...]
 
 
 class Inquiry:
@@ -75,6 +77,7 @@ class Inquiry:
         self._death_signal = self._writes(8, "prctl", abi.PR_GET_PDEATHSIG)
         self._thp = self.batch.add("prctl", abi.PR_GET_THP_DISABLE, 0, 0, 0, 0)
         self._securebits = self.batch.add("prctl", abi.PR_GET_SECUREBITS)
+        self._switches = Questions(self.batch)
         self._slack = self.batch.add("prctl", abi.PR_GET_TIMERSLACK)
 
     def _asks_action(self, signal: int) -> int:
@@ -118,6 +121,7 @@ class Inquiry:
             thp_disabled=result[self._thp] == 1,
             securebits=max(result[self._securebits], 0),
             timer_slack_ns=max(result[self._slack], 0),
+            switches=self._switches.read(answers),
         )
 
 

@@ -525,6 +525,8 @@ class PtraceSession:
             child_subreaper=told.child_subreaper,
             parent_death_signal=told.parent_death_signal,
             thp_disabled=told.thp_disabled,
+            switches=told.switches,
+            coredump_filter=_coredump_filter(self.pid),
             signal_actions=told.actions,
             pending=frozen.shared_pending,
             interval_timers=told.interval_timers,
@@ -713,6 +715,14 @@ def _limits(pid: int) -> dict[int, tuple[int, int]]:
 
 def _limit(word: str) -> int:
     return -1 if word == "unlimited" else int(word)
+
+
+def _coredump_filter(pid: int) -> int:
+    """Source: core(5); the file is empty for a process without memory, and missing where the kernel makes no core dumps."""
+    try:
+        return int(procfs.read_text(pid, "coredump_filter"), 16)
+    except (ProbeError, ValueError):
+        return -1
 
 
 def _policy(pid: int) -> int:

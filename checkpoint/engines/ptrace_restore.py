@@ -26,7 +26,7 @@ from typing import Final
 
 from checkpoint.arch import x86_64, x86_64_stub
 from checkpoint.engine import RestoreOptions
-from checkpoint.engines import restore_checks, restore_memory, restore_process
+from checkpoint.engines import restore_checks, restore_memory, restore_process, switches
 from checkpoint.engines.restore_process import Vessel
 from checkpoint.errors import CheckpointError, MismatchError, RestoreError
 from checkpoint.linux import abi, call_table, procfs
@@ -142,6 +142,7 @@ class _Restore:
         self._notes += stub.run(second)
         self._stub = stub
         _write_oom_score(tracee.pid, state.process.oom_score_adj, self._notes)
+        _write_coredump_filter(tracee.pid, state.process.coredump_filter, self._notes)
 
     def _mappings_table(self, table: CallTable, vessel: Vessel, mappings: tuple[procfs.MapsLine, ...], refuge: int) -> CallTable:
         vmas, runs = self._state.vmas, self._state.runs
@@ -155,7 +156,7 @@ class _Restore:
     def _state_table(self, table: CallTable, vessel: Vessel) -> CallTable:
         process, thread, elapsed_ns = self._state.process, self._thread, self._options.elapsed_ns
         restore_memory.settle(table, self._state.vmas, self._state.runs)
-        self._notes += rebuild_all(table, self._state, self._options)
+        self._notes += rebuild_all(table, self._state, self._options, vessel.inner_pid)
         restore_process.memory_layout(table, process, with_executable=vessel.may_choose_executable)
         restore_process.signal_actions(table, process.signal_actions)
         restore_process.thread_marks(table, thread)
@@ -167,6 +168,7 @@ class _Restore:
         restore_process.posix_timers(table, process, thread, vessel, elapsed_ns)
         restore_process.interval_timers(table, process.interval_timers, elapsed_ns)
         restore_process.last_marks(table, process)
+        switches.set_again(table, process.switches)
         return table
 
     def _become_program(self) -> None:
@@ -269,3 +271,12 @@ def _write_oom_score(pid: int, score: int, notes: list[str]) -> None:
         Path(f"/proc/{pid}/oom_score_adj").write_bytes(str(score).encode())
     except PermissionError:
         notes.append(f"oom_score_adj {score} is not kept: lowering it needs CAP_SYS_RESOURCE")
+
+
+def _write_coredump_filter(pid: int, wanted: int, notes: list[str]) -> None:
+    if wanted < 0:
+        return
+    try:
+        Path(f"/proc/{pid}/coredump_filter").write_bytes(hex(wanted).encode())
+    except OSError as error:
+        notes.append(f"the choice of mappings in a core dump is not kept: {error.strerror}")

@@ -125,16 +125,16 @@ def with_contents(opened: Sequence[OpenFile]) -> tuple[OpenFile, ...]:
 
 def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
     """Sort open files into the kinds: what comes back, and what does not."""
-    from checkpoint.resources import devices, files, pipes, streams, unsupported
+    from checkpoint.resources import devices, files, pipes, signalling, streams, unsupported
 
     resources, findings = [], []
     for held in opened:
         for kind in (streams, devices, files, pipes, unsupported):
-            if reason := kind.refuse(held, surroundings):
+            if reason := kind.refuse(held, surroundings) or signalling.refuse(held):
                 findings.append(Finding(kind.KIND, held.name, REFUSED, reason))
                 break
             if resource := kind.describe(held, surroundings):
-                resources.append(resource)
+                resources.append(replace(resource, facts={**resource.facts, **signalling.describe(held)}))
                 findings.append(Finding(kind.KIND, held.name, KEPT, f"{held.name} is {held.first.target}"))
                 break
     return Held(tuple(resources), tuple(findings))

@@ -21,7 +21,7 @@ from checkpoint.engine import RestoreOptions
 from checkpoint.errors import RestoreError
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource, Snapshot
-from checkpoint.resources import pipes
+from checkpoint.resources import pipes, signalling
 
 REOPENED_FLAGS: Final = (
     os.O_ACCMODE | os.O_APPEND | os.O_NONBLOCK | os.O_DSYNC | os.O_SYNC | os.O_DIRECT | os.O_NOATIME | os.O_DIRECTORY
@@ -42,8 +42,11 @@ class Wanted:
     resource: Resource
 
 
-def rebuild_all(table: CallTable, state: Snapshot, options: RestoreOptions) -> tuple[str, ...]:
+def rebuild_all(table: CallTable, state: Snapshot, options: RestoreOptions, inner_pid: int) -> tuple[str, ...]:
     """Add the calls that bring all descriptors back: a note for each difference.
+
+    Args:
+        inner_pid: what the process itself will know as its PID.
 
     Raises:
         RestoreError: a resource of a kind that this version does not know.
@@ -65,6 +68,7 @@ def rebuild_all(table: CallTable, state: Snapshot, options: RestoreOptions) -> t
         else:
             _obtain(table, one, moved, piped, options)
             holders[id(one.resource)] = one.number
+            signalling.rebuild(table, one.number, one.resource, inner_pid)
     for number in (*moved, *piped.values()):
         table.close(number)
     return ()

@@ -123,13 +123,6 @@ NOT_YET = {
     "deleted_mapping": "refused: a mapping of a deleted file is not kept yet",
     "sigwait-timed": "a sigtimedwait ends with EAGAIN at a capture",
     "timer_overrun": "the kernel does not tell how often a timer went off while its signal was pending",
-    "portrait-no_tsc": "PR_SET_TSC is not kept yet",
-    "portrait-mdwe": "PR_SET_MDWE is not kept yet",
-    "portrait-memory_merge": "PR_SET_MEMORY_MERGE is not kept yet",
-    "portrait-store_bypass": "PR_SET_SPECULATION_CTRL is not kept yet",
-    "portrait-mce_kill": "PR_MCE_KILL is not kept yet",
-    "portrait-coredump_filter": "/proc/PID/coredump_filter is not kept yet",
-    "files-owner_signal": "owner and signal of F_SETOWN and F_SETSIG are not kept yet",
 }
 """What a restore does not preserve so far, and why."""
 
@@ -166,12 +159,12 @@ def test_a_captured_program_notices_nothing(case: Case, compiled: Compiled, tmp_
 def test_blocking_calls_end_only_when_their_time_is_over(compiled: Compiled, tmp_path: Path) -> None:
     """All at once, because each takes its time: captured, killed and brought back while they wait."""
     program = compiled("sleeps", "-O2")
-    waiting = {}
+    back = {}
     for case in SLEEPS:
         directory = tmp_path / case.arguments[0]
         directory.mkdir()
-        waiting[case] = start_tracee(program, directory, *case.arguments)
-    back = {case: restored(captured_and_killed(tracee), tracee.directory) for case, tracee in waiting.items()}
+        tracee = start_tracee(program, directory, *case.arguments)
+        back[case] = restored(captured_and_killed(tracee), directory)
     complaints = [f"{case}: {found}" for case, tracee in back.items() if (found := _complaint(tracee))]
     assert not complaints, "\n".join(complaints)
 
@@ -183,8 +176,7 @@ def test_blocking_calls_do_not_notice_a_capture(compiled: Compiled, tmp_path: Pa
         directory = tmp_path / case.arguments[0]
         directory.mkdir()
         waiting[case] = start_tracee(program, directory, *case.arguments)
-    for tracee in waiting.values():
-        captured(tracee)
+        captured(waiting[case])
     complaints = [f"{case}: {found}" for case, tracee in waiting.items() if (found := _complaint(tracee))]
     assert not complaints, "\n".join(complaints)
 

@@ -1,0 +1,78 @@
+"""Who gets which signal when a descriptor becomes ready: F_SETOWN and F_SETSIG of fcntl(2), kept of every kind of open file.
+
+Facts, added to a resource's own: ``signal`` (0 for SIGIO) and ``owner``: 1 if it is the process itself. Directory notifications
+(F_NOTIFY) cannot be asked for; they are lost with the descriptor's next opening.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import struct
+from collections.abc import Iterator
+from typing import Final
+
+from checkpoint.linux import abi
+from checkpoint.linux.call_table import CallTable
+from checkpoint.model import Fact, Resource
+from checkpoint.resources import OpenFile
+
+F_SETSIG: Final = 10
+F_GETSIG: Final = 11
+F_SETOWN_EX: Final = 15
+F_GETOWN_EX: Final = 16
+F_OWNER_PID: Final = 1
+_OWNER: Final = struct.Struct("<ii")
+O_PATH: Final = 0o10000000
+
+
+def describe(held: OpenFile) -> dict[str, Fact]:
+    """The facts of one open file; none where nothing was set."""
+    asked = _asked(held)
+    if asked is None:
+        return {}
+    signal, kind, owner = asked
+    return {"signal": signal, "owner": int(kind == F_OWNER_PID and owner == held.pid)}
+
+
+def refuse(held: OpenFile) -> str | None:
+    """Why its signals cannot be kept: they go to somebody else."""
+    asked = _asked(held)
+    if asked is None or asked[2] in (0, held.pid):
+        return None
+    return f"{held.name} sends its signals to {asked[2]}, not to the process itself, which is not kept: let it own them itself"
+
+
+def rebuild(table: CallTable, descriptor: int, held: Resource, inner_pid: int) -> None:
+    """Set them again."""
+    if held.facts.get("owner"):
+        owner = table.place(_OWNER.pack(F_OWNER_PID, inner_pid))
+        table.call(f"own the signals of {held.name}", "fcntl", descriptor, F_SETOWN_EX, owner)
+    if held.facts.get("signal"):
+        table.call(f"choose the signal of {held.name}", "fcntl", descriptor, F_SETSIG, int(str(held.facts["signal"])))
+
+
+def _asked(held: OpenFile) -> tuple[int, int, int] | None:
+    """(signal, kind of owner, owner) if anything was set, asked through a copy of the descriptor; None where there is none."""
+    if held.first.flags & O_PATH:
+        return None
+    with contextlib.suppress(OSError), _copy(held) as descriptor:
+        signal = fcntl.fcntl(descriptor, F_GETSIG)
+        kind, owner = _OWNER.unpack(fcntl.fcntl(descriptor, F_GETOWN_EX, bytes(_OWNER.size)))
+        return (signal, kind, owner) if signal or owner else None
+    return None
+
+
+@contextlib.contextmanager
+def _copy(held: OpenFile) -> Iterator[int]:
+    """The same open file, as a descriptor of ours."""
+    pidfd = os.pidfd_open(held.pid)
+    try:
+        descriptor = abi.pidfd_getfd(pidfd, held.first.number)
+    finally:
+        os.close(pidfd)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
