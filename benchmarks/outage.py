@@ -1,28 +1,72 @@
-"""The whole: from the power cut to the program's next output, by the demo itself."""
+"""The whole: from the power cut of a robot to the next output of its programs at the other one."""
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-from collections import defaultdict
+import time
 from pathlib import Path
 
 from benchmarks.figures import Figure
+from failover.cli.demo.robots import RobotMachine, Stage, means
+
+COUNTS = (1, 2, 4)
+"""Programs that are taken over at once."""
+
+COUNTING = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.01)\n"
+"""Prints every 10 ms."""
+
+SNAPSHOTS = 25
+PATIENCE_S = 60.0
+IN_FLIGHT_S = 0.03
+"""A snapshot that was on its way at the cut may still lengthen the standby's log so much later."""
 
 
-def outage(quick: bool, _directory: Path) -> list[Figure]:
-    """Run the demo several times; a run whose output differs is an error, not a figure."""
-    found: dict[tuple[str, str, str], list[float]] = defaultdict(list)
-    for _ in range(2 if quick else 8):
-        ran = subprocess.run(
-            [sys.executable, "-m", "failover.cli.main", "demo", "--json"], capture_output=True, text=True, check=False
-        )
-        if ran.returncode:
-            raise RuntimeError(f"the demo failed: {ran.stdout.strip()} {ran.stderr.strip()}")
-        for program in json.loads(ran.stdout)["programs"]:
-            case = program["name"]
-            found["power cut to next output", case, "ms"].append(program["outage_ms"])
-            found["age of the checkpoint at the cut", case, "ms"].append(program["lag_ms"])
-            found["freeze in the demo, median", case, "ms"].append(program["freeze_us_median"] / 1000)
-    return [Figure(*key, tuple(values)) for key, values in found.items()]
+def outage(quick: bool, directory: Path) -> list[Figure]:
+    """Cut a robot's power again and again, with one, two and four programs running there."""
+    return [_outages(count, 3 if quick else 10, directory) for count in COUNTS]
+
+
+def _outages(count: int, cuts: int, directory: Path) -> Figure:
+    found: list[float] = []
+    for number in range(cuts):
+        with Stage(directory / f"outage-{count}-{number}", means()) as stage:
+            stage.directory.mkdir()
+            stage.start()
+            found += _one_cut(stage, count)
+    return Figure("power cut to next output", f"{count} at once", "ms", tuple(found))
+
+
+def _one_cut(stage: Stage, count: int) -> list[float]:
+    """Milliseconds from the cut to the first byte that each program writes at the standby."""
+    primary, standby = stage.robots
+    for number in range(count):
+        with primary.control() as link:
+            link.ask("run", argv=["/usr/bin/python3", "-S", "-c", COUNTING], name=f"count{number}", cwd="/", wait=False)
+    _wait_for_snapshots(standby, count)
+    cut = time.monotonic()
+    primary.cut_power()
+    logs = sorted((standby.directory / "state" / "logs").glob("*/stdout.log"))
+    sizes = {log: log.stat().st_size for log in logs}
+    first: dict[Path, float] = {}
+    while len(first) < count:
+        now = time.monotonic()
+        if now > cut + PATIENCE_S:
+            raise RuntimeError(
+                f"{count - len(first)} of {count} programs did not go on at {standby.name}: {standby.last_words()}"
+            )
+        for log in logs:
+            size = log.stat().st_size
+            if size > sizes[log] and now > cut + IN_FLIGHT_S:
+                first.setdefault(log, now)
+            sizes[log] = size
+        time.sleep(0.0005)
+    return [(instant - cut) * 1e3 for instant in first.values()]
+
+
+def _wait_for_snapshots(standby: RobotMachine, count: int) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        components = standby.status()["components"]
+        if len(components) == count and all((one["snapshots"] or 0) >= SNAPSHOTS for one in components):
+            return
+        time.sleep(0.02)
+    raise RuntimeError(f"no {SNAPSHOTS} snapshots of each program came to {standby.name}: {standby.last_words()}")
