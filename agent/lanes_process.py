@@ -43,6 +43,8 @@ class LanesProcess:
         self._waiting: deque[ToLanes] = deque()
         self._expected: dict[tuple[str, str], Act] = {}
         self._admitted: dict[str, acts.Admit] = {}
+        self._ready = False
+        self._early: deque[Act] = deque(maxlen=WAITING_LIMIT)
 
     def start(self) -> None:
         """Start the process; it begins by sending its inventory.
@@ -63,6 +65,7 @@ class LanesProcess:
             theirs.close()
         self._channel = Channel(ours, ToHeart)
         self._waiting.clear()
+        self._ready = False
 
     def fileno(self) -> int:
         """Readable when `receive` has something."""
@@ -78,12 +81,28 @@ class LanesProcess:
         self._waiting.append(message)
 
     def order(self, act: Act) -> None:
-        """Pass an act on, and remember it until it is answered."""
+        """Pass an act on, and remember it until it is answered.
+
+        A process that has not sent its inventory cannot carry anything out yet: what is expected of it counts as lost when the
+        inventory comes, the rest is sent then.
+        """
+        expected = isinstance(act, EXPECTED)
         if isinstance(act, acts.Admit):
             self._admitted[act.component] = act
-        if isinstance(act, acts.Start | acts.Restore | acts.Capture | acts.Ship | acts.Stop | acts.End):
-            self._expected[type(act).__name__, act.component] = act
-        self.send(door.order(act))
+        if expected:
+            self._expected[type(act).__name__, act.component] = act  # type: ignore[union-attr]
+        if self._ready:
+            self.send(door.order(act))
+        elif not expected and not isinstance(act, acts.Admit):
+            self._early.append(act)
+
+    def ready(self) -> None:
+        """The inventory has come: whatever was ordered in the meantime leaves now."""
+        self._ready = True
+        for admit in self._admitted.values():
+            self.send(door.order(admit))
+        while self._early:
+            self.send(door.order(self._early.popleft()))
 
     def flush(self) -> None:
         """Send what waits, as much as goes without waiting."""
@@ -116,8 +135,7 @@ class LanesProcess:
 
     def lost(self, inventory: Inventory) -> list[Event]:
         """After a restart: what the core must hear, and what the new process must be told again."""
-        for admit in self._admitted.values():
-            self.send(door.order(admit))
+        self.ready()
         expected, self._expected = self._expected, {}
         told: list[Event] = []
         for act in expected.values():
@@ -150,6 +168,9 @@ class LanesProcess:
             os.kill(self._child.pid, signal.SIGKILL)
             self._child.wait()
 
+
+EXPECTED: Final = (acts.Start, acts.Restore, acts.Capture, acts.Ship, acts.Stop, acts.End)
+"""Acts that the core waits for."""
 
 ANSWERS: Final[dict[type[Event], tuple[str, ...]]] = {
     events.Started: ("Start",),

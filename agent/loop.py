@@ -214,6 +214,7 @@ class Heart:
             for event in self._lanes.lost(inventory):
                 self._step(event)
             return
+        self._lanes.ready()
         boot = self._ballot.record.boot
         config = node_config(self._settings)
         durable = self._outbox.durable

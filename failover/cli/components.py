@@ -70,7 +70,7 @@ class _Follower:
             if not self._name:
                 raise
         while True:
-            with self._reconnect() as agent:
+            with reconnect(self._arguments, self._name) as agent:
                 try:
                     return self._show(agent, "logs", {"name": self._name, "follow": True, "offsets": self._offsets})
                 except LostAgentError:
@@ -97,19 +97,6 @@ class _Follower:
         else:
             _notes(started)
 
-    def _reconnect(self) -> Control:
-        deadline = time.monotonic() + RECONNECT_S
-        while True:
-            try:
-                return connect(self._arguments)
-            except NoAgentError as error:
-                if time.monotonic() > deadline:
-                    raise LostAgentError(
-                        f"the agent went away and did not come back within {RECONNECT_S:.0f} s; {self._name} runs on without it: "
-                        f"start failover-agent, then follow with: failover logs --follow {self._name}"
-                    ) from error
-                time.sleep(RECONNECT_EVERY_S)
-
     @contextmanager
     def passing_signals_on(self) -> Iterator[None]:
         """Ctrl-C and termination are the program's business: pass them on instead of leaving it behind."""
@@ -132,6 +119,25 @@ class _Follower:
                 agent.ask("stop", name=self._name, signal=number)
         except FailoverError as error:
             print(f"failover: {error}", file=sys.stderr)
+
+
+def reconnect(arguments: argparse.Namespace, name: str) -> Control:
+    """Wait for an agent that went away in the middle of a component's output.
+
+    Raises:
+        LostAgentError: it did not come back.
+    """
+    deadline = time.monotonic() + RECONNECT_S
+    while True:
+        try:
+            return connect(arguments)
+        except NoAgentError as error:
+            if time.monotonic() > deadline:
+                raise LostAgentError(
+                    f"the agent went away and did not come back within {RECONNECT_S:.0f} s; {name} runs on without it: "
+                    f"start failover-agent, then follow with: failover logs --follow {name}"
+                ) from error
+            time.sleep(RECONNECT_EVERY_S)
 
 
 def write_output(piece: Output) -> None:
@@ -189,20 +195,37 @@ def stop(arguments: argparse.Namespace) -> int:
 
 
 def logs(arguments: argparse.Namespace) -> int:
-    """Show what a component wrote, from whichever robot it wrote it."""
-    totals: dict[str, Any] = {}
-    with connect(arguments) as agent:
-        try:
-            for reply in agent.stream("logs", name=arguments.name, follow=arguments.follow):
-                if isinstance(reply, Output):
-                    _show_piece(arguments, reply)
-                elif isinstance(reply, Result):
-                    totals = reply.value
-        except KeyboardInterrupt:
-            return 0
+    """Show what a component wrote, from whichever robot it wrote it; with --follow through restarts of the agent."""
+    offsets = [0, 0]
+    agent = connect(arguments)
+    try:
+        while True:
+            try:
+                totals = _show_logs(agent, arguments, offsets)
+                break
+            except LostAgentError:
+                if not arguments.follow:
+                    raise
+                agent.close()
+                agent = reconnect(arguments, arguments.name)
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        agent.close()
     if arguments.json:
         render.as_json(totals)
     return 0
+
+
+def _show_logs(agent: Control, arguments: argparse.Namespace, offsets: list[int]) -> dict[str, Any]:
+    """Show the streams from the offsets on, which move along; returns what the agent ends with."""
+    for reply in agent.stream("logs", name=arguments.name, follow=arguments.follow, offsets=offsets):
+        if isinstance(reply, Output):
+            _show_piece(arguments, reply)
+            offsets[reply.stream - 1] = reply.offset + len(reply.content)
+        elif isinstance(reply, Result):
+            return reply.value
+    return {}
 
 
 def _show_piece(arguments: argparse.Namespace, piece: Output) -> None:

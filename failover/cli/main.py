@@ -27,6 +27,13 @@ INTERRUPTED: Final = 128 + signal.SIGINT
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command line; returns its exit status. Errors are told on standard error, never as a traceback."""
+    try:
+        return _main(argv)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+def _main(argv: Sequence[str] | None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a name in other letters than the terminal's must not end in an error
@@ -46,8 +53,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return FAILED
     except OSError as error:
         return tell(error, arguments, FAILED)
-    except KeyboardInterrupt:
-        return INTERRUPTED
 
 
 def verb_function(name: str) -> Callable[[argparse.Namespace], int]:

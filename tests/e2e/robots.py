@@ -42,6 +42,8 @@ def two_robots(directory: Path, settings: str = "") -> Iterator[tuple[RobotMachi
         try:
             until(lambda: connected(first) and connected(second), "the robots to hear each other")
             yield first, second
+            for robot in stage.robots:
+                assert "Traceback" not in robot.log.read_text(errors="replace"), f"a mistake in the agent of {robot.name}"
         finally:
             for robot in stage.robots:  # shown by pytest where a test fails
                 print(f"--- {robot.name} said:", *robot.log.read_text(errors="replace").splitlines()[-LOG_LINES:], sep="\n")

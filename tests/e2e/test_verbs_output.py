@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -94,3 +96,22 @@ def test_run_stays_with_its_program_when_that_is_handed_over(pair: Pair, tmp_pat
     assert running.wait(timeout=robots.PATIENCE_S) == 7
     assert lines(out) == list(range(BRIEF))
     assert lines(err) == [-number for number in range(BRIEF)]
+
+
+def test_whoever_watches_goes_on_when_the_agent_is_back(pair: Pair, tmp_path: Path) -> None:
+    first, _ = pair
+    robots.run(first, "both", *program(ENDLESS))
+    until_protected(first)
+    out, err = tmp_path / "out", tmp_path / "err"
+    with out.open("wb") as stdout, err.open("wb") as stderr:
+        watching = subprocess.Popen(command(first, "logs", "--follow", "both"), stdout=stdout, stderr=stderr)
+    try:
+        robots.until(lambda: len(lines(out)) > 20, "the output to be seen")
+        os.kill(robots.host_pid(first, first.status()["lanes_pid"]), signal.SIGKILL)
+        seen = len(lines(out))
+        robots.until(lambda: len(lines(out)) > seen + 100, "the output to go on")
+    finally:
+        watching.terminate()
+        watching.wait()
+    assert lines(out) == list(range(len(lines(out))))
+    assert lines(err) == [-number for number in range(len(lines(err)))]
