@@ -7,8 +7,8 @@ import struct
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from checkpoint.linux.dirty import NOT_CARRIED
 from checkpoint.linux.procfs import DELETED, MapsLine
+from checkpoint.linux.tracking import NOT_CARRIED
 from checkpoint.model import FileIdentity, Vma, VmaKind
 from checkpoint.resources import files
 

@@ -15,40 +15,32 @@ written meanwhile.
 from __future__ import annotations
 
 import contextlib
-import functools
 import gc
 import os
-import re
 import signal
-import socket
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from blake3 import blake3
 
 from checkpoint import pages
 from checkpoint.arch import x86_64 as arch
 from checkpoint.chain import position_of
 from checkpoint.engine import CaptureOrder, Streams
+from checkpoint.engines import description, entering
 from checkpoint.engines import probe as probing
+from checkpoint.engines.entering import Entered, where_it_stands
 from checkpoint.engines.identities import Identities
 from checkpoint.engines.inquiry import Inquiry, Told, rearmed
 from checkpoint.engines.outputs import Outputs, Totals
-from checkpoint.engines.restart import Interruption, outside_critical_section, undisturbed
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, UnsupportedError
-from checkpoint.linux import abi, dirty, procfs, remote
-from checkpoint.linux.dirty import NONE, DigestTracker, PagemapTracker, SharedPages, SoftDirtyTracker, Tracker
-from checkpoint.linux.memory import Memory
+from checkpoint.linux import abi, digests, pagetables, procfs, tracking
+from checkpoint.linux.digests import SharedPages
 from checkpoint.linux.procfs import MapsLine, MapsReader, Stat, Status
-from checkpoint.linux.remote import BorrowedPages
 from checkpoint.linux.tracee import Tracee
+from checkpoint.linux.tracking import NONE
 from checkpoint.model import (
-    Credentials,
-    Machine,
-    MemoryLayout,
     Position,
     ProcessState,
     Rseq,
@@ -59,15 +51,10 @@ from checkpoint.model import (
 from checkpoint.pages import PageTable, Words
 from checkpoint.resources import OpenFile, Surroundings, gather, look, unsupported, with_contents
 
-LIMIT_COUNT: Final = 16
-"""RLIMIT numbers of Linux. Source: asm-generic/resource.h."""
 US_PER_NS: Final = 1000
 EMPTY_CONTENT: Final = bytearray()
 BUFFER_SIZE: Final = 8 << 20
 """Bytes that a freeze may copy without asking for memory first."""
-LEAVE_TIMEOUT_S: Final = 0.5
-"""How long a program may take to leave the code of a tracer that died in the middle: that waits 100 ms at most."""
-LEAVE_PAUSE_S: Final = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +62,7 @@ class Frozen:
     """Everything that one freeze brought home; nothing in it needs the process any more.
 
     Attributes:
-        written, cleared: relative to the acknowledged position, see `dirty.Scan`.
+        written, cleared: relative to the acknowledged position, see `tracking.Scan`.
         content: begins with the bytes of ``written``.
         status, stat: of /proc, unparsed.
         freeze_us: how long the program stood still.
@@ -117,22 +104,14 @@ class PtraceSession:
     acknowledged position; ``_table`` is the state at the last capture that was handed out.
     """
 
-    def __init__(
-        self,
-        pid: int,
-        component: str,
-        tracee: Tracee,
-        borrowed: BorrowedPages,
-        tracker: Tracker,
-        interruption: Interruption,
-    ) -> None:
+    def __init__(self, pid: int, component: str, tracee: Tracee, entered: Entered) -> None:
         self.pid = pid
         self.component = component
-        self.notes: tuple[str, ...] = ()
+        self.notes = entered.notes
         self.totals: Totals = (0, 0)
         self._tracee = tracee
-        self._borrowed = borrowed
-        self._tracker = tracker
+        self._borrowed = entered.pages
+        self._tracker = entered.tracker
         self._shared = SharedPages(pid)
         self._maps = MapsReader(pid)
         self._has_moved = False
@@ -146,7 +125,7 @@ class PtraceSession:
         self._flags: dict[int, tuple[str, ...]] = {}
         self._flags_of: tuple[MapsLine, ...] = ()
         self._identities = Identities(pid)
-        self._interruption = interruption
+        self._interruption = entered.interruption
         self._outputs: Outputs | None = None
         self._based = False
         self._table = PageTable.empty(abi.PAGE_SIZE)
@@ -168,7 +147,8 @@ class PtraceSession:
             if not report.supported:
                 listed = "; ".join(report.reasons)
                 raise UnsupportedError(f"cannot protect pid {pid} ({report.command}): {listed}", report.reasons)
-            session = _entered(cls, pid, component)
+            tracee = Tracee(pid)
+            session = cls(pid, component, tracee, entering.enter(tracee))
         except BaseException:
             if outputs:
                 outputs.close()
@@ -265,7 +245,7 @@ class PtraceSession:
         existing = self._tracker.existing(lines)
         found, content = [], bytearray(pages.total_size(existing))
         filled = 0
-        for chunk in dirty.chunks_of(existing):
+        for chunk in digests.chunks_of(existing):
             try:
                 part = self._tracee.memory.read_pages(chunk)
             except ProcessGoneError:
@@ -276,7 +256,7 @@ class PtraceSession:
             content[filled : filled + len(part)] = part
             filled += len(part)
         del content[filled:]
-        return dirty.pages_joined(np.concatenate(found)) if found else NONE, content
+        return pagetables.pages_joined(np.concatenate(found)) if found else NONE, content
 
     def _frozen_look(self, *, base: bool, hold: bool) -> Frozen:
         tracee = self._tracee
@@ -328,7 +308,7 @@ class PtraceSession:
         pending = tracee.pending(shared=False) if waits_here else ()
         shared_pending = tracee.pending(shared=True) if waits_shared else ()
         mask, rseq = tracee.signal_mask(), tracee.rseq()
-        decoded = _where_it_stands(tracee, mask, (*pending, *shared_pending), rseq)
+        decoded = where_it_stands(tracee, mask, (*pending, *shared_pending), rseq)
         if self._borrowed.holds(decoded[arch.INSTRUCTION_POINTER]):
             raise CaptureError(f"pid {self.pid} still stands in code of an earlier look; capture it again in a moment")
         registers = arch.encode_registers(decoded)
@@ -366,10 +346,10 @@ class PtraceSession:
             return
         self._has_moved = True
         self._lines = tuple(line for line in self._maps.lines if not self._borrowed.holds(line.start))
-        self._private = [line for line in self._lines if dirty.is_private(line)]
-        self._shared_lines = [line for line in self._lines if dirty.is_shared(line)]
+        self._private = [line for line in self._lines if tracking.is_private(line)]
+        self._shared_lines = [line for line in self._lines if tracking.is_shared(line)]
 
-    def _scan(self) -> dirty.Scan:
+    def _scan(self) -> tracking.Scan:
         """What was written since the last scan. One that fails half-way has protected pages that it tells nobody of."""
         try:
             scan = self._tracker.scan(self._private, changed=self._has_moved)
@@ -381,7 +361,7 @@ class PtraceSession:
             return scan
         self._had_shared = bool(self._shared_lines)
         shared = self._shared.scan(self._shared_lines)
-        return dirty.Scan(pages.union(scan.written, shared.written), pages.union(scan.cleared, shared.cleared))
+        return tracking.Scan(pages.union(scan.written, shared.written), pages.union(scan.cleared, shared.cleared))
 
     def _start_over(self) -> None:
         """Make the next snapshot a base, with everything armed anew: what was written is not known any more."""
@@ -405,12 +385,12 @@ class PtraceSession:
             self._flags = procfs.parse_vm_flags(procfs.read_text(self.pid, "smaps"))
             self._flags_of = self._maps.lines
 
-    def _remember(self, scan: dirty.Scan) -> None:
+    def _remember(self, scan: tracking.Scan) -> None:
         """Keep what a scan found until it is acknowledged; a scan whose capture failed is joined with the next."""
         if self._unacknowledged and self._unacknowledged[-1].position is None:
             last = self._unacknowledged.pop()
             still = pages.intersection(pages.difference(last.written, scan.cleared), self._mapped())
-            scan = dirty.Scan(pages.union(still, scan.written), pages.union(last.cleared, scan.cleared))
+            scan = tracking.Scan(pages.union(still, scan.written), pages.union(last.cleared, scan.cleared))
         self._unacknowledged.append(Unacknowledged(None, scan.written, scan.cleared))
 
     def _since_acknowledged(self, *, base: bool) -> tuple[Words, Words]:
@@ -426,7 +406,7 @@ class PtraceSession:
 
     def _mapped(self) -> Words:
         """Everything that a snapshot may carry pages of."""
-        return dirty.extents_of([line for line in self._lines if line.name not in dirty.NOT_CARRIED])
+        return tracking.extents_of([line for line in self._lines if line.name not in tracking.NOT_CARRIED])
 
     # Describing, while the program runs
 
@@ -450,7 +430,7 @@ class PtraceSession:
             engine="ptrace",
             position=Position(order.generation, order.sequence, bytes(16)),
             parent=parent,
-            machine=replace(this_machine(), robot=order.robot, xstate_mask=_xstate_mask(frozen.xstate)),
+            machine=replace(description.this_machine(), robot=order.robot, xstate_mask=description.xstate_mask(frozen.xstate)),
             clocks=frozen.told.clocks,
             process=self._process_state(frozen),
             threads=(self._thread_state(frozen),),
@@ -465,7 +445,7 @@ class PtraceSession:
         addresses = pages.addresses_of(frozen.written, abi.PAGE_SIZE)
         content: bytearray | memoryview = frozen.content
         zero = pages.zero_pages(content, abi.PAGE_SIZE) if len(addresses) else np.zeros(0, dtype=np.bool_)
-        of_files = dirty.extents_of([line for line in frozen.lines if line.has_file])
+        of_files = tracking.extents_of([line for line in frozen.lines if line.has_file])
         zero &= ~pages.covered(of_files, addresses)
         cleared = frozen.cleared
         if zero.any():
@@ -494,11 +474,11 @@ class PtraceSession:
             robust_list=told.robust_list,
             clear_tid=told.clear_tid,
             rseq=frozen.rseq,
-            policy=_policy(self.pid),
+            policy=description.policy(self.pid),
             priority=stat.priority,
             nice=stat.nice,
             io_priority=abi.io_priority(self.pid),
-            affinity=_affinity(self.pid),
+            affinity=description.affinity(self.pid),
             timer_slack_ns=told.timer_slack_ns,
             interrupted=frozen.interrupted,
         )
@@ -512,13 +492,13 @@ class PtraceSession:
             sid=status.sids[-1] if status.sids else 0,
             executable=self._identities.executable(),
             arguments=tuple(os.fsdecode(procfs.read_bytes(self.pid, "cmdline")).split("\0")[:-1]),
-            layout=_layout(_stat_of(frozen), told, procfs.read_bytes(self.pid, "auxv")),
+            layout=description.layout(_stat_of(frozen), told, procfs.read_bytes(self.pid, "auxv")),
             working_directory=procfs.read_link(self.pid, "cwd"),
             root_directory=procfs.read_link(self.pid, "root"),
             umask=status.umask,
-            credentials=_credentials(status, told),
+            credentials=description.credentials(status, told),
             personality=int(procfs.read_text(self.pid, "personality"), 16),
-            limits=_limits(self.pid),
+            limits=description.limits(self.pid),
             oom_score_adj=int(procfs.read_text(self.pid, "oom_score_adj")),
             dumpable=told.dumpable,
             keep_caps=told.keep_caps,
@@ -526,7 +506,7 @@ class PtraceSession:
             parent_death_signal=told.parent_death_signal,
             thp_disabled=told.thp_disabled,
             switches=told.switches,
-            coredump_filter=_coredump_filter(self.pid),
+            coredump_filter=description.coredump_filter(self.pid),
             signal_actions=told.actions,
             pending=frozen.shared_pending,
             interval_timers=told.interval_timers,
@@ -535,89 +515,7 @@ class PtraceSession:
         )
 
 
-# Entering
-
-
-def _entered(kind: type[PtraceSession], pid: int, component: str) -> PtraceSession:
-    """Borrow pages, choose how to track, and let go again."""
-    tracee, interruption = Tracee(pid), Interruption(Memory(pid))
-    deadline = time.perf_counter() + LEAVE_TIMEOUT_S
-    while (entered := _try_to_enter(tracee, interruption, last=time.perf_counter() > deadline)) is None:
-        time.sleep(LEAVE_PAUSE_S)
-    tracker, notes = _tracker_for(pid, entered)
-    session = kind(pid, component, tracee, entered.pages, tracker, interruption)
-    session.notes = notes
-    return session
-
-
-def _try_to_enter(tracee: Tracee, interruption: Interruption, *, last: bool) -> remote.Entered | None:
-    """Enter once; None while the program still stands in the code of a tracer that died.
-
-    Args:
-        last: waiting has helped nothing: pages that somebody was in are left to the program.
-    """
-    with _stopped(tracee):
-        mask = tracee.signal_mask()
-        pending = (*tracee.pending(shared=False), *tracee.pending(shared=True))
-        decoded = _where_it_stands(tracee, mask, pending, tracee.rseq())
-        lines = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
-        left = remote.leftovers(tracee.memory, lines)
-        place = decoded[arch.INSTRUCTION_POINTER]
-        stands_inside = remote.is_in_stub(place, tracee.memory, lines) or any(borrowed.holds(place) for borrowed in left)
-        if stands_inside or (not last and any(borrowed.state() == remote.ARMED for borrowed in left)):
-            if last:
-                raise CaptureError(f"pid {tracee.pid} does not leave the code of an earlier tracer; protect it again")
-            return None
-        interruption.settled(decoded)  # remembers the call that it stands in
-        registers = arch.encode_registers(decoded)
-        for borrowed in left:
-            if borrowed.state() == remote.ARMED:
-                borrowed.abandon()
-        free = [borrowed for borrowed in left if borrowed.state() != remote.ABANDONED]
-        if free:
-            entered = remote.reenter(tracee, free[0], registers, mask)
-        else:
-            entered = remote.enter(tracee, lines, registers, mask)
-        batch = remote.Batch(entered.pages.table)
-        batch.add("close", entered.inside)
-        entered.pages.run(tracee, batch, registers, mask)
-        return entered
-
-
-def _where_it_stands(tracee: Tracee, mask: int, pending: tuple[bytes, ...], rseq: Rseq | None) -> arch.Registers:
-    """The registers that the program is given back: as they are, but for what our stop alone has brought about."""
-    decoded = arch.decode_registers(tracee.registers())
-    if decoded[arch.CALL_NUMBER] >> 63:
-        return outside_critical_section(decoded, tracee.memory, rseq.address) if rseq else decoded
-    return undisturbed(decoded, bool(_unblocked(pending, mask)))
-
-
-def _tracker_for(pid: int, entered: remote.Entered) -> tuple[Tracker, tuple[str, ...]]:
-    """The best way to find written pages that this kernel has for this process, and what to say about it."""
-    why = os.strerror(entered.why_not)
-    if entered.faults is not None:
-        try:
-            return PagemapTracker(pid, entered.faults), ()
-        except OSError as error:
-            os.close(entered.faults)
-            why = str(error)
-    tracker: Tracker = SoftDirtyTracker(pid) if dirty.has_soft_dirty() else DigestTracker(pid)
-    return tracker, (f"written pages are found by {tracker.name}, which takes longer: no write protection ({why})",)
-
-
-@contextlib.contextmanager
-def _stopped(tracee: Tracee) -> Iterator[None]:
-    """Hold it still for the body; let it go however that ends."""
-    tracee.seize()
-    try:
-        tracee.freeze()
-        yield
-    finally:
-        with contextlib.suppress(ProcessGoneError):
-            tracee.detach()
-
-
-# Pieces of a description
+# Pieces
 
 
 def _readable(tracee: Tracee, ranges: Words) -> tuple[Words, bytearray]:
@@ -637,7 +535,7 @@ def _readable(tracee: Tracee, ranges: Words) -> tuple[Words, bytearray]:
 def _merged(copied: tuple[Words, bytearray], frozen: Frozen) -> Frozen:
     """One base of the pages that were copied while the program ran and those of the freeze."""
     before, content = copied
-    mapped = dirty.extents_of([line for line in frozen.lines if line.name not in dirty.NOT_CARRIED])
+    mapped = tracking.extents_of([line for line in frozen.lines if line.name not in tracking.NOT_CARRIED])
     replaced = pages.union(frozen.written, frozen.cleared)
     keep = pages.intersection(pages.difference(before, replaced), mapped)
     old = pages.addresses_of(before, abi.PAGE_SIZE)
@@ -665,117 +563,3 @@ def _status_of(frozen: Frozen) -> Status:
 
 def _stat_of(frozen: Frozen) -> Stat:
     return procfs.parse_stat(os.fsdecode(frozen.stat))
-
-
-def _unblocked(pending: tuple[bytes, ...], mask: int) -> list[int]:
-    numbers = (int.from_bytes(siginfo[:4], "little") for siginfo in pending)
-    return [number for number in numbers if not mask >> (number - 1) & 1]
-
-
-def _layout(stat: Stat, told: Told, auxv: bytes) -> MemoryLayout:
-    return MemoryLayout(
-        start_code=stat.start_code,
-        end_code=stat.end_code,
-        start_data=stat.start_data,
-        end_data=stat.end_data,
-        start_brk=stat.start_brk,
-        brk=told.brk,
-        start_stack=stat.start_stack,
-        arg_start=stat.arg_start,
-        arg_end=stat.arg_end,
-        env_start=stat.env_start,
-        env_end=stat.env_end,
-        auxv=auxv,
-    )
-
-
-def _credentials(status: Status, told: Told) -> Credentials:
-    return Credentials(
-        uids=status.uids,
-        gids=status.gids,
-        groups=status.groups,
-        capabilities=status.capabilities,
-        no_new_privs=status.no_new_privs,
-        securebits=told.securebits,
-    )
-
-
-_LIMIT_LINE: Final = re.compile(r" (unlimited|[0-9]+) +(unlimited|[0-9]+) ")
-
-
-def _limits(pid: int) -> dict[int, tuple[int, int]]:
-    """Soft and hard limits from /proc/PID/limits, whose lines stand in the order of the numbers; -1 is infinity.
-
-    prlimit(2) would need CAP_SYS_RESOURCE for a process of another user.
-    """
-    lines = procfs.read_text(pid, "limits").splitlines()[1 : LIMIT_COUNT + 1]
-    found = (_LIMIT_LINE.search(line) for line in lines)
-    return {number: (_limit(match[1]), _limit(match[2])) for number, match in enumerate(found) if match}
-
-
-def _limit(word: str) -> int:
-    return -1 if word == "unlimited" else int(word)
-
-
-def _coredump_filter(pid: int) -> int:
-    """Source: core(5); the file is empty for a process without memory, and missing where the kernel makes no core dumps."""
-    try:
-        return int(procfs.read_text(pid, "coredump_filter"), 16)
-    except (ProbeError, ValueError):
-        return -1
-
-
-def _policy(pid: int) -> int:
-    """The scheduling policy with SCHED_RESET_ON_FORK, as sched_setscheduler(2) takes it."""
-    try:
-        return os.sched_getscheduler(pid)
-    except ProcessLookupError as error:
-        raise ProcessGoneError(f"pid {pid} ended while it was being described") from error
-
-
-def _affinity(pid: int) -> tuple[int, ...]:
-    try:
-        return tuple(sorted(os.sched_getaffinity(pid)))
-    except ProcessLookupError as error:
-        raise ProcessGoneError(f"pid {pid} ended while it was being described") from error
-
-
-XSTATE_HEADER: Final = 512
-"""Offset of XSTATE_BV, the bits of the components that are in use. Source: Intel SDM volume 1, 13.4.2."""
-
-
-def _xstate_mask(xstate: bytes) -> int:
-    return int.from_bytes(xstate[XSTATE_HEADER : XSTATE_HEADER + 8], "little")
-
-
-@functools.cache
-def this_machine() -> Machine:
-    """Where we run; ``robot`` and ``xstate_mask`` are left to the capture."""
-    about = os.uname()
-    with open("/proc/sys/kernel/random/boot_id") as file:
-        boot_id = file.read().strip()
-    return Machine(
-        architecture=about.machine,
-        page_size=abi.PAGE_SIZE,
-        kernel=about.release,
-        boot_id=boot_id,
-        hostname=socket.gethostname(),
-        features=_features(),
-        vdso_digest=_vdso_digest(),
-    )
-
-
-def _features() -> tuple[str, ...]:
-    with open("/proc/cpuinfo") as file:
-        for line in file:
-            if line.startswith("flags"):
-                return tuple(sorted(line.partition(":")[2].split()))
-    return ()
-
-
-def _vdso_digest() -> bytes:
-    own = os.getpid()
-    for line in procfs.parse_maps(procfs.read_text(own, "maps")):
-        if line.name == "[vdso]":
-            return blake3(Tracee(own).memory.read(line.start, line.size)).digest()
-    return b""

@@ -14,8 +14,8 @@ from blake3 import blake3
 
 from checkpoint.arch import x86_64, x86_64_stub
 from checkpoint.engine import RestoreOptions
+from checkpoint.engines.description import this_machine
 from checkpoint.engines.identities import build_id
-from checkpoint.engines.ptrace_capture import this_machine
 from checkpoint.engines.restore_memory import is_file_mapping, kernel_pages, kernel_pages_of
 from checkpoint.errors import MismatchError
 from checkpoint.linux import abi, procfs

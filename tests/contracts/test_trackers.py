@@ -1,4 +1,4 @@
-"""The contract of ``checkpoint.linux.dirty.Tracker``, on every implementation that this kernel has.
+"""The contract of ``checkpoint.linux.tracking.Tracker``, on every implementation that this kernel has.
 
 A child of ours obeys one-letter orders about one mapping; we follow it from outside. It stands still whenever we look,
 because it waits for the next order.
@@ -17,14 +17,17 @@ import numpy as np
 import pytest
 
 from checkpoint import pages
-from checkpoint.linux import abi, dirty
-from checkpoint.linux.dirty import DigestTracker, PagemapTracker, Scan, SoftDirtyTracker, Tracker
+from checkpoint.linux import abi, dirty, write_protection
+from checkpoint.linux.digests import DigestTracker
+from checkpoint.linux.dirty import SoftDirtyTracker
 from checkpoint.linux.memory import Memory
-from checkpoint.linux.procfs import MapsReader
+from checkpoint.linux.procfs import MapsLine, MapsReader
+from checkpoint.linux.tracking import Scan, Tracker
+from checkpoint.linux.write_protection import PagemapTracker
 
 PAGE = abi.PAGE_SIZE
 COUNT = 256
-"""Pages of the child's mapping: more than what may be a page on the move (`dirty.MARKER_RUN`)."""
+"""Pages of the child's mapping: more than what may be a page on the move (`pagetables.MARKER_RUN`)."""
 
 CHILD = r"""
 import ctypes, os, sys
@@ -84,7 +87,7 @@ class Child:
         changed = self.maps.refresh()
         return self.tracker.scan(self.lines(), changed=changed)
 
-    def lines(self) -> list[dirty.MapsLine]:
+    def lines(self) -> list[MapsLine]:
         """The lines of its mapping."""
         return [line for line in self.maps.lines if self.place <= line.start < self.place + COUNT * PAGE]
 
@@ -188,10 +191,10 @@ def test_existing_pages_are_those_with_content(child: Child) -> None:
 
 
 def test_large_mappings_are_protected_around_what_exists() -> None:
-    line = dirty.MapsLine(0, 64 << 30, 3, False, 0, 0, 0, "")
+    line = MapsLine(0, 64 << 30, 3, False, 0, 0, 0, "")
     existing = np.array([[1 << 30, (1 << 30) + PAGE], [(1 << 30) + (4 << 20), (1 << 30) + (4 << 20) + PAGE]], dtype=np.uint64)
-    windows = dirty.windows_of(line, existing)
-    assert pages.total_size(windows) <= 4 * dirty.WINDOW + dirty.WINDOW
+    windows = write_protection.windows_of(line, existing)
+    assert pages.total_size(windows) <= 4 * write_protection.WINDOW + write_protection.WINDOW
     assert not len(pages.difference(existing, windows))
 
 

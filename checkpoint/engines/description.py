@@ -1,0 +1,134 @@
+"""What a snapshot says of a process besides its pages, read from /proc and from what the process told: while it runs on."""
+
+from __future__ import annotations
+
+import functools
+import os
+import re
+import socket
+from typing import Final
+
+from blake3 import blake3
+
+from checkpoint.engines.inquiry import Told
+from checkpoint.errors import ProbeError, ProcessGoneError
+from checkpoint.linux import abi, procfs
+from checkpoint.linux.memory import Memory
+from checkpoint.linux.procfs import Stat, Status
+from checkpoint.model import Credentials, Machine, MemoryLayout
+
+LIMIT_COUNT: Final = 16
+"""RLIMIT numbers of Linux. Source: asm-generic/resource.h."""
+
+
+def layout(stat: Stat, told: Told, auxv: bytes) -> MemoryLayout:
+    """Where code, data, heap, stack, arguments and environment lie."""
+    return MemoryLayout(
+        start_code=stat.start_code,
+        end_code=stat.end_code,
+        start_data=stat.start_data,
+        end_data=stat.end_data,
+        start_brk=stat.start_brk,
+        brk=told.brk,
+        start_stack=stat.start_stack,
+        arg_start=stat.arg_start,
+        arg_end=stat.arg_end,
+        env_start=stat.env_start,
+        env_end=stat.env_end,
+        auxv=auxv,
+    )
+
+
+def credentials(status: Status, told: Told) -> Credentials:
+    """Whose rights it has."""
+    return Credentials(
+        uids=status.uids,
+        gids=status.gids,
+        groups=status.groups,
+        capabilities=status.capabilities,
+        no_new_privs=status.no_new_privs,
+        securebits=told.securebits,
+    )
+
+
+_LIMIT_LINE: Final = re.compile(r" (unlimited|[0-9]+) +(unlimited|[0-9]+) ")
+
+
+def limits(pid: int) -> dict[int, tuple[int, int]]:
+    """Soft and hard limits from /proc/PID/limits, whose lines stand in the order of the numbers; -1 is infinity.
+
+    prlimit(2) would need CAP_SYS_RESOURCE for a process of another user.
+    """
+    lines = procfs.read_text(pid, "limits").splitlines()[1 : LIMIT_COUNT + 1]
+    found = (_LIMIT_LINE.search(line) for line in lines)
+    return {number: (_limit(match[1]), _limit(match[2])) for number, match in enumerate(found) if match}
+
+
+def _limit(word: str) -> int:
+    return -1 if word == "unlimited" else int(word)
+
+
+def coredump_filter(pid: int) -> int:
+    """Source: core(5); the file is empty for a process without memory, and missing where the kernel makes no core dumps."""
+    try:
+        return int(procfs.read_text(pid, "coredump_filter"), 16)
+    except (ProbeError, ValueError):
+        return -1
+
+
+def policy(pid: int) -> int:
+    """The scheduling policy with SCHED_RESET_ON_FORK, as sched_setscheduler(2) takes it."""
+    try:
+        return os.sched_getscheduler(pid)
+    except ProcessLookupError as error:
+        raise ProcessGoneError(f"pid {pid} ended while it was being described") from error
+
+
+def affinity(pid: int) -> tuple[int, ...]:
+    """The processors that it may run on."""
+    try:
+        return tuple(sorted(os.sched_getaffinity(pid)))
+    except ProcessLookupError as error:
+        raise ProcessGoneError(f"pid {pid} ended while it was being described") from error
+
+
+XSTATE_HEADER: Final = 512
+"""Offset of XSTATE_BV, the bits of the components that are in use. Source: Intel SDM volume 1, 13.4.2."""
+
+
+def xstate_mask(xstate: bytes) -> int:
+    """Which parts of the processor\'s state are in use."""
+    return int.from_bytes(xstate[XSTATE_HEADER : XSTATE_HEADER + 8], "little")
+
+
+@functools.cache
+def this_machine() -> Machine:
+    """Where we run; ``robot`` and ``xstate_mask`` are left to the capture."""
+    about = os.uname()
+    with open("/proc/sys/kernel/random/boot_id") as file:
+        boot_id = file.read().strip()
+    return Machine(
+        architecture=about.machine,
+        page_size=abi.PAGE_SIZE,
+        kernel=about.release,
+        boot_id=boot_id,
+        hostname=socket.gethostname(),
+        features=_features(),
+        vdso_digest=_vdso_digest(),
+    )
+
+
+def _features() -> tuple[str, ...]:
+    with open("/proc/cpuinfo") as file:
+        for line in file:
+            if line.startswith("flags"):
+                return tuple(sorted(line.partition(":")[2].split()))
+    return ()
+
+
+def _vdso_digest() -> bytes:
+    own = os.getpid()
+    for line in procfs.parse_maps(procfs.read_text(own, "maps")):
+        if line.name == "[vdso]":
+            return blake3(Memory(own).read(line.start, line.size)).digest()
+    return b""

@@ -1,0 +1,123 @@
+"""The way into a process: pages borrowed from it, a tracker of what it writes, and where it stands when it is stopped."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from checkpoint.arch import x86_64 as arch
+from checkpoint.engines.restart import Interruption, outside_critical_section, undisturbed
+from checkpoint.errors import CaptureError, ProcessGoneError
+from checkpoint.linux import dirty, procfs, remote
+from checkpoint.linux.digests import DigestTracker
+from checkpoint.linux.dirty import SoftDirtyTracker
+from checkpoint.linux.memory import Memory
+from checkpoint.linux.remote import BorrowedPages
+from checkpoint.linux.tracee import Tracee
+from checkpoint.linux.tracking import Tracker
+from checkpoint.linux.write_protection import PagemapTracker
+from checkpoint.model import Rseq
+
+LEAVE_TIMEOUT_S: Final = 0.5
+"""How long a program may take to leave the code of a tracer that died in the middle: that waits 100 ms at most."""
+LEAVE_PAUSE_S: Final = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Entered:
+    """What one session works with; ``notes`` are sentences for the operator."""
+
+    pages: BorrowedPages
+    tracker: Tracker
+    interruption: Interruption
+    notes: tuple[str, ...]
+
+
+def enter(tracee: Tracee) -> Entered:
+    """Borrow pages, choose how to track, and let go again.
+
+    Raises:
+        CaptureError, ProcessGoneError: it could not be entered; nothing of ours is left in it.
+    """
+    interruption = Interruption(Memory(tracee.pid))
+    deadline = time.perf_counter() + LEAVE_TIMEOUT_S
+    while (entered := _try_to_enter(tracee, interruption, last=time.perf_counter() > deadline)) is None:
+        time.sleep(LEAVE_PAUSE_S)
+    tracker, notes = _tracker_for(tracee.pid, entered)
+    return Entered(entered.pages, tracker, interruption, notes)
+
+
+def _try_to_enter(tracee: Tracee, interruption: Interruption, *, last: bool) -> remote.Entered | None:
+    """Enter once; None while the program still stands in the code of a tracer that died.
+
+    Args:
+        last: waiting has helped nothing: pages that somebody was in are left to the program.
+    """
+    with stopped(tracee):
+        mask = tracee.signal_mask()
+        pending = (*tracee.pending(shared=False), *tracee.pending(shared=True))
+        decoded = where_it_stands(tracee, mask, pending, tracee.rseq())
+        lines = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
+        left = remote.leftovers(tracee.memory, lines)
+        place = decoded[arch.INSTRUCTION_POINTER]
+        stands_inside = remote.is_in_stub(place, tracee.memory, lines) or any(borrowed.holds(place) for borrowed in left)
+        if stands_inside or (not last and any(borrowed.state() == remote.ARMED for borrowed in left)):
+            if last:
+                raise CaptureError(f"pid {tracee.pid} does not leave the code of an earlier tracer; protect it again")
+            return None
+        interruption.settled(decoded)  # remembers the call that it stands in
+        registers = arch.encode_registers(decoded)
+        for borrowed in left:
+            if borrowed.state() == remote.ARMED:
+                borrowed.abandon()
+        free = [borrowed for borrowed in left if borrowed.state() != remote.ABANDONED]
+        if free:
+            entered = remote.reenter(tracee, free[0], registers, mask)
+        else:
+            entered = remote.enter(tracee, lines, registers, mask)
+        batch = remote.Batch(entered.pages.table)
+        batch.add("close", entered.inside)
+        entered.pages.run(tracee, batch, registers, mask)
+        return entered
+
+
+def where_it_stands(tracee: Tracee, mask: int, pending: tuple[bytes, ...], rseq: Rseq | None) -> arch.Registers:
+    """The registers that the program is given back: as they are, but for what our stop alone has brought about."""
+    decoded = arch.decode_registers(tracee.registers())
+    if decoded[arch.CALL_NUMBER] >> 63:
+        return outside_critical_section(decoded, tracee.memory, rseq.address) if rseq else decoded
+    return undisturbed(decoded, bool(_unblocked(pending, mask)))
+
+
+def _tracker_for(pid: int, entered: remote.Entered) -> tuple[Tracker, tuple[str, ...]]:
+    """The best way to find written pages that this kernel has for this process, and what to say about it."""
+    why = os.strerror(entered.why_not)
+    if entered.faults is not None:
+        try:
+            return PagemapTracker(pid, entered.faults), ()
+        except OSError as error:
+            os.close(entered.faults)
+            why = str(error)
+    tracker: Tracker = SoftDirtyTracker(pid) if dirty.has_soft_dirty() else DigestTracker(pid)
+    return tracker, (f"written pages are found by {tracker.name}, which takes longer: no write protection ({why})",)
+
+
+@contextlib.contextmanager
+def stopped(tracee: Tracee) -> Iterator[None]:
+    """Hold it still for the body; let it go however that ends."""
+    tracee.seize()
+    try:
+        tracee.freeze()
+        yield
+    finally:
+        with contextlib.suppress(ProcessGoneError):
+            tracee.detach()
+
+
+def _unblocked(pending: tuple[bytes, ...], mask: int) -> list[int]:
+    numbers = (int.from_bytes(siginfo[:4], "little") for siginfo in pending)
+    return [number for number in numbers if not mask >> (number - 1) & 1]

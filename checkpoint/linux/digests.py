@@ -1,0 +1,118 @@
+"""Changed pages by digest: for private mappings where the kernel tells nothing, and always for shared ones.
+
+Needs nothing of the kernel, and costs a pass over the memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from checkpoint import pages
+from checkpoint.linux import abi
+from checkpoint.linux.memory import Memory
+from checkpoint.linux.pagetables import existence
+from checkpoint.linux.procfs import MapsLine
+from checkpoint.linux.tracking import NONE, Scan, extents_of
+from checkpoint.pages import PageMap, Words
+
+READ_CHUNK: Final = 8 << 20
+
+
+class DigestTracker:
+    """Reads everything that exists and compares digests. Needs nothing of the kernel."""
+
+    name = "digest"
+
+    def __init__(self, pid: int) -> None:
+        self._memory = Memory(pid)
+        self._existence = existence(pid)
+        self._known = PageMap.empty()
+
+    def arm(self, lines: Sequence[MapsLine]) -> None:
+        """See `Tracker.arm`: nothing is known, so that the first scan finds everything."""
+        self._known = PageMap.empty()
+
+    def scan(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
+        """See `Tracker.scan`."""
+        existing = self.existing(lines)
+        addresses = pages.addresses_of(existing, abi.PAGE_SIZE)
+        digests = digests_of(self._memory, existing)
+        before, self._known = self._known, PageMap(addresses, digests)
+        return compared(before, self._known)
+
+    def existing(self, lines: Sequence[MapsLine]) -> Words:
+        """See `Tracker.existing`."""
+        return self._existence.existing(extents_of(lines))
+
+    def close(self) -> None:
+        """See `Tracker.close`."""
+        self._existence.close()
+
+
+def compared(before: PageMap, now: PageMap) -> Scan:
+    """Pages that are new or changed, and pages that went."""
+    places = np.minimum(np.searchsorted(before.addresses, now.addresses), max(len(before.addresses) - 1, 0))
+    if len(before.addresses):
+        same = (before.addresses[places] == now.addresses) & (before.words[places] == now.words).all(axis=1)
+    else:
+        same = np.zeros(len(now.addresses), dtype=np.bool_)
+    gone = before.addresses[~np.isin(before.addresses, now.addresses, assume_unique=True)]
+    return Scan(pages.extents_of_addresses(now.addresses[~same], abi.PAGE_SIZE), pages.extents_of_addresses(gone, abi.PAGE_SIZE))
+
+
+def digests_of(memory: Memory, existing: Words) -> Words:
+    """The digest of each page, read in chunks."""
+    found = []
+    for chunk in chunks_of(existing):
+        content = memory.read_pages(chunk)
+        found.append(pages.digest_pages(content, pages.addresses_of(chunk, abi.PAGE_SIZE), abi.PAGE_SIZE))
+    return np.concatenate(found) if found else NONE
+
+
+def chunks_of(ranges: Words, size: int = READ_CHUNK) -> list[Words]:
+    """The same set in parts of at most ``size`` bytes."""
+    parts: list[list[tuple[int, int]]] = [[]]
+    room = size
+    for start, end in ranges.tolist():
+        while start < end:
+            step = min(room, end - start)
+            parts[-1].append((start, start + step))
+            start, room = start + step, room - step
+            if not room:
+                parts.append([])
+                room = size
+    return [np.array(part, dtype=np.uint64) for part in parts if part]
+
+
+class SharedPages:
+    """Shared mappings, compared by page digest at every scan: others may write them behind our page tables."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._memory = Memory(pid)
+        self._existence = existence(pid)
+        self._known = PageMap.empty()
+
+    def scan(self, lines: Sequence[MapsLine]) -> Scan:
+        """Find what changed since the last scan; everything is new to the first."""
+        if not lines and not len(self._known.addresses):
+            return Scan(NONE, NONE)
+        existing = self.existing(lines)
+        before = self._known
+        self._known = PageMap(pages.addresses_of(existing, abi.PAGE_SIZE), digests_of(self._memory, existing))
+        return compared(before, self._known)
+
+    def existing(self, lines: Sequence[MapsLine]) -> Words:
+        """Populated pages of these mappings."""
+        return self._existence.existing(extents_of(lines), own=False)
+
+    def forget(self) -> None:
+        """Let the next scan find everything."""
+        self._known = PageMap.empty()
+
+    def close(self) -> None:
+        """Give descriptors back."""
+        self._existence.close()

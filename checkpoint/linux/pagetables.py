@@ -1,0 +1,197 @@
+"""Which pages of a process exist, and which were written: /proc/PID/pagemap, by PAGEMAP_SCAN or read as a file.
+
+Source: Documentation/admin-guide/mm/pagemap.rst.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+from typing import Final, Protocol
+
+import numpy as np
+
+from checkpoint import pages
+from checkpoint.errors import CaptureError, ProcessGoneError
+from checkpoint.linux import abi, procfs
+from checkpoint.linux.tracking import NONE
+from checkpoint.pages import Words
+
+REGION_COUNT: Final = 1 << 15
+"""Regions that one scan call may answer with; more are asked for in the next call."""
+MARKER_RUN: Final = 64 * abi.PAGE_SIZE
+"""Where nothing is swapped out, what looks so is a hole that we protected, or a page that the kernel moves just now: it moves 32
+at a time (COMPACT_CLUSTER_MAX), so a longer run is a hole."""
+
+
+class MappingLostError(CaptureError):
+    """A mapping is not write-protected any more."""
+
+
+class PageScanner:
+    """PAGEMAP_SCAN on one process's pagemap.
+
+    Raises:
+        ProcessGoneError: it ended, or it became another program (exec).
+    """
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._pagemap = os.open(f"/proc/{pid}/pagemap", os.O_RDONLY | os.O_CLOEXEC)
+        self._regions = np.zeros((REGION_COUNT, 3), dtype=np.uint64)
+        self._order = abi.PageScan(size=ctypes.sizeof(abi.PageScan), vec=self._regions.ctypes.data, vec_len=REGION_COUNT)
+
+    def close(self) -> None:
+        """Give the descriptor back."""
+        os.close(self._pagemap)
+
+    def is_protected(self, start: int, end: int) -> bool:
+        """Whether every mapping in a range is registered for asynchronous write protection."""
+        order = self._order
+        order.flags, order.start, order.end = abi.PM_SCAN_CHECK_WPASYNC, start, end
+        order.category_mask = order.category_inverted = abi.PAGE_IS_WPALLOWED
+        order.category_anyof_mask, order.return_mask = 0, abi.PAGE_IS_WPALLOWED
+        if abi.ioctl(self._pagemap, abi.PAGEMAP_SCAN, ctypes.addressof(order)) >= 0:
+            return True
+        return self._refused("check") != errno.EPERM
+
+    def written(self, ranges: Words) -> Words:
+        """Pages written since they were last protected, and holes that never were; all are protected again.
+
+        With exactly this mask the kernel takes its fast path.
+        """
+        order = self._order
+        order.flags = abi.PM_SCAN_CHECK_WPASYNC | abi.PM_SCAN_WP_MATCHING
+        order.category_mask, order.category_inverted, order.category_anyof_mask = abi.PAGE_IS_WRITTEN, 0, 0
+        order.return_mask = abi.PAGE_IS_WRITTEN
+        return self._collect(ranges)[:, :2]
+
+    def existing(self, ranges: Words, *, own: bool = True) -> Words:
+        """Pages present or swapped out.
+
+        Args:
+            own: leave out unchanged pages of files and the shared page of zeros.
+        """
+        order = self._order
+        unwanted = abi.PAGE_IS_FILE | abi.PAGE_IS_PFNZERO if own else abi.PAGE_IS_PFNZERO
+        order.flags = 0
+        order.category_mask = order.category_inverted = unwanted
+        order.category_anyof_mask = abi.PAGE_IS_PRESENT | abi.PAGE_IS_SWAPPED
+        order.return_mask = abi.PAGE_IS_PRESENT | abi.PAGE_IS_SWAPPED
+        found = self._collect(ranges)
+        absent = found[:, 2] & np.uint64(abi.PAGE_IS_PRESENT) == 0
+        if absent.any() and not procfs.swapped_size(self._pid):
+            found = found[~(absent & (found[:, 1] - found[:, 0] >= MARKER_RUN))]
+        return pages_joined(found[:, :2])
+
+    def _collect(self, ranges: Words) -> Words:
+        order, found = self._order, []
+        for start, end in ranges.tolist():
+            order.end = end
+            while start < end:
+                order.start = start
+                count = abi.ioctl(self._pagemap, abi.PAGEMAP_SCAN, ctypes.addressof(order))
+                if count < 0:
+                    self._refused("scan")
+                    raise MappingLostError(
+                        f"cannot find written pages of pid {self._pid}: a mapping lost its protection; capture it again"
+                    )
+                if count:
+                    found.append(self._regions[:count].copy())
+                start = int(order.walk_end)
+        if not found:
+            return np.empty((0, 3), dtype=np.uint64)
+        return found[0] if len(found) == 1 else np.concatenate(found)
+
+    def _refused(self, what: str) -> int:
+        number = ctypes.get_errno()
+        if number == errno.ESRCH:
+            raise ProcessGoneError(f"cannot {what} pages of pid {self._pid}: it has ended, or has become another program")
+        if number != errno.EPERM:
+            raise CaptureError(f"cannot {what} pages of pid {self._pid}: {os.strerror(number)}; capture it again")
+        return number
+
+
+def pages_joined(found: Words) -> Words:
+    """Extents that touch or overlap, as one.
+
+    They touch where categories differ, and overlap where the program changed its pages under a scan (seen with xz, Linux 6.18).
+
+    Args:
+        found: in order of their starts.
+    """
+    if len(found) < 2:
+        return found
+    ends = np.maximum.accumulate(found[:, 1])
+    apart = found[1:, 0] > ends[:-1]
+    return np.stack((found[np.concatenate(([True], apart)), 0], ends[np.concatenate((apart, [True]))]), axis=1)
+
+
+# Without PAGEMAP_SCAN
+
+_PRESENT: Final = np.uint64(1 << 63)
+_SWAPPED: Final = np.uint64(1 << 62)
+_FILE: Final = np.uint64(1 << 61)
+SOFT_DIRTY: Final = np.uint64(1 << 55)
+PAGEMAP_CHUNK: Final = 1 << 16
+"""Pages whose entries (8 bytes each) are read at once."""
+
+
+class PagemapFile:
+    """/proc/PID/pagemap read as a file: slower, but every kernel has it."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._file = os.open(f"/proc/{pid}/pagemap", os.O_RDONLY | os.O_CLOEXEC)
+
+    def close(self) -> None:
+        """Give the descriptor back."""
+        os.close(self._file)
+
+    def existing(self, ranges: Words, *, own: bool = True) -> Words:
+        """As `PageScanner.existing`; the shared page of zeros counts, too."""
+        unwanted = _FILE if own else np.uint64(0)
+        return self._select(ranges, _PRESENT | _SWAPPED, unwanted)
+
+    def soft_dirty(self, ranges: Words) -> Words:
+        """Pages whose soft-dirty bit is set."""
+        return self._select(ranges, SOFT_DIRTY, np.uint64(0))
+
+    def _select(self, ranges: Words, anyof: np.uint64, unwanted: np.uint64) -> Words:
+        found = []
+        for start, end in ranges.tolist():
+            for first in range(start // abi.PAGE_SIZE, end // abi.PAGE_SIZE, PAGEMAP_CHUNK):
+                count = min(PAGEMAP_CHUNK, end // abi.PAGE_SIZE - first)
+                entries = np.frombuffer(os.pread(self._file, count * 8, first * 8), dtype=np.uint64)
+                if len(entries) != count:
+                    raise ProcessGoneError(
+                        f"cannot read the page tables of pid {self._pid}: it has ended, or became another program"
+                    )
+                chosen = np.flatnonzero((entries & anyof != 0) & (entries & unwanted == 0))
+                found.append((chosen.astype(np.uint64) + np.uint64(first)) * np.uint64(abi.PAGE_SIZE))
+        return pages.extents_of_addresses(np.concatenate(found), abi.PAGE_SIZE) if found else NONE
+
+
+class Existence(Protocol):
+    """Tells which pages exist: `PageScanner` or `PagemapFile`."""
+
+    def existing(self, ranges: Words, *, own: bool = True) -> Words:
+        """Pages present or swapped out."""
+        ...
+
+    def close(self) -> None:
+        """Give descriptors back."""
+        ...
+
+
+def existence(pid: int) -> Existence:
+    """The best way that this kernel has."""
+    scanner = PageScanner(pid)
+    try:
+        scanner.existing(NONE + np.uint64(0))
+        scanner.is_protected(0, abi.PAGE_SIZE)
+    except CaptureError:
+        scanner.close()
+        return PagemapFile(pid)
+    return scanner

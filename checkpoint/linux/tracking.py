@@ -1,0 +1,85 @@
+"""What finding written pages means: the contract of every tracker, and which mappings it is about.
+
+Trackers speak of *private* mappings; shared ones can be written by others behind the page tables' back (`digests.SharedPages`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+
+from checkpoint.linux import abi, procfs
+from checkpoint.linux.procfs import MapsLine
+from checkpoint.pages import Words
+
+NONE: Final[Words] = np.empty((0, 2), dtype=np.uint64)
+NOT_CARRIED: Final = frozenset(("[vdso]", "[vvar]", "[vvar_vclock]", "[vsyscall]", "[uprobes]"))
+"""Mappings of the kernel's own: made anew on restore."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """What happened since the last scan.
+
+    Attributes:
+        written: pages to be read: written, or of unknown history.
+        cleared: pages whose earlier content is forgotten; ``written`` comes on top.
+    """
+
+    written: Words
+    cleared: Words
+
+
+class Tracker(Protocol):
+    """Finds written pages."""
+
+    name: str
+
+    def arm(self, lines: Sequence[MapsLine]) -> None:
+        """Begin to follow: whatever is written from now on is in the next scan. The process may run."""
+        ...
+
+    def scan(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
+        """Find what was written since `arm` or the last scan, and begin anew. The process stands still.
+
+        Args:
+            lines: every private mapping that is followed, in address order.
+            changed: whether the lines differ from those of the last call.
+        """
+        ...
+
+    def existing(self, lines: Sequence[MapsLine]) -> Words:
+        """Pages that hold something of the process's own: neither holes nor a file's unchanged pages."""
+        ...
+
+    def close(self) -> None:
+        """Stop following; the process is not changed."""
+        ...
+
+
+def is_private(line: MapsLine) -> bool:
+    """Whether a mapping is one that trackers follow."""
+    return not line.shared and line.name not in NOT_CARRIED
+
+
+def is_shared(line: MapsLine) -> bool:
+    """Whether its pages are shared memory that the snapshot carries: not those of a file that it may only read here.
+
+    Such a mapping (glibc's gconv-modules.cache is one in many programs) has nothing that its file does not have, and the
+    one that restores could not write to it.
+    """
+    from_its_file = line.has_file and not line.protection & abi.PROT_WRITE and not line.name.endswith(procfs.DELETED)
+    return line.shared and line.name not in NOT_CARRIED and not from_its_file
+
+
+def extents_of(lines: Sequence[MapsLine]) -> Words:
+    """The set of pages that mappings cover."""
+    if not lines:
+        return NONE
+    array = np.array([(line.start, line.end) for line in lines], dtype=np.uint64)
+    first = np.concatenate(([True], array[1:, 0] != array[:-1, 1]))
+    last = np.concatenate((first[1:], [True]))
+    return np.stack((array[first, 0], array[last, 1]), axis=1)

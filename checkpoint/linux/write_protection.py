@@ -1,0 +1,221 @@
+"""Written pages by asynchronous write protection (userfaultfd) and one scan that finds and protects again. Costs next to nothing.
+
+Source: Documentation/admin-guide/mm/userfaultfd.rst, pagemap.rst.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from checkpoint import pages
+from checkpoint.linux import abi
+from checkpoint.linux.pagetables import MappingLostError, PageScanner, pages_joined
+from checkpoint.linux.procfs import MapsLine
+from checkpoint.linux.tracking import NONE, Scan, extents_of
+from checkpoint.pages import Words
+
+WHOLE_WINDOW: Final = 64 << 20
+"""A mapping up to this size is protected whole: its page tables (two thousandths) are cheaper than finding what is populated."""
+WINDOW: Final = 2 << 20
+"""Larger ones are protected in windows of what one page table covers."""
+LONG_RUN: Final = 16 * abi.PAGE_SIZE
+"""A written run longer than this is looked at for holes before it is read: reading a hole makes the kernel fill it."""
+
+
+def windows_of(line: MapsLine, existing: Words) -> Words:
+    """The parts of a mapping that are worth protecting: all of a small one, the surroundings of what exists in a large one."""
+    if line.size <= WHOLE_WINDOW:
+        return np.array([[line.start, line.end]], dtype=np.uint64)
+    step = np.uint64(WINDOW)
+    low = np.maximum(existing[:, 0] // step * step, np.uint64(line.start))
+    high = np.minimum((existing[:, 1] + step - np.uint64(1)) // step * step, np.uint64(line.end))
+    if not len(low):
+        return NONE
+    apart = low[1:] > np.maximum.accumulate(high)[:-1] + np.uint64(WINDOW)
+    return np.stack((low[np.concatenate(([True], apart))], high[np.concatenate((apart, [True]))]), axis=1)
+
+
+class PagemapTracker:
+    """Asynchronous write protection, and one scan that finds and protects again.
+
+    Invariants: every page that exists in a followed mapping lies in ``_armed`` or is found by looking at the rest; a mapping
+    without registration is fresh, whatever maps says, and is copied whole; one that cannot be registered is fresh each time.
+
+    Args:
+        faults: a userfaultfd of the process's memory; the tracker owns it.
+    """
+
+    name = "pagemap"
+
+    def __init__(self, pid: int, faults: int) -> None:
+        self._faults = faults
+        self._scanner = PageScanner(pid)
+        self._armed: Words = NONE
+        self._tracked: Words = NONE
+        self._spans: list[tuple[int, int]] = []
+        self._open: Words = NONE
+        self._protect: Words = NONE
+        self._files: Words = NONE
+        self._owned: Words = NONE
+        self._stubborn: set[tuple[int, int]] = set()
+        enable_write_protection(faults)
+
+    def arm(self, lines: Sequence[MapsLine]) -> None:
+        """See `Tracker.arm`. A mapping that goes or comes meanwhile is found fresh by the scan."""
+        self._stubborn.clear()
+        for line in lines:
+            self._register(line)
+        existing = self._scanner.existing(extents_of(lines))
+        with contextlib.suppress(MappingLostError):
+            self._protect_windows(lines, existing)
+        self._learn(lines)
+        self._owned = pages.intersection(self._scanner.existing(self._files), self._files)
+
+    def scan(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
+        """See `Tracker.scan`."""
+        if changed:
+            self._learn(lines)
+        fresh = [
+            line
+            for start, end in self._spans
+            if not self._scanner.is_protected(start, end)
+            for line in self._lost(lines, start, end)
+        ]
+        cleared, copied = extents_of(fresh), NONE
+        if fresh:
+            self._armed = pages.difference(self._armed, cleared)
+            copied = self._fresh(fresh)
+            self._learn(lines)
+            written = self._scanner.written(pages.difference(self._protect, cleared))
+        else:
+            written = self._scanner.written(self._protect)
+        if len(self._open):
+            appeared = self._scanner.existing(self._open)
+            if len(appeared):
+                copied = pages.union(copied, appeared)
+                self._protect_windows(lines, appeared)
+                self._learn(lines)
+        written, emptied = self._sift(written)
+        if len(copied):
+            written = pages.union(written, copied)
+        if len(given_back := self._given_back(written)):
+            emptied = pages.union(emptied, given_back)
+        if len(emptied):
+            cleared = pages.union(cleared, emptied)
+        return Scan(written, cleared)
+
+    def existing(self, lines: Sequence[MapsLine]) -> Words:
+        """See `Tracker.existing`."""
+        return self._scanner.existing(extents_of(lines))
+
+    def close(self) -> None:
+        """See `Tracker.close`."""
+        self._scanner.close()
+        os.close(self._faults)
+
+    def _learn(self, lines: Sequence[MapsLine]) -> None:
+        """Work out what a scan has to ask for these mappings."""
+        followed = [line for line in lines if (line.start, line.end) not in self._stubborn]
+        self._tracked = extents_of(followed)
+        self._armed = pages.intersection(self._armed, self._tracked)
+        self._open = pages.difference(self._tracked, self._armed)
+        self._protect = self._armed
+        self._files = extents_of([line for line in followed if line.has_file])
+        self._spans = [(int(start), int(end)) for start, end in extents_of(lines).tolist()]
+
+    def _lost(self, lines: Sequence[MapsLine], start: int, end: int) -> list[MapsLine]:
+        inside = (line for line in lines if start <= line.start and line.end <= end)
+        return [line for line in inside if not self._scanner.is_protected(line.start, line.end)]
+
+    def _fresh(self, lines: Sequence[MapsLine]) -> Words:
+        """Register mappings and protect them: what exists in them."""
+        for line in lines:
+            if not self._register(line):
+                self._stubborn.add((line.start, line.end))
+        existing = self._scanner.existing(extents_of(lines))
+        self._protect_windows([line for line in lines if (line.start, line.end) not in self._stubborn], existing)
+        return existing
+
+    def _protect_windows(self, lines: Sequence[MapsLine], existing: Words) -> None:
+        parts = [
+            windows_of(line, _inside(existing, line))
+            for line in lines
+            if line.size <= WHOLE_WINDOW or len(_inside(existing, line))
+        ]
+        if parts:
+            windows = pages_joined(np.concatenate(parts))
+            self._armed = pages.union(self._armed, windows)
+            self._scanner.written(windows)
+
+    def _register(self, line: MapsLine) -> bool:
+        """Register a mapping, and forget what an earlier registration has marked; whether the kernel agreed.
+
+        A registration that mremap(2) has ended leaves its marks in the page tables (userfaultfd_reset_ctx() in
+        fs/userfaultfd.c drops the mapping's, not the pages'). A page written afterwards keeps its mark and is writable: it
+        would count as unwritten for ever.
+        """
+        order = abi.UffdRegister(line.start, line.size, abi.UFFDIO_REGISTER_MODE_WP, 0)
+        if abi.ioctl(self._faults, abi.UFFDIO_REGISTER, ctypes.addressof(order)) != 0:
+            return False
+        unmark = abi.UffdWriteProtect(line.start, line.size, 0)
+        return int(abi.ioctl(self._faults, abi.UFFDIO_WRITEPROTECT, ctypes.addressof(unmark))) == 0
+
+    def _given_back(self, written: Words) -> Words:
+        """Private copies of a file's pages that the program has dropped (MADV_DONTNEED): the file shows again.
+
+        The kernel leaves such a page protected (zap_install_uffd_wp_if_needed() in mm/memory.c), so that no scan tells.
+        """
+        if not len(self._files):
+            return NONE
+        now = self._scanner.existing(self._owned)
+        gone = pages.difference(self._owned, now)
+        came = written[touching(written, self._files)]
+        if len(came) or len(gone):
+            self._owned = pages.union(now, pages.intersection(came, self._files))
+        return gone
+
+    def _sift(self, written: Words) -> tuple[Words, Words]:
+        """Tell pages that hold something from holes and from a file's own: (to read, to clear)."""
+        if not len(written):
+            return NONE, NONE
+        is_doubtful = (written[:, 1] - written[:, 0]) > LONG_RUN
+        if len(self._files):
+            is_doubtful |= touching(written, self._files)
+        doubtful = written[is_doubtful]
+        if not len(doubtful):
+            return written, NONE
+        real = self._scanner.existing(doubtful)
+        empty = pages.difference(doubtful, real)
+        return pages.difference(written, empty), empty
+
+
+def touching(extents: Words, others: Words) -> pages.Flags:
+    """For each extent whether it shares a page with the other set."""
+    first = np.searchsorted(others[:, 1], extents[:, 0], side="right")
+    begin = others[np.minimum(first, len(others) - 1), 0]
+    touch: pages.Flags = (first < len(others)) & (begin < extents[:, 1])
+    return touch
+
+
+def _inside(existing: Words, line: MapsLine) -> Words:
+    first = np.searchsorted(existing[:, 1], np.uint64(line.start), side="right")
+    last = np.searchsorted(existing[:, 0], np.uint64(line.end), side="left")
+    return existing[first:last]
+
+
+def enable_write_protection(faults: int) -> None:
+    """Agree with the kernel on asynchronous write protection, also of pages that do not exist yet.
+
+    Raises:
+        OSError: this kernel has no such mode (before 6.7).
+    """
+    features = abi.UFFD_FEATURE_WP_UNPOPULATED | abi.UFFD_FEATURE_WP_ASYNC
+    order = abi.UffdApi(abi.UFFD_API, features, 0)
+    if abi.ioctl(faults, abi.UFFDIO_API, ctypes.addressof(order)) != 0:
+        abi.raise_errno("UFFDIO_API with asynchronous write protection")
