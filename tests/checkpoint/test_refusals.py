@@ -74,7 +74,7 @@ REFUSED = {
 def _facts(pid: int) -> tuple[str, str, list[str]]:
     """What a touch would change: mappings, open descriptors, blocked and pending signals."""
     status = Path(f"/proc/{pid}/status").read_text().splitlines()
-    signals = [line for line in status if line.startswith(("Sig", "ShdPnd", "TracerPid"))]
+    signals = [line for line in status if line.startswith(("SigPnd", "SigBlk", "SigIgn", "SigCgt", "ShdPnd", "TracerPid"))]
     return Path(f"/proc/{pid}/maps").read_text(), " ".join(sorted(os.listdir(f"/proc/{pid}/fd"))), signals
 
 
