@@ -141,8 +141,8 @@ def _safe(component: Component, turn: Turn, position: Position) -> None:
 
 
 def _give_up(component: Component, turn: Turn, why: str = "") -> None:
-    """Nothing is forgotten: the keeper's next delta counts from the same position. A handover waits for nothing."""
-    if component.handing is not None:
+    """Nothing is forgotten: the keeper's next delta counts from the same position. A handover's last delta is not tried twice."""
+    if component.handing is not None and component.flight is not None and component.flight.final:
         component.handing.until_ns = turn.now_ns
     component.flight = None
     component.due_ns = turn.now_ns + turn.config.retry_ms * MS
