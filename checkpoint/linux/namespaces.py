@@ -133,6 +133,7 @@ def set_clocks(clocks: Clocks, elapsed_ns: int) -> None:
         elapsed_ns: time since the reading; below zero counts as zero, so that the program's clocks never go back.
 
     Raises:
+        PermissionError: CAP_SYS_TIME is missing where the namespace belongs.
         OSError: the kernel refuses the offset (ERANGE: the clock would be negative or leave its range).
     """
     elapsed_ns = max(elapsed_ns, 0)
@@ -143,7 +144,11 @@ def set_clocks(clocks: Clocks, elapsed_ns: int) -> None:
     for name, (reading_ns, clock) in wanted.items():
         seconds, rest = divmod(now[name] + reading_ns + elapsed_ns - time.clock_gettime_ns(clock), _NS_PER_S)
         lines.append(f"{name} {seconds} {rest}\n")
-    offsets.write_text("".join(lines))
+    try:
+        offsets.write_text("".join(lines))
+    except PermissionError as error:
+        reason = "its clocks cannot be set; give the agent CAP_SYS_TIME, see systemd/failover-agent.service"
+        raise PermissionError(error.errno, reason) from error
 
 
 def mount_proc() -> None:

@@ -5,17 +5,15 @@ from __future__ import annotations
 import json
 import os
 import signal
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from failover.client.control import Control, Output, Result
 from tests.e2e import machines, robots
-from tests.e2e.machines import CHECKOUT, Machine
+from tests.e2e.machines import Machine
+from tests.e2e.service import SERVICE, component, control, counted, install, make_team, started, status
 
 pytestmark = [
     pytest.mark.root,
@@ -23,8 +21,6 @@ pytestmark = [
     pytest.mark.skipif(bool(machines.why_not()), reason=machines.why_not() or "-"),
 ]
 
-SERVICE = "failover-agent.service"
-COUNT = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.01)\n"
 MORE = 20
 
 
@@ -33,61 +29,10 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
     """A robot with the service installed as README says, and started."""
     with machines.booted(tmp_path_factory.mktemp("machines"), "robot1") as booted:
         install(booted)
+        make_team(booted, robot1="127.0.0.1")
         booted.run("systemctl", "start", SERVICE)
         yield booted
         print(booted.run("journalctl", "--unit", SERVICE, "--no-pager", "--lines=100", check=False).stdout)
-
-
-def install(machine: Machine) -> None:
-    """What a package would do, and then a team of one."""
-    units, binaries = CHECKOUT / "systemd", Path(sys.prefix) / "bin"
-    for name in ("failover", "failover-agent"):
-        machine.run("ln", "-s", str(binaries / name), f"/usr/bin/{name}")
-    machine.run("install", "-m644", "-t", "/etc/systemd/system", str(units / SERVICE), str(units / "failover.slice"))
-    machine.run("install", "-Dm644", str(units / "failover.sysusers"), "/usr/lib/sysusers.d/failover.conf")
-    machine.run("install", "-Dm644", str(units / "failover.tmpfiles"), "/usr/lib/tmpfiles.d/failover.conf")
-    machine.run("systemd-sysusers")
-    machine.run("systemd-tmpfiles", "--create", "/usr/lib/tmpfiles.d/failover.conf")
-    machine.run("install", "-m644", str(units / "agent.toml"), "/etc/failover/agent.toml")
-    machine.run("failover", "team", "create", "lab")
-    machine.run("failover", "team", "enrol", "robot1", "127.0.0.1")
-    machine.run("systemctl", "daemon-reload")
-
-
-def control(machine: Machine) -> Control:
-    return Control.open(machine.root / "run" / "failover" / "control.sock")
-
-
-def status(machine: Machine) -> dict[str, Any]:
-    with control(machine) as link:
-        return link.ask("status")
-
-
-def component(machine: Machine, name: str) -> dict[str, Any]:
-    """As ``failover status`` shows it; empty where it is unknown, or nobody answers."""
-    try:
-        return next((one for one in status(machine)["components"] if one["name"].endswith("/" + name)), {})
-    except robots.NO_ANSWER:
-        return {}
-
-
-def started(machine: Machine, name: str) -> int:
-    """A counting component; the PID of its program, there."""
-    with control(machine) as link:
-        argv = ["/usr/bin/python3", "-S", "-c", COUNT]
-        return int(link.ask("run", argv=argv, name=name, env={"PATH": "/usr/bin"}, cwd="/", wait=False)["pid"])
-
-
-def counted(machine: Machine, name: str) -> list[int]:
-    collected = bytearray()
-    with control(machine) as link:
-        for reply in link.stream("logs", name=name):
-            if isinstance(reply, Output) and reply.stream == 1:
-                assert reply.offset == len(collected)
-                collected += reply.content
-            elif isinstance(reply, Result):
-                break
-    return [int(line) for line in collected.split()]
 
 
 def expect_it_to_count_on(machine: Machine, name: str, pid: int) -> None:

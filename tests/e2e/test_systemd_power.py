@@ -1,0 +1,88 @@
+"""Two machines, each under a systemd of its own, joined by a cable: one goes, the other counts on."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from tests.e2e import machines, robots
+from tests.e2e.machines import Machine
+from tests.e2e.service import SERVICE, component, counted, install, make_team, started, status
+
+pytestmark = [
+    pytest.mark.root,
+    pytest.mark.slow,
+    pytest.mark.skipif(bool(machines.why_not()), reason=machines.why_not() or "-"),
+]
+
+ADDRESSES = {"robot1": "10.9.0.1", "robot2": "10.9.0.2"}
+MORE = 20
+SNAPSHOTS = 5
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> Iterator[tuple[Machine, Machine]]:
+    """Two robots of one team that hear each other."""
+    with ExitStack() as stack:
+        first, second = (stack.enter_context(machines.booted(tmp_path, name)) for name in ADDRESSES)
+        lay_cable(first, second)
+        for machine in (first, second):
+            install(machine)
+        make_team(first, **ADDRESSES)
+        shutil.copytree(first.root / "etc/failover/team", second.root / "etc/failover/team", dirs_exist_ok=True)
+        for machine in (first, second):
+            machine.run("systemctl", "start", SERVICE)
+        robots.until(lambda: connected(first) and connected(second), "the robots to hear each other")
+        yield first, second
+        print(second.run("journalctl", "--unit", SERVICE, "--no-pager", "--lines=100", check=False).stdout)
+
+
+def lay_cable(first: Machine, second: Machine) -> None:
+    ends = [["netns", str(machine.pid)] for machine in (first, second)]
+    command = ["ip", "link", "add", "wire", *ends[0], "type", "veth", "peer", "name", "wire", *ends[1]]
+    subprocess.run(command, check=True)
+    for machine in (first, second):
+        machine.run("ip", "address", "add", f"{ADDRESSES[machine.name]}/24", "dev", "wire")
+        machine.run("ip", "link", "set", "wire", "up")
+
+
+def connected(machine: Machine) -> bool:
+    """Whether it hears its peer, and could send it a snapshot."""
+    (peer,) = status(machine)["peers"]
+    return bool(peer["state"] == "live" and peer["hears_us"] and peer["lane"] == "connected")
+
+
+def protected(machine: Machine, name: str) -> None:
+    """Start a counting component and wait until its neighbour holds some of its snapshots."""
+    started(machine, name)
+    robots.until(lambda: int(component(machine, name).get("snapshots") or 0) >= SNAPSHOTS, "snapshots")
+    robots.until(lambda: len(counted(machine, name)) > MORE, "output")
+
+
+def expect_it_to_go_on_at(machine: Machine, name: str) -> None:
+    """It runs there, and its output has no gap and no repetition."""
+    robots.until(lambda: component(machine, name).get("restores", 0) >= 1, "the other robot to take over")
+    before = len(counted(machine, name))
+    robots.until(lambda: len(counted(machine, name)) > before + MORE, "the count to go on")
+    numbers = counted(machine, name)
+    assert numbers == list(range(len(numbers)))
+
+
+def test_a_machine_whose_power_is_cut_is_replaced_by_the_other(pair: tuple[Machine, Machine]) -> None:
+    first, second = pair
+    protected(first, "cut")
+    first.end()
+    expect_it_to_go_on_at(second, "cut")
+
+
+def test_a_machine_that_is_shut_down_in_order_is_replaced_by_the_other(pair: tuple[Machine, Machine]) -> None:
+    first, second = pair
+    protected(first, "shut")
+    first.run("systemctl", "poweroff", check=False)
+    first.process.wait(machines.PATIENCE_S)
+    expect_it_to_go_on_at(second, "shut")
