@@ -159,6 +159,32 @@ with open("numbers.txt") as numbers, open("log.txt", "a") as log, open("blocks.b
             for _ in range(20000): pass
 """
 
+PHP = """
+$x = 3; $seen = [];
+for ($round = 0; $round < 300; $round++) {
+    for ($i = 0; $i < 9000; $i++) { $x = ($x * 48271 + $i) % 2147483647; $seen["k" . ($x % 701)] = $i; }
+    ksort($seen);
+    printf("%d %d %s\\n", $round, $x, md5(implode(",", array_slice($seen, 0, 40))));
+}
+"""
+
+SHELL = """
+x=3; round=0
+while [ $round -lt 300 ]; do
+    i=0
+    while [ $i -lt 400 ]; do x=$(((x * 48271 + i) % 2147483647)); i=$((i + 1)); done
+    case $x in *7) word=seven ;; *) word=${x#?} ;; esac
+    echo "$round $x $word"; round=$((round + 1))
+done
+"""
+
+FORTH = """
+variable x 3 x !
+: step x @ 48271 * + 2147483647 mod x ! ;
+: rounds 400 0 do 60000 0 do i step loop i . x @ . cr stdout flush-file throw loop ;
+rounds bye
+"""
+
 DC = "[la 1 + dsa lb * 7 + 1000000007 % dsb p la 120000 >x] sx 0sa 12345sb lx x"
 NUMBERS = "".join(f"{index * 7919 % 100003}\n" for index in range(30000))
 
@@ -179,6 +205,10 @@ PLAIN = [
     Case("xz", ("xz", "-k", "-6", "-T1", "text"), (("text", "text"),), ("text.xz",), progress="text.xz"),
     Case("dc", ("dc", "-e", DC)),
     Case("mawk", ("mawk", GAWK)),
+    Case("php", ("php", "-n", "-r", PHP)),
+    Case("dash", ("dash", "script.sh"), (("script.sh", SHELL),)),
+    Case("bash", ("bash", "--norc", "script.sh"), (("script.sh", SHELL),)),
+    Case("gforth", ("gforth", "script.fs"), (("script.fs", FORTH),)),
     Case("tcl", ("tclsh", "script.tcl"), (("script.tcl", TCL),)),
     Case("cpython_libraries", (sys.executable, "script.py"), (("script.py", PYTHON_MIXED),)),
     Case(
