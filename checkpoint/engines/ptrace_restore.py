@@ -70,7 +70,7 @@ def restore(vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restor
     """See ``checkpoint.engine.Engine.restore``."""
     if not state.is_base:
         raise RestoreError("cannot restore a delta by itself: fold its chain first")
-    restore_checks.require(state, options)
+    restore_checks.require(state, options, vessel_pid)
     try:
         return _Restore(vessel_pid, state, options).run()
     except RestoreError:

@@ -17,21 +17,24 @@ from checkpoint.engine import RestoreOptions
 from checkpoint.engines.description import this_machine
 from checkpoint.engines.identities import build_id
 from checkpoint.engines.restore_memory import is_file_mapping, kernel_pages, kernel_pages_of
-from checkpoint.errors import MismatchError
+from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux import abi, procfs
 from checkpoint.model import FileIdentity, Resource, Snapshot
-from checkpoint.resources import rebuild
+from checkpoint.resources import rebuild, writers
 
 _FAR: str = "bring it here from the machine that ran the program"
 
 
-def require(state: Snapshot, options: RestoreOptions) -> None:
+def require(state: Snapshot, options: RestoreOptions, vessel_pid: int) -> None:
     """Refuse a snapshot that cannot come back here.
+
+    Args:
+        vessel_pid: what is to become the program; it, we and our forebears may hold files that the program writes to.
 
     Raises:
         MismatchError: with one reason for each difference.
     """
-    reasons = mismatches(state, options)
+    reasons = (*mismatches(state, options), *_of_writers(state, options, vessel_pid))
     if reasons:
         listed = "; ".join(reasons)
         raise MismatchError(f"cannot restore {state.component} here: {listed}", reasons)
@@ -145,3 +148,23 @@ def _of_open_file(held: Resource, path: str, same_boot: bool) -> Iterator[str]:
         yield f"{named} was written to since the snapshot, and not only at its end; end the program with the capture, or {shared}"
     elif digest and digest_of(path) != digest:
         yield f"{named} has another content here; {_FAR}, or {shared}"
+
+
+def _of_writers(state: Snapshot, options: RestoreOptions, vessel_pid: int) -> Iterator[str]:
+    """Files that the program writes to and somebody else does, too: their words would mix, and the cut would lose some."""
+    for held in state.resources:
+        path = str(held.facts.get("path", ""))
+        if held.kind != "files" or held.facts.get("deleted") or path in options.accept_changed:
+            continue
+        if not (os.path.isfile(path) and rebuild.is_written(held) and writers.may_be_written(path)):
+            continue
+        if pid := writers.writer_of(path, writers.family(os.getpid()) | writers.family(vessel_pid)):
+            who = f"pid {pid} ({_name_of(pid)})"
+            yield f"{path}, open as {held.name}, is held open for writing by {who}: end that first, or accept it as shared"
+
+
+def _name_of(pid: int) -> str:
+    try:
+        return procfs.status(pid).name
+    except CheckpointError:
+        return "it has just ended"

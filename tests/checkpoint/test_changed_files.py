@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -29,12 +30,12 @@ def _expect_ok(snapshot: Snapshot, directory: Path, accept_changed: tuple[str, .
         expect_ok(back)
 
 
-def _expect_refusal(snapshot: Snapshot, directory: Path, path: Path) -> None:
-    """Refused, by the file's whole name, before anything was touched."""
+def _expect_refusal(snapshot: Snapshot, directory: Path, path: Path, culprit: str = "") -> None:
+    """Refused, by the file's whole name (and who holds it), before anything was touched."""
     before = {entry.name: entry.read_bytes() for entry in directory.iterdir() if entry.is_file()}
     with pytest.raises(MismatchError) as refusal:
         restored(snapshot, directory).kill()
-    assert any(str(path) in reason for reason in refusal.value.reasons), refusal.value.reasons
+    assert any(str(path) in reason and culprit in reason for reason in refusal.value.reasons), refusal.value.reasons
     assert {entry.name: entry.read_bytes() for entry in directory.iterdir() if entry.is_file()} == before
 
 
@@ -95,6 +96,25 @@ def test_a_file_that_was_written_in_its_middle_is_refused(compiled: Compiled, tm
         file.seek(1)
         file.write(b"!")
     _expect_refusal(snapshot, tmp_path, path)
+
+
+def test_a_file_that_another_program_writes_to_is_refused_until_it_stops(compiled: Compiled, tmp_path: Path) -> None:
+    snapshot = _snapshot(compiled, tmp_path, "append")
+    with subprocess.Popen(["sleep", "1000"], stdout=(tmp_path / "log").open("ab")) as writer:
+        try:
+            _expect_refusal(snapshot, tmp_path, tmp_path / "log", f"pid {writer.pid} (sleep)")
+        finally:
+            writer.kill()
+    _expect_ok(snapshot, tmp_path)
+
+
+def test_a_file_that_another_program_reads_is_no_hindrance(compiled: Compiled, tmp_path: Path) -> None:
+    snapshot = _snapshot(compiled, tmp_path, "append")
+    with subprocess.Popen(["sleep", "1000"], stdin=(tmp_path / "log").open("rb")) as reader:
+        try:
+            _expect_ok(snapshot, tmp_path)
+        finally:
+            reader.kill()
 
 
 def _is_offset_three(facts: object) -> bool:
