@@ -15,6 +15,10 @@ INVOCATION: Final = "INVOCATION_ID"
 """systemd sets it for every service process."""
 
 
+STOP_S: Final = 5
+"""How long a shutdown waits for a component to obey SIGTERM; one that is frozen never does, and the default is 90 s."""
+
+
 def launcher() -> tuple[str, ...]:
     """What to put before a guard's command line: nothing, or the way into a scope of its own."""
     if os.geteuid() != 0 or INVOCATION not in os.environ or not os.path.isdir("/run/systemd/system"):
@@ -22,4 +26,5 @@ def launcher() -> tuple[str, ...]:
     program = shutil.which("systemd-run")
     if program is None:
         return ()
-    return (program, "--scope", "--quiet", "--collect", f"--slice={SLICE}", "--property=Delegate=yes", "--")
+    properties = ("--property=Delegate=yes", f"--property=TimeoutStopSec={STOP_S}s")
+    return (program, "--scope", "--quiet", "--collect", f"--slice={SLICE}", *properties, "--")
