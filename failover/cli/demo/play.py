@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import statistics
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 from failover.cli import picture, render
 from failover.cli.demo import programs, robots
+from failover.cli.demo.interruption import Interruption
 from failover.cli.demo.programs import Program
 from failover.cli.demo.robots import RobotMachine, Stage
 from failover.cli.demo.watch import Watcher, whole_output
@@ -71,12 +69,14 @@ def demo(arguments: argparse.Namespace) -> int:
     """Show a program outliving its robot; 0 only if its whole output equals an undisturbed run, byte for byte."""
     live = render.is_terminal() and not arguments.json
     screen = _LiveScreen() if live else _PlainScreen(quiet=arguments.json)
-    with _ending_well():
+    interruption = Interruption()
+    with interruption.noted():
         directory = Path(tempfile.mkdtemp(prefix="failover-demo-", dir=short_place()))
-        with screen, Stage(directory, robots.means()) as stage:
+        with screen, Stage(directory, robots.means(), interruption=interruption) as stage:
             play = Play(stage, screen)
             try:
-                play.perform()
+                with interruption.allowed():
+                    play.perform()
             finally:
                 play.end_references()
     return _conclude(arguments, play, screen)
@@ -86,21 +86,6 @@ def short_place() -> str:
     """Where the demo makes its directory: the usual place, unless the robots' sockets would have too long a name there."""
     usual = tempfile.gettempdir()
     return usual if len(usual) <= PLACE_LIMIT else "/tmp"
-
-
-@contextmanager
-def _ending_well() -> Iterator[None]:
-    """Have every way of being told to end unwind the stack, so that whatever was started is ended."""
-
-    def unwind(_number: int, _frame: FrameType | None) -> NoReturn:
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, unwind) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, action in before.items():
-            signal.signal(number, action)
 
 
 # --- The screen ------------------------------------------------------------------------------------------------------
@@ -206,7 +191,8 @@ class Play:
                 answer = link.ask("run", **wanted, env=environment, umask=0o022, isolate=True, wait=False)
             started = answer.get("started", answer)
             before, after = (Watcher(program.name, robot.socket) for robot in self._stage.robots)
-            self.acts.append(Act(program, program.undisturbed(environment), before, after))
+            with self._stage.interruption.held():
+                self.acts.append(Act(program, program.undisturbed(environment), before, after))
             before.start()
             after.start()
             command = " ".join([Path(program.argv[0]).name, *program.argv[1:]])

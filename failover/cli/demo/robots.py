@@ -20,6 +20,7 @@ from typing import Any, Final
 
 from failover.cli import keys
 from failover.cli.demo.host import descendants
+from failover.cli.demo.interruption import Interruption
 from failover.client import team
 from failover.client.control import Control
 from failover.client.team import Robot, Team
@@ -191,14 +192,16 @@ def cgroup_of(pid: int) -> Path | None:
 class Stage:
     """Both robots and the place where they stand. A context manager: leaving it ends them and removes the place."""
 
-    def __init__(self, directory: Path, allowed: Means, settings: str = "") -> None:
+    def __init__(self, directory: Path, allowed: Means, settings: str = "", interruption: Interruption | None = None) -> None:
         """
         Args:
             settings: lines of TOML added to each robot's configuration.
+            interruption: held while a robot is begun, so that no robot goes unnoted.
         """
         self.directory = directory
         self._settings = settings
         self.means = allowed
+        self.interruption = interruption or Interruption()
         self.robots: list[RobotMachine] = []
 
     def __enter__(self) -> Stage:
@@ -213,7 +216,8 @@ class Stage:
         """Write keys and configuration, start both agents, join their networks, wait until both answer."""
         self._write_team()
         for name in NAMES:
-            self.robots.append(self._start_robot(name))
+            with self.interruption.held():
+                self.robots.append(self._start_robot(name))
         if self.means.own_network:
             self._join()
         for robot in self.robots:
