@@ -88,7 +88,8 @@ class ControlServer:
         except KeyError as error:
             raise AgentError(f"group = {self._group!r}: this system has no such group; make it, or leave it empty") from error
         except OSError as error:
-            raise AgentError(f"cannot listen on {self._path}: {error.strerror}; name another runtime_directory") from error
+            why = error.strerror or error  # a path that is too long has no errno
+            raise AgentError(f"cannot listen on {self._path}: {why}; name another runtime_directory") from error
 
     async def close(self) -> None:
         """Hang up on everybody and remove the socket."""

@@ -295,7 +295,7 @@ def main(arguments: list[str]) -> int:
     try:
         listener = _listen(path)
     except OSError as error:
-        print(f"guard: cannot listen on {path}: {error.strerror}", file=sys.stderr)
+        print(f"guard: cannot listen on {path}: {error.strerror or error}", file=sys.stderr)
         return 1
     try:
         Guard(listener, _settle()).run()
