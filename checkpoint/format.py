@@ -7,6 +7,7 @@ and what does not hold together is refused with FormatError, whatever the bytes.
 
 from __future__ import annotations
 
+import errno
 import io
 import mmap
 import os
@@ -125,10 +126,17 @@ def _write_frame(file: Sink, raw: memoryview, offset: int, compressor: zstandard
 
 
 def _write_all(file: Sink, content: bytes | memoryview) -> None:
-    """Write all of it: an unbuffered file may take less at a time."""
+    """Write all of it: an unbuffered file may take less at a time.
+
+    Raises:
+        OSError: it takes nothing more, and says no reason.
+    """
     rest = memoryview(content)
     while rest:
-        rest = rest[file.write(rest) or 0 :]
+        taken = file.write(rest)
+        if not taken:
+            raise OSError(errno.EIO, "the file takes nothing more")
+        rest = rest[taken:]
 
 
 def _pack_runs(cleared: tuple[PageRun, ...], runs: tuple[PageRun, ...]) -> bytes:

@@ -75,12 +75,15 @@ class Shelf:
 
     def unneeded_for(self, oldest: Position) -> tuple[Entry, ...]:
         """Files without which ``oldest`` and everything later can still be restored; none if it cannot be restored itself."""
-        restorable = self._restorable()
-        floor = next((entry.order for entry in restorable if entry.position == oldest), None)
+        floor = self.order_of(oldest)
         if floor is None:
             return ()
-        needed = {entry for kept in restorable if kept.order >= floor for entry in self.chain_to(kept.position)}
-        return tuple(entry for entry in self.entries if entry not in needed and entry.order <= restorable[-1].order)
+        needed = {entry for kept in self._restorable() if kept.order >= floor for entry in self.chain_to(kept.position)}
+        return tuple(entry for entry in self.entries if entry not in needed)
+
+    def order_of(self, position: Position) -> tuple[int, int, int] | None:
+        """Where a position stands in the order of the files; None if it cannot be restored."""
+        return next((entry.order for entry in self._restorable() if entry.position == position), None)
 
     def _restorable(self) -> list[Entry]:
         """One file for every position whose chain is whole, oldest first."""
@@ -124,3 +127,13 @@ def file_name(header: Header) -> str:
     position = header.position
     suffix = BASE_SUFFIX if header.is_base else DELTA_SUFFIX
     return f"{header.epoch:016x}-{position.generation:016x}-{position.sequence:016x}-{position.digest.hex()}{suffix}"
+
+
+def order_of_name(name: str) -> tuple[int, int, int] | None:
+    """``Entry.order`` as a file's name says it, for a file whose content cannot be believed; None if it is no such name."""
+    parts = name.split("-")
+    try:
+        epoch, generation, sequence = (int(part, 16) for part in parts[:3])
+    except ValueError:
+        return None
+    return epoch, generation, sequence

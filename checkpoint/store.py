@@ -22,7 +22,7 @@ from checkpoint.disk import Disk, DiskFile, lock_exclusively
 from checkpoint.errors import ChainError, FormatError, StoreError
 from checkpoint.model import OutputPiece, Position, Snapshot
 from checkpoint.pages import PageTable
-from checkpoint.shelf import BASE_SUFFIX, DELTA_SUFFIX, FOLDER_PREFIX, Entry, Shelf, file_name, folder_name
+from checkpoint.shelf import BASE_SUFFIX, DELTA_SUFFIX, FOLDER_PREFIX, Entry, Shelf, file_name, folder_name, order_of_name
 from checkpoint.state import header_of
 from checkpoint.validity import place
 
@@ -71,6 +71,8 @@ class Store:
         self._lock = threading.RLock()
         self._shelves: dict[str, Shelf] = {}
         self._proved: dict[str, _Proved] = {}
+        self._damaged: set[Path] = set()
+        """Files that are never offered; pruned by the order in their names. A whole file put under such a name is not damaged."""
         self._serial = count()
         self.notices: list[str] = []
         """What was found damaged or left over: one sentence each."""
@@ -234,7 +236,11 @@ class Store:
         if self._fold_is_due(component, oldest):
             self.fold(component, oldest)
         with self._lock:
-            self._remove(component, self._shelf(component).unneeded_for(oldest))
+            shelf = self._shelf(component)
+            self._remove(component, shelf.unneeded_for(oldest))
+            floor = shelf.order_of(oldest)
+            if floor is not None:
+                self._remove_damaged(component, lambda path: (order_of_name(path.name) or floor) < floor)
 
     def keep_newest(self, component: str, positions: int) -> None:
         """Forget all but the newest positions; as ``prune``."""
@@ -291,7 +297,9 @@ class Store:
         """Forget everything of a component; what was set aside stays."""
         with self._lock:
             self._remove(component, self._shelf(component).entries)
+            self._remove_damaged(component, lambda _: True)
             self._shelves.pop(component, None)
+            self._proved.pop(component, None)
 
     def close(self) -> None:
         """Let another process have the store; nothing else may be called afterwards."""
@@ -311,7 +319,9 @@ class Store:
             temporary = final.parent / f"{TEMPORARY_PREFIX}{next(self._serial)}"
             try:
                 size = self._write_temporary(temporary, fill, unnamed)
-                self._disk.rename(temporary, final)
+                with self._lock:
+                    self._disk.rename(temporary, final)
+                    self._damaged.discard(final)
             except BaseException:
                 self._disk.remove(temporary)
                 raise
@@ -344,10 +354,21 @@ class Store:
                 self._shelves[component] = self._shelf(component).without((entry,))
                 self._disk.remove(entry.path)
 
+    def _remove_damaged(self, component: str, is_old: Callable[[Path], bool]) -> None:
+        """Remove files that were set out of use; one that has been put again since is no longer among them."""
+        folder = self._root / folder_name(component)
+        with self._disk_trouble(f"remove damaged snapshots of {component}"):
+            for path in [path for path in self._damaged if path.parent == folder and is_old(path)]:
+                self._disk.remove(path)
+                self._damaged.discard(path)
+
     def _set_out_of_use(self, component: str, entry: Entry, why: str) -> None:
         """Never offer this file again; it stays where it is, for whoever wants to look, until it is pruned."""
         with self._lock:
-            self._shelves[component] = self._shelf(component).without((entry,))
+            shelf = self._shelf(component)
+            if entry in shelf.entries:
+                self._damaged.add(entry.path)
+            self._shelves[component] = shelf.without((entry,))
             self._proved.pop(component, None)
             newest = self.newest(component)
             self._notice(f"{why}; going back to position {place(newest)}" if newest else f"{why}; nothing older is intact")
@@ -389,6 +410,7 @@ class Store:
         try:
             header = format.verify(path)
         except FormatError as error:
+            self._damaged.add(path)
             self._notice(f"{error}; it is not used")
             return
         if (path.parent.name, path.name) != (folder_name(header.component), file_name(header)):

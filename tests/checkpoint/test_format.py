@@ -197,3 +197,15 @@ def test_no_input_makes_the_reader_crash_hang_or_allocate_without_bound(sample: 
     )
     assert done.returncode == 0, f"seed {seed}: {done.stderr[-2000:]}"
     assert done.stdout.endswith("done\n")
+
+
+class FullSink:
+    """A file that takes nothing and says no reason."""
+
+    def write(self, content: bytes | memoryview, /) -> int:
+        return 0
+
+
+def test_a_file_that_takes_nothing_more_is_an_error_and_no_endless_loop() -> None:
+    with pytest.raises(OSError, match="takes nothing more"):
+        format.encode(history(1)[0], FullSink())

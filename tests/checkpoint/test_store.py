@@ -121,6 +121,72 @@ def test_a_damaged_newest_file_leads_back_to_what_is_intact_and_says_so(tmp_path
         assert store.notices
 
 
+def damage(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 8
+    path.write_bytes(content)
+
+
+def test_a_snapshot_that_was_damaged_and_sent_again_survives_pruning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("checkpoint.store.FOLD_DELTA_PART", 1000)  # a chain that is folded would not need the file
+    made = history(4)
+    with opened(tmp_path / "store") as store:
+        for one in made:
+            put(store, one)
+        damage(store.chain_of(COMPONENT)[2].path)
+        assert store.load(COMPONENT).position == made[1].position
+        put(store, made[2])
+        put(store, made[3])
+        store.prune(COMPONENT, made[3].position)
+        assert pages_of(store.load(COMPONENT)) == pages_of(chain.fold(made))
+    with opened(tmp_path / "store") as store:
+        assert store.newest(COMPONENT) == made[3].position
+        assert not store.notices
+
+
+@pytest.mark.parametrize("reopened", [False, True])
+@pytest.mark.parametrize("wholly", [False, True])
+def test_damaged_files_go_when_what_is_older_goes(tmp_path: Path, *, reopened: bool, wholly: bool) -> None:
+    made, root = history(3), tmp_path / "store"
+    later = snapshot({1: page("later")}, generation=2)
+    with opened(root) as store:
+        for one in made:
+            put(store, one)
+        damage(store.chain_of(COMPONENT)[1].path)
+        if not reopened:
+            assert store.load(COMPONENT).position == made[0].position
+            put(store, later)
+            store.drop(COMPONENT) if wholly else store.prune(COMPONENT, later.position)
+    if reopened:
+        with opened(root) as store:
+            put(store, later)
+            store.drop(COMPONENT) if wholly else store.prune(COMPONENT, later.position)
+    assert len([*root.glob("@*/*")]) == (0 if wholly else 1)
+
+
+def test_deltas_whose_parent_is_lost_go_although_they_are_newer(tmp_path: Path) -> None:
+    made = history(4)
+    with opened(tmp_path / "store") as store:
+        for one in made:
+            put(store, one)
+        damage(store.chain_of(COMPONENT)[2].path)
+        assert store.load(COMPONENT).position == made[1].position
+        orphan = next((tmp_path / "store").glob(f"@*/*{made[3].position.digest.hex()}.delta"))
+        store.prune(COMPONENT, made[1].position)
+        assert not orphan.exists()
+        assert store.newest(COMPONENT) == made[1].position
+
+
+def test_a_dropped_component_leaves_no_page_table(tmp_path: Path) -> None:
+    base, delta = history(2)
+    with opened(tmp_path / "store") as store:
+        put(store, base)
+        store.drop(COMPONENT)
+        assert not store._proved
+        with pytest.raises(ChainError, match="ask for a base"):
+            put(store, delta)
+
+
 def test_what_is_older_than_wanted_is_forgotten(tmp_path: Path) -> None:
     made = history(5)
     later = snapshot({1: page("later")}, generation=2)
