@@ -34,11 +34,12 @@ class PageScanner:
 
     Raises:
         ProcessGoneError: it ended, or it became another program (exec).
+        ProbeError: not permitted: it ended just now, or became another user's.
     """
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
-        self._pagemap = os.open(f"/proc/{pid}/pagemap", os.O_RDONLY | os.O_CLOEXEC)
+        self._pagemap = procfs.opened(pid, "pagemap")
         self._regions = np.zeros((REGION_COUNT, 3), dtype=np.uint64)
         self._order = abi.PageScan(size=ctypes.sizeof(abi.PageScan), vec=self._regions.ctypes.data, vec_len=REGION_COUNT)
 
@@ -143,7 +144,7 @@ class PagemapFile:
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
-        self._file = os.open(f"/proc/{pid}/pagemap", os.O_RDONLY | os.O_CLOEXEC)
+        self._file = procfs.opened(pid, "pagemap")
 
     def close(self) -> None:
         """Give the descriptor back."""

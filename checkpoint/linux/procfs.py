@@ -7,6 +7,7 @@ Source: proc(5) and the pages it is split into (proc_pid_maps(5), proc_pid_statu
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from collections.abc import Iterator, Mapping
@@ -27,13 +28,26 @@ def read_bytes(pid: int, name: str) -> bytes:
         ProcessGoneError: no such process.
         ProbeError: not permitted, or this kernel has no such file.
     """
-    path = f"/proc/{pid}/{name}"
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    with _explained(pid, name):
+        descriptor = os.open(f"/proc/{pid}/{name}", os.O_RDONLY | os.O_CLOEXEC)
         try:
             return _read_whole(descriptor)
         finally:
             os.close(descriptor)
+
+
+def opened(pid: int, name: str) -> int:
+    """A descriptor of ``/proc/PID/name``, to read from; the caller closes it. Raises as `read_bytes`."""
+    with _explained(pid, name):
+        return os.open(f"/proc/{pid}/{name}", os.O_RDONLY | os.O_CLOEXEC)
+
+
+@contextlib.contextmanager
+def _explained(pid: int, name: str) -> Iterator[None]:
+    """What the system says about a file of /proc, in our own words."""
+    path = f"/proc/{pid}/{name}"
+    try:
+        yield
     except (FileNotFoundError, ProcessLookupError) as error:
         if os.path.exists(f"/proc/{pid}"):
             raise ProbeError(f"cannot read {path}: this kernel does not offer it") from error
