@@ -200,6 +200,8 @@ def give_back(component: Component, turn: Turn) -> None:
     if flight is not None and (turn.now_ns >= flight.until_ns or not turn.alive(flight.to)):
         component.flight = flight = None
     home = component.primary
+    if turn.now_ns < component.due_ns:  # it was refused just now: what home says and what it takes may differ for a moment
+        return
     if not component.waits or mine is None or component.spec is None or flight is not None or not turn.alive(home):
         return
     peer = turn.team.peers[home]
