@@ -43,10 +43,16 @@ def two_robots(directory: Path, settings: str = "") -> Iterator[tuple[RobotMachi
             until(lambda: connected(first) and connected(second), "the robots to hear each other")
             yield first, second
             for robot in stage.robots:
-                assert "Traceback" not in robot.log.read_text(errors="replace"), f"a mistake in the agent of {robot.name}"
+                assert not mistake(robot), f"a mistake in the agent of {robot.name}:\n{mistake(robot)}"
         finally:
             for robot in stage.robots:  # shown by pytest where a test fails
                 print(f"--- {robot.name} said:", *robot.log.read_text(errors="replace").splitlines()[-LOG_LINES:], sep="\n")
+
+
+def mistake(robot: RobotMachine) -> str:
+    """The first traceback in its agent's log, and what follows; "" if there is none."""
+    _, found, rest = robot.log.read_text(errors="replace").partition("Traceback")
+    return "\n".join((found + rest).splitlines()[:LOG_LINES])
 
 
 def until(condition: Callable[[], T], what: str, patience_s: float = PATIENCE_S) -> T:
