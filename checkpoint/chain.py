@@ -151,10 +151,14 @@ def _newest_sources(chain: Sequence[Snapshot], page_size: int) -> PageMap:
 
 
 def _gathered(chain: Sequence[Snapshot], sources: PageMap, page_size: int) -> memoryview:
-    """The content of every page, in address order: neighbours from one snapshot are copied at once."""
+    """The content of every page, in address order: neighbours from one snapshot at once, and uncopied if that is all."""
     carried = [np.frombuffer(snapshot.contents, dtype=np.uint8) for snapshot in chain]
+    stretches = _stretches(sources.words)
+    if len(stretches) == 1:
+        _, (index, page), count = stretches[0]
+        return carried[index][page * page_size : (page + count) * page_size].data.toreadonly()
     gathered = np.empty(len(sources.addresses) * page_size, dtype=np.uint8)
-    for target, (index, page), count in _stretches(sources.words):
+    for target, (index, page), count in stretches:
         start = page * page_size
         gathered[target * page_size : (target + count) * page_size] = carried[index][start : start + count * page_size]
     return gathered.data.toreadonly()
