@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from benchmarks.figures import Figure
+from benchmarks.running import running
 from checkpoint import channel
 from checkpoint.linux import vessel
 from checkpoint.linux.vessel import Birth
@@ -22,7 +21,6 @@ DIRTY_KB = (40, 400, 2000)
 """Written between two snapshots; the largest belongs to a program that writes 20 MB a second under ten snapshots a second."""
 
 PERIOD_S = 0.1
-PROGRAM = Path(__file__).parent / "resident.py"
 
 
 def freeze(quick: bool, directory: Path) -> list[Figure]:
@@ -41,10 +39,10 @@ def _freeze_of(megabytes: int, dirty_kb: int, count: int, directory: Path) -> li
     dirty: list[float] = []
     with resident(megabytes, dirty_kb, directory) as pid, Keeper.spawn() as keeper:
         keeper.ask(channel.Protect(pid, "/benchmark"), channel.Protected)
-        base, _ = _capture(keeper, base=True, sequence=1)
+        base, _ = capture(keeper, base=True, sequence=1)
         for sequence in range(2, count + 2):
             time.sleep(PERIOD_S)
-            captured, wall_ms = _capture(keeper, base=False, sequence=sequence)
+            captured, wall_ms = capture(keeper, base=False, sequence=sequence)
             freezes.append(captured.freeze_us / 1000)
             walls.append(wall_ms)
             dirty.append(captured.dirty_bytes / 1e6)
@@ -59,27 +57,12 @@ def _freeze_of(megabytes: int, dirty_kb: int, count: int, directory: Path) -> li
 
 @contextmanager
 def resident(megabytes: int, dirty_kb: int, directory: Path) -> Iterator[int]:
-    """The measured program with files as its standard streams; yields its PID once it has all its memory."""
-    python = getattr(sys, "_base_executable", sys.executable)
-    output = directory / "output"
-    with output.open("wb") as file:
-        process = subprocess.Popen(
-            [python, str(PROGRAM), str(megabytes), str(dirty_kb)],
-            stdin=subprocess.DEVNULL,
-            stdout=file,
-            stderr=file,
-            start_new_session=True,
-        )
-    try:
-        while output.stat().st_size == 0:
-            time.sleep(0.005)
-        yield process.pid
-    finally:
-        process.kill()
-        process.wait()
+    """The measured program; yields its PID once it has all its memory."""
+    with running("resident", megabytes, dirty_kb, directory=directory) as program:
+        yield program.pid
 
 
-def _capture(keeper: Keeper, base: bool, sequence: int) -> tuple[channel.Captured, float]:
+def capture(keeper: Keeper, base: bool, sequence: int) -> tuple[channel.Captured, float]:
     """One snapshot, acknowledged at once: what the keeper told, and milliseconds from asking to having it encoded."""
     began = time.perf_counter()
     captured, (content,) = keeper.ask(channel.Capture(base=base, generation=1, sequence=sequence), channel.Captured)

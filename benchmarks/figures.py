@@ -1,20 +1,29 @@
-"""Figures: one case measured many times, and how a table of them is written."""
+"""Figures: one case measured many times, and how a table of them is written, side by side with the alternatives."""
 
 from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
+
+OURS: Final = "failover"
+"""The row that the others of its case are divided by."""
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One case of one benchmark; ``values`` in ``unit``, in the order they were measured."""
+    """One case of one benchmark; ``values`` in ``unit``, in the order they were measured.
+
+    Attributes:
+        who: what was measured: `OURS`, or an alternative in the same case.
+    """
 
     benchmark: str
     case: str
     unit: str
     values: tuple[float, ...]
+    who: str = OURS
 
     @property
     def median(self) -> float:
@@ -22,12 +31,62 @@ class Figure:
         return statistics.median(self.values)
 
 
+@dataclass(frozen=True, slots=True)
+class Absent:
+    """An alternative that was not measured, and why not."""
+
+    who: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What one benchmark found.
+
+    Attributes:
+        title: heading of its table.
+        story: one paragraph: what was measured, and how.
+    """
+
+    title: str
+    story: str
+    figures: tuple[Figure, ...]
+    absent: tuple[Absent, ...] = ()
+
+
+def percentile(values: Sequence[float], share: float) -> float:
+    """The value below which ``share`` (0 to 1) of all lie, by the nearest rank."""
+    ordered = sorted(values)
+    return ordered[round(share * (len(ordered) - 1))]
+
+
+def ratio(figure: Figure, figures: Sequence[Figure]) -> float | None:
+    """The median beside ours in the same case; None for ours, without one, or where ours is nought."""
+    if figure.who == OURS:
+        return None
+    case = (figure.benchmark, figure.case, figure.unit)
+    ours = [one for one in figures if one.who == OURS and (one.benchmark, one.case, one.unit) == case]
+    return figure.median / ours[0].median if ours and ours[0].median else None
+
+
 def table(figures: Sequence[Figure]) -> str:
-    """A Markdown table."""
-    lines = ["| benchmark | case | unit | min | median | p95 | max | n |", "|---|---|---|---|---|---|---|---|"]
-    for figure in figures:
-        ordered = sorted(figure.values)
-        p95 = ordered[min(len(ordered) - 1, round(0.95 * (len(ordered) - 1)))]
-        numbers = " | ".join(f"{value:.2f}" for value in (ordered[0], figure.median, p95, ordered[-1]))
-        lines.append(f"| {figure.benchmark} | {figure.case} | {figure.unit} | {numbers} | {len(ordered)} |")
-    return "\n".join(lines)
+    """A Markdown table; the columns of alternatives and ratios only where there are any."""
+    compared = any(figure.who != OURS for figure in figures)
+    lines = [_line(figure, ratio(figure, figures), compared) for figure in figures]
+    head = ["measured", "case", *(["by"] if compared else []), "unit", "min", "median", "p95", "max", "n"]
+    head += [f"÷ {OURS}"] if compared else []
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, ["---"] * len(head), *lines))
+
+
+def _line(figure: Figure, beside: float | None, compared: bool) -> list[str]:
+    values = figure.values
+    numbers = [number(value) for value in (min(values), figure.median, percentile(values, 0.95), max(values))]
+    closing = ["" if beside is None else f"{number(beside)} ×"] if compared else []
+    return [figure.benchmark, figure.case, *([figure.who] if compared else []), figure.unit, *numbers, str(len(values)), *closing]
+
+
+def number(value: float) -> str:
+    """Three digits that matter, no exponent."""
+    if abs(value) >= 100:
+        return f"{value:,.0f}"
+    return f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"

@@ -1,15 +1,28 @@
-"""The facts of the machine that figures belong to."""
+"""The facts of the machine that figures belong to, and whether anything else keeps it busy."""
 
 from __future__ import annotations
 
 import os
 import platform
+import shutil
 import subprocess
+import time
 from pathlib import Path
+from typing import Final
+
+WATCHED_S: Final = 1.0
+"""How long the machine is looked at before anything is measured."""
+
+BUSY_SHARE: Final = 0.05
+"""Of all cores' time, used by others while we look: more than this moves the figures."""
+
+SHARED_MEMORY: Final = Path("/dev/shm")
+IMAGES_SIZE: Final = 4 << 30
+"""Bytes of room that images of the largest program want, several at a time."""
 
 
-def facts() -> dict[str, str]:
-    """What a reader needs to know before comparing."""
+def facts(share: float) -> dict[str, str]:
+    """What a reader needs to know before comparing; ``share`` is what `busy_share` found."""
     return {
         "processor": _field("/proc/cpuinfo", "model name"),
         "cores": str(os.cpu_count()),
@@ -18,7 +31,40 @@ def facts() -> dict[str, str]:
         "python": platform.python_version(),
         "user": "root" if os.geteuid() == 0 else "ordinary",
         "commit": _commit(),
+        "load average at the start": " ".join(f"{one:.2f}" for one in os.getloadavg()),
+        "busy with something else at the start": f"{share:.0%} of its cores' time",
+        "images were written to": f"{images_place()} ({_file_system(images_place())})",
     }
+
+
+def busy_share() -> float:
+    """The part of all cores' time that somebody used during the last `WATCHED_S`; we only wait."""
+    before = _ticks()
+    time.sleep(WATCHED_S)
+    used, idle = (after - earlier for after, earlier in zip(_ticks(), before, strict=True))
+    return used / max(used + idle, 1)
+
+
+def warning(share: float) -> str:
+    """What to say when the machine is not quiet; "" when it is."""
+    if share <= BUSY_SHARE:
+        return ""
+    return f"{share:.0%} of this machine's time goes to something else: the figures are worse than those of a quiet machine"
+
+
+def images_place() -> Path:
+    """Where images go: a memory file system where there is room, so that nobody is measured by a disk."""
+    try:
+        roomy = shutil.disk_usage(SHARED_MEMORY).free >= IMAGES_SIZE
+    except OSError:
+        roomy = False
+    return SHARED_MEMORY if roomy else Path(os.environ.get("TMPDIR", "/tmp"))
+
+
+def _ticks() -> tuple[int, int]:
+    """Clock ticks that all cores were used and idle since boot. Source: proc_stat(5)."""
+    user, nice, system, idle, waiting, *others = map(int, Path("/proc/stat").read_text().splitlines()[0].split()[1:9])
+    return user + nice + system + sum(others), idle + waiting
 
 
 def _field(path: str, name: str) -> str:
@@ -27,6 +73,13 @@ def _field(path: str, name: str) -> str:
         if key.strip() == name:
             return value.strip()
     return "unknown"
+
+
+def _file_system(path: Path) -> str:
+    """The kind of file system that a path lies on: the deepest mount point above it."""
+    mounts = [line.split()[1:3] for line in Path("/proc/self/mounts").read_text().splitlines()]
+    above = [(len(point), kind) for point, kind in mounts if path.is_relative_to(point)]
+    return max(above)[1] if above else "unknown"
 
 
 def _commit() -> str:
