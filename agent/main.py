@@ -19,6 +19,21 @@ DEFAULT_CONFIG: Final = Path("/etc/failover/agent.toml")
 FAILED: Final = 1
 INSECURE: Final = "INSECURE: running without keys: anybody on the network can read programs' memory and start programs here"
 
+DESCRIPTION: Final = """
+Protect the programs of this robot and of its neighbours. Runs in the foreground, logs to standard error, leaves on SIGTERM;
+components outlive it, and the next agent finds them again. People talk to it by `failover`.
+
+  failover-agent --config /etc/failover/agent.toml           run
+  failover-agent check --config /etc/failover/agent.toml     read configuration, team file and key, and say what is wrong
+  failover-agent keypair                                     a new pair as JSON; the secret half stays on this robot, in
+                                                             /etc/failover/team/keys/ROBOT.secret, mode 600
+"""
+
+EPILOG: Final = """
+Every key of the configuration stands with its default in systemd/agent.toml, and in docs/configuration.md.
+Exit status: 0 it was asked to end, 1 it could not run; the reason is the last line on standard error.
+"""
+
 log = logging.getLogger("failover.agent")
 
 
@@ -60,7 +75,9 @@ def _print_keys() -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="failover-agent",
-        description="Protect the programs of this robot and of its neighbours. Runs in the foreground; components outlive it.",
+        description=DESCRIPTION.strip(),
+        epilog=EPILOG.strip(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "command",

@@ -10,11 +10,31 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 from textwrap import dedent
-from typing import Final
+from typing import Any, Final
 
 from failover import __version__
 
 EXIT_STATUSES: Final = "Exit status: 0 healthy, 1 failed or degraded, 2 usage, 3 no agent."
+
+DESCRIPTION: Final = """
+A program outlives its robot: it goes on elsewhere, from where it stood a fraction of a second ago.
+
+  failover demo                    see it happen on this machine, in half a minute
+  failover check                   what this machine offers, and what is missing
+  failover run -- CMD              start a program under protection (needs an agent)
+  failover status                  how the team stands
+  failover VERB --help             a verb with examples
+"""
+
+PLACES: Final = """
+Files and environment:
+  $FAILOVER_SOCKET                 the agent's control socket; without it $XDG_RUNTIME_DIR/failover/control.sock if that is
+                                   there, else /run/failover/control.sock
+  /etc/failover/agent.toml         the agent's configuration, every key with its default
+  /etc/failover/team               who belongs (team.toml, the same on every robot) and this robot's secret key
+  /var/lib/failover                snapshots and streams
+  $NO_COLOR                        no colours
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +64,9 @@ def build() -> argparse.ArgumentParser:
     """The whole parser."""
     parser = argparse.ArgumentParser(
         prog="failover",
-        description="A program outlives its robot: it goes on elsewhere, from where it stood a fraction of a second ago.",
-        epilog=f"{EXIT_STATUSES} `failover VERB --help` explains a verb with examples. Start with: failover demo",
+        description=DESCRIPTION.strip(),
+        epilog=f"{PLACES.strip()}\n\n{EXIT_STATUSES} failover run and restore --wait: the program's own.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"failover {__version__}")
@@ -216,10 +237,10 @@ def _team(room: argparse.ArgumentParser) -> None:
         "--directory", metavar="DIR", default="/etc/failover/team", help="the team directory (default: %(default)s)"
     )
     _json(shared)
-    create = acts.add_parser("create", parents=[shared], help="begin a team", allow_abbrev=False)
+    create = _act(acts, "create", shared, "begin a team", CREATE_STORY)
     create.add_argument("name", metavar="TEAM", help="the team's name")
     create.set_defaults(function="failover.cli.teams:create")
-    enrol = acts.add_parser("enrol", parents=[shared], help="add a robot and make its key", allow_abbrev=False)
+    enrol = _act(acts, "enrol", shared, "add a robot and make its key", ENROL_STORY)
     enrol.add_argument("name", metavar="ROBOT", help="the robot's name")
     enrol.add_argument(
         "address", metavar="HOST[:PORT]", nargs="+", help="where it hears beats: one address for each of its links (port 7420)"
@@ -230,8 +251,39 @@ def _team(room: argparse.ArgumentParser) -> None:
     enrol.add_argument("--public-key", metavar="KEY", help="the public half of a key made on the robot itself")
     enrol.add_argument("--replace", action="store_true", help="give a known robot new addresses and a new key")
     enrol.set_defaults(function="failover.cli.teams:enrol")
-    show = acts.add_parser("show", parents=[shared], help="list the team", allow_abbrev=False)
+    show = _act(acts, "show", shared, "list the team", "Show every robot with its addresses and its public key.")
     show.set_defaults(function="failover.cli.teams:show")
+
+
+CREATE_STORY: Final = """
+    Make the team directory with a team file that knows nobody yet. Do this once, anywhere; failover team enrol adds the robots.
+
+      failover team create lab
+    """
+
+ENROL_STORY: Final = """
+    Add a robot to the team file and make its key pair. The team file then goes to every robot, the secret key (keys/ROBOT.secret)
+    to that robot alone; remove it here afterwards. Or make the pair on the robot (failover-agent keypair), so that the secret
+    never travels, and enrol its public half. Agents read the team file when they start.
+
+      failover team enrol robot1 192.168.7.11
+      failover team enrol robot2 192.168.7.12 10.0.0.12 --bulk 192.168.7.12
+      failover team enrol robot3 192.168.7.13 --public-key 'lU^njTi%j-s0Um6-=T!3XtpbYKc@&EDt>F+fX01f'
+    """
+
+
+def _act(acts: Any, name: str, shared: argparse.ArgumentParser, summary: str, story: str) -> argparse.ArgumentParser:
+    """One act of ``failover team``."""
+    room: argparse.ArgumentParser = acts.add_parser(
+        name,
+        parents=[shared],
+        help=summary,
+        description=dedent(story).strip(),
+        epilog=EXIT_STATUSES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    return room
 
 
 def _demo(room: argparse.ArgumentParser) -> None:
