@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
 import msgspec
 
 from agent.errors import RefusedError
+
+SIGNAL_MAX: Final = 64
+"""The last real-time signal. Source: signal(7)."""
+
+PID_MAX: Final = (1 << 31) - 1
+"""What a pid_t holds."""
+
+Text = Annotated[str, msgspec.Meta(pattern=r"\A[^\0]*\Z")]
+"""What the kernel can be told: a string of C ends with a NUL."""
+
+Variable = Annotated[str, msgspec.Meta(pattern=r"\A[^\0=]+\Z")]
+"""A name in the environment."""
+
+Offset = Annotated[int, msgspec.Meta(ge=0)]
+"""Of a byte in a stream, from its beginning."""
 
 T = TypeVar("T")
 
@@ -26,11 +41,11 @@ def arguments_of(kind: type[T], verb: str, arguments: dict[str, Any]) -> T:
 class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
     """Of ``run``."""
 
-    argv: list[str]
+    argv: list[Text]
     name: str = ""
-    env: dict[str, str] = {}
-    cwd: str = "/"
-    umask: int = 0o022
+    env: dict[Variable, Text] = {}
+    cwd: Text = "/"
+    umask: Annotated[int, msgspec.Meta(ge=0, le=0o777)] = 0o022
     isolate: bool = True
     wait: bool = True
 
@@ -38,7 +53,7 @@ class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
 class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):
     """Of ``protect``."""
 
-    pid: int
+    pid: Annotated[int, msgspec.Meta(ge=1, le=PID_MAX)]
     name: str
 
 
@@ -46,7 +61,7 @@ class StopArguments(msgspec.Struct, forbid_unknown_fields=True):
     """Of ``stop``."""
 
     name: str
-    signal: int = 15
+    signal: Annotated[int, msgspec.Meta(ge=1, le=SIGNAL_MAX)] = 15
 
 
 class LogsArguments(msgspec.Struct, forbid_unknown_fields=True):
@@ -54,7 +69,7 @@ class LogsArguments(msgspec.Struct, forbid_unknown_fields=True):
 
     name: str
     follow: bool = False
-    offsets: tuple[int, int] = (0, 0)
+    offsets: tuple[Offset, Offset] = (0, 0)
 
 
 class NameArguments(msgspec.Struct, forbid_unknown_fields=True):
@@ -81,7 +96,7 @@ class StatusArguments(msgspec.Struct, forbid_unknown_fields=True):
     """Of ``status``."""
 
     watch: bool = False
-    every_ms: int = 500
+    every_ms: Annotated[int, msgspec.Meta(ge=1, le=3_600_000)] = 500
     team: bool = False
 
 
@@ -90,4 +105,4 @@ class PieceArguments(msgspec.Struct, forbid_unknown_fields=True):
 
     name: str
     stream: int
-    offset: int
+    offset: Offset

@@ -15,7 +15,7 @@ import msgspec
 
 from agent.charge import end_lanes_on_mistake
 from agent.errors import AgentError, RefusedError
-from checkpoint.errors import CheckpointError
+from checkpoint.errors import UNDECODABLE, CheckpointError
 from failover.client.control import LENGTH, MESSAGE_LIMIT, Output, Refused, Reply, Request, Result, Update
 from failover.errors import FailoverError
 
@@ -114,8 +114,8 @@ class ControlServer:
                 return
             while (request := await _request(reader)) is not None:
                 await self._serve(request, conversation, reader)
-        except (ConnectionError, asyncio.IncompleteReadError):
-            pass  # the client has gone; its request goes with it, the component does not
+        except (ConnectionError, asyncio.IncompleteReadError, asyncio.CancelledError):
+            pass  # the client has gone, or the agent ends; the request goes with it, the component does not
         except RefusedError as refusal:
             await conversation.reply(Refused(refusal.kind, str(refusal)))
         finally:
@@ -160,7 +160,7 @@ async def _request(reader: asyncio.StreamReader) -> Request | None:
         raise RefusedError(f"a request of {size} bytes is over the limit of {MESSAGE_LIMIT}")
     try:
         return _decoder.decode(await reader.readexactly(size))
-    except msgspec.MsgspecError as error:
+    except UNDECODABLE as error:
         raise RefusedError(f"a request was not understood: {error}; client and agent are of different versions") from error
 
 

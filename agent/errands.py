@@ -16,6 +16,7 @@ import msgspec
 
 from agent.charge import TROUBLE, end_lanes_on_mistake
 from agent.errors import RefusedError
+from checkpoint.errors import UNDECODABLE
 from failover.core.messages import CHUNK_SIZE_MAX, Bulk, Errand, ErrandDone
 from failover.errors import FailoverError
 
@@ -35,7 +36,7 @@ Order = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
 class Errands:
     """Both ends: what was sent from here, and what came from others. Lives in the lanes' loop."""
 
-    def __init__(self, say: Callable[[str, Bulk], None], hindrance: Callable[[str], str], orders: dict[str, Order]) -> None:
+    def __init__(self, say: Callable[[str, Bulk], object], hindrance: Callable[[str], str], orders: dict[str, Order]) -> None:
         """
         Args:
             hindrance: why nothing can be said to a peer now; "" when it can.
@@ -70,7 +71,10 @@ class Errands:
             self._waiting.pop((peer, number), None)
         if done.refusal:
             raise RefusedError(f"{peer}: {done.refusal}", done.kind, done.reasons)
-        return msgspec.msgpack.decode(done.content, type=dict[str, Any])
+        try:
+            return msgspec.msgpack.decode(done.content, type=dict[str, Any])
+        except UNDECODABLE as error:
+            raise RefusedError(f"{peer} answered {verb} in a way not understood: {error}; same release there?") from error
 
     def done(self, peer: str, message: ErrandDone) -> None:
         """A peer has answered."""
@@ -108,12 +112,18 @@ class Errands:
             order = self._orders.get(message.verb)
             if order is None:
                 raise RefusedError(f"no order {message.verb!r} can be given from another robot")
-            arguments = msgspec.msgpack.decode(message.arguments, type=dict[str, Any])
-            done = ErrandDone(message.number, msgspec.msgpack.encode(await order(arguments)))
+            done = ErrandDone(message.number, msgspec.msgpack.encode(await order(_arguments(message))))
         except RefusedError as refusal:
             done = ErrandDone(message.number, b"", str(refusal), refusal.kind, tuple(refusal.reasons))
-        except (*TROUBLE, FailoverError, msgspec.DecodeError) as trouble:
+        except (*TROUBLE, FailoverError) as trouble:
             done = ErrandDone(message.number, b"", str(trouble) or type(trouble).__name__)
         if len(done.content) > CONTENT_MAX:
             done = ErrandDone(message.number, b"", f"its answer of {len(done.content)} bytes is too long to travel; ask there")
         self._say(peer, done)
+
+
+def _arguments(message: Errand) -> dict[str, Any]:
+    try:
+        return msgspec.msgpack.decode(message.arguments, type=dict[str, Any])
+    except UNDECODABLE as error:
+        raise RefusedError(f"the arguments of {message.verb} were not understood: {error}; same release there?") from error

@@ -18,13 +18,15 @@ from typing import Any, Final, Generic, TypeVar
 import msgspec
 
 from checkpoint.engine import Report
-from checkpoint.errors import CheckpointError
+from checkpoint.errors import UNDECODABLE, CheckpointError
 from checkpoint.model import Position
 
 INLINE: Final = b"\x00"
 IN_MEMFD: Final = b"\x01"
 INLINE_LIMIT: Final = 64 << 10
 """Bytes of a message that travel in the packet itself; a larger one would not fit a socket's default buffer."""
+MEMFD_LIMIT: Final = 64 << 20
+"""Bytes of a message in a memfd; what is larger by nature (pages, streams) travels as descriptors of its own."""
 DESCRIPTOR_LIMIT: Final = 250
 """Descriptors in one message: SCM_MAX_FD is 253; a chain of more files is folded by its sender first."""
 
@@ -102,14 +104,14 @@ class Channel(Generic[M]):
             close_all(descriptors)
             raise ChannelClosedError("the other end of the local socket has gone")
         try:
-            if packet[:1] == IN_MEMFD and descriptors:
-                body = content_of(descriptors[0])
+            if packet == IN_MEMFD and descriptors:
+                message = self._decoder.decode(_sealed_content_of(descriptors[0]))
                 os.close(descriptors[0])
-                descriptors = descriptors[1:]
-            else:
-                body = packet[1:]
-            return self._decoder.decode(body), descriptors
-        except (msgspec.DecodeError, OSError) as error:
+                return message, descriptors[1:]
+            if packet[:1] != INLINE:
+                raise ValueError(f"form {packet[0]} of a packet of {len(packet)} bytes")
+            return self._decoder.decode(packet[1:]), descriptors
+        except (*UNDECODABLE, OSError) as error:
             close_all(descriptors)
             raise ChannelError(f"the other end of the local socket sent something that is no message: {error}") from error
 
@@ -154,6 +156,20 @@ def seal(descriptor: int) -> None:
     """Close a memory file to every change, for everybody and for good."""
     seals = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE | fcntl.F_SEAL_SEAL
     fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, seals)
+
+
+def _sealed_content_of(descriptor: int) -> bytes:
+    """Read a message's memory file.
+
+    Raises:
+        OSError: it is no memory file.
+        ValueError: it is too large, or its sender could still cut it while it is read (SIGBUS).
+    """
+    missing = ~fcntl.fcntl(descriptor, fcntl.F_GET_SEALS) & (fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_WRITE)
+    size = os.fstat(descriptor).st_size
+    if missing or size > MEMFD_LIMIT:
+        raise ValueError(f"a memory file of {size} bytes that is {'not sealed' if missing else f'over {MEMFD_LIMIT}'}")
+    return content_of(descriptor)
 
 
 def content_of(descriptor: int) -> bytes:

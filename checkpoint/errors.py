@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Final
+
+UNDECODABLE: Final = (ValueError, RecursionError)
+"""What msgspec raises for bytes that are no message: its own errors and those of text that is not UTF-8 are `ValueError`s."""
+
 
 class CheckpointError(Exception):
     """Something about capturing, storing or restoring a process did not work.

@@ -37,6 +37,7 @@ from typing import Any, Final
 
 import msgspec
 
+from checkpoint.errors import UNDECODABLE
 from failover.errors import AgentRefusedError, LostAgentError, NoAgentError
 
 STATUS: Final = """
@@ -198,7 +199,7 @@ class Control:
             raise LostAgentError(f"{self._path} announced a reply of {size} bytes, over {MESSAGE_LIMIT}; is it an agent?")
         try:
             return _reply_decoder.decode(self._exactly(size, verb))
-        except msgspec.MsgspecError as error:
+        except UNDECODABLE as error:
             raise LostAgentError(f"{self._path} answered {verb} in a way not understood: {error}; same version?") from error
 
     def _exactly(self, size: int, verb: str) -> bytes:

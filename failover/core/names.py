@@ -36,7 +36,7 @@ def check_robot(name: str) -> str:
     Raises:
         NameFormatError: it is empty, too long, or holds "/" or something invisible.
     """
-    if not name or "/" in name or not _visible(name) or _size(name) > ROBOT_SIZE_MAX:
+    if not name or "/" in name or not _visible(name) or text_size(name) > ROBOT_SIZE_MAX:
         raise NameFormatError(
             f"{name!r} cannot name a robot: use 1 to {ROBOT_SIZE_MAX} bytes of visible characters without blanks and '/'"
         )
@@ -51,7 +51,7 @@ def check_component(name: str) -> str:
     """
     steps = name.split("/")
     sound = len(steps) > 1 and not steps[0] and all(step not in ("", ".", "..") and _visible(step) for step in steps[1:])
-    if not sound or _size(name) > COMPONENT_SIZE_MAX:
+    if not sound or text_size(name) > COMPONENT_SIZE_MAX:
         raise NameFormatError(
             f"{name!r} cannot name a component: use a path such as /lab/robot1/mapper, at most {COMPONENT_SIZE_MAX} bytes, "
             "of visible characters without blanks, '.' and '..' standing alone"
@@ -63,7 +63,7 @@ def _visible(text: str) -> bool:
     return text.isprintable() and not any(character.isspace() for character in text)
 
 
-def _size(text: str) -> int:
+def text_size(text: str) -> int:
     """Bytes of UTF-8; a lone surrogate counts as too long, because it has none."""
     try:
         return len(text.encode())

@@ -14,8 +14,9 @@ from hashlib import blake2b
 
 import msgspec
 
+from checkpoint.errors import UNDECODABLE
 from failover.core.messages import VERSION, Beat, Bulk, Entry
-from failover.core.names import COMPONENT_SIZE_MAX, ROBOT_SIZE_MAX
+from failover.core.names import COMPONENT_SIZE_MAX, ROBOT_SIZE_MAX, text_size
 from failover.core.types import PEERS_MAX
 from failover.errors import FailoverError
 
@@ -89,7 +90,7 @@ def decode_bulk(body: bytes | memoryview) -> Bulk | None:
     """The message, or None for bytes that are none. Never raises."""
     try:
         return _bulk_decoder.decode(body)
-    except (msgspec.MsgspecError, ValueError, RecursionError, FailoverError):
+    except (*UNDECODABLE, FailoverError):
         return None
 
 
@@ -193,7 +194,7 @@ class Receiver:
     def _believe(self, sender: str, body: bytes) -> Beat | Refused:
         try:
             beat = _decoder.decode(body)
-        except (msgspec.MsgspecError, ValueError, RecursionError):
+        except UNDECODABLE:
             return Refused(Reason.MALFORMED, sender)
         if beat.sender != sender:
             return Refused(Reason.SENDER, sender)
@@ -217,8 +218,8 @@ def _sound(beat: Beat) -> bool:
 def _sound_entry(entry: Entry) -> bool:
     robots = (entry.primary, entry.standby, entry.yields_to)
     return (
-        0 < len(entry.name) <= COMPONENT_SIZE_MAX
-        and all(len(robot) <= ROBOT_SIZE_MAX for robot in robots)
+        0 < text_size(entry.name) <= COMPONENT_SIZE_MAX
+        and all(text_size(robot) <= ROBOT_SIZE_MAX for robot in robots)
         and 0 <= entry.epoch < EPOCH_MAX
         and 0 <= entry.generation < EPOCH_MAX * (PEERS_MAX + 1)
         and 0 <= entry.sequence < NUMBER_MAX
