@@ -46,7 +46,7 @@ INCOMING_LIMIT: Final = 64
 class Lane(Protocol):
     """What of `agent.transport.BulkLane` is needed here."""
 
-    def say(self, peer: str, message: Bulk) -> None: ...
+    def say(self, peer: str, message: Bulk) -> bool: ...
     async def ship(self, peer: str, chunk: Chunk) -> None: ...
 
 
@@ -88,7 +88,8 @@ class Shipper:
         number = next(self._numbers)
         transfer = self._outgoing[number] = _Outgoing(peer)
         try:
-            self._lane.say(peer, msgspec.structs.replace(offer, transfer=number))
+            if not self._lane.say(peer, msgspec.structs.replace(offer, transfer=number)):
+                raise LaneError(f"the bulk lane to {peer} is not connected")
             for offset in range(0, offer.size, CHUNK_SIZE_MAX):
                 size = min(CHUNK_SIZE_MAX, offer.size - offset)
                 await self._until(transfer, lambda end=offset + size: transfer.until >= end)  # type: ignore[misc]
@@ -190,7 +191,7 @@ class Receiver:
     def offered(self, peer: str, offer: Offer) -> None:
         """Begin to receive; an older transfer of the same component is dropped."""
         for key, older in list(self._incoming.items()):
-            if key[0] == peer and older.offer.component == offer.component:
+            if key == (peer, offer.transfer) or (key[0] == peer and older.offer.component == offer.component):
                 self._drop(key)
         try:
             self._check(peer, offer)

@@ -27,11 +27,14 @@ class Lane:
 
     def __init__(self, deliver: Callable[[str, Bulk], None]) -> None:
         self.deliver = deliver
+        self.connected = True
         self.said: list[Bulk] = []
 
-    def say(self, peer: str, message: Bulk) -> None:
-        self.said.append(message)
-        asyncio.get_running_loop().call_soon(self.deliver, peer, message)
+    def say(self, peer: str, message: Bulk) -> bool:
+        if self.connected:
+            self.said.append(message)
+            asyncio.get_running_loop().call_soon(self.deliver, peer, message)
+        return self.connected
 
     async def ship(self, peer: str, chunk: Chunk) -> None:
         self.say(peer, chunk)
@@ -122,6 +125,18 @@ def test_never_more_chunks_are_under_way_than_there_is_credit_for(tmp_path: Path
         task = asyncio.create_task(ship(two, content))
         with pytest.raises(LaneError, match="took nothing"):
             await task
+
+    run(body())
+
+
+def test_an_offer_that_cannot_leave_is_given_up_at_once(tmp_path: Path, content: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shipping, "PATIENCE_S", 10 * BOUND_S)
+
+    async def body() -> None:
+        two = Two(tmp_path, Desk())
+        two.out.connected = False
+        with pytest.raises(LaneError, match="is not connected"):
+            await ship(two, content)
 
     run(body())
 
