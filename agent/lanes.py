@@ -61,6 +61,7 @@ from failover.core.messages import (
     Taken,
 )
 from failover.core.types import HISTORY_MAX, Found, Held
+from failover.core.wire import KEY_SIZE_MIN
 
 BEAT_KEY_SIZE: Final = 32
 BYTES_A_MEGABIT: Final = 125_000
@@ -98,10 +99,13 @@ class Lanes:
         self._begun: asyncio.Future[Life] = asyncio.get_running_loop().create_future()
         self._end: asyncio.Event = asyncio.Event()
         self._incompatible: dict[str, str] = {}
+        self._own_troubles: list[str] = []
         keys = Keys("", "", {})
         if not config.insecure:
             publics = {name: robot.public_key for name, robot in settings.team.robots.items()}
             keys = Keys(public_key_of(settings.secret_key), settings.secret_key, publics)
+            if keys.public != settings.me.public_key:
+                self._own_troubles.append(UNFIT_KEY)
         bulks = {name: robot.bulk for name, robot in settings.peers.items()}
         self._lane = BulkLane(config.robot, settings.me.bulk, bulks, keys, self._hear, self._link_changed)
         self._shipper = Shipper(self._lane, config.link_mbit_s * BYTES_A_MEGABIT)
@@ -331,6 +335,8 @@ class Lanes:
             reason = f"{peer} speaks version {hello.version}, this robot {VERSION}; install the same release on both"
         elif hello.team != self.settings.team.team:
             reason = f"{peer} belongs to team {hello.team!r}, this robot to {self.settings.team.team!r}"
+        elif len(hello.beat_key) < KEY_SIZE_MIN:
+            reason = f"{peer} sent a beat key of {len(hello.beat_key)} bytes; install the same release on both"
         self._receiver.lost(peer)  # a new connection: what was half here stays half
         if reason:
             self._incompatible[peer] = reason
@@ -354,9 +360,19 @@ class Lanes:
 
     def picture(self, told: Told) -> dict[str, Any]:
         """What ``status`` shows."""
-        notices = [*self._incompatible.values(), *self._around.store.notices[-NOTICES_SHOWN:]]
+        notices = [
+            *self._own_troubles,
+            *self._incompatible.values(),
+            *self._lane.troubles(),
+            *self._around.store.notices[-NOTICES_SHOWN:],
+        ]
         return team_view(self.settings, self._life, told, self.charges, self._lane.links, notices)
 
+
+UNFIT_KEY: Final = (
+    "this robot's secret key does not belong to its public key in team.toml: no other robot lets it in; failover team enrol "
+    "makes a fresh pair"
+)
 
 NOTICES_SHOWN: Final = 10
 """Of the store's latest findings."""

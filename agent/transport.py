@@ -13,7 +13,7 @@ import asyncio
 import contextlib
 import enum
 import logging
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -23,6 +23,7 @@ import zmq.asyncio
 from zmq.utils import z85
 from zmq.utils.monitor import parse_monitor_message
 
+from agent.charge import end_lanes_on_mistake
 from agent.errors import LaneError
 from failover.core.messages import CHUNK_SIZE_MAX, Bulk, Chunk
 from failover.core.wire import decode_bulk, encode_bulk
@@ -124,12 +125,16 @@ class Link:
         self._monitor = self._socket.get_monitor_socket()
         self._socket.connect(f"tcp://{address}")
         self._tasks = (asyncio.create_task(self._watch()), asyncio.create_task(self._send()))
+        for task in self._tasks:
+            task.add_done_callback(end_lanes_on_mistake)
 
-    def say(self, message: Bulk) -> None:
-        """Queue a small message; it overtakes chunks. Dropped where there is no connection."""
-        if self.state is LinkState.CONNECTED:
-            self._words.append(encode_bulk(message))
-            self._wake.set()
+    def say(self, message: Bulk) -> bool:
+        """Queue a small message; it overtakes chunks. False: there is no connection, it was dropped."""
+        if self.state is not LinkState.CONNECTED:
+            return False
+        self._words.append(encode_bulk(message))
+        self._wake.set()
+        return True
 
     async def ship(self, chunk: Chunk) -> None:
         """Send one chunk after all small messages; returns when ZeroMQ has taken it.
@@ -226,6 +231,8 @@ class BulkLane:
         self._tasks: list[asyncio.Task[None]] = []
         self.links: dict[str, Link] = {}
         self.strangers = 0
+        self._stranger = ""
+        self._misunderstood: Counter[str] = Counter()
 
     def open(self) -> None:
         """Listen, and begin to connect to everybody.
@@ -252,16 +259,31 @@ class BulkLane:
                 f"cannot listen for snapshots at {self._bind}: {error.strerror}; is another agent running, or is it not ours?"
             ) from error
         self._tasks.append(asyncio.create_task(self._hear(router)))
+        for task in self._tasks:
+            task.add_done_callback(end_lanes_on_mistake)
         for peer, address in self._peers.items():
             self.links[peer] = Link(self._context, self._me, peer, address, self._keys, self._changed)
 
-    def say(self, peer: str, message: Bulk) -> None:
-        """Queue a small message to a peer; dropped when it is not connected."""
-        self.links[peer].say(message)
+    def say(self, peer: str, message: Bulk) -> bool:
+        """Queue a small message to a peer; False: it is not connected, the message was dropped."""
+        return self.links[peer].say(message)
 
     async def ship(self, peer: str, chunk: Chunk) -> None:
         """Send one chunk; see `Link.ship`."""
         await self.links[peer].ship(chunk)
+
+    def troubles(self) -> list[str]:
+        """What was refused in this life, for the status: a sentence each."""
+        told = [
+            f"{peer} sent {count} messages on the bulk lane that this robot does not understand; install the same release on both"
+            for peer, count in self._misunderstood.items()
+        ]
+        if self.strangers:
+            told.append(
+                f"a key that is not in this robot's team.toml was refused on the bulk lane, {self.strangers} times, last from "
+                f"{self._stranger}; bring the same team.toml to every robot if it is one of yours"
+            )
+        return told
 
     async def close(self) -> None:
         """Close every socket and wait for the tasks."""
@@ -278,10 +300,12 @@ class BulkLane:
                 frames = await router.recv_multipart(copy=False)
                 peer = self._speaker(frames)
                 message = decode_bulk(frames[1].bytes) if peer and len(frames) == 2 else None
-                if message is None:
-                    self.strangers += 1
-                    continue
-                self._receive(peer, message)
+                if message is not None:
+                    self._receive(peer, message)
+                elif peer:
+                    self._misunderstood[peer] += 1
+                else:
+                    self._refused("somebody under another's name")
         finally:
             router.close(0)
 
@@ -302,12 +326,18 @@ class BulkLane:
                 version, request, _domain, address, _identity, mechanism, *credentials = await gate.recv_multipart()
                 owner = owners.get(credentials[0]) if mechanism == b"CURVE" and len(credentials) == 1 else None
                 if owner is None:
-                    self.strangers += 1
-                    log.warning("refused a stranger's key from %s on the bulk lane", address.decode(errors="replace"))
+                    self._refused(address.decode(errors="replace"))
                 status = (b"200", b"OK", owner.encode()) if owner else (b"400", b"not in the team", b"")
                 await gate.send_multipart([version, request, *status, b""])
         finally:
             gate.close(0)
+
+    def _refused(self, stranger: str) -> None:
+        """Count one that is not in the team; the log hears of it once, for it may knock for ever."""
+        self.strangers += 1
+        if stranger != self._stranger:
+            log.warning("refused a key that is not in team.toml on the bulk lane: %s", stranger)
+        self._stranger = stranger
 
 
 def _limits(socket: zmq.asyncio.Socket) -> None:

@@ -82,7 +82,7 @@ def is_unprotected(component: Mapping[str, Any]) -> bool:
 
 def _robot_row(status: Mapping[str, Any], name: str, peer: Mapping[str, Any] | None) -> Row:
     if peer is None:
-        return Row((f"{name} (here)", str(status.get("role") or ""), "live", "", "", "", "", _lanes(status["peers"])), "good")
+        return Row((f"{name} (here)", str(status.get("role") or ""), "live", "", "", "", "", _lanes(status)), "good")
     state = peer["state"]
     lost = peer.get("beats_lost")
     links = ", ".join(part for part in (peer.get("lane") or "", f"{lost} beats lost" if lost else "") if part)
@@ -90,9 +90,12 @@ def _robot_row(status: Mapping[str, Any], name: str, peer: Mapping[str, Any] | N
     return Row((name, "", state, "", "", "", "", links), mood)
 
 
-def _lanes(peers: Sequence[Mapping[str, Any]]) -> str:
+def _lanes(status: Mapping[str, Any]) -> str:
+    peers = status["peers"]
     connected = sum(peer.get("lane") == "connected" for peer in peers)
-    return f"{connected} of {len(peers)} connected" if peers else "no peers"
+    refused = sum((status.get("beats") or {}).get("refused", {}).values())
+    lanes = f"{connected} of {len(peers)} connected" if peers else "no peers"
+    return lanes + (f", {refused} beats refused" if refused else "")
 
 
 def _branch(components: Sequence[Mapping[str, Any]], indent: str) -> list[Row]:
@@ -150,6 +153,9 @@ def remarks(status: Mapping[str, Any]) -> tuple[str, ...]:
         if component.get("state") != "released":
             found += _remarks_on(component)
     found += [f"{peer['name']}: {line}" for peer in status["peers"] for line in peer.get("notes") or ()]
+    forged = {reason: count for reason, count in (status.get("beats") or {}).get("refused", {}).items() if reason not in PASSING}
+    if forged:
+        found.append("beats were refused: " + ", ".join(f"{reason} ({count})" for reason, count in sorted(forged.items())))
     if status.get("insecure"):
         found.append("links are neither authenticated nor encrypted (insecure = true)")
     return tuple(found) + tuple(status.get("notes") or ())
@@ -172,6 +178,9 @@ def _remarks_on(component: Mapping[str, Any]) -> list[str]:
         lines.append(str(seen["promise"]))
     return [f"{component['name']}: {line}" for line in lines]
 
+
+PASSING: Final = frozenset({"unknown key", "seen before, or too old", "from an earlier life of its sender"})
+"""Why a beat may be refused also when all is well: a robot has just started, or is heard on two links at once."""
 
 REASONS_SHOWN: Final = 8
 """Of a component that cannot be captured; ``--json`` has them all."""

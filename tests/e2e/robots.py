@@ -6,6 +6,7 @@ They are the demo's own robots (`failover.cli.demo.robots`), so that what people
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -33,10 +34,18 @@ T = TypeVar("T")
 
 
 @contextmanager
-def two_robots(directory: Path, settings: str = "") -> Iterator[tuple[RobotMachine, RobotMachine]]:
-    """robot1 and robot2, beating and connected; ``settings`` are lines added to their configurations."""
+def two_robots(
+    directory: Path, settings: str = "", prepare: Callable[[Path], None] = lambda _: None
+) -> Iterator[tuple[RobotMachine, RobotMachine]]:
+    """robot1 and robot2, beating and connected.
+
+    Args:
+        settings: lines added to their configurations.
+        prepare: called with the directory in which each robot will have its own, before they start.
+    """
     with Stage(directory / "stage", means(), settings) as stage:
         stage.directory.mkdir()
+        prepare(stage.directory)
         stage.start()
         first, second = stage.robots
         try:
@@ -126,9 +135,16 @@ def keep_on(robot: RobotMachine) -> None:
     start_inside(robot, "sleep", "1000000")
 
 
-def start_agent(robot: RobotMachine) -> None:
+def start_agent(robot: RobotMachine, **environment: str) -> None:
     """Start the robot's agent again, as its service would."""
-    start_inside(robot, *agent_command(robot.directory / "agent.toml"))
+    variables = [f"{name}={value}" for name, value in environment.items()]
+    start_inside(robot, "env", *variables, *agent_command(robot.directory / "agent.toml"))
+
+
+def stop_agent(robot: RobotMachine) -> None:
+    """End the robot's agent in order, as its service would; call `keep_on` first where nothing else keeps the robot alive."""
+    os.kill(host_pid(robot, robot.status()["pid"]), signal.SIGTERM)
+    until(lambda: not answers(robot), f"the agent of {robot.name} to end")
 
 
 def answers(robot: RobotMachine) -> bool:

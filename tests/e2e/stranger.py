@@ -1,0 +1,87 @@
+"""Somebody on the robots' network who does not belong to the team: listens, repeats what it heard, invents, knocks.
+
+Each act is a process of its own inside the network of a robot.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+
+from failover.cli.demo.robots import RobotMachine
+from failover.client import team
+from failover.client.team import split_address
+from tests.e2e.robots import PATIENCE_S, has_cable
+
+RECORD = """
+import socket, struct, sys
+ETH_P_IP = 0x0800
+port, count = int(sys.argv[1]), int(sys.argv[2])
+with socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(ETH_P_IP)) as wire:
+    while count:
+        packet = wire.recv(65535)
+        head = (packet[0] & 15) * 4
+        if packet[9] == socket.IPPROTO_UDP and struct.unpack_from(">H", packet, head + 2) == (port,):
+            print(packet[head + 8 :].hex())
+            count -= 1
+"""
+
+SEND = """
+import socket, sys
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+    for line in sys.stdin:
+        link.sendto(bytes.fromhex(line), (sys.argv[1], int(sys.argv[2])))
+"""
+
+KNOCK = """
+import asyncio, sys
+from agent.transport import BulkLane, Keys, LinkState, new_keys
+from failover.core.messages import Cancel
+
+async def knock(name, address, server_key):
+    public, secret = new_keys()
+    refused = asyncio.Event()
+    said = []
+    def changed(peer, state, reason):
+        said.append((state, reason))
+        if state in (LinkState.REFUSED, LinkState.CONNECTED):
+            refused.set()
+    lane = BulkLane(name, "127.0.0.1:*", {"door": address}, Keys(public, secret, {"door": server_key}), print, changed)
+    lane.open()
+    await asyncio.wait_for(refused.wait(), 30)
+    lane.say("door", Cancel(1))
+    await lane.close()
+    print(*said[-1])
+
+asyncio.run(knock(*sys.argv[1:]))
+"""
+
+
+def _inside(robot: RobotMachine, script: str, *arguments: str, said: str = "") -> str:
+    enter = ["nsenter", "--net", f"--target={robot.process.pid}"] if has_cable() and os.geteuid() == 0 else []
+    command = [*enter, sys.executable, "-c", script, *arguments]
+    return subprocess.run(command, input=said, capture_output=True, text=True, check=True, timeout=PATIENCE_S).stdout
+
+
+def record(robot: RobotMachine, count: int) -> list[bytes]:
+    """The next beats that arrive at the robot. Needs root."""
+    _, port = _beat_address(robot)
+    return [bytes.fromhex(line) for line in _inside(robot, RECORD, str(port), str(count)).split()]
+
+
+def send(robot: RobotMachine, frames: Sequence[bytes]) -> None:
+    """Send datagrams to where the robot hears beats."""
+    host, port = _beat_address(robot)
+    _inside(robot, SEND, host, str(port), said="\n".join(frame.hex() for frame in frames))
+
+
+def knock(robot: RobotMachine, claimed: str) -> str:
+    """Connect to the robot's bulk lane under a team member's name, with a key of one's own; what came of it."""
+    me = team.read(robot.directory / "team").robots[robot.name]
+    return _inside(robot, KNOCK, claimed, me.bulk, me.public_key)
+
+
+def _beat_address(robot: RobotMachine) -> tuple[str, int]:
+    return split_address(team.read(robot.directory / "team").robots[robot.name].beats[0], robot.name)
