@@ -79,6 +79,7 @@ class Vma:
         flags: the two-letter codes of VmFlags in smaps that matter on restore ("gd" grows down, "dc" don't copy on
             fork, "dd" don't dump, "wf" wipe on fork, "hg"/"nh" huge page advice, "lo" locked, "nr" no reserve,
             "sr"/"rr" read advice, "mg" mergeable).
+        guards: pages that MADV_GUARD_INSTALL (madvise(2)) lets nobody touch, in address order; they hold nothing.
     """
 
     start: int
@@ -90,6 +91,7 @@ class Vma:
     name: str = ""
     file: FileIdentity | None = None
     flags: tuple[str, ...] = ()
+    guards: tuple[PageRun, ...] = ()
 
     @property
     def size(self) -> int:

@@ -43,6 +43,7 @@ def check_snapshot(snapshot: Snapshot, contents_size: int | None = None) -> None
     _check_extents(snapshot.cleared, page_size, "cleared runs")
     _check_extents(snapshot.runs, page_size, "runs")
     _check_runs_mapped(snapshot.runs, snapshot.vmas)
+    _check_guards(snapshot, page_size)
     _check_contents(snapshot, len(memoryview(snapshot.contents).cast("B")) if contents_size is None else contents_size)
     _check_threads(snapshot)
     _check_output(snapshot.output)
@@ -97,6 +98,19 @@ def _check_runs_mapped(runs: tuple[PageRun, ...], vmas: tuple[Vma, ...]) -> None
     stray = pages.difference(pages.extents(runs), pages.extents(vmas))
     if len(stray):
         raise FormatError(f"runs: {_span(stray, np.intp(0))} lies in no mapping")
+
+
+def _check_guards(snapshot: Snapshot, page_size: int) -> None:
+    """Guards lie inside their own mapping and hold nothing."""
+    for vma in snapshot.vmas:
+        if vma.guards:
+            _check_extents(vma.guards, page_size, "guards")
+            if vma.guards[0].start < vma.start or vma.guards[-1].end > vma.end:
+                raise FormatError(f"guards: not all inside their mapping {vma.start:#x}-{vma.end:#x}")
+    every = pages.extents(guard for vma in snapshot.vmas for guard in vma.guards)
+    carried = pages.intersection(every, pages.extents(snapshot.runs)) if len(every) else every
+    if len(carried):
+        raise FormatError(f"guards: {_span(carried, np.intp(0))} is carried, too")
 
 
 def _check_contents(snapshot: Snapshot, contents_size: int) -> None:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
+from checkpoint import pages
 from checkpoint.linux.procfs import DELETED, MapsLine
 from checkpoint.linux.tracking import NOT_CARRIED
 from checkpoint.model import FileIdentity, Vma, VmaKind
+from checkpoint.pages import Words
 from checkpoint.resources import files
 
 KEPT_FLAGS: Final = frozenset(("gd", "dc", "dd", "wf", "hg", "nh", "lo", "lf", "nr", "sr", "rr", "mg"))
@@ -32,13 +35,17 @@ class Identities:
         self._pid = pid
         self._known: dict[tuple[int, int, str], FileIdentity] = {}
 
-    def vmas(self, lines: Sequence[MapsLine], flags: Mapping[int, tuple[str, ...]]) -> tuple[Vma, ...]:
+    def vmas(self, lines: Sequence[MapsLine], flags: Mapping[int, tuple[str, ...]], guards: Words) -> tuple[Vma, ...]:
         """The mappings as the model has them.
 
         Args:
             flags: VmFlags by start, possibly older than ``lines``.
+            guards: guard pages of all of them.
         """
-        return tuple(self._vma(line, flags.get(line.start, ())) for line in lines if line.name != VSYSCALL)
+        found = (self._vma(line, flags.get(line.start, ())) for line in lines if line.name != VSYSCALL)
+        if not len(guards):
+            return tuple(found)
+        return tuple(replace(vma, guards=pages.page_runs(pages.intersection(guards, pages.extents((vma,))))) for vma in found)
 
     def _vma(self, line: MapsLine, flags: tuple[str, ...]) -> Vma:
         is_file = line.has_file and line.name not in NOT_CARRIED and not line.name.startswith("/dev/zero")

@@ -84,6 +84,7 @@ class Frozen:
     totals: Totals
     written: Words
     cleared: Words
+    guards: Words
     content: bytearray
     freeze_us: int
 
@@ -113,6 +114,7 @@ class PtraceSession:
         self._borrowed = entered.pages
         self._tracker = entered.tracker
         self._shared = SharedPages(pid)
+        self._page_tables = pagetables.existence(pid)
         self._maps = MapsReader(pid)
         self._has_moved = False
         self._lines: tuple[MapsLine, ...] = ()
@@ -166,6 +168,7 @@ class PtraceSession:
             self._thaw()
         self._tracker.close()
         self._shared.close()
+        self._page_tables.close()
         if self._outputs:
             self._outputs.close()
 
@@ -204,7 +207,7 @@ class PtraceSession:
             raise UnsupportedError(f"cannot capture {self.component} (pid {self.pid}): {'; '.join(reasons)}", reasons)
         if copied is not None:
             frozen = _merged(copied, frozen)
-        vmas = self._identities.vmas(frozen.lines, self._flags)
+        vmas = self._identities.vmas(frozen.lines, self._flags, frozen.guards)
         snapshot = self._with_pages(self._outline(order, parent, frozen, vmas), frozen)
         snapshot = replace(
             snapshot,
@@ -313,7 +316,8 @@ class PtraceSession:
             raise CaptureError(f"pid {self.pid} still stands in code of an earlier look; capture it again in a moment")
         registers = arch.encode_registers(decoded)
         self._refresh_mappings()
-        self._remember(self._scan())
+        guards = self._page_tables.guards(self._mapped())
+        self._remember(_without(guards, self._scan()))
         written, cleared = self._since_acknowledged(base=base)
         content = tracee.memory.read_pages(written, self._buffer) if len(written) else EMPTY_CONTENT
         told = self._ask(special, registers, mask)
@@ -336,6 +340,7 @@ class PtraceSession:
             totals=self._outputs.totals() if self._outputs else (0, 0),
             written=written,
             cleared=cleared,
+            guards=guards,
             content=content,
             freeze_us=0,
         )
@@ -516,6 +521,14 @@ class PtraceSession:
 
 
 # Pieces
+
+
+def _without(guards: Words, scan: tracking.Scan) -> tracking.Scan:
+    """A page that has become a guard counts as written, and there is nothing to read."""
+    installed = pages.intersection(scan.written, guards) if len(guards) else NONE
+    if not len(installed):
+        return scan
+    return tracking.Scan(pages.difference(scan.written, installed), pages.union(scan.cleared, installed))
 
 
 def _readable(tracee: Tracee, ranges: Words) -> tuple[Words, bytearray]:

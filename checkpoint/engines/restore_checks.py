@@ -63,10 +63,22 @@ def _of_machine(state: Snapshot) -> Iterator[str]:
     if lacking := set(machine.features) & x86_64_stub.INSTRUCTION_SETS - set(here.features):
         listed = ", ".join(sorted(lacking))
         yield f"this processor lacks {listed}, by which the program may have chosen its code: use one that has them"
+    if any(vma.guards for vma in state.vmas) and not can_install_guards():
+        yield f"it has guard pages of madvise(2), which our kernel ({here.kernel}) does not know: boot Linux 6.13 or later"
     if state.process.root_directory != "/":
         yield f"its root directory is {state.process.root_directory}: programs in a chroot are not supported"
     if not os.path.isdir(state.process.working_directory):
         yield f"its working directory {state.process.working_directory} is missing: make it"
+
+
+def can_install_guards() -> bool:
+    """Whether this kernel knows MADV_GUARD_INSTALL."""
+    with mmap.mmap(-1, abi.PAGE_SIZE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS) as page:
+        try:
+            page.madvise(abi.MADV_GUARD_INSTALL)
+        except OSError:
+            return False
+    return True
 
 
 # --- Files -----------------------------------------------------------------------------------------------------------

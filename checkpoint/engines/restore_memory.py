@@ -159,13 +159,15 @@ def fill(memory: Memory, snapshot: Snapshot) -> None:
 
 
 def settle(table: CallTable, vmas: Iterable[Vma], runs: Sequence[PageRun]) -> None:
-    """Give every mapping its own protection, advice, name and lock."""
+    """Give every mapping its own protection, guards, advice, name and lock (a locked mapping takes no guards)."""
     carried = Carried(runs)
     for vma in vmas:
         if vma.kind in KERNEL_KINDS:
             continue
         if vma.shared or _first_protection(vma, carried) != vma.protection:
             table.call(f"protect {vma.start:#x}", "mprotect", vma.start, vma.size, vma.protection)
+        for guard in vma.guards:
+            table.call(f"install a guard at {guard.start:#x}", "madvise", guard.start, guard.size, abi.MADV_GUARD_INSTALL)
         for letters in vma.flags:
             if letters in ADVICE:
                 lost = f"memory at {vma.start:#x} loses its advice {letters!r}"

@@ -68,6 +68,7 @@ MAP_STACK: Final = 0x20000
 MAP_FIXED_NOREPLACE: Final = 0x100000
 MADV_DONTDUMP: Final = 16
 MADV_DONTFORK: Final = 10
+MADV_GUARD_INSTALL: Final = 102
 
 # linux/userfaultfd.h
 O_CLOEXEC: Final = os.O_CLOEXEC
@@ -94,6 +95,7 @@ PAGE_IS_SWAPPED: Final = 1 << 4
 PAGE_IS_PFNZERO: Final = 1 << 5
 PAGE_IS_HUGE: Final = 1 << 6
 PAGE_IS_SOFT_DIRTY: Final = 1 << 7
+PAGE_IS_GUARD: Final = 1 << 8
 
 # linux/prctl.h
 PR_SET_PDEATHSIG: Final = 1

@@ -41,6 +41,7 @@ WAYS = {
     "shared_memory": "s",
     "huge_pages": "hH",
     "a_private_file_mapping": "k",
+    "guards": "gp",
     "everything": "wpzdDmMorSjxvcbshHk",
 }
 SEEDS = range(1, 2 + int(os.environ.get("FAILOVER_TEST_SEEDS", "0")))

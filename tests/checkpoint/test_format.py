@@ -115,10 +115,17 @@ def test_what_is_no_snapshot_is_said_so(content: bytes) -> None:
         format.decode(content)
 
 
+def with_guards(made: Snapshot, first: int, count: int) -> Snapshot:
+    guards = (PageRun(START + first * PAGE, START + (first + count) * PAGE),)
+    return replace(made, vmas=(replace(made.vmas[0], guards=guards),))
+
+
 BROKEN = {
     "page size": lambda made: replace(made, machine=replace(made.machine, page_size=5000)),
     "overlaps": lambda made: replace(made, vmas=made.vmas * 2),
     "lies in no mapping": lambda made: replace(made, runs=(PageRun(PAGE, 5 * PAGE),)),
+    "not all inside": lambda made: with_guards(made, 200, 1),
+    "is carried, too": lambda made: with_guards(made, 3, 2),
     "where the runs need": lambda made: replace(made, contents=made.contents[:-1]),
     "page sum": lambda made: replace(made, page_sum=b""),
     "same id": lambda made: replace(made, threads=made.threads * 2),

@@ -23,7 +23,7 @@ MAPS = {
         for kind in (
             *(model.Position, model.Machine, model.Clocks, model.ProcessState, model.FileIdentity, model.MemoryLayout),
             *(model.Credentials, model.SignalAction, model.IntervalTimer, model.PosixTimer, model.ThreadState, model.Rseq),
-            *(model.Vma, model.OutputPiece),
+            *(model.Vma, model.PageRun, model.OutputPiece),
         )
     },
 }

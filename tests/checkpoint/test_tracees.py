@@ -119,7 +119,6 @@ FILES = cases(
 PRESERVED = [*MEMORY, *REGISTERS, *SIGNALS, *TIME, *PORTRAITS, *FILES]
 
 NOT_YET = {
-    "guard_pages-advised": "guards made by MADV_GUARD_INSTALL are not kept yet",
     "deleted_mapping": "refused: a mapping of a deleted file is not kept yet",
     "sigwait-timed": "a sigtimedwait ends with EAGAIN at a capture",
     "timer_overrun": "the kernel does not tell how often a timer went off while its signal was pending",

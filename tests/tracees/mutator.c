@@ -10,11 +10,18 @@
 #define COUNT 384           /* pages of the arena */
 #define BREAK_COUNT 64      /* pages of heap, at most */
 #define HUGE_COUNT 1024     /* two huge pages */
+#define GUARD_COUNT 256     /* pages of which some are guards (MADV_GUARD_INSTALL, Linux 6.13) */
 #define OPERATIONS_A_ROUND 12
 
-static unsigned char *arena, *elsewhere, *broken, *shared, *large, *mapped;
+#ifndef MADV_GUARD_INSTALL
+#define MADV_GUARD_INSTALL 102
+#define MADV_GUARD_REMOVE 103
+#endif
+
+static unsigned char *arena, *elsewhere, *broken, *shared, *large, *mapped, *guarded;
 static uint64_t expected[COUNT], expected_shared[16], expected_large[HUGE_COUNT], expected_break[BREAK_COUNT],
-    expected_mapped[16];
+    expected_mapped[16], expected_guarded[GUARD_COUNT];
+static char is_guard[GUARD_COUNT];
 static char last[COUNT];
 static int break_count, scratch;
 static uint64_t state;
@@ -145,8 +152,25 @@ static void change_break(void) {
     break_count = wanted;
 }
 
+static void guard_or_write(void) {
+    int first = dice(GUARD_COUNT), size = 1 + dice(dice(4) ? 4 : 100), way = dice(3);
+    unsigned char *place = guarded + first * PAGE;
+    if (size > GUARD_COUNT - first) size = GUARD_COUNT - first;
+    if (way < 2) must(madvise(place, size * PAGE, way ? MADV_GUARD_INSTALL : MADV_GUARD_REMOVE) == 0, "madvise of guards");
+    for (int index = first; index < first + size; index++) {
+        if (way < 2) is_guard[index] = way;
+        if (is_guard[index]) continue;
+        if (way == 2) patch_word(guarded + index * PAGE, 1);
+        expected_guarded[index] = sum_of(guarded + index * PAGE);
+    }
+}
+
+/* The kernel reads the page for us, as the name of a file, and says EFAULT instead of sending SIGSEGV. */
+static int bites(int index) { return access((char *)guarded + index * PAGE, F_OK) != 0 && errno == EFAULT; }
+
 static void change_others(char letter) {
     if (letter == 'b') change_break();
+    if (letter == 'g') guard_or_write();
     if (letter == 's') {
         int index = dice(16);
         patch_word(shared + index * PAGE, 1);
@@ -199,15 +223,28 @@ static uint64_t compare(const char *what, const unsigned char *place, const uint
     return total;
 }
 
+static uint64_t compare_guarded(void) {
+    uint64_t total = 0;
+    for (int index = 0; index < GUARD_COUNT; index++) {
+        total = mix(total ^ is_guard[index]);
+        if (bites(index) != is_guard[index])
+            differs("page %d is %s guard", index, is_guard[index] ? "no longer a" : "now a");
+        else if (!is_guard[index])
+            total ^= compare("guarded", guarded + index * PAGE, expected_guarded + index, 1);
+    }
+    return total;
+}
+
 static uint64_t compare_all(void) {
     uint64_t total = compare("arena", arena, expected, COUNT);
+    if (guarded) total = mix(total ^ compare_guarded());
     total = mix(total ^ compare("shared", shared, expected_shared, 16));
     total = mix(total ^ compare("huge", large, expected_large, HUGE_COUNT));
     total = mix(total ^ compare("file", mapped, expected_mapped, 16));
     return mix(total ^ compare("heap", broken, expected_break, break_count));
 }
 
-static void set_stage(void) {
+static void set_stage(const char *letters) {
     arena = map_pages(COUNT + 2, PROT_READ | PROT_WRITE, 0) + PAGE;
     elsewhere = map_pages(16, PROT_NONE, 0);
     large = map_pages(2 * HUGE_COUNT, PROT_READ | PROT_WRITE, 0);
@@ -224,6 +261,12 @@ static void set_stage(void) {
     mapped = mmap(NULL, 16 * PAGE, PROT_READ | PROT_WRITE, MAP_PRIVATE, scratch, 0);
     for (int index = 0; index < COUNT; index++) fill(arena + index * PAGE, PAGE * (index % 4 != 0), index);
     note(0, COUNT, 'i');
+    if (strchr(letters, 'g')) {
+        guarded = map_pages(GUARD_COUNT, PROT_READ | PROT_WRITE, 0);
+        if (madvise(guarded, PAGE, MADV_GUARD_INSTALL) || madvise(guarded, PAGE, MADV_GUARD_REMOVE))
+            cannot("install guards by madvise");
+        for (int index = 0; index < GUARD_COUNT; index++) expected_guarded[index] = sum_of(guarded + index * PAGE);
+    }
     for (int index = 0; index < 16; index++) expected_shared[index] = sum_of(shared + index * PAGE);
     for (int index = 0; index < 16; index++) expected_mapped[index] = sum_of(mapped + index * PAGE);
     for (int index = 0; index < HUGE_COUNT; index++) expected_large[index] = sum_of(large + index * PAGE);
@@ -237,7 +280,7 @@ int main(int count, char **arguments) {
     state = strtoull(arguments[3], NULL, 0);
     static char buffer[4096]; /* the heap belongs to the experiment */
     setvbuf(stdout, buffer, _IOFBF, sizeof buffer);
-    set_stage();
+    set_stage(letters);
     ready();
     for (long round = 0; round < rounds && !is_told(arguments[1]); round++) {
         for (int step = 0; step < OPERATIONS_A_ROUND; step++) operate(letters);
