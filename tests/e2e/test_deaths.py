@@ -1,7 +1,7 @@
 """Keeper, agent and both are killed, at instants spread over captures and restores: the program is none the worse.
 
 Two robots of which one waits (``on_loss = "hold"``), so that an agent that is away for a second is a pause of the protection and
-not a takeover. FAILOVER_KILLS=200 kills each that often.
+not a takeover. FAILOVER_KILLS=200 kills each that often, at instants that FAILOVER_SEED chooses.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from tests.e2e.robots import RobotMachine
 pytestmark = pytest.mark.root
 
 KILLS = int(os.environ.get("FAILOVER_KILLS", "4"))
+SEED = os.environ.get("FAILOVER_SEED", "")
 COUNT = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.005)\n"
 SPREAD_S = 0.15
 """Instants of death lie in here: a capture begins every 0.1 s."""
@@ -95,7 +96,7 @@ def numbers(content: bytes) -> list[int]:
 @pytest.mark.parametrize("way", WAYS)
 def test_whoever_is_killed_the_program_runs_on(pair: Pair, way: str) -> None:
     first, second = pair
-    dice = random.Random(way)
+    dice = random.Random(f"{way} {SEED}")
     robots.run(first, "count", "/usr/bin/python3", "-S", "-c", COUNT)
     robots.until(lambda: robots.checkpoints(second, "count") >= 3, "checkpoints at robot2")
     pid = robots.component(first, "count")["pid"]
@@ -145,7 +146,7 @@ def copies(robot: RobotMachine) -> tuple[int, int]:
 @pytest.mark.parametrize("way", WAYS)
 def test_a_restore_that_is_broken_off_leaves_nothing_behind(pair: Pair, way: str) -> None:
     """The robot that is to go on with the program loses a part of its agent in the middle of it, again and again."""
-    dice = random.Random(f"restore {way}")
+    dice = random.Random(f"restore {way} {SEED}")
     robots.run(pair[0], "count", "/usr/bin/python3", "-S", "-c", COUNT)
     for _ in range(KILLS):
         source = robots.until(lambda: settled(pair), "one robot to run it and the other to protect it")
