@@ -25,6 +25,8 @@ DIRTY_KB: Final = 400
 NOBODY: Final = "nobody"
 FIRST_BASE: Final = f"{OURS}, first base"
 
+SEEN: Final = ("the program stands still (its own clock)", "until the snapshot is whole", "size of the snapshot")
+
 NANOSECONDS_A_MILLISECOND: Final = 1_000_000
 
 T = TypeVar("T")
@@ -40,11 +42,7 @@ class Observed:
 
     def figures(self, case: str, who: str) -> list[Figure]:
         """One figure for each of the three that was seen at all."""
-        rows = (
-            ("the program stands still (its own clock)", "ms", self.stops_ms),
-            ("until the snapshot is whole", "ms", self.walls_ms),
-            ("size of the snapshot", "MB", self.sizes_mb),
-        )
+        rows = zip(SEEN, ("ms", "ms", "MB"), (self.stops_ms, self.walls_ms, self.sizes_mb), strict=True)
         return [Figure(what, case, unit, tuple(values), who) for what, unit, values in rows if values]
 
 
@@ -60,7 +58,7 @@ def beside(quick: bool, directory: Path) -> Findings:
         f"A program with random memory of the given size writes {DIRTY_KB} KB of it anew each 50 ms and reads its clock without "
         "a pause; the longest time between two readings is what it felt. Ours is a delta, the others write the whole program "
         f"again each time. “{NOBODY}”: no snapshot at all, what the machine itself does to it.",
-        tuple(sorted(figures, key=lambda figure: figure.benchmark)),
+        tuple(sorted(figures, key=lambda figure: SEEN.index(figure.benchmark))),
         absent,
     )
 
