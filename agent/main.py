@@ -39,7 +39,7 @@ log = logging.getLogger("failover.agent")
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the agent until SIGTERM, or print a key pair, or check a configuration."""
-    wanted = _parser().parse_args(arguments)
+    wanted = command_line().parse_args(arguments)
     try:
         if wanted.command == "keypair":
             return _print_keys()
@@ -72,7 +72,8 @@ def _print_keys() -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
+def command_line() -> argparse.ArgumentParser:
+    """What can be typed."""
     parser = argparse.ArgumentParser(
         prog="failover-agent",
         description=DESCRIPTION.strip(),

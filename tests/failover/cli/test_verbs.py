@@ -274,6 +274,25 @@ def test_completion_knows_every_verb(shell: str) -> None:
     assert all(verb in script for verb in parser.verbs())
 
 
+@pytest.mark.command("bash")
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [("st", {"stop", "status"}), ("team en", {"enrol"}), ("run --na", {"--name"}), ("completion z", {"zsh"})],
+)
+def test_a_real_bash_completes(typed: str, offered: set[str], tmp_path: Path) -> None:
+    (tmp_path / "failover.bash").write_text(failover("completion", "bash").stdout)
+    *before, last = ["failover", *typed.split()]
+    script = f"""
+        source {tmp_path}/failover.bash
+        function=$(complete -p failover | sed 's/.*-F \\([^ ]*\\).*/\\1/')
+        COMP_WORDS=({" ".join([*before, last])}) COMP_CWORD={len(before)}
+        $function failover '{last}' '{before[-1]}'
+        printf '%s\\n' "${{COMPREPLY[@]}}"
+    """
+    ran = subprocess.run(["bash", "--norc", "-c", script], capture_output=True, text=True, check=False)
+    assert set(ran.stdout.split()) == offered, ran.stderr
+
+
 def test_a_reader_that_has_seen_enough_is_no_error_message(agent: Start) -> None:
     stand_in = agent(lambda request: [*(Output(1, n * 1000, b"x" * 999 + b"\n") for n in range(2000)), Result({"name": "x"})])
     command = f"{' '.join(COMMAND)} logs x | head -n 1"
