@@ -21,7 +21,7 @@ from checkpoint.resources import OpenFile, Surroundings
 
 KIND: Final = "unsupported"
 
-_ADVICE: Final = "is not kept yet: protect the program while it has none, or let it use the cooperative engine"
+_ADVICE: Final = "is not kept yet: protect the program while it has none"
 
 ANONYMOUS_INODES: Final[Mapping[str, str]] = {
     "eventpoll": "an epoll instance",

@@ -85,7 +85,7 @@ def _robot_row(status: Mapping[str, Any], name: str, peer: Mapping[str, Any] | N
         return Row((f"{name} (here)", str(status.get("role") or ""), "live", "", "", "", "", _lanes(status)), "good")
     state = peer["state"]
     lost = peer.get("beats_lost")
-    links = ", ".join(part for part in (peer.get("lane") or "", f"{lost} beats lost" if lost else "") if part)
+    links = ", ".join(part for part in (peer.get("lane") or "", f"{lost} beat{'s' * (lost > 1)} lost" if lost else "") if part)
     mood: Mood = "good" if state == "live" else "bad" if state == "dead" else "warning"
     return Row((name, "", state, "", "", "", "", links), mood)
 
