@@ -21,7 +21,7 @@ from failover.client import team
 NAME: Final = "/demo/robot1/measured"
 RESIDENT_MB: Final = 100
 DIRTY_KB: Final = (0, 400, 2000)
-WINDOW_S: Final = 2.5
+WINDOW_S: Final = 2.0
 WARM_SNAPSHOTS: Final = 5
 
 SHIPPED_MB: Final = 500
@@ -44,7 +44,7 @@ def throughput(quick: bool, directory: Path) -> Findings:
         with Stage(place, ON_LOOPBACK) as stage, running("working", RESIDENT_MB, dirty_kb, directory=directory) as program:
             place.mkdir()
             stage.start()
-            figures += _in_turns(stage, program, dirty_kb, 2 if quick else 4)
+            figures += _in_turns(stage, program, dirty_kb, 2 if quick else 3)
     return Findings(
         "What protection costs the program",
         f"A Python program with {RESIDENT_MB} MB resident that calculates without a pause, on a machine that plays both robots "

@@ -9,13 +9,15 @@ from benchmarks.figures import Figure
 from benchmarks.running import BenchmarkError
 from failover.cli.demo.robots import RobotMachine, Stage, means
 
-COUNTS = (1, 2, 4)
-"""Programs that are taken over at once."""
+CUTS = {1: 6, 2: 5, 4: 4}
+"""Programs that are taken over at once, and how often the power is cut for it."""
+
+QUICK_CUTS = {1: 2, 2: 1}
 
 COUNTING = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.01)\n"
 """Prints every 10 ms."""
 
-SNAPSHOTS = 25
+SNAPSHOTS = 15
 PATIENCE_S = 60.0
 IN_FLIGHT_S = 0.03
 """A snapshot that was on its way at the cut may still lengthen the standby's log so much later."""
@@ -23,7 +25,7 @@ IN_FLIGHT_S = 0.03
 
 def outage(quick: bool, directory: Path) -> list[Figure]:
     """Cut a robot's power again and again, with one, two and four programs running there."""
-    return [_outages(count, 2 if quick else 6, directory) for count in (COUNTS[:2] if quick else COUNTS)]
+    return [_outages(count, cuts, directory) for count, cuts in (QUICK_CUTS if quick else CUTS).items()]
 
 
 def _outages(count: int, cuts: int, directory: Path) -> Figure:
