@@ -8,6 +8,7 @@ holds the boot counter, which tells this life of the agent from every earlier on
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 from pathlib import Path
@@ -18,6 +19,10 @@ import msgspec
 from agent.errors import BallotError
 
 FILE_NAME: Final = "ballot"
+RESERVE_NAME: Final = "ballot.reserve"
+RESERVE_SIZE: Final = 64 << 10
+"""Bytes kept for the ballot of a full disk: a vote needs a few hundred, and a takeover cannot wait for an administrator."""
+FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 VERSION: Final = 1
 SIZE_LIMIT: Final = 4 << 20
 """Bytes; a record of ten thousand components is under a tenth of it."""
@@ -99,7 +104,7 @@ class Ballot:
         body = msgspec.json.encode(record)
         aside = self._path.with_suffix(".new")
         try:
-            write_durably(aside, body + b"\n" + _digest(body).encode() + b"\n")
+            self._write_aside(aside, body + b"\n" + _digest(body).encode() + b"\n")
             aside.rename(self._path)
             sync_directory(self._directory)
         except OSError as error:
@@ -109,6 +114,38 @@ class Ballot:
                 f"cannot keep an epoch in {self._path}: {error.strerror}; until then this robot gives no vote, takes nothing over"
             ) from error
         self._record = record
+        self._take_reserve()
+
+    def _write_aside(self, aside: Path, content: bytes) -> None:
+        """Write durably, if need be into the room that was kept for this."""
+        try:
+            write_durably(aside, content)
+        except OSError as error:
+            if error.errno not in FULL or not self._give_reserve():
+                raise
+            write_durably(aside, content)
+
+    def _give_reserve(self) -> bool:
+        """The disk is full: let the room go that was kept; False if there is none."""
+        try:
+            (self._directory / RESERVE_NAME).unlink()
+        except OSError:
+            return False
+        return True
+
+    def _take_reserve(self) -> None:
+        """Keep some room, if there is any."""
+        path = self._directory / RESERVE_NAME
+        if path.exists():
+            return
+        with contextlib.suppress(OSError):
+            descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            try:
+                os.posix_fallocate(descriptor, 0, RESERVE_SIZE)
+            except OSError:
+                path.unlink()  # an empty one would be no reserve
+            finally:
+                os.close(descriptor)
 
 
 def write_durably(path: Path, content: bytes) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -61,3 +63,23 @@ def test_a_disk_that_refuses_leaves_the_old_record(tmp_path: Path) -> None:
     ballot = Ballot(tmp_path / "gone", "robot1")
     with pytest.raises(BallotError, match="gives no vote"):
         ballot.open()
+
+
+@pytest.mark.root
+def test_a_vote_finds_room_on_a_disk_that_became_full(tmp_path: Path) -> None:
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "disk", str(tmp_path)], check=True)
+    try:
+        kept = Ballot(tmp_path, "robot1")
+        kept.open()
+        with (tmp_path / "film").open("wb", buffering=0) as film, contextlib.suppress(OSError):
+            while film.write(bytes(4096)):
+                pass
+        kept.keep(b"epoch 7")
+        with pytest.raises(BallotError, match="No space left"):
+            kept.keep(bytes(128 << 10))  # more than was kept free
+        assert kept.record.core == b"epoch 7"
+        (tmp_path / "film").unlink()
+        kept.keep(b"epoch 8")
+        assert (tmp_path / "ballot.reserve").stat().st_blocks * 512 >= 64 << 10
+    finally:
+        subprocess.run(["umount", str(tmp_path)], check=True)

@@ -242,7 +242,7 @@ class Stage:
     def _start_robot(self, name: str) -> RobotMachine:
         directory = self.directory / name
         for part in ("state", "run"):
-            (directory / part).mkdir()
+            (directory / part).mkdir(exist_ok=True)  # a test may have put a disk of its own there
         config = directory / "agent.toml"
         config.write_text(
             f'robot = "{name}"\n'
