@@ -340,6 +340,7 @@ class Charge:
     async def _keep_aside(self, act: acts.KeepAside) -> None:
         """One last snapshot of a copy that lost, where nobody resumes from it by himself."""
         component = self._present()
+        await component.freeze(exposed=True)  # perhaps its lease has frozen it already
         newest = self.figures.newest or Position(1, 0, b"")
         captured = await component.capture(
             base=True, generation=newest.generation, sequence=newest.sequence + 1, epoch=act.epoch, hold=True

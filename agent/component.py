@@ -328,9 +328,9 @@ class Component:
         """The program may run until CLOCK_MONOTONIC passes ``until_ns``; renew in time. 0 for ever. Thaws what a lease froze."""
         await self._ask_guard(guard_messages.Lease(until_ns))
 
-    async def freeze(self) -> None:
-        """Hold the program still; it is when this returns."""
-        await self._ask_guard(guard_messages.Freeze())
+    async def freeze(self, *, exposed: bool = False) -> None:
+        """Hold the program still; it is when this returns. Held ``exposed`` it can be captured all the same."""
+        await self._ask_guard(guard_messages.Freeze(exposed))
 
     async def thaw(self) -> None:
         """Let it go on. Raises GuardError while its lease is over."""

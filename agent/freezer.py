@@ -42,6 +42,9 @@ class Freezer(Protocol):
     def freeze(self) -> bool:
         """Hold everything; True once every thread stands, False if one does not yet (it will as soon as it leaves the kernel)."""
 
+    def expose(self) -> None:
+        """Hold what is frozen so that a tracer can make calls in it, too; nothing of it runs by itself meanwhile."""
+
     def thaw(self) -> None:
         """Let everything go on."""
 
@@ -65,6 +68,7 @@ class CgroupFreezer:
         """
         directory.mkdir()
         self._directory = directory
+        self._exposed: list[int] = []
         try:
             self._write("cgroup.freeze", "0")
         except OSError:
@@ -101,17 +105,34 @@ class CgroupFreezer:
                 events.seek(0)
         return True
 
+    def expose(self) -> None:
+        """Let SIGSTOP hold it instead: a thread that its cgroup holds does not come back to a tracer that lets it make a call.
+
+        The signal is pending before the cgroup lets go, so that a thread goes from the one into the other (get_signal() in the
+        kernel's signal.c). It also outlives the tracer: a process that was stopped before it was seized stands when it is let go.
+        """
+        fresh = [pid for pid in self._processes() if _state(pid) not in STANDING]
+        for pid in fresh:
+            _send(pid, signal.SIGSTOP)
+        self._exposed += fresh
+        self._write("cgroup.freeze", "0")
+        deadline = time.monotonic() + SETTLE_S
+        while not {_state(pid) for pid in fresh} <= HELD | {""} and time.monotonic() < deadline:
+            time.sleep(SETTLE_STEP_S)
+
     def thaw(self) -> None:
         """Thaw."""
         self._write("cgroup.freeze", "0")
+        while self._exposed:
+            _send(self._exposed.pop(), signal.SIGCONT)
 
     def kill(self) -> None:
         """Kill all at once (Linux 5.14), else one by one."""
         try:
             self._write("cgroup.kill", "1")
         except FileNotFoundError:
-            for pid in (self._directory / "cgroup.procs").read_text(encoding="ascii").split():
-                _send(int(pid), signal.SIGKILL)
+            for pid in self._processes():
+                _send(pid, signal.SIGKILL)
 
     def close(self) -> None:
         """Remove the cgroup, once its last process has been reaped."""
@@ -127,6 +148,9 @@ class CgroupFreezer:
                 time.sleep(SETTLE_STEP_S)
             else:
                 return
+
+    def _processes(self) -> list[int]:
+        return [int(pid) for pid in (self._directory / "cgroup.procs").read_text(encoding="ascii").split()]
 
     def _write(self, name: str, text: str) -> None:
         with open(self._directory / name, "w", encoding="ascii") as file:
@@ -165,6 +189,9 @@ class SignalFreezer:
             if time.monotonic() > deadline:
                 return False
             time.sleep(SETTLE_STEP_S)
+
+    def expose(self) -> None:
+        """It is held by SIGSTOP already."""
 
     def thaw(self) -> None:
         """Continue those that we stopped; what stood before by itself stays as it was."""

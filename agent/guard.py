@@ -81,7 +81,7 @@ class Guard:
             Watch: self._watch,
             Commit: self._commit,
             Lease: self._lease,
-            Freeze: lambda _, __: self._act(lambda ward: ward.freeze()),
+            Freeze: lambda request, _: self._act(lambda ward: ward.freeze(exposed=request.exposed)),
             Thaw: lambda _, __: self._act(lambda ward: ward.thaw()),
             Kill: lambda request, _: self._act(lambda ward: ward.kill(request.signal)),
             Describe: lambda _, __: self._reply(self._description(), self._ward.descriptors() if self._ward is not None else ()),

@@ -74,7 +74,13 @@ class Lease(Message, frozen=True):
 
 
 class Freeze(Message, frozen=True):
-    """Hold the component still until `Thaw`."""
+    """Hold the component still until `Thaw`.
+
+    Attributes:
+        exposed: so that a tracer can make calls in it: by SIGSTOP, also where its cgroup would hold it.
+    """
+
+    exposed: bool = False
 
 
 class Thaw(Message, frozen=True):

@@ -140,14 +140,19 @@ class Ward:
         self.committed = True
         self.lapse(time.monotonic_ns())
 
-    def freeze(self, by: Literal["order", "lease"] = "order") -> None:
+    def freeze(self, by: Literal["order", "lease"] = "order", *, exposed: bool = False) -> None:
         """Hold it; a thread that is deep in the kernel stands as soon as it leaves it.
+
+        Args:
+            exposed: a tracer may look into it, see `Freezer.expose`.
 
         Raises:
             WardError: it has ended.
         """
         self._check_alive("freeze it")
         self.freezer.freeze()
+        if exposed:
+            self.freezer.expose()
         self.frozen_by = by
 
     def thaw(self) -> None:
@@ -170,7 +175,7 @@ class Ward:
 
     def lapse(self, now_ns: int) -> bool:
         """Freeze it if its lease is over by now; returns whether this did it."""
-        held = not self.committed or self.frozen_by == "lease"
+        held = not self.committed or self.frozen_by
         if held or self.exited is not None or not self._lease_is_over(now_ns):
             return False
         self.freeze("lease")

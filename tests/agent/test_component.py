@@ -8,6 +8,7 @@ import os
 import signal
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -218,6 +219,23 @@ def test_a_program_that_a_capture_holds_goes_on_when_it_is_thawed(tmp_path: Path
             await component.thaw()
             await more(component)
             counted(output(component))
+            captures.close()
+
+    live(tmp_path, story)
+
+
+@pytest.mark.parametrize("cgroup", ["", "/nonexistent"])
+def test_a_program_that_its_lease_has_frozen_can_be_captured_when_it_is_held_for_that(tmp_path: Path, cgroup: str) -> None:
+    async def story(places: Places) -> None:
+        async with started(replace(places, cgroup=cgroup), COUNT) as component:
+            await more(component)
+            await component.lease(1)
+            await component.freeze(exposed=True)
+            standing = output(component)
+            captures = Captures(component)
+            piece = piece_of(await captures.take(hold=True))
+            assert piece.offset + len(piece.content) == len(standing)
+            assert output(component) == standing, "it did not run for it"
             captures.close()
 
     live(tmp_path, story)

@@ -307,6 +307,28 @@ def test_a_vessel_is_held_from_its_commit_on_if_its_lease_is_over(guard: GuardPr
     assert agent.describe().frozen_by == "lease"
 
 
+def state_of(pid: int) -> str:
+    """The state letter of a process."""
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+
+
+@pytest.mark.parametrize("by", ["order", "lease"])
+@pytest.mark.parametrize("cgroup", ["", NO_CGROUP])
+def test_what_is_held_for_a_tracer_stands_by_itself_until_it_is_thawed(guard: GuardProcess, cgroup: str, by: str) -> None:
+    agent = guard.agent()
+    pid = guard.start(agent, *COUNTING, cgroup=cgroup).pid
+    grows(guard)
+    if by == "lease":
+        agent.ask(Lease(1))
+        agent.event(FrozenByLease)
+    assert isinstance(agent.ask(Freeze(exposed=True)), Done)
+    assert state_of(pid) == "T" and stands_still(guard)
+    agent.ask(Lease(0))
+    assert stands_still(guard)
+    agent.ask(Thaw())
+    assert grows(guard)
+
+
 def test_a_frozen_program_can_be_killed(guard: GuardProcess) -> None:
     agent = guard.agent()
     guard.start(agent, *COUNTING)
