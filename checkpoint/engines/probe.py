@@ -79,10 +79,13 @@ def _process_findings(pid: int, status: Status) -> Iterator[Finding]:
 def _memory_findings(pid: int) -> Iterator[Finding]:
     smaps = procfs.read_text(pid, "smaps")
     flags = procfs.parse_vm_flags(smaps)
-    for line in procfs.parse_maps(procfs.read_text(pid, "maps")):
+    lines = procfs.parse_maps(procfs.read_text(pid, "maps"))
+    for line in lines:
         reason = unsupported.refuse_mapping(line, flags.get(line.start, ()))
         if reason is not None:
             yield Finding("memory", f"VMA {line.start:x}-{line.end:x}", REFUSED, reason)
+    for path, note in unsupported.note_mappings(lines):
+        yield Finding("memory", path, NOTED, note)
     for reason in unsupported.refuse_protection_keys(smaps):
         yield Finding("memory", "protection key", REFUSED, reason)
 

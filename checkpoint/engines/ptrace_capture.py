@@ -249,12 +249,7 @@ class PtraceSession:
         found, content = [], bytearray(pages.total_size(existing))
         filled = 0
         for chunk in digests.chunks_of(existing):
-            try:
-                part = self._tracee.memory.read_pages(chunk)
-            except ProcessGoneError:
-                raise
-            except CaptureError:
-                chunk, part = _readable(self._tracee, chunk)
+            chunk, part = self._tracee.memory.readable_pages(chunk)
             found.append(chunk)
             content[filled : filled + len(part)] = part
             filled += len(part)
@@ -352,7 +347,7 @@ class PtraceSession:
         self._has_moved = True
         self._lines = tuple(line for line in self._maps.lines if not self._borrowed.holds(line.start))
         self._private = [line for line in self._lines if tracking.is_private(line)]
-        self._shared_lines = [line for line in self._lines if tracking.is_shared(line)]
+        self._shared_lines = [line for line in self._lines if tracking.is_shared(line) or tracking.is_orphan(line)]
 
     def _scan(self) -> tracking.Scan:
         """What was written since the last scan. One that fails half-way has protected pages that it tells nobody of."""
@@ -366,7 +361,11 @@ class PtraceSession:
             return scan
         self._had_shared = bool(self._shared_lines)
         shared = self._shared.scan(self._shared_lines)
-        return tracking.Scan(pages.union(scan.written, shared.written), pages.union(scan.cleared, shared.cleared))
+        orphans = tracking.extents_of([line for line in self._shared_lines if tracking.is_orphan(line)])
+        cleared = pages.difference(
+            scan.cleared, orphans
+        )  # what the tracker says of them dates from before their file was deleted
+        return tracking.Scan(pages.union(scan.written, shared.written), pages.union(cleared, shared.cleared))
 
     def _start_over(self) -> None:
         """Make the next snapshot a base, with everything armed anew: what was written is not known any more."""
@@ -529,20 +528,6 @@ def _without(guards: Words, scan: tracking.Scan) -> tracking.Scan:
     if not len(installed):
         return scan
     return tracking.Scan(pages.difference(scan.written, installed), pages.union(scan.cleared, installed))
-
-
-def _readable(tracee: Tracee, ranges: Words) -> tuple[Words, bytearray]:
-    """The pages of a set that can be read just now, and their bytes."""
-    kept, content = [], bytearray()
-    for address in pages.addresses_of(ranges, abi.PAGE_SIZE).tolist():
-        try:
-            content += tracee.memory.read(address, abi.PAGE_SIZE)
-        except ProcessGoneError:
-            raise
-        except CaptureError:
-            continue
-        kept.append((address, address + abi.PAGE_SIZE))
-    return np.array(kept, dtype=np.uint64).reshape(-1, 2), content
 
 
 def _merged(copied: tuple[Words, bytearray], frozen: Frozen) -> Frozen:

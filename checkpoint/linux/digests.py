@@ -15,7 +15,7 @@ from checkpoint.linux import abi
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.pagetables import existence
 from checkpoint.linux.procfs import MapsLine
-from checkpoint.linux.tracking import NONE, Scan, extents_of
+from checkpoint.linux.tracking import NONE, Scan, extents_of, is_orphan
 from checkpoint.pages import PageMap, Words
 
 READ_CHUNK: Final = 8 << 20
@@ -88,7 +88,8 @@ def chunks_of(ranges: Words, size: int = READ_CHUNK) -> list[Words]:
 
 
 class SharedPages:
-    """Shared mappings, compared by page digest at every scan: others may write them behind our page tables."""
+    """Mappings that are compared by page digest at every scan: shared ones, which others may write behind our page tables, and
+    those of deleted files, of which every page is carried."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
@@ -106,8 +107,11 @@ class SharedPages:
         return compared(before, self._known)
 
     def existing(self, lines: Sequence[MapsLine]) -> Words:
-        """Populated pages of these mappings."""
-        return self._existence.existing(extents_of(lines), own=False)
+        """Populated pages of shared mappings, and all that can be read of deleted files."""
+        shared = extents_of([line for line in lines if not is_orphan(line)])
+        orphans = extents_of([line for line in lines if is_orphan(line)])
+        populated = self._existence.existing(shared, own=False) if len(shared) else NONE
+        return pages.union(populated, self._memory.readable_pages(orphans)[0]) if len(orphans) else populated
 
     def forget(self) -> None:
         """Let the next scan find everything."""

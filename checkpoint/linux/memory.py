@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from checkpoint import pages
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import abi
 
@@ -88,6 +89,30 @@ class Memory:
         except CaptureError:
             self._peek_into(ranges, memoryview(buffer))
         return buffer
+
+    def readable_pages(self, extents: Ranges) -> tuple[Ranges, bytearray]:
+        """The pages of a set that can be read just now, as extents, and their bytes.
+
+        Raises:
+            ProcessGoneError: the process has ended.
+        """
+        try:
+            return extents, self.read_pages(extents)
+        except ProcessGoneError:
+            raise
+        except CaptureError:
+            pass  # one of them cannot be read: find out which
+        kept, content = [], bytearray()
+        for address in pages.addresses_of(extents, abi.PAGE_SIZE).tolist():
+            page = np.array([[address, address + abi.PAGE_SIZE]], dtype=np.uint64)
+            try:
+                content += self.read_pages(page)
+            except ProcessGoneError:
+                raise
+            except CaptureError:
+                continue
+            kept.append(address)
+        return pages.extents_of_addresses(np.array(kept, dtype=np.uint64), abi.PAGE_SIZE), content
 
     def _peek_into(self, ranges: Ranges, buffer: memoryview) -> None:
         """Read whatever the protection says, through ``/proc/PID/mem``."""

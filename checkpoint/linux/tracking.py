@@ -1,6 +1,7 @@
 """What finding written pages means: the contract of every tracker, and which mappings it is about.
 
-Trackers speak of *private* mappings; shared ones can be written by others behind the page tables' back (`digests.SharedPages`).
+Trackers speak of *private* mappings; shared ones can be written by others behind the page tables' back, and those of deleted
+files are carried whole (`digests.SharedPages`).
 """
 
 from __future__ import annotations
@@ -62,7 +63,15 @@ class Tracker(Protocol):
 
 def is_private(line: MapsLine) -> bool:
     """Whether a mapping is one that trackers follow."""
-    return not line.shared and line.name not in NOT_CARRIED
+    return not line.shared and line.name not in NOT_CARRIED and not is_orphan(line)
+
+
+def is_orphan(line: MapsLine) -> bool:
+    """Whether it is a private mapping of a file that has no name any more, as after a package was upgraded.
+
+    Its unchanged pages cannot be had from the file on the other side: all of them are carried, and compared as shared ones are.
+    """
+    return not line.shared and line.has_file and line.name.endswith(procfs.DELETED)
 
 
 def is_shared(line: MapsLine) -> bool:

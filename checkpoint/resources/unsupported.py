@@ -9,13 +9,14 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.procfs import MapsLine, Status
+from checkpoint.linux.tracking import is_orphan
 from checkpoint.model import Resource
 from checkpoint.resources import OpenFile, Surroundings
 
@@ -58,6 +59,9 @@ _VM_FLAGS: Final[Mapping[str, str]] = {
     "ss": "a shadow stack",
 }
 """VmFlags of proc_pid_smaps(5) that no fresh mapping can be given."""
+
+ORPHAN_LIMIT: Final = 64 << 20
+"""Bytes of one mapping of a deleted file that are carried: every freeze reads them all, a millisecond for 4 MiB."""
 
 _KERNEL_PAGES: Final = ("[vvar", "[vdso", "[vsyscall")
 """Mappings that the kernel gives every process: they move, see ``restore_memory``."""
@@ -122,8 +126,28 @@ def refuse_mapping(line: MapsLine, flags: tuple[str, ...]) -> str | None:
         if flag in _VM_FLAGS:
             return f"{where} is {_VM_FLAGS[flag]}, which {_ADVICE}"
     if line.has_file and line.name.endswith(procfs.DELETED) and not is_shared_anonymous(line):
-        return f"{where} is of {line.name}, replaced since the program started: restart the program, then protect it"
+        replaced = f"{where} is of {line.name}, replaced since the program started"
+        if not is_orphan(line):
+            return f"{replaced}, and shared: restart the program, then protect it"
+        if line.size > ORPHAN_LIMIT:
+            return f"{replaced}, and larger than {ORPHAN_LIMIT >> 20} MiB: restart the program, then protect it"
     return None
+
+
+def note_mappings(lines: Iterable[MapsLine]) -> Iterator[tuple[str, str]]:
+    """Deleted files that mappings hold on to: the path of each, and what an operator should know of it."""
+    carried: dict[str, int] = {}
+    for line in filter(is_orphan, lines):
+        path = line.name.removesuffix(procfs.DELETED)
+        carried[path] = carried.get(path, 0) + line.size
+    for path, size in carried.items():
+        yield (
+            path,
+            (
+                f"{path} was replaced since the program started: {size >> 10} KiB of the old one are carried, and compared at "
+                "every snapshot; restart the program when that suits"
+            ),
+        )
 
 
 def is_shared_anonymous(line: MapsLine) -> bool:

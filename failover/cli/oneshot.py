@@ -42,7 +42,7 @@ def capture(arguments: argparse.Namespace) -> int:
             os.kill(arguments.pid, signal.SIGKILL)
         with contextlib.suppress(CheckpointError):  # it was killed a moment ago: nothing is left to let go of
             keeper.ask(Release(), Released)
-    return _tell_capture(arguments, captured, protected.notes + captured.notes)
+    return _tell_capture(arguments, captured, tuple(dict.fromkeys(protected.notes + captured.notes)))
 
 
 def _tell_capture(arguments: argparse.Namespace, captured: Captured, notes: tuple[str, ...]) -> int:

@@ -41,6 +41,7 @@ WAYS = {
     "shared_memory": "s",
     "huge_pages": "hH",
     "a_private_file_mapping": "k",
+    "a_mapped_file_that_is_deleted": "Kpd",
     "guards": "gp",
     "everything": "wpzdDmMorSjxvcbshHk",
 }

@@ -119,8 +119,7 @@ FILES = cases(
 PRESERVED = [*MEMORY, *REGISTERS, *SIGNALS, *TIME, *PORTRAITS, *FILES]
 
 NOT_YET = {
-    "deleted_mapping": "refused: a mapping of a deleted file is not kept yet",
-    "sigwait-timed": "a sigtimedwait ends with EAGAIN at a capture",
+    "sigwait-timed": "a sigtimedwait with a limit ends with EINTR at any stop, and what was left of it is not known",
     "timer_overrun": "the kernel does not tell how often a timer went off while its signal was pending",
 }
 """What a restore does not preserve so far, and why."""

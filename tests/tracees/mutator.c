@@ -186,6 +186,12 @@ static void change_others(char letter) {
         must(madvise(large + index * PAGE, PAGE, MADV_DONTNEED) == 0, "MADV_DONTNEED in a huge page");
         expected_large[index] = sum_of(large + index * PAGE);
     }
+    if (letter == 'K') { /* the mapping's file loses its name, as when a package is upgraded */
+        int index = dice(16);
+        if (!dice(8)) unlink("mutator.bin");
+        patch_word(mapped + index * PAGE, 1);
+        expected_mapped[index] = sum_of(mapped + index * PAGE);
+    }
     if (letter == 'k') {
         int index = dice(16);
         if (dice(3))
