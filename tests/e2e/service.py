@@ -1,9 +1,8 @@
-"""The agent as a service of a booted machine: installed as the README says, and asked as a client asks."""
+"""The agent as a service of a booted machine: installed as the guide says, and asked as a client asks."""
 
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import Any, Final
 
 from failover.client.control import Control, Output, Result
@@ -15,18 +14,11 @@ COUNT: Final = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i
 
 
 def install(machine: Machine) -> None:
-    """What a package would do; see the README."""
-    units, binaries = CHECKOUT / "systemd", Path(sys.prefix) / "bin"
-    for name in ("failover", "failover-agent"):
-        machine.run("ln", "-s", str(binaries / name), f"/usr/bin/{name}")
-    machine.run("install", "-m644", "-t", "/etc/systemd/system", str(units / SERVICE), str(units / "failover.slice"))
-    machine.run("install", "-Dm644", str(units / "failover.sysusers"), "/usr/lib/sysusers.d/failover.conf")
-    machine.run("install", "-Dm644", str(units / "failover.tmpfiles"), "/usr/lib/tmpfiles.d/failover.conf")
-    machine.run("systemd-sysusers")
-    machine.run("systemd-tmpfiles", "--create", "/usr/lib/tmpfiles.d/failover.conf")
-    machine.run("install", "-m644", str(units / "agent.toml"), "/etc/failover/agent.toml")
-    machine.run("sed", "-i", f's/^robot = .*/robot = "{machine.name}"/', "/etc/failover/agent.toml")
-    machine.run("systemctl", "daemon-reload")
+    """What the guide tells a person to type, line by line; the checkout is set up already."""
+    commands = (CHECKOUT / "docs" / "guide.md").read_text().split("```\n")[1]
+    lines = [line for line in commands.splitlines() if line not in ("./run setup", ".venv/bin/failover check")]
+    typed = "\n".join(lines).replace("$PWD/.venv", sys.prefix).replace('"r1"', f'"{machine.name}"')
+    machine.run("sh", "-ec", f"cd {CHECKOUT}\n{typed}")
 
 
 def make_team(machine: Machine, **addresses: str) -> None:

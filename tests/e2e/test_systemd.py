@@ -26,7 +26,7 @@ MORE = 20
 
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
-    """A robot with the service installed as README says, and started."""
+    """A robot with the service installed as the guide says, and started."""
     with machines.booted(tmp_path_factory.mktemp("machines"), "robot1") as booted:
         install(booted)
         make_team(booted, robot1="127.0.0.1")

@@ -57,8 +57,7 @@ class Means:
     def sentence(self) -> str:
         """What the robots have of their own, and why not more."""
         pids = "own PIDs" if self.own_pids else "shared PIDs (this system forbids user namespaces)"
-        reason = "needs root" if os.geteuid() else "needs iproute2"
-        network = "own network, joined by a cable" if self.own_network else f"loopback ports (a network of their own {reason})"
+        network = "own network, joined by a cable" if self.own_network else f"loopback ports ({why_no_network()})"
         return f"{pids}, {network}"
 
 
@@ -67,6 +66,13 @@ def means() -> Means:
     probe = subprocess.run(host_command(True, ["/bin/true"]), input=GO, capture_output=True, check=False)
     own_network = os.geteuid() == 0 and ip_command() is not None and can_unshare_network()
     return Means(own_pids=probe.returncode == 0, own_network=own_network)
+
+
+def why_no_network() -> str:
+    """Why robots cannot have a network of their own here."""
+    if os.geteuid() != 0:
+        return "a network of their own needs root"
+    return "this system forbids networks of their own" if ip_command() else "a network of their own needs iproute2"
 
 
 def ip_command() -> str | None:
