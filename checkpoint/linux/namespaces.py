@@ -109,6 +109,9 @@ def enter(pids: bool, clocks: bool) -> Entered:
     return Entered(False, False, False, tuple(notes))
 
 
+_CURE: Final = "give it CAP_SYS_ADMIN, or allow user namespaces (sysctl user.max_user_namespaces; never in a chroot)"
+
+
 def _unshare_as_permitted(flags: int) -> tuple[bool, str | None]:
     """Unshare plainly, else inside a new user namespace: (whether a user namespace was made, why nothing could be done)."""
     if _libc.unshare(flags) == 0:
@@ -117,7 +120,7 @@ def _unshare_as_permitted(flags: int) -> tuple[bool, str | None]:
         return False, os.strerror(ctypes.get_errno())
     uid, gid = os.geteuid(), os.getegid()
     if _libc.unshare(flags | CLONE_NEWUSER) != 0:
-        return False, f"{os.strerror(ctypes.get_errno())}; allow user namespaces (sysctl user.max_user_namespaces) or run as root"
+        return False, f"{os.strerror(ctypes.get_errno())}; {_CURE}"
     Path("/proc/self/uid_map").write_text(f"{uid} {uid} 1")
     Path("/proc/self/setgroups").write_text("deny")
     Path("/proc/self/gid_map").write_text(f"{gid} {gid} 1")
