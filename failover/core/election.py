@@ -77,7 +77,7 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str) -> 
     component.undelivered = component.unstored = ""
     component.resumed_ns = component.resumed_age_ns = -1
     component.handing, component.ending, component.reported = None, False, False
-    component.crashed = 0
+    component.crashed, component.reason = 0, ""
     component.lease_ns = component.told_ns = 0
     open_line(component, turn)
     start = "its newest checkpoint" if plan else "the beginning"

@@ -100,6 +100,8 @@ def _promise(component: Component, turn: Turn, protection: Protection) -> str:
         return f"It is {component.state}; nobody runs it."
     if not component.holding:
         return f"{turn.me} keeps its checkpoints for {component.primary or 'whoever runs it'}."
+    if component.unprotected:
+        return f"If {turn.me} is lost now, so is its state: no robot keeps a checkpoint of it."
     if protection is not Protection.PROTECTED:
         return "If this robot is lost now, it goes on from its last checkpoint, if there is one."
     if component.waits:

@@ -120,13 +120,18 @@ def test_a_takeover_from_an_old_checkpoint_says_how_old_it_is(pair: Pair, flag: 
 def test_protection_that_was_given_up_is_said_and_nothing_is_taken_over(pair: Pair, flag: Path) -> None:
     first, second = pair
     flag.touch()
-    until_status(first, 1, "protected no longer", "a socket")
+    until_status(first, 1, "protected no longer", "a socket", "failover release, then protect, begins anew")
     robots.until(lambda: robots.component(second, "count").get("standby") == "", "robot2 to forget its checkpoints")
     flag.unlink()
-    assert robots.component(first, "count")["protection"] == "stopped"
+    shown = robots.component(first, "count")
+    assert (shown["protection"], "no robot keeps a checkpoint" in shown["promise"]) == ("stopped", True)
     released = robots.failover(first, "release", "count")
     assert released.returncode == 0, released
     robots.until(lambda: robots.failover(second, "status").returncode == 0, "nothing to be amiss any more")
+    again = robots.failover(first, "protect", str(shown["pid"]), "--name", "count")
+    assert again.returncode == 0, again
+    until_protected(first)
+    assert robots.component(first, "count")["notes"] == []
 
 
 def lanes_of(robot: RobotMachine) -> int:
