@@ -10,6 +10,7 @@ As root more is measured (CRIU, beats on the wire). Nothing else should run mean
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 import tempfile
 import time
@@ -71,6 +72,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
 def main() -> int:
     """Measure, print, write."""
     arguments = _parser().parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that whatever was started is ended
     share = machine.busy_share()
     warning = machine.warning(share)
     facts = machine.facts(share) | {"measured": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"}

@@ -103,7 +103,7 @@ def _pages_of(snapshot: Snapshot) -> Pages:
     size = snapshot.machine.page_size
     addresses = [address for run in snapshot.runs for address in range(run.start, run.end, size)]
     contents = bytes(snapshot.contents)
-    return {address: contents[index * size :][:size] for index, address in enumerate(addresses)}
+    return {address: contents[index * size : (index + 1) * size] for index, address in enumerate(addresses)}
 
 
 # --- Ways ----------------------------------------------------------------------------------------------------------------
