@@ -15,10 +15,12 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from agent import clock
+from agent import births, clock
 from agent.ballot import write_durably
-from agent.component import Captured, Component, Places, Program
+from agent.births import Program
+from agent.component import Captured, Component
 from agent.errors import AgentError, KeeperLostError
+from agent.places import Places
 from agent.records import Records
 from checkpoint.channel import close_all, content_of
 from checkpoint.errors import CheckpointError, UnsupportedError
@@ -228,7 +230,7 @@ class Charge:
 
     async def _begun(self, launch: Launch) -> Component:
         if launch.pid:
-            return await Component.watch(self.name, launch.pid, self.around.places)
+            return await births.watch(self.name, launch.pid, self.around.places)
         program = Program(
             tuple(os.fsencode(argument) for argument in launch.argv),
             tuple(os.fsencode(f"{name}={value}") for name, value in launch.environment),
@@ -236,7 +238,7 @@ class Charge:
             launch.umask,
             launch.isolate,
         )
-        return await Component.start(self.name, program, self.around.places)
+        return await births.start(self.name, program, self.around.places)
 
     async def _protect(self, *, refuse: bool) -> None:
         """Give it a keeper. A program that was started here runs on unprotected where it cannot have one; a guest is refused."""
@@ -259,7 +261,7 @@ class Charge:
         laps.lap(f"opening {len(descriptors)} snapshots")
         try:
             outage_ns, read_ns = clock.age_ns(descriptors[-1]), clock.now_ns()
-            component = await Component.restore(
+            component = await births.restore(
                 self.name, descriptors, self.around.places, outage_ns=outage_ns, lease_until_ns=act.lease_until_ns, laps=laps
             )
         finally:

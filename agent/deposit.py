@@ -6,7 +6,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Collection
 
-from agent.component import Places, complete_logs, log_directory
+from agent.places import Places, complete_logs, log_directory
 from agent.shipping import Refusal
 from agent.streams import OutputLogs
 from checkpoint import format

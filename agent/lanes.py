@@ -20,10 +20,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, Literal
 
+from agent import births, door
 from agent import config as configuration
-from agent import door
 from agent.charge import Charge, Surroundings
-from agent.component import Component, Places, guard_sockets
 from agent.config import Settings
 from agent.control import ControlServer
 from agent.deposit import Deposit
@@ -33,6 +32,7 @@ from agent.errands import Errands
 from agent.errors import AgentError, GuardLostError
 from agent.journal import set_up_log
 from agent.nursery import Nursery
+from agent.places import Places, guard_sockets
 from agent.records import Records
 from agent.scope import launcher
 from agent.shipping import Receiver, Shipper
@@ -269,7 +269,7 @@ class Lanes:
         found = []
         for path in guard_sockets(self.places):
             try:
-                component = await Component.reconnect(path, self.places)
+                component = await births.reconnect(path, self.places)
                 standing = await component.describe()
             except GuardLostError as error:
                 log.info("%s", error)

@@ -52,6 +52,17 @@ class KeeperLink:
     dialogue: Dialogue
     process: subprocess.Popen[bytes]
 
+    def pidfd(self) -> int:
+        """A descriptor of its process, the caller's to close.
+
+        Raises:
+            KeeperLostError: it has ended.
+        """
+        try:
+            return os.pidfd_open(self.process.pid)
+        except ProcessLookupError as error:
+            raise KeeperLostError("the keeper ended before it was asked anything") from error
+
     def end(self) -> None:
         """Hang up: it lets go of what it follows, and ends."""
         self.dialogue.close()

@@ -11,12 +11,12 @@ from typing import Any, Final, Protocol
 
 from agent.arguments import PieceArguments, arguments_of
 from agent.charge import Charge
-from agent.component import Places, log_directory
 from agent.config import Settings
 from agent.control import Conversation
 from agent.door import Told
 from agent.errands import Errands
 from agent.errors import RefusedError
+from agent.places import Places, log_directory
 from agent.streams import STREAMS, OutputLogs
 from checkpoint.model import OutputPiece
 from failover.core.types import ENDED, ComponentView, PeerView, State

@@ -21,13 +21,13 @@ from agent.arguments import (
     arguments_of,
 )
 from agent.charge import Charge
-from agent.component import Places
 from agent.config import Settings
 from agent.control import Conversation, Verb
 from agent.door import Told
 from agent.errands import Errands, Order
 from agent.errors import RefusedError
 from agent.outflow import Outflow
+from agent.places import Places
 from agent.rules import rules_for
 from agent.view import version
 from failover.core import acts, events

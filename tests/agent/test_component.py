@@ -14,9 +14,12 @@ from typing import Any, Final
 
 import pytest
 
-from agent.component import Captured, Component, Places, Program, guard_sockets
+from agent import births
+from agent.births import Program
+from agent.component import Captured, Component
 from agent.errors import GuardError, GuardLostError, KeeperLostError
 from agent.nursery import Nursery
+from agent.places import Places, guard_sockets
 from checkpoint import format
 from checkpoint.errors import CheckpointError, FormatError
 from checkpoint.model import OutputPiece
@@ -59,7 +62,7 @@ def program(script: str) -> Program:
 @asynccontextmanager
 async def started(places: Places, script: str) -> AsyncIterator[Component]:
     """A program that runs; whatever becomes of it, it is gone afterwards."""
-    component = await Component.start(NAME, program(script), places)
+    component = await births.start(NAME, program(script), places)
     try:
         yield component
     finally:
@@ -89,7 +92,7 @@ async def forever(act: Callable[[], Coroutine[Any, Any, Any]]) -> None:
 
 async def looked_for(path: Path, places: Places) -> None:
     """Connect to a guard and hang up."""
-    (await Component.reconnect(path, places)).close()
+    (await births.reconnect(path, places)).close()
 
 
 def output(component: Component) -> bytes:
@@ -172,7 +175,7 @@ def test_a_restored_program_goes_on_exactly_after_what_its_snapshot_carries(tmp_
                 await captures.take()
             await more(first)  # a takeover takes this back
             await first.stop(signal.SIGKILL)
-        second = await Component.restore(NAME, captures.chain, places, outage_ns=0)
+        second = await births.restore(NAME, captures.chain, places, outage_ns=0)
         try:
             assert (await second.describe()).state == "vessel"
             await second.resume()
@@ -246,10 +249,10 @@ def test_a_program_that_its_lease_has_frozen_can_be_captured_when_it_is_held_for
 
 def test_an_agent_that_comes_back_finds_its_component_by_the_socket(tmp_path: Path) -> None:
     async def story(places: Places) -> None:
-        component = await Component.start(NAME, program(COUNT), places)
+        component = await births.start(NAME, program(COUNT), places)
         component.close()  # all that an agent leaves when it is killed: closed sockets
         (path,) = [path for path in guard_sockets(places) if path == component._guard.socket_path]
-        again = await Component.reconnect(path, places)
+        again = await births.reconnect(path, places)
         try:
             assert (again.name, again.pid) == (NAME, component.pid)
             captures = Captures(again)
@@ -265,10 +268,10 @@ def test_an_agent_that_comes_back_finds_its_component_by_the_socket(tmp_path: Pa
 
 def test_an_agent_that_comes_back_too_late_is_told_how_it_ended(tmp_path: Path) -> None:
     async def story(places: Places) -> None:
-        component = await Component.start(NAME, program("import os; os._exit(5)"), places)
+        component = await births.start(NAME, program("import os; os._exit(5)"), places)
         path = component._guard.socket_path
         component.close()
-        again = await Component.reconnect(path, places)
+        again = await births.reconnect(path, places)
         assert await again.ended == 5 << 8
         await again.forget()
         with pytest.raises(GuardLostError, match="has gone"):
@@ -283,7 +286,7 @@ def test_a_restore_that_nobody_resumes_leaves_nothing(tmp_path: Path) -> None:
         async with started(places, COUNT) as first:
             captures = Captures(first)
             await captures.take()
-        second = await Component.restore(NAME, captures.chain, places, outage_ns=0)
+        second = await births.restore(NAME, captures.chain, places, outage_ns=0)
         pid, path = second.pid, second._guard.socket_path
         second.close()
         await until(lambda: not lives(pid) and not path.exists(), "vessel and guard to end")
@@ -305,7 +308,7 @@ def test_a_restore_from_something_damaged_is_refused_and_leaves_nothing(tmp_path
         damaged = tmp_path / "damaged"
         damaged.write_bytes(content)
         with damaged.open("rb") as file, pytest.raises(FormatError):
-            await Component.restore(NAME, [file.fileno()], places, outage_ns=0)
+            await births.restore(NAME, [file.fileno()], places, outage_ns=0)
         captures.close()
 
     live(tmp_path, story)
@@ -314,14 +317,14 @@ def test_a_restore_from_something_damaged_is_refused_and_leaves_nothing(tmp_path
 def test_a_program_that_cannot_be_started_leaves_nothing(tmp_path: Path) -> None:
     async def story(places: Places) -> None:
         with pytest.raises(GuardError, match="cannot start /no/such: No such file"):
-            await Component.start(NAME, Program((b"/no/such",), (), b"/"), places)
+            await births.start(NAME, Program((b"/no/such",), (), b"/"), places)
 
     live(tmp_path, story)
 
 
 def test_a_program_whose_guard_is_killed_is_known_to_have_ended(tmp_path: Path) -> None:
     async def story(places: Places) -> None:
-        component = await Component.start(NAME, program(COUNT), places)
+        component = await births.start(NAME, program(COUNT), places)
         await more(component)
         pid = component.pid
         os.kill(guard_of(pid), signal.SIGKILL)
@@ -349,7 +352,7 @@ def test_a_program_that_does_not_heed_its_signal_is_killed_in_the_end(tmp_path: 
 
 def test_a_program_that_was_released_runs_on_unprotected(tmp_path: Path) -> None:
     async def story(places: Places) -> None:
-        component = await Component.start(NAME, program(COUNT), places)
+        component = await births.start(NAME, program(COUNT), places)
         captures = Captures(component)
         await captures.take()
         captures.close()

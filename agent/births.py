@@ -1,0 +1,172 @@
+"""How a component of this robot comes to be: started afresh, taken in, restored from a checkpoint, or found again.
+
+component = await births.start("/lab/robot1/mapper", program, places)           # it runs, and is not protected yet
+component = await births.restore(name, chain_descriptors, places, outage_ns=…)  # stopped, whole, uncommitted: `resume` it
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from agent import guard_messages
+from agent.clock import Laps
+from agent.component import Component
+from agent.errors import GuardError, GuardLostError, KeeperLostError
+from agent.nursery import KeeperLink, connect
+from agent.places import Places, complete_logs, log_directory
+from agent.streams import discard, total_of
+from checkpoint import channel, format
+from checkpoint.errors import CheckpointError
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """What to start, as execve(2) wants it."""
+
+    argv: tuple[bytes, ...]
+    environment: tuple[bytes, ...]
+    working_directory: bytes
+    umask: int = 0o022
+    isolate: bool = True
+
+
+async def start(name: str, program: Program, places: Places) -> Component:
+    """Start a guard and under it the program. It runs, and is not protected yet.
+
+    Raises:
+        GuardError: it could not be started; nothing is left of it.
+    """
+    guard = await places.nursery.guard()
+    try:
+        discard(log_directory(name, places))  # a namesake that was let go may still write to its own
+    except OSError as error:
+        guard.dialogue.close()
+        raise GuardError(f"{name}: cannot begin its output anew in {error.filename}: {error.strerror}") from error
+    component = Component(name, guard, places)
+    request = guard_messages.Start(
+        component=name,
+        argv=program.argv,
+        environment=program.environment,
+        working_directory=program.working_directory,
+        umask=program.umask,
+        isolate=program.isolate,
+        log_directory=str(log_directory(name, places)),
+        cgroup=places.cgroup,
+    )
+    return await _born(component, request)
+
+
+async def watch(name: str, pid: int, places: Places) -> Component:
+    """Take a running process in: its guard is not its parent and does not own its streams.
+
+    Raises:
+        GuardError: there is no such process.
+    """
+    component = Component(name, await places.nursery.guard(), places)
+    component.pid = component.inner_pid = pid
+    return await _born(component, guard_messages.Watch(name, pid))
+
+
+async def restore(
+    name: str,
+    chain: Sequence[int],
+    places: Places,
+    *,
+    outage_ns: int,
+    lease_until_ns: int = 0,
+    laps: Laps | None = None,
+) -> Component:
+    """Rebuild a component from a chain (descriptors of encoded snapshots, oldest first), stopped, committed to nothing.
+
+    Whatever fails, and whoever dies before `resume`: nothing of it is left.
+
+    Args:
+        laps: told how long each stage took.
+        outage_ns: added to the program's monotonic and boot time: how long ago the newest snapshot was taken.
+
+    Raises:
+        checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
+    """
+    laps = laps or Laps()
+    outline = await asyncio.to_thread(format.read_outline, chain[-1])
+    await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
+    laps.lap("reading the newest")
+    component = Component(name, await places.nursery.guard(), places)
+    request = guard_messages.MakeVessel(
+        component=name,
+        inner_pid=outline.process.pid,
+        isolate=outline.process.isolated,
+        clocks=outline.clocks,
+        elapsed_ns=outage_ns,
+        totals=total_of(outline.output),
+        log_directory=str(log_directory(name, places)),
+        cgroup=places.cgroup,
+    )
+    try:
+        keeper = component.give_keeper()
+        laps.lap("guard and keeper")
+        await _vessel(component, request, keeper)
+        laps.lap("vessel")
+        order = channel.Restore(component.pid, name, outage_ns, streams=True, robot=places.robot)
+        restored, _ = await component.ask_keeper(order, (*chain, *component.streams))
+        laps.lap("restore")
+        if lease_until_ns:
+            await component.lease(lease_until_ns)
+    except (CheckpointError, GuardError, KeeperLostError):
+        await component.undo()
+        raise
+    component.notes = (*component.notes, *restored.notes)
+    return component
+
+
+async def reconnect(socket_path: Path, places: Places) -> Component:
+    """Find a component again after the agent was restarted.
+
+    Raises:
+        GuardLostError: nobody listens there any more; the left-over socket has been removed.
+    """
+    try:
+        guard = connect(socket_path)
+    except OSError as error:
+        with contextlib.suppress(FileNotFoundError):
+            socket_path.unlink()
+        raise GuardLostError(f"the guard of {socket_path.name} has gone: {error.strerror}") from error
+    guard.dialogue.heard = lambda message: isinstance(message, guard_messages.Event)  # the end is told by the answer, too
+    described, streams = await guard.dialogue.ask(guard_messages.Describe())
+    if described.state == "none":
+        guard.dialogue.close()
+        raise GuardLostError(f"the guard of {socket_path.name} guards nothing; it ends")
+    component = Component(described.component, guard, places)
+    component.take(described, streams)
+    if described.state == "ended" and not component.ended.done():
+        component.ended.set_result(described.exit_status)
+    return component
+
+
+async def _vessel(component: Component, request: guard_messages.MakeVessel, keeper: KeeperLink) -> None:
+    """Have its guard make a vessel that ends with the keeper until it is committed to."""
+    pidfd = keeper.pidfd()
+    try:
+        await _born(component, request, (pidfd,))
+    finally:
+        os.close(pidfd)
+
+
+async def _born(component: Component, request: Any, descriptors: tuple[int, ...] = ()) -> Component:
+    """Have its guard begin it; a guard that refuses is hung up on, and ends."""
+    try:
+        born, streams = await component.ask_guard(request, descriptors)
+    except GuardError:
+        component.close()
+        raise
+    if isinstance(born, guard_messages.Watching):
+        component.notes = born.notes
+    else:
+        component.take(born, streams)
+    return component

@@ -1,0 +1,61 @@
+"""Where the components of one robot keep their things: sockets, output, and where their guards come from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from agent.nursery import Nursery
+from agent.streams import OutputLogs, total_of
+from checkpoint import format
+from checkpoint.shelf import folder_name
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Where the components of this robot keep their things.
+
+    Attributes:
+        sockets: directory of the guards' sockets; gone after a reboot, as the guards are.
+        logs: directory with one directory of output a component.
+        nursery: where guards and keepers come from.
+        cgroup: a delegated cgroup v2 directory that each component gets a cgroup of its own in; "" for the guard's own.
+        robot: this robot's name, for the snapshots.
+    """
+
+    sockets: Path
+    logs: Path
+    nursery: Nursery
+    cgroup: str = ""
+    robot: str = ""
+
+
+def guard_sockets(places: Places) -> tuple[Path, ...]:
+    """The sockets of all guards that may still live, for `Component.reconnect` after a restart."""
+    return tuple(sorted(places.sockets.glob("*.guard")))
+
+
+def log_directory(name: str, places: Places) -> Path:
+    """Where a component's output is kept on this robot."""
+    return places.logs / folder_name(name)
+
+
+def complete_logs(directory: Path, chain: Sequence[int]) -> bool:
+    """Bring output logs as far as the newest snapshot of a chain says; returns whether they were shorter.
+
+    They are where a robot died, or was killed, between storing a snapshot and extending its logs.
+
+    Args:
+        chain: descriptors of encoded snapshots, oldest first.
+    """
+    logs = OutputLogs(directory)
+    try:
+        told = total_of(format.read_outline(chain[-1]).output)
+        short = any(has < total for has, total in zip(logs.totals(), told, strict=True))
+        if short:
+            for descriptor in chain:
+                logs.apply(format.read_outline(descriptor).output)
+        return short
+    finally:
+        logs.close()
