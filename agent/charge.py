@@ -18,8 +18,10 @@ from typing import Any, Final
 from agent import births, clock
 from agent.ballot import write_durably
 from agent.births import Program
-from agent.component import Captured, Component
+from agent.component import Component
 from agent.errors import AgentError, KeeperLostError
+from agent.figures import Figures, shortened
+from agent.mistake import end_lanes_on_mistake
 from agent.places import Places
 from agent.records import Records
 from checkpoint.channel import close_all, content_of
@@ -38,42 +40,7 @@ KILLED: Final = 9
 TROUBLE: Final = (CheckpointError, AgentError, OSError)
 """What can go wrong with a program, its processes or a disk, and is told; anything else is our mistake and ends the lanes."""
 
-REASONS_TOLD: Final = 3
-"""Of the reasons why it cannot be captured, in one sentence of the core; ``status --json`` has them all."""
-
 log = logging.getLogger("failover.component")
-
-
-@dataclass(slots=True)
-class Figures:
-    """What ``failover status`` shows of one component on this robot; None where it is not known."""
-
-    snapshots: int = 0
-    restores: int = 0
-    crashes: int = 0
-    freeze_us: int | None = None
-    freeze_us_max: int | None = None
-    snapshot_size: int | None = None
-    dirty_bytes: int | None = None
-    newest: Position | None = None
-    exit_status: int | None = None
-    outage_ms: float | None = None
-    reasons: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-
-    def captured(self, captured: Captured) -> None:
-        """Count one snapshot that was taken here."""
-        self.snapshots += 1
-        self.freeze_us = captured.freeze_us
-        self.freeze_us_max = max(self.freeze_us_max or 0, captured.freeze_us)
-        self.snapshot_size, self.dirty_bytes = captured.size, captured.dirty_bytes
-        self.newest = captured.position
-        self.notes = captured.notes
-
-    def stored(self, position: Position, size: int) -> None:
-        """Count one snapshot that came from the primary."""
-        self.snapshots += 1
-        self.newest, self.snapshot_size = position, size
 
 
 @dataclass(slots=True)
@@ -407,17 +374,3 @@ class Charge:
         if self.component is component and not self._stopping:
             self.figures.crashes += bool(status and os.WIFSIGNALED(status))
             self.around.tell(events.Exited(self.name, self.epoch, status or 0))
-
-
-def shortened(reasons: tuple[str, ...]) -> str:
-    """The first reasons as one sentence, and how many there are besides."""
-    more = len(reasons) - REASONS_TOLD
-    return "; ".join(reasons[:REASONS_TOLD]) + (f"; and {more} more" if more > 0 else "")
-
-
-def end_lanes_on_mistake(task: asyncio.Task[Any]) -> None:
-    """A task that ended by an error nobody foresaw: say it and end the process; the heart starts another, components live on."""
-    if task.cancelled() or task.exception() is None:
-        return
-    log.critical("a mistake in the agent: please report it", exc_info=task.exception())
-    os._exit(70)

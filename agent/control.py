@@ -13,8 +13,8 @@ from typing import Any, Final
 
 import msgspec
 
-from agent.charge import end_lanes_on_mistake
 from agent.errors import AgentError, RefusedError
+from agent.mistake import end_lanes_on_mistake
 from checkpoint.errors import UNDECODABLE, CheckpointError
 from failover.client.control import LENGTH, MESSAGE_LIMIT, Output, Refused, Reply, Request, Result, Update
 from failover.errors import FailoverError

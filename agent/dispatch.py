@@ -7,8 +7,8 @@ import logging
 import os
 from collections.abc import Callable
 
-from agent.charge import end_lanes_on_mistake
 from agent.errors import LaneError
+from agent.mistake import end_lanes_on_mistake
 from agent.shipping import Shipper, digest_of
 from checkpoint.errors import CheckpointError
 from checkpoint.model import Position

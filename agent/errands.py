@@ -14,8 +14,9 @@ from typing import Any, Final
 
 import msgspec
 
-from agent.charge import TROUBLE, end_lanes_on_mistake
+from agent.charge import TROUBLE
 from agent.errors import RefusedError
+from agent.mistake import end_lanes_on_mistake
 from checkpoint.errors import UNDECODABLE
 from failover.core.messages import CHUNK_SIZE_MAX, Bulk, Errand, ErrandDone
 from failover.errors import FailoverError

@@ -23,8 +23,8 @@ import zmq.asyncio
 from zmq.utils import z85
 from zmq.utils.monitor import parse_monitor_message
 
-from agent.charge import end_lanes_on_mistake
 from agent.errors import LaneError
+from agent.mistake import end_lanes_on_mistake
 from failover.core.messages import CHUNK_SIZE_MAX, Bulk, Chunk
 from failover.core.wire import decode_bulk, encode_bulk
 
