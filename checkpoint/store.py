@@ -3,6 +3,10 @@
 ``ROOT/lock``, and one folder for each component with a file for each snapshot. A file appears under its name only when it is
 whole and on the disk: written aside, synced, renamed, folder synced. What was acknowledged is therefore always
 there, and what did not arrive whole leaves nothing but a temporary that the next opening removes.
+
+Two kinds of lock, taken in this order: one a component for whoever changes what is held of it, for as long as that takes (a base
+may be gigabytes), and one for what is known of all, held for moments only. Who reads waits for the second alone: a takeover never
+stands behind a snapshot that is being written, proved or folded.
 """
 
 from __future__ import annotations
@@ -69,6 +73,7 @@ class Store:
         self._disk = disk
         self._lock_descriptor = lock
         self._lock = threading.RLock()
+        self._changing: dict[str, threading.RLock] = {}
         self._shelves: dict[str, Shelf] = {}
         self._proved: dict[str, _Proved] = {}
         self._damaged: set[Path] = set()
@@ -174,19 +179,31 @@ class Store:
             ChainError: it continues no position that the store holds, or does not lead to the state it names; ask for a base.
             StoreError: the disk does not take it; nothing of it is left.
         """
-        with self._lock:
-            snapshot = format.decode(source) if prove else format.read_outline(source)
-            header = format.verify(source) if not prove else header_of(snapshot)
+        snapshot = format.decode(source) if prove else format.read_outline(source)
+        header = format.verify(source) if not prove else header_of(snapshot)
+        with self._change_of(snapshot.component):
             shelf = self._shelf(snapshot.component)
             self._check_parent(shelf, snapshot)
             proved = self._prove(shelf, snapshot) if prove else None
             final = self._root / folder_name(header.component) / file_name(header)
             if all(entry.path != final for entry in shelf.entries):
                 size = self._write_whole(final, lambda file: file.copy_from(source), source)
-                self._shelves[shelf.component] = shelf.with_entry(_entry_of(final, snapshot, size))
+                self._add(snapshot.component, _entry_of(final, snapshot, size))
             if proved is not None:
-                self._proved[shelf.component] = proved
-            return replace(snapshot, runs=(), cleared=(), contents=b"")
+                self._proved[snapshot.component] = proved
+        return replace(snapshot, runs=(), cleared=(), contents=b"")
+
+    @contextmanager
+    def _change_of(self, component: str) -> Iterator[None]:
+        """Nobody else changes what is held of a component during the body; everybody may read it."""
+        with self._lock:
+            changing = self._changing.setdefault(component, threading.RLock())
+        with changing:
+            yield
+
+    def _add(self, component: str, entry: Entry) -> None:
+        with self._lock:
+            self._shelves[component] = self._shelf(component).with_entry(entry)
 
     def _check_parent(self, shelf: Shelf, snapshot: Snapshot) -> None:
         if snapshot.parent is not None and not shelf.chain_to(snapshot.parent):
@@ -235,7 +252,7 @@ class Store:
         """
         if self._fold_is_due(component, oldest):
             self.fold(component, oldest)
-        with self._lock:
+        with self._change_of(component):
             shelf = self._shelf(component)
             self._remove(component, shelf.unneeded_for(oldest))
             floor = shelf.order_of(oldest)
@@ -251,7 +268,7 @@ class Store:
     def fold(self, component: str, position: Position) -> None:
         """Write the state at a position as a base of its own, so that what is older can go.
 
-        The long part holds no lock: snapshots are taken in meanwhile. Cut off anywhere, the old chain is whole.
+        The long part holds no lock at all: snapshots are taken in meanwhile. Cut off anywhere, the old chain is whole.
 
         Raises:
             StoreError: the position cannot be loaded, or the disk does not take the base.
@@ -260,8 +277,11 @@ class Store:
         folded = replace(folded, output=_newest_output(folded.output))
         final = self._root / folder_name(component) / file_name(header_of(folded))
         size = self._write_whole(final, lambda file: format.encode(folded, file))
-        with self._lock:
-            self._shelves[component] = self._shelf(component).with_entry(_entry_of(final, folded, size))
+        with self._change_of(component):
+            if self._shelf(component).order_of(position) is None:  # dropped or set aside meanwhile
+                self._disk.remove(final)
+            else:
+                self._add(component, _entry_of(final, folded, size))
 
     def _fold_is_due(self, component: str, oldest: Position) -> bool:
         with self._lock:
@@ -278,7 +298,7 @@ class Store:
         Returns:
             That file; None when nothing of these generations could be restored.
         """
-        with self._lock:
+        with self._change_of(component):
             shelf = self._shelf(component)
             chosen = set(generations)
             gone = tuple(entry for entry in shelf.entries if entry.position.generation in chosen)
@@ -295,7 +315,7 @@ class Store:
 
     def drop(self, component: str) -> None:
         """Forget everything of a component; what was set aside stays."""
-        with self._lock:
+        with self._change_of(component), self._lock:
             self._remove(component, self._shelf(component).entries)
             self._remove_damaged(component, lambda _: True)
             self._shelves.pop(component, None)
@@ -343,21 +363,23 @@ class Store:
             os.close(descriptor)
 
     def _ensure_folder(self, folder: Path) -> None:
-        if not folder.is_dir():
-            self._disk.make_folder(folder)
-            self._disk.sync_folder(folder.parent)
+        with self._lock:  # the one for what is set aside belongs to all components
+            if not folder.is_dir():
+                self._disk.make_folder(folder)
+                self._disk.sync_folder(folder.parent)
 
     def _remove(self, component: str, entries: tuple[Entry, ...]) -> None:
         """Remove files, the youngest first: what is left at any instant is whole chains."""
         with self._disk_trouble(f"remove snapshots of {component}"):
             for entry in sorted(entries, key=lambda entry: entry.order, reverse=True):
-                self._shelves[component] = self._shelf(component).without((entry,))
-                self._disk.remove(entry.path)
+                with self._lock:
+                    self._shelves[component] = self._shelf(component).without((entry,))
+                self._disk.remove(entry.path)  # who opens a chain has opened it, or does not know this file any more
 
     def _remove_damaged(self, component: str, is_old: Callable[[Path], bool]) -> None:
         """Remove files that were set out of use; one that has been put again since is no longer among them."""
         folder = self._root / folder_name(component)
-        with self._disk_trouble(f"remove damaged snapshots of {component}"):
+        with self._lock, self._disk_trouble(f"remove damaged snapshots of {component}"):
             for path in [path for path in self._damaged if path.parent == folder and is_old(path)]:
                 self._disk.remove(path)
                 self._damaged.discard(path)

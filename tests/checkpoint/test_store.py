@@ -9,7 +9,9 @@ import signal
 import stat
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +25,9 @@ from checkpoint.errors import ChainError, FormatError, StoreError
 from checkpoint.model import Position, Snapshot
 from checkpoint.store import Store, open_store
 from tests.checkpoint.snapshots import COMPONENT, history, page, pages_of, snapshot
+
+PATIENCE_S = 60.0
+"""How long anything awaited here may take; generous, because the machine may be busy with other tests."""
 
 
 @contextmanager
@@ -207,6 +212,69 @@ def test_a_long_chain_is_folded_and_stays_the_same_state(tmp_path: Path) -> None
         assert store.newest(COMPONENT) == made[-1].position
         assert len(store.chain_of(COMPONENT)) <= 2
         assert pages_of(store.load(COMPONENT)) == pages_of(chain.fold(made))
+
+
+class StuckDisk(Disk):
+    """A disk whose syncs wait until somebody opens the gate."""
+
+    def __init__(self) -> None:
+        self.gate, self.waits = threading.Event(), threading.Event()
+        self.gate.set()
+
+    def sync_file(self, descriptor: int) -> None:
+        """See `Disk.sync_file`."""
+        self.waits.set()
+        assert self.gate.wait(PATIENCE_S)
+        super().sync_file(descriptor)
+
+
+LONG_CHANGES: dict[str, Callable[[Store, tuple[Snapshot, ...]], object]] = {
+    "put": lambda store, made: put(store, made[3]),
+    "fold": lambda store, made: store.fold(COMPONENT, made[2].position),
+    "set_aside": lambda store, made: store.set_aside(COMPONENT, [1]),
+}
+
+
+@pytest.mark.parametrize("change", LONG_CHANGES)
+def test_whoever_reads_does_not_wait_for_a_long_change(change: str, tmp_path: Path) -> None:
+    made, disk = history(4), StuckDisk()
+    other = snapshot({1: page("x")}, component="/lab/robot2/arm")
+    with opened(tmp_path / "store", disk) as store, ThreadPoolExecutor() as pool:
+        for one in made[:3]:
+            put(store, one)
+        put(store, other)
+        disk.gate.clear()
+        disk.waits.clear()
+        try:
+            under_way = pool.submit(LONG_CHANGES[change], store, made)
+            assert disk.waits.wait(PATIENCE_S)
+            descriptors = pool.submit(store.open_chain, COMPONENT).result(PATIENCE_S)
+            for one in descriptors:
+                os.close(one)
+            assert len(descriptors) == 3
+            pool.submit(store.drop, other.component).result(PATIENCE_S)
+            assert not under_way.done()
+        finally:
+            disk.gate.set()
+        under_way.result(PATIENCE_S)
+
+
+def test_a_fold_of_what_is_dropped_meanwhile_leaves_nothing(tmp_path: Path) -> None:
+    made, disk = history(4), StuckDisk()
+    with opened(tmp_path / "store", disk) as store, ThreadPoolExecutor() as pool:
+        for one in made:
+            put(store, one)
+        disk.gate.clear()
+        disk.waits.clear()
+        try:
+            folding = pool.submit(store.fold, COMPONENT, made[3].position)
+            assert disk.waits.wait(PATIENCE_S)
+            store.drop(COMPONENT)
+        finally:
+            disk.gate.set()
+        folding.result(PATIENCE_S)
+        assert store.components() == ()
+    assert not list((tmp_path / "store").glob("@*/*"))
 
 
 def test_a_history_that_lost_the_argument_is_kept_aside(tmp_path: Path) -> None:
