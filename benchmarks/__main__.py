@@ -92,9 +92,12 @@ def main() -> int:
 def _measure(name: str, quick: bool) -> Findings:
     """One benchmark; one that comes to nothing says why and leaves the others their turn."""
     print(f"measuring {name} …", file=sys.stderr, flush=True)
+    began = time.monotonic()
     try:
         with tempfile.TemporaryDirectory(prefix="failover-benchmark-") as directory:
-            return BENCHMARKS[name](quick, Path(directory))
+            found = BENCHMARKS[name](quick, Path(directory))
+        print(f"  in {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
+        return found
     except (BenchmarkError, CheckpointError, FailoverError, OSError) as error:
         print(f"{name} came to nothing: {error}", file=sys.stderr)
         return Findings(name, "This came to nothing.", (), (Absent(name, str(error)),))

@@ -12,7 +12,7 @@ from failover.cli.demo.robots import RobotMachine, Stage, means
 CUTS = {1: 6, 2: 5, 4: 4}
 """Programs that are taken over at once, and how often the power is cut for it."""
 
-QUICK_CUTS = {1: 2, 2: 1}
+QUICK_CUTS = {1: 2}
 
 COUNTING = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.01)\n"
 """Prints every 10 ms."""
