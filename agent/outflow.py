@@ -61,9 +61,10 @@ class Outflow:
         at = dict(zip(STREAMS, offsets, strict=True))
         while True:
             over, elsewhere = await self._standing(name)
+            whole = over or not committed or (not follow and await self._has_ended(name))
             sent = False
             for stream in STREAMS:
-                piece = await self._read(name, elsewhere, stream, at[stream], committed and not over)
+                piece = await self._read(name, elsewhere, stream, at[stream], not whole)
                 if piece.content:
                     await say.output(stream, piece.offset, piece.content)
                     at[stream] = piece.offset + len(piece.content)
@@ -78,11 +79,7 @@ class Outflow:
         wanted = arguments_of(PieceArguments, "piece", arguments)
         if wanted.stream not in STREAMS:
             raise RefusedError(f"piece: {wanted.stream} is no stream; 1 is standard output, 2 standard error")
-        view, _ = await self._view(
-            wanted.name
-        )  # the core's word: whoever asks has heard of the end, perhaps before our own charge
-        over = view is not None and view.state in ENDED
-        piece = self._read_here(wanted.name, wanted.stream, wanted.offset, not over)
+        piece = self._read_here(wanted.name, wanted.stream, wanted.offset, not await self._has_ended(wanted.name))
         return {"offset": piece.offset, "content": piece.content}
 
     async def _read(self, name: str, robot: str, stream: int, offset: int, committed: bool) -> OutputPiece:
@@ -107,6 +104,11 @@ class Outflow:
             return False, ""
         view, peers = await self._view(name)
         return (view.state in ENDED, _where(view, peers)) if view is not None else (False, "")
+
+    async def _has_ended(self, name: str) -> bool:
+        """The core's word: status shows it, and peers hear it, before it is written and our own charge is told."""
+        view, _ = await self._view(name)
+        return view is not None and view.state in ENDED
 
     async def _view(self, name: str) -> tuple[ComponentView | None, tuple[PeerView, ...]]:
         """The component as this robot's core sees it, and the peers."""
