@@ -125,7 +125,7 @@ def reconnect(arguments: argparse.Namespace, name: str) -> Control:
     """Wait for an agent that went away in the middle of a component's output.
 
     Raises:
-        LostAgentError: it did not come back.
+        NoAgentError: it did not come back.
     """
     deadline = time.monotonic() + RECONNECT_S
     while True:
@@ -133,7 +133,7 @@ def reconnect(arguments: argparse.Namespace, name: str) -> Control:
             return connect(arguments)
         except NoAgentError as error:
             if time.monotonic() > deadline:
-                raise LostAgentError(
+                raise NoAgentError(
                     f"the agent went away and did not come back within {RECONNECT_S:.0f} s; {name} runs on without it: "
                     f"start failover-agent, then follow with: failover logs --follow {name}"
                 ) from error

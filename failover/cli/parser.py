@@ -318,6 +318,9 @@ VERBS: Final = (
         Ctrl-C is passed on to the program. Its exit status becomes ours (128 + N if signal N ended it). --json prints how it was
         started on standard error.
 
+        While it waits, the agent may be restarted and the program may go to another robot and end there: it goes on waiting, and
+        shows each byte once. An agent that does not come back within half a minute is status 3; the program runs on.
+
         Its standard output and error are pipes that belong to it, not to this terminal, and its standard input is empty: it does
         not see a terminal even where you have one. Many programs then write by the block and not by the line; python3 -u, or
         stdbuf -oL before other commands, shows their output at once.
