@@ -240,6 +240,25 @@ def test_check_without_a_pid_says_what_this_machine_offers() -> None:
     assert ran.returncode == 0
 
 
+FILTERED = """
+import ctypes, os, struct, sys
+allow = ctypes.create_string_buffer(struct.pack("HBBI", 0x06, 0, 0, 0x7FFF0000))  # BPF_RET, SECCOMP_RET_ALLOW
+program = struct.pack("HxxxxxxP", 1, ctypes.addressof(allow))
+libc = ctypes.CDLL(None)
+assert libc.prctl(38, 1, 0, 0, 0) == 0  # PR_SET_NO_NEW_PRIVS
+assert libc.prctl(22, 2, program) == 0  # PR_SET_SECCOMP, SECCOMP_MODE_FILTER
+os.execv(sys.executable, [sys.executable, "-m", "failover.cli.main", *sys.argv[1:]])
+"""
+"""Runs our command as a container does: under a seccomp filter, which every program started there inherits."""
+
+
+def test_check_without_a_pid_tries_a_capture_and_says_what_forbids_it() -> None:
+    ran = subprocess.run([sys.executable, "-c", FILTERED, "check", "--json"], capture_output=True, text=True, check=False)
+    assert ran.returncode == 1, ran.stderr
+    missing = [offer for offer in json.loads(ran.stdout)["offers"] if offer["verdict"] == "missing"]
+    assert ["seccomp filter" in offer["text"] for offer in missing] == [True]
+
+
 def test_a_signal_that_ends_a_restored_program_is_passed_on_as_shells_do(snapshot: Path) -> None:
     with subprocess.Popen(
         [sys.executable, "-m", "failover.cli.main", "restore", "--wait", str(snapshot)], stdout=subprocess.PIPE
