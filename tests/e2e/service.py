@@ -11,6 +11,8 @@ from tests.e2e.machines import CHECKOUT, Machine
 
 SERVICE: Final = "failover-agent.service"
 COUNT: Final = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.01)\n"
+POLITE: Final = "import signal, sys\nsignal.signal(signal.SIGTERM, lambda *_: sys.exit(0))\n" + COUNT
+"""The same, and it exits with status 0 when it is told to end."""
 
 
 def install(machine: Machine) -> None:
@@ -45,10 +47,10 @@ def component(machine: Machine, name: str) -> dict[str, Any]:
         return {}
 
 
-def started(machine: Machine, name: str) -> int:
+def started(machine: Machine, name: str, script: str = COUNT) -> int:
     """A counting component; the PID of its program, there."""
     with control(machine) as link:
-        argv = ["/usr/bin/python3", "-S", "-c", COUNT]
+        argv = ["/usr/bin/python3", "-S", "-c", script]
         return int(link.ask("run", argv=argv, name=name, env={"PATH": "/usr/bin"}, cwd="/", wait=False)["pid"])
 
 

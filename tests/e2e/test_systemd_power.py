@@ -12,7 +12,7 @@ import pytest
 
 from tests.e2e import machines, robots
 from tests.e2e.machines import Machine
-from tests.e2e.service import SERVICE, component, counted, install, make_team, started, status
+from tests.e2e.service import COUNT, POLITE, SERVICE, component, counted, install, make_team, started, status
 
 pytestmark = [
     pytest.mark.root,
@@ -57,9 +57,9 @@ def connected(machine: Machine) -> bool:
     return bool(peer["state"] == "live" and peer["hears_us"] and peer["lane"] == "connected")
 
 
-def protected(machine: Machine, name: str) -> None:
+def protected(machine: Machine, name: str, script: str = COUNT) -> None:
     """Start a counting component and wait until its neighbour holds some of its snapshots."""
-    started(machine, name)
+    started(machine, name, script)
     robots.until(lambda: int(component(machine, name).get("snapshots") or 0) >= SNAPSHOTS, "snapshots")
     robots.until(lambda: len(counted(machine, name)) > MORE, "output")
 
@@ -81,8 +81,11 @@ def test_a_machine_whose_power_is_cut_is_replaced_by_the_other(pair: tuple[Machi
 
 
 def test_a_machine_that_is_shut_down_in_order_is_replaced_by_the_other(pair: tuple[Machine, Machine]) -> None:
+    """Also where a program exits as if it were done, because systemd told it to end: that is no end of the component."""
     first, second = pair
     protected(first, "shut")
+    protected(first, "polite", POLITE)
     first.run("systemctl", "poweroff", check=False)
     first.process.wait(machines.PATIENCE_S)
     expect_it_to_go_on_at(second, "shut")
+    expect_it_to_go_on_at(second, "polite")
