@@ -7,6 +7,7 @@ it ends all the same, the program ends with it (PR_SET_PDEATHSIG): a program wit
 It listens on SOCKET_PATH (0600) for one agent at a time; a new one takes the place of the old. It ends
 
 * when the agent says `Forget` after the program's end;
+* when the program has ended, no agent is there, and the system told the guard to end (SIGTERM: a shutdown);
 * when the program ends that was let go (`LetGo`); at once, if it is somebody else's child;
 * when the agent is lost before anything was started, or before a restore was committed;
 * when no agent ever came, after `FIRST_CALL_S`.
@@ -73,8 +74,9 @@ class Guard:
         self._keeper: int | None = None
         self._over = False
         self._ends_with_ward = False
+        self._told_to_end = False
         self._started_at = time.monotonic()
-        self._children_ended = _wake_on_children()
+        self._signals = _wake_on_signals()
         self._answers: dict[type, Callable[[Any, tuple[int, ...]], None]] = {
             Start: self._start,
             MakeVessel: self._make_vessel,
@@ -97,14 +99,19 @@ class Guard:
                 self._tell(FrozenByLease())
             for act in ready:
                 act()
-            if self._agent is None and self._ward is None and time.monotonic() > self._started_at + FIRST_CALL_S:
-                self._over = True
+            self._over |= self._agent is None and self._is_of_no_use()
         if self._ward is not None:
             self._ward.close()
 
+    def _is_of_no_use(self) -> bool:
+        """Whether no agent will ask for what this guard knows."""
+        if self._ward is None:
+            return time.monotonic() > self._started_at + FIRST_CALL_S
+        return self._told_to_end and self._ward.exited is not None
+
     def _wait(self) -> list[Callable[[], None]]:
         """Sleep until something is to be done, or a deadline passes; returns what is to be done."""
-        watched: dict[int, Callable[[], None]] = {self._children_ended.fileno(): self._reap}
+        watched: dict[int, Callable[[], None]] = {self._signals.fileno(): self._heed_signals}
         if self._listener.fileno() >= 0:  # it was not let go
             watched[self._listener.fileno()] = self._accept
         if self._agent is not None:
@@ -268,9 +275,9 @@ class Guard:
 
     # --- ends ---
 
-    def _reap(self) -> None:
-        while _drain(self._children_ended):
-            pass
+    def _heed_signals(self) -> None:
+        while numbers := _drain(self._signals):
+            self._told_to_end |= signal.SIGTERM in numbers
         if self._ward is not None and self._ward.reap():
             self._announce_end()
 
@@ -337,8 +344,8 @@ def _settle() -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _wake_on_children() -> socket.socket:
-    """A socket that becomes readable when a child has ended."""
+def _wake_on_signals() -> socket.socket:
+    """A socket that gives the number of each signal that came, one byte each: of SIGCHLD, when a child has ended."""
     inside, outside = socket.socketpair()
     inside.setblocking(False)
     outside.setblocking(False)

@@ -202,6 +202,17 @@ def test_a_guard_does_not_end_by_a_signal_of_a_shutdown_before_its_program_has(g
     assert grows(guard)
 
 
+def test_a_shutdown_ends_a_program_and_then_its_guard_when_no_agent_is_left(guard: GuardProcess) -> None:
+    agent = guard.agent()
+    pid = guard.start(agent, *COUNTING).pid
+    guard.process.send_signal(signal.SIGTERM)
+    assert agent.describe().state == "running"
+    agent.close()
+    assert grows(guard)
+    os.kill(pid, signal.SIGTERM)
+    assert guard.ended() == 0
+
+
 def vessel(guard: GuardProcess) -> MakeVessel:
     clocks = Clocks(monotonic_ns=0, boottime_ns=0, realtime_ns=0)
     return MakeVessel("/test/one", 0, False, clocks, 0, (0, 0), str(guard.logs))
