@@ -63,10 +63,12 @@ def read(directory: Path) -> Team:
     """Read the team file.
 
     Raises:
-        FileMistakeError: it is missing or mistaken; names the line.
-        TeamFileError: its content makes no team.
+        FileMistakeError: it is mistaken; names the line.
+        TeamFileError: it is missing, or its content makes no team.
     """
     path = directory / TEAM_FILE
+    if not path.exists():
+        raise TeamFileError(f"{path}: there is no such file; failover team create makes one, or carry it here from another robot")
     team = strict_toml.read(path, Team)
     if len(team.robots) > ROBOT_LIMIT:
         raise TeamFileError(f"{path}: {len(team.robots)} robots are over the limit of {ROBOT_LIMIT}")

@@ -319,6 +319,12 @@ def test_a_team_is_created_enrolled_into_and_shown(tmp_path: Path) -> None:
     assert shown["robots"]["robot2"]["beats"] == ["[fe80::1]:7420"]
 
 
+def test_without_a_team_file_the_way_to_one_is_named(tmp_path: Path) -> None:
+    ran = failover("team", "show", "--directory", str(tmp_path))
+    assert ran.returncode == 1
+    assert "failover team create makes one" in ran.stderr
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
