@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from checkpoint.model import Position
 from failover.core import acts
 from failover.core.messages import Beat
-from failover.core.types import Ballot, State, WhenAlone
+from failover.core.types import Ballot, ComponentView, State, WhenAlone
 from tests.simulation.world import World, ballot_of
 
 
@@ -126,9 +126,7 @@ class Invariants:
         primaries = [name for name, state in states.items() if state is State.PRIMARY]
         if len(primaries) != 1 or world.acting(component) != primaries:
             raise _broken(world, f"{component} should act at one robot: {states}, acts at {world.acting(component)}")
-        node = world.robots[primaries[0]].node
-        assert node is not None
-        seen = next(one for one in node.status(world.local(world.robots[primaries[0]])).components if one.name == component)
+        seen = seen_at(world, primaries[0], component)
         if seen.protection != "protected" or not 0 <= seen.lag_ns < 1_000_000_000:
             raise _broken(
                 world, f"{component} at {primaries[0]} is {seen.protection}, its checkpoint {seen.lag_ns / 1e6:.0f} ms old"
@@ -137,10 +135,18 @@ class Invariants:
 
 def state_at(world: World, robot: str, component: str) -> State:
     """How the component stands at a robot, as that robot says."""
+    return next((one.state for one in _views(world, robot) if one.name == component), State.ABSENT)
+
+
+def seen_at(world: World, robot: str, component: str) -> ComponentView:
+    """All that a robot says of a component that it knows."""
+    return next(one for one in _views(world, robot) if one.name == component)
+
+
+def _views(world: World, robot: str) -> tuple[ComponentView, ...]:
     node = world.robots[robot].node
     assert node is not None, f"{robot} is down"
-    views = node.status(world.local(world.robots[robot])).components
-    return next((one.state for one in views if one.name == component), State.ABSENT)
+    return node.status(world.local(world.robots[robot])).components
 
 
 def _broken(world: World, sentence: str) -> Broken:

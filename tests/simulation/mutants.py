@@ -124,6 +124,40 @@ def no_grace() -> Any:
     return patch.object(Config, "grace_ns", property(lambda _: 0))
 
 
+def blind_to_the_better() -> Any:
+    """Whoever holds a checkpoint claims, although another robot holds a newer one."""
+    return patch.object(election, "_living_entries", lambda *_: [])
+
+
+def loyal_to_the_lost() -> Any:
+    """A standby that died is not replaced by another one."""
+    honest = replication.choose_standby
+
+    def loyal(component: Component, turn: Turn) -> None:
+        if not component.standby:
+            honest(component, turn)
+
+    return patch.object(replication, "choose_standby", loyal)
+
+
+def tireless_giver() -> Any:
+    """A checkpoint that was not taken is offered again at once, and again."""
+    honest = replication.ship_ended
+
+    def hasty(component: Component, turn: Turn, event: Any) -> None:
+        honest(component, turn, event)
+        component.due_ns = turn.now_ns
+
+    return patch.object(replication, "ship_ended", hasty)
+
+
+SPOILERS: tuple[tuple[Mutant, str], ...] = (
+    (blind_to_the_better, "the_newest_checkpoint_wins_over_the_lesser_name"),
+    (loyal_to_the_lost, "three_robots_stand_in_for_one_another"),
+    (tireless_giver, "a_chain_that_is_not_taken_is_offered_again_after_a_pause"),
+)
+"""Mistakes that a pair survives, or that cost no promise but the peace: each spoils a scenario."""
+
 MUTANTS: tuple[Mutant, ...] = (
     impatient_standby,
     lease_from_the_answer,

@@ -2,26 +2,32 @@
 
 A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment. ``expect`` looks at the world at that instant:
 
-    rule when_alone=freeze on_loss=hold    rules of the component, before everything else
+    team robot1 robot2 robot3              who is in the team, if not robot1 and robot2; before everything else
+    rule when_alone=freeze on_loss=hold    rules of the component, before everything but that
     0    on robot1                         start a robot; off: power cut; agent-dies: guards and programs live on
     100  run robot1                        an operator starts the component there
     500  cut robot1 robot2                 nothing passes, both ways;  one-way A B: from A to B;  mend: all cuts end
     600  stall robot1 300                  its loop gets no processor for 300 ms
     700  exit robot1 0                     its program ends with this wait status (11: crash)
     800  handover robot1                   an operator moves it to the standby
+    850  new-disk robot1                   its checkpoints are gone; what it has decided is not
     900  expect robot1 primary             its state there
+    900  standby robot1 robot2             where the checkpoints of the one that runs at robot1 go
     900  acts robot1                       where it computes: robots, or nobody
+    900  offers robot2 1 4                 how often it has offered a checkpoint since the last such line: at least, at most
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 import msgspec
 
+from failover.core import acts
 from failover.core.events import Handover, Run, Stop
 from failover.core.types import MS, ComponentSpec, Launch, Rules
-from tests.simulation.invariants import Invariants, state_at
+from tests.simulation.invariants import Invariants, seen_at, state_at
 from tests.simulation.world import World, pair
 
 COMPONENT = "/team/part"
@@ -33,21 +39,26 @@ class Story:
 
     rules: Rules = field(default_factory=Rules)
     failures: list[str] = field(default_factory=list)
+    offers: Counter[str] = field(default_factory=Counter)
     world: World = field(init=False)
     invariants: Invariants = field(init=False)
 
     def play(self, text: str) -> World:
         """Play the lines in order; raises AssertionError with the story when an expectation is not met."""
         lines = [words for line in text.splitlines() if (words := line.split("#")[0].split())]
+        names = tuple(lines.pop(0)[1:]) if lines[0][0] == "team" else ("robot1", "robot2")
         if lines[0][0] == "rule":
             self.rules = _rules(lines.pop(0)[1:])
         self.invariants = Invariants(safe={COMPONENT} if self.rules.when_alone == "freeze" else set())
-        self.world = World(1, pair(), (self.invariants,))
+        self.world = World(1, pair(names=names), (self.invariants, self._count))
         for at_ms, verb, *arguments in lines:
             self.world.run(int(at_ms) * MS)
             self._play(verb, arguments)
         assert not self.failures, "\n".join([*self.failures, *self.world.log])
         return self.world
+
+    def _count(self, world: World, robot: str, what: object) -> None:
+        self.offers[robot] += isinstance(what, acts.Ship)
 
     def _play(self, verb: str, arguments: list[str]) -> None:
         world, robot = self.world, arguments[0] if arguments else ""
@@ -76,8 +87,16 @@ class Story:
                 world.network.cuts.add((robot, arguments[1]))
             case "mend":
                 world.network.cuts.clear()
+            case "new-disk":
+                world.robots[robot].store.clear()
+            case "offers":
+                least, most = map(int, arguments[1:])
+                found = self.offers.pop(robot, 0)
+                self._expect(f"{robot} has offered {found}:", str(least <= found <= most), "True")
             case "expect":
                 self._expect(f"{robot} is", state_at(world, robot, COMPONENT), " ".join(arguments[1:]))
+            case "standby":
+                self._expect(f"the standby of {robot} is", seen_at(world, robot, COMPONENT).standby, arguments[1])
             case "acts":
                 self._expect("it acts at", " ".join(world.acting(COMPONENT)) or "nobody", " ".join(arguments))
             case _:
