@@ -15,7 +15,9 @@ import agent.errors
 import agent.main
 import checkpoint.errors
 import failover.errors
+from agent import view
 from agent.config import ComponentConfig, Config
+from agent.transport import LinkState
 from checkpoint.resources import unsupported
 from failover.cli import parser
 from failover.client.team import Robot
@@ -138,6 +140,14 @@ def test_every_class_of_error_has_its_cause_and_cure() -> None:
     table = (ROOT / "docs" / "troubleshooting.md").read_text().split("\n## Classes of errors\n")[1].split("\n## ")[0]
     told = {name for line in table.splitlines() for name in re.findall(r"`(\w+Error)`", line.partition(" | ")[0])}
     assert error_classes() <= told
+
+
+def test_every_word_of_the_status_is_told() -> None:
+    text = (ROOT / "docs" / "guide.md").read_text().split("## 5.")[1].split("## 6.")[0]
+    of_components = set(view.STATES.values()) - {"absent", "released"}  # these are not shown
+    of_robots = {"unknown", "live", "suspect", "dead"}
+    words = of_components | of_robots | {"degraded"} | {str(state) for state in LinkState}
+    assert [word for word in sorted(words) if not re.search(rf"\*{word}\b", text)] == []
 
 
 def test_everything_that_is_refused_by_name_is_listed() -> None:
