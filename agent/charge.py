@@ -15,8 +15,7 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from agent import births, clock
-from agent.ballot import write_durably
+from agent import births, clock, lost
 from agent.births import Program
 from agent.component import Component
 from agent.errors import AgentError, KeeperLostError
@@ -27,7 +26,6 @@ from agent.records import Records
 from checkpoint.channel import close_all, content_of
 from checkpoint.errors import CheckpointError, UnsupportedError
 from checkpoint.model import Position
-from checkpoint.shelf import folder_name
 from checkpoint.store import Store
 from failover.core import acts, events
 from failover.core.acts import Act
@@ -163,8 +161,8 @@ class Charge:
             case acts.Capture():
                 unsupported = isinstance(trouble, UnsupportedError)
                 self.figures.reasons = reasons
-                lost = isinstance(trouble, KeeperLostError)
-                self.around.tell(events.CaptureFailed(self.name, act.epoch, shortened(reasons), unsupported, lost))
+                by_keeper = isinstance(trouble, KeeperLostError)
+                self.around.tell(events.CaptureFailed(self.name, act.epoch, shortened(reasons), unsupported, by_keeper))
             case acts.Start() | acts.Restore():
                 guest = isinstance(act, acts.Start) and act.spec.launch.pid != 0
                 with contextlib.suppress(*TROUBLE):
@@ -318,10 +316,8 @@ class Charge:
             content = content_of(captured.snapshot)
         finally:
             os.close(captured.snapshot)
-        folder = self.around.places.logs.parent / "lost"
-        folder.mkdir(mode=0o700, exist_ok=True)
-        path = folder / f"{folder_name(self.name)}-epoch{act.epoch}.snapshot"
-        await asyncio.to_thread(write_durably, path, content)
+        directory = self.around.places.logs.parent / "lost"
+        path = await asyncio.to_thread(lost.keep, directory, self.name, act.epoch, content)
         log.warning("%s: the copy that lost is kept for inspection in %s: %s", self.name, path, act.reason)
 
     async def _keep_house(self, act: acts.Forget | acts.Prune | acts.Drop) -> None:
