@@ -1,4 +1,4 @@
-"""``failover run`` waits for its program: through deaths of its agent, and when the program has gone to the other robot."""
+"""``failover run`` waits for its program: through deaths of its agent, also when the program has gone to the other robot then."""
 
 from __future__ import annotations
 
@@ -83,12 +83,30 @@ def test_run_goes_on_waiting_when_its_agent_is_killed_and_started_again(tmp_path
         run.expect_the_end()
 
 
-def test_run_goes_on_waiting_when_its_program_was_taken_over_meanwhile(tmp_path: Path) -> None:
+def written(robot: RobotMachine) -> bytes:
+    """All that its copy wrote to standard output, shown to anybody or not."""
+    (log,) = (robot.directory / "state" / "logs").glob("*/stdout.log")
+    return log.read_bytes()
+
+
+def test_an_agent_that_comes_back_after_a_takeover_ends_the_copy_that_outlived_it_and_run_goes_on(tmp_path: Path) -> None:
+    """Of what the old copy wrote after the checkpoint that the other robot resumed from, nothing is in the output."""
     with robots.two_robots(tmp_path) as (first, second), waiting(first, tmp_path) as run:
+        program = robots.host_pid(first, robots.component(first, "told")["pid"])
         run.expect_more()
         kill(first, ("heart", "lanes"))
         robots.until(lambda: robots.component(second, "told").get("restores") == 1, "robot2 to take over")
+        standing, begun = written(first), len(written(second))
+        robots.until(lambda: len(written(second)) > begun + MORE, "robot2 to count on")
+        assert written(first) == standing, "the old copy stood still before the new one ran"
+        assert Path(f"/proc/{program}").exists()
         revived(first, ("heart", "lanes"))
+        robots.until(lambda: not Path(f"/proc/{program}").exists(), "the old copy to be ended")
+        robots.until(lambda: list((first.directory / "state" / "lost").glob("*.snapshot")), "what became of it, for inspection")
         run.expect_more()
-        assert robots.component(second, "told")["role"] == "primary"
+        shown = robots.component(second, "told")
+        assert (shown["role"], shown["restores"]) == ("primary", 1)
         run.expect_the_end()
+        for robot in (first, second):
+            counted = [int(line) for line in robots.output(robot, "told").split()]
+            assert counted == list(range(len(counted))), robot.name

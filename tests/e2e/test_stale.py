@@ -12,7 +12,7 @@ import pytest
 from checkpoint import format
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
-from tests.e2e.test_deaths import COUNT, kill, numbers, parts
+from tests.e2e.test_deaths import COUNT, numbers, parts
 
 pytestmark = pytest.mark.root
 
@@ -85,21 +85,3 @@ def test_a_stopped_agent_and_keeper_leave_a_frozen_program_and_wake_up_stale(pai
     robots.until(lambda: not Path(f"/proc/{program}").exists(), "the old copy to be ended")
     expect_one_history(pair)
     expect_kept_aside(first)
-
-
-def test_an_agent_that_comes_back_after_a_takeover_ends_the_copy_that_outlived_it(pair: Pair) -> None:
-    first, second = pair
-    program = protected_count(pair)
-    kill(first, ("heart", "lanes"))
-    robots.until(lambda: runs_at(second), "robot2 to take over")
-    standing = written(first)
-    before = len(robots.output(second, "count"))
-    robots.until(lambda: len(robots.output(second, "count")) > before + MORE, "robot2 to count on")
-    assert written(first) == standing, "the old copy stood still before the new one ran"
-    assert Path(f"/proc/{program}").exists()
-    robots.start_agent(first)
-    robots.until(lambda: robots.answers(first), "the agent to answer")
-    robots.until(lambda: not Path(f"/proc/{program}").exists(), "the old copy to be ended")
-    expect_one_history(pair)
-    expect_kept_aside(first)
-    assert robots.component(second, "count")["restores"] == 1
