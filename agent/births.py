@@ -109,7 +109,7 @@ async def restore(
         cgroup=places.cgroup,
     )
     try:
-        keeper = component.give_keeper()
+        keeper = await component.give_keeper()
         laps.lap("guard and keeper")
         await _vessel(component, request, keeper)
         laps.lap("vessel")

@@ -127,7 +127,7 @@ class Component:
         """
         if self._keeper is not None and self._keeper.dialogue.open:
             return ()
-        self.give_keeper()
+        await self.give_keeper()
         order = channel.Protect(self.pid, self.name, bool(self.streams), self._places.robot)
         try:
             protected, _ = await self.ask_keeper(order, self.streams)
@@ -260,13 +260,13 @@ class Component:
             raise GuardError(f"{self.name}: {reply.message}")
         return reply, streams
 
-    def give_keeper(self) -> KeeperLink:
+    async def give_keeper(self) -> KeeperLink:
         """Give it a keeper that follows nothing yet.
 
         Raises:
             KeeperLostError: none can be had.
         """
-        self._keeper = self._places.nursery.keeper()
+        self._keeper = await self._places.nursery.keeper()
         return self._keeper
 
     async def ask_keeper(self, request: Any, descriptors: tuple[int, ...] = ()) -> Any:

@@ -34,9 +34,9 @@ from agent.journal import set_up_log
 from agent.nursery import Nursery
 from agent.places import Places, guard_sockets
 from agent.records import Records
-from agent.scope import launcher
 from agent.shipping import Receiver, Shipper
 from agent.transport import BulkLane, Keys, LinkState, public_key_of
+from agent.units import starter
 from agent.verbs import Verbs
 from agent.view import team_view
 from checkpoint.channel import Channel, ChannelClosedError, ChannelError
@@ -88,7 +88,7 @@ class Lanes:
         self._runtime = runtime
         self._store_path = state / "store"
         sockets = runtime / "guards"
-        self._nursery = Nursery(sockets, launcher())
+        self._nursery = Nursery(sockets, starter())
         self.places = Places(sockets, state / "logs", self._nursery, robot=config.robot)
         self._heart = heart
         self._outgoing: asyncio.Queue[door.ToHeart] = asyncio.Queue()

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
 import logging
 import os
+import secrets
 import socket
+import struct
 import subprocess
 import sys
 from collections import deque
@@ -21,12 +22,14 @@ from typing import Final
 from agent import guard_messages
 from agent.dialogue import Dialogue
 from agent.errors import GuardError, GuardLostError, KeeperLostError
+from agent.units import Kind, in_a_unit
 from checkpoint import channel
 
 BIRTH_S: Final = 20.0
 """How long a guard may take until it listens; a tenth of a second is usual."""
 
 POLL_S: Final = 0.005
+_PEER: Final = struct.Struct("3i")
 
 SPARES_MAX: Final = 8
 """Pairs that wait at most; each holds about 60 MB. Whatever is taken over beyond that waits for interpreters to start."""
@@ -50,7 +53,7 @@ class KeeperLink:
     """A keeper, and our conversation with it."""
 
     dialogue: Dialogue
-    process: subprocess.Popen[bytes]
+    pid: int
 
     def pidfd(self) -> int:
         """A descriptor of its process, the caller's to close.
@@ -59,7 +62,7 @@ class KeeperLink:
             KeeperLostError: it has ended.
         """
         try:
-            return os.pidfd_open(self.process.pid)
+            return os.pidfd_open(self.pid)
         except ProcessLookupError as error:
             raise KeeperLostError("the keeper ended before it was asked anything") from error
 
@@ -71,17 +74,16 @@ class KeeperLink:
 class Nursery:
     """Starts guards and keepers. Lives in one loop."""
 
-    def __init__(self, sockets: Path, launcher: tuple[str, ...]) -> None:
+    def __init__(self, sockets: Path, starter: str) -> None:
         """
         Args:
-            launcher: put before every command line, see `agent.scope`.
+            starter: of services of their own, see `agent.units`; "": they are our children.
         """
         self._sockets = sockets
-        self._launcher = launcher
-        self._numbers = itertools.count(1)
+        self._starter = starter
         self._wanted = 1
         self._guards: deque[asyncio.Task[GuardLink]] = deque()
-        self._keepers: deque[KeeperLink] = deque()
+        self._keepers: deque[asyncio.Task[KeeperLink]] = deque()
         self._children: list[subprocess.Popen[bytes]] = []
         self._closed = False
 
@@ -92,13 +94,11 @@ class Nursery:
 
     def prepare(self) -> None:
         """Have as many wait as are wanted."""
-        self._keepers = deque(keeper for keeper in self._keepers if keeper.dialogue.open)
+        self._keepers = deque(born for born in self._keepers if not _lost(born))
         while len(self._guards) < self._wanted:
             self._guards.append(asyncio.create_task(self._guard_born()))
         while len(self._keepers) < self._wanted:
-            keeper = self._keeper_born()
-            keeper.dialogue.ended = self._refill
-            self._keepers.append(keeper)
+            self._keepers.append(asyncio.create_task(self._keeper_waits()))
 
     async def guard(self) -> GuardLink:
         """A guard that guards nothing yet.
@@ -114,7 +114,7 @@ class Nursery:
                     return link
         return await self._guard_born()
 
-    def keeper(self) -> KeeperLink:
+    async def keeper(self) -> KeeperLink:
         """A keeper that follows nothing yet.
 
         Raises:
@@ -122,20 +122,22 @@ class Nursery:
         """
         self._refill()
         while self._keepers:
-            link = self._keepers.popleft()
-            link.dialogue.ended = lambda: None
-            if link.dialogue.open:
-                return link
-        return self._keeper_born()
+            with contextlib.suppress(KeeperLostError):
+                link = await self._keepers.popleft()
+                link.dialogue.ended = lambda: None
+                if link.dialogue.open:
+                    return link
+        return await self._keeper_born()
 
     async def close(self) -> None:
         """End the ones that wait; they guard nothing. Those in use live on."""
         self._closed = True
-        for born in self._guards:
+        for guard in self._guards:
             with contextlib.suppress(GuardError):
-                (await born).dialogue.close()
+                (await guard).dialogue.close()
         for keeper in self._keepers:
-            keeper.end()
+            with contextlib.suppress(KeeperLostError):
+                (await keeper).end()
         self._reap()
 
     def _refill(self) -> None:
@@ -151,38 +153,70 @@ class Nursery:
             log.warning("no guard and keeper wait in advance, a takeover will take longer: %s", error)
 
     async def _guard_born(self) -> GuardLink:
-        path = self._sockets / f"{os.getpid()}-{next(self._numbers)}.guard"
-        command = [*self._launcher, sys.executable, "-m", "agent.guard", str(path)]
-        child = self._spawn(command)
+        name = _new_name()
+        path = self._sockets / f"{name}.guard"
+        child = self._spawn("guard", name, ["agent.guard", str(path)])
+        return _guard_at(path, await self._connected(path, child, "a guard"))
+
+    async def _keeper_waits(self) -> KeeperLink:
+        """A keeper whose end, while nothing needs it, is noticed."""
+        link = await self._keeper_born()
+        link.dialogue.ended = self._refill
+        return link
+
+    async def _keeper_born(self) -> KeeperLink:
+        try:
+            end, pid = await self._keeper_called() if self._starter else self._keeper_forked()
+        except GuardError as error:
+            raise KeeperLostError(str(error)) from error
+        return KeeperLink(Dialogue(end, channel.Reply, KeeperLostError, "the keeper"), pid)
+
+    async def _keeper_called(self) -> tuple[socket.socket, int]:
+        """One that systemd started: it listens as a guard does."""
+        name = _new_name()
+        path = self._sockets / f"{name}.keeper"
+        child = self._spawn("keeper", name, ["checkpoint", "keeper", str(path)])
+        end = await self._connected(path, child, "a keeper")
+        pid, _, _ = _PEER.unpack(end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
+        return end, pid
+
+    def _keeper_forked(self) -> tuple[socket.socket, int]:
+        ours, theirs = channel.pair()
+        with theirs:
+            try:
+                child = self._spawn("keeper", "", ["checkpoint", "keeper", str(theirs.fileno())], (theirs.fileno(),))
+            except GuardError:
+                ours.close()
+                raise
+        return ours, child.pid
+
+    async def _connected(self, path: Path, child: subprocess.Popen[bytes], what: str) -> socket.socket:
+        """Wait until somebody listens at a path.
+
+        Raises:
+            GuardError: it has ended, or takes longer than `BIRTH_S`.
+        """
         waited = 0.0
         while waited < BIRTH_S:
             with contextlib.suppress(FileNotFoundError, ConnectionRefusedError):
-                return connect(path)
-            if child.poll() is not None:
-                raise GuardError(f"a guard ended at once, status {child.returncode}; what it said stands in the agent's log")
+                return _call(path)
+            status = child.poll()
+            if status is not None and (status or not self._starter):  # systemd-run ends well as soon as it has been started
+                raise GuardError(f"{what} ended at once, status {status}; what it said stands in the agent's log")
             await asyncio.sleep(POLL_S)
             waited += POLL_S
         child.kill()
-        raise GuardError(f"a guard did not listen within {BIRTH_S:.0f} s; is the machine out of memory?")
+        raise GuardError(f"{what} did not listen within {BIRTH_S:.0f} s; is the machine out of memory?")
 
-    def _keeper_born(self) -> KeeperLink:
-        ours, theirs = channel.pair()
-        command = [*self._launcher, sys.executable, "-m", "checkpoint", "keeper", str(theirs.fileno())]
-        try:
-            child = self._spawn(command, (theirs.fileno(),))
-        except GuardError as error:
-            ours.close()
-            raise KeeperLostError(str(error)) from error
-        finally:
-            theirs.close()
-        return KeeperLink(Dialogue(ours, channel.Reply, KeeperLostError, "the keeper"), child)
-
-    def _spawn(self, command: list[str], descriptors: tuple[int, ...] = ()) -> subprocess.Popen[bytes]:
+    def _spawn(self, kind: Kind, name: str, module: list[str], descriptors: tuple[int, ...] = ()) -> subprocess.Popen[bytes]:
         self._reap()
+        way = in_a_unit(self._starter, kind, name) if self._starter else []
         try:
-            child = subprocess.Popen(command, pass_fds=descriptors, stdin=subprocess.DEVNULL, start_new_session=True)
+            child = subprocess.Popen(
+                [*way, sys.executable, "-m", *module], pass_fds=descriptors, stdin=subprocess.DEVNULL, start_new_session=True
+            )
         except OSError as error:
-            raise GuardError(f"cannot start {command[-2]}: {error.strerror}; is memory or the process limit used up?") from error
+            raise GuardError(f"cannot start a {kind}: {error.strerror}; is memory or the process limit used up?") from error
         self._children.append(child)
         return child
 
@@ -197,11 +231,29 @@ def connect(path: Path) -> GuardLink:
     Raises:
         FileNotFoundError, ConnectionRefusedError: nobody does (yet, or any more).
     """
+    return _guard_at(path, _call(path))
+
+
+def _guard_at(path: Path, end: socket.socket) -> GuardLink:
+    incoming = guard_messages.Reply | guard_messages.Event
+    return GuardLink(Dialogue(end, incoming, GuardLostError, f"the guard at {path.name}"), path)
+
+
+def _call(path: Path) -> socket.socket:
     end = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
     try:
         end.connect(str(path))
     except OSError:
         end.close()
         raise
-    incoming = guard_messages.Reply | guard_messages.Event
-    return GuardLink(Dialogue(end, incoming, GuardLostError, f"the guard at {path.name}"), path)
+    return end
+
+
+def _new_name() -> str:
+    """Of a guard or keeper: one that none of an earlier agent's has."""
+    return secrets.token_hex(4)
+
+
+def _lost(born: asyncio.Task[KeeperLink]) -> bool:
+    """Whether a keeper that was to wait has not come, or has gone."""
+    return born.done() and (born.cancelled() or born.exception() is not None or not born.result().dialogue.open)

@@ -1,4 +1,4 @@
-"""The keeper: the tracer's own process, ``python -m checkpoint keeper FD``.
+"""The keeper: the tracer's own process, ``python -m checkpoint keeper FD``, or ``keeper PATH``: it listens there.
 
 One thread serves one channel; requests and answers stand in `checkpoint.channel`. It follows at most one process. When its
 peer has gone it lets go of that process, which runs on, and ends; a restore that was not resumed by then ends with it.
@@ -6,6 +6,7 @@ peer has gone it lets go of that process, which runs on, and ends; a restore tha
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import signal
@@ -22,7 +23,10 @@ from checkpoint.engine import CaptureOrder, Engine, Restored, RestoreOptions, Se
 from checkpoint.errors import CaptureError, CheckpointError, RestoreError
 from checkpoint.model import Snapshot
 
-USAGE: Final = "usage: python -m checkpoint keeper FD\n"
+USAGE: Final = "usage: python -m checkpoint keeper FD|PATH\n"
+CALL_S: Final = 30.0
+"""How long one that listens waits for its peer."""
+
 STREAM_DESCRIPTORS: Final = 5
 """Counters, two outputs, two logs: what a message brings along for streams."""
 
@@ -193,16 +197,43 @@ def folded(files: Descriptors) -> Snapshot:
 
 
 def main(arguments: list[str]) -> int:
-    """Run a keeper on an inherited socket."""
-    if len(arguments) != 2 or arguments[0] != "keeper" or not arguments[1].isdigit():
+    """Run a keeper on an inherited socket, or for whoever calls at a path."""
+    if len(arguments) != 2 or arguments[0] != "keeper":
         sys.stderr.write(USAGE)
         return 2
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # a Ctrl-C at the terminal is for our peer to act on
     gc.disable()  # no collection inside a freeze; what a capture makes is freed by counting
-    link: Channel[Request] = Channel(socket.socket(fileno=int(arguments[1])), Request)
+    try:
+        end = socket.socket(fileno=int(arguments[1])) if arguments[1].isdigit() else called_at(arguments[1])
+    except OSError as error:
+        sys.stderr.write(f"keeper: nobody to serve at {arguments[1]}: {error.strerror or error}\n")
+        return 1
+    link: Channel[Request] = Channel(end, Request)
     Keeper(link, engine.engine_named("ptrace")).serve()
     return 0
+
+
+def called_at(path: str) -> socket.socket:
+    """Listen at a path (0600) until somebody connects; nobody can afterwards.
+
+    Raises:
+        OSError: it cannot be listened there, or nobody came.
+    """
+    before = os.umask(0o177)
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC) as listener:
+            listener.bind(path)
+            os.umask(before)
+            listener.listen(1)
+            listener.settimeout(CALL_S)
+            end, _ = listener.accept()
+    finally:
+        os.umask(before)
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(path)
+    end.settimeout(None)
+    return end
 
 
 if __name__ == "__main__":

@@ -53,7 +53,7 @@ def live(directory: Path, story: Story) -> None:
     """Run a story in a loop of its own; every guard and keeper that waits is ended after it."""
 
     async def whole() -> None:
-        cradle = Nursery(directory / "guards", ())
+        cradle = Nursery(directory / "guards", "")
         (directory / "guards").mkdir()
         places = Places(directory / "guards", directory / "logs", cradle, robot="robot1")
         try:
@@ -211,7 +211,7 @@ def test_a_keeper_that_dies_costs_a_base_and_nothing_else(tmp_path: Path) -> Non
             assert (await captures.take()).parent is not None
             keeper = component._keeper
             assert keeper is not None
-            keeper.process.kill()
+            os.kill(keeper.pid, signal.SIGKILL)
             with pytest.raises(KeeperLostError):
                 await forever(captures.take)
             assert (await captures.take()).parent is None

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from agent import units
 from failover.cli.demo.robots import free_ports
 from failover.client import team
 from failover.client.team import Robot, Team
@@ -81,3 +82,10 @@ def test_a_loop_that_stands_still_feeds_no_watchdog(config: Path, tmp_path: Path
         finally:
             agent.kill()
             agent.wait()
+
+
+def test_only_the_service_itself_asks_systemd_for_services(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot of the demo, under a CI runner that is a service, would have its guards outside its own namespaces."""
+    monkeypatch.setenv("INVOCATION_ID", "0" * 32)
+    monkeypatch.setenv(units.STARTED, str(os.getpid()))
+    assert units.starter() == ""

@@ -22,6 +22,8 @@ pytestmark = [
 ]
 
 MORE = 20
+EXPOSURE_MAX = 30
+"""In tenths, as systemd-analyze(1) takes it: from 0, shut in, to 100, exposed; a plain service has 96."""
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +61,35 @@ def test_the_service_is_ready_when_it_protects(machine: Machine) -> None:
     assert machine.property(SERVICE, "StatusText") == "protecting this robot and its neighbours"
     assert json.loads(machine.run("failover", "status", "--json").stdout)["robot"] == "robot1"
     assert status(machine)["realtime"]
+
+
+def test_the_service_is_shut_in_and_has_no_capability(machine: Machine) -> None:
+    machine.run("systemd-analyze", "security", f"--threshold={EXPOSURE_MAX}", SERVICE)
+    for pid in (main_pid(machine), status(machine)["lanes_pid"]):
+        assert "CapEff:\t0000000000000000" in standing(machine, pid) and "Seccomp:\t2" in standing(machine, pid)
+
+
+def test_its_guards_and_programs_inherit_nothing_of_that(machine: Machine) -> None:
+    program = started(machine, "free")
+    guard = next(int(line[6:]) for line in standing(machine, program) if line.startswith("PPid:"))
+    for pid in (program, guard):
+        (everything,) = (line for line in standing(machine, 1) if line.startswith("CapBnd:"))
+        assert {everything, "Seccomp:\t0", "NoNewPrivs:\t0"} <= set(standing(machine, pid))
+        assert not {"Gid:\t" + "\t".join([group(machine)] * 4)} & set(standing(machine, pid))
+    assert (machine.root / f"proc/{program}/oom_score_adj").read_text() == "0\n"
+    assert set(machine.property("failover-guard-*", "OOMScoreAdjust").split()) == {"-900"}
+    limits = (machine.root / f"proc/{program}/limits").read_text().splitlines()
+    assert any(line.split() == ["Max", "realtime", "priority", "0", "0"] for line in limits), limits
+
+
+def standing(machine: Machine, pid: int) -> list[str]:
+    """What the kernel says of a process there."""
+    return (machine.root / f"proc/{pid}/status").read_text().splitlines()
+
+
+def group(machine: Machine) -> str:
+    """The number of group failover."""
+    return machine.run("getent", "group", "failover").stdout.split(":")[2]
 
 
 def test_a_component_lives_outside_the_service(machine: Machine) -> None:

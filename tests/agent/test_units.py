@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from agent.scope import own_service
+from agent.units import own_service
 
 UNIFIED = "0::/failover.slice/failover-agent.service\n"
 HYBRID = "4:memory:/system.slice/other.service\n1:name=systemd:/failover.slice/mine.service\n0::/failover.slice/mine.service\n"
