@@ -48,6 +48,7 @@ class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
     umask: Annotated[int, msgspec.Meta(ge=0, le=0o777)] = 0o022
     isolate: bool = True
     wait: bool = True
+    user: str = ""
 
 
 class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from agent import guard_messages
+from agent.caller import ROOT
 from agent.clock import Laps
 from agent.component import Component
 from agent.errors import GuardError, GuardLostError, KeeperLostError
@@ -22,7 +23,9 @@ from agent.nursery import KeeperLink, connect
 from agent.places import Places, complete_logs, log_directory
 from agent.streams import discard, total_of
 from checkpoint import channel, format
-from checkpoint.errors import CheckpointError
+from checkpoint.errors import CheckpointError, MismatchError
+from checkpoint.linux.inheritance import Inheritance
+from checkpoint.model import Credentials
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +37,7 @@ class Program:
     working_directory: bytes
     umask: int = 0o022
     isolate: bool = True
+    inheritance: Inheritance | None = None
 
 
 async def start(name: str, program: Program, places: Places) -> Component:
@@ -58,6 +62,7 @@ async def start(name: str, program: Program, places: Places) -> Component:
         isolate=program.isolate,
         log_directory=str(log_directory(name, places)),
         cgroup=places.cgroup,
+        inheritance=program.inheritance,
     )
     return await _born(component, request)
 
@@ -80,6 +85,7 @@ async def restore(
     *,
     outage_ns: int,
     lease_until_ns: int = 0,
+    owner: int | None = None,
     laps: Laps | None = None,
 ) -> Component:
     """Rebuild a component from a chain (descriptors of encoded snapshots, oldest first), stopped, committed to nothing.
@@ -89,12 +95,16 @@ async def restore(
     Args:
         laps: told how long each stage took.
         outage_ns: added to the program's monotonic and boot time: how long ago the newest snapshot was taken.
+        owner: uid; None: whoever it ran as. What is not root's opens its files with its owner's rights, and gets no others.
 
     Raises:
         checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
     """
     laps = laps or Laps()
     outline = await asyncio.to_thread(format.read_outline, chain[-1])
+    theirs = outline.process.credentials
+    owner = theirs.uids[0] if owner is None else owner
+    check_rights(name, theirs, owner)
     await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
     laps.lap("reading the newest")
     component = Component(name, await places.nursery.guard(), places)
@@ -107,13 +117,14 @@ async def restore(
         totals=total_of(outline.output),
         log_directory=str(log_directory(name, places)),
         cgroup=places.cgroup,
+        user=(theirs.uids[1], theirs.gids[1]),
     )
     try:
         keeper = await component.give_keeper()
         laps.lap("guard and keeper")
         await _vessel(component, request, keeper)
         laps.lap("vessel")
-        order = channel.Restore(component.pid, name, outage_ns, streams=True, robot=places.robot)
+        order = channel.Restore(component.pid, name, outage_ns, streams=True, robot=places.robot, own_eyes=owner != ROOT)
         restored, _ = await component.ask_keeper(order, (*chain, *component.streams))
         laps.lap("restore")
         if lease_until_ns:
@@ -147,6 +158,19 @@ async def reconnect(socket_path: Path, places: Places) -> Component:
     if described.state == "ended" and not component.ended.done():
         component.ended.set_result(described.exit_status)
     return component
+
+
+def check_rights(name: str, credentials: Credentials, owner: int) -> None:
+    """Let a snapshot come back with the rights of its owner, and no more.
+
+    Raises:
+        MismatchError: it has become another user, as a set-user-id program does.
+    """
+    _, permitted, effective, _, ambient = credentials.capabilities
+    if owner == ROOT or os.geteuid() != ROOT or (set(credentials.uids) == {owner} and not permitted | effective | ambient):
+        return  # root may; where we are not root, there is nothing to be gained
+    reason = f"it runs with other rights than those of its owner, uid {owner}: only a program of root may; start it as root"
+    raise MismatchError(f"cannot restore {name}: {reason}", (reason,))
 
 
 async def _vessel(component: Component, request: guard_messages.MakeVessel, keeper: KeeperLink) -> None:

@@ -15,6 +15,8 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+import msgspec
+
 from agent import births, clock, lost
 from agent.births import Program
 from agent.component import Component
@@ -25,6 +27,7 @@ from agent.places import Places
 from agent.records import Records
 from checkpoint.channel import close_all, content_of
 from checkpoint.errors import CheckpointError, UnsupportedError
+from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Position
 from checkpoint.store import Store
 from failover.core import acts, events
@@ -202,6 +205,7 @@ class Charge:
             os.fsencode(launch.directory),
             launch.umask,
             launch.isolate,
+            msgspec.msgpack.decode(launch.inheritance, type=Inheritance) if launch.inheritance else None,
         )
         return await births.start(self.name, program, self.around.places)
 
@@ -226,8 +230,10 @@ class Charge:
         laps.lap(f"opening {len(descriptors)} snapshots")
         try:
             outage_ns, read_ns = clock.age_ns(descriptors[-1]), clock.now_ns()
+            owner = act.spec.owner if act.spec is not None else None
+            until_ns = act.lease_until_ns
             component = await births.restore(
-                self.name, descriptors, self.around.places, outage_ns=outage_ns, lease_until_ns=act.lease_until_ns, laps=laps
+                self.name, descriptors, self.around.places, outage_ns=outage_ns, lease_until_ns=until_ns, owner=owner, laps=laps
             )
         finally:
             close_all(tuple(descriptors))

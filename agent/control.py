@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import msgspec
 
+from agent.caller import Caller, caller_of
 from agent.errors import AgentError, RefusedError
 from agent.mistake import end_lanes_on_mistake
 from checkpoint.errors import UNDECODABLE, CheckpointError
@@ -32,10 +33,11 @@ _decoder = msgspec.msgpack.Decoder(Request)
 
 
 class Conversation:
-    """What a verb says to its client while it works."""
+    """What a verb says to its client while it works, and who that is."""
 
-    def __init__(self, writer: asyncio.StreamWriter) -> None:
+    def __init__(self, writer: asyncio.StreamWriter, caller: Caller) -> None:
         self._writer = writer
+        self.caller = caller
 
     async def update(self, value: dict[str, Any]) -> None:
         """Something to show."""
@@ -107,7 +109,8 @@ class ControlServer:
         self._clients.add(task)
         task.add_done_callback(self._clients.discard)
         task.add_done_callback(end_lanes_on_mistake)
-        conversation = Conversation(writer)
+        connection = writer.get_extra_info("socket")
+        conversation = Conversation(writer, caller_of(connection))
         try:
             if len(self._clients) > CLIENTS_LIMIT:
                 await conversation.reply(Refused("RefusedError", f"{CLIENTS_LIMIT} clients are connected; close some"))

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import msgspec
 
+from agent.caller import NOBODY
 from agent.charge import TROUBLE
 from agent.errors import RefusedError
 from agent.mistake import end_lanes_on_mistake
@@ -30,8 +31,8 @@ UNDER_WAY_MAX: Final = 64
 CONTENT_MAX: Final = CHUNK_SIZE_MAX
 """Bytes of an answer: the lane takes no larger message than a chunk of a snapshot."""
 
-Order = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
-"""Carries one verb out on this robot: its arguments → its result."""
+Order = Callable[[dict[str, Any], int], Awaitable[dict[str, Any]]]
+"""Carries one verb out on this robot: its arguments, the uid of who gave it → its result."""
 
 
 class Errands:
@@ -50,8 +51,13 @@ class Errands:
         self._waiting: dict[tuple[str, int], asyncio.Future[ErrandDone]] = {}
         self._under_way: dict[str, set[asyncio.Task[None]]] = {}
 
-    async def send(self, peer: str, verb: str, arguments: dict[str, Any], patience_s: float = PATIENCE_S) -> dict[str, Any]:
+    async def send(
+        self, peer: str, verb: str, arguments: dict[str, Any], by: int = NOBODY, patience_s: float = PATIENCE_S
+    ) -> dict[str, Any]:
         """Have a peer carry an order out, or answer a question.
+
+        Args:
+            by: uid of who gave the order.
 
         Raises:
             RefusedError: it cannot be reached; it refused, with its reasons; or its answer did not come.
@@ -62,7 +68,7 @@ class Errands:
         answer: asyncio.Future[ErrandDone] = asyncio.get_running_loop().create_future()
         self._waiting[peer, number] = answer
         try:
-            self._say(peer, Errand(number, verb, msgspec.msgpack.encode(arguments)))
+            self._say(peer, Errand(number, verb, msgspec.msgpack.encode(arguments), by))
             done = await asyncio.wait_for(answer, patience_s)
         except TimeoutError:
             raise RefusedError(
@@ -113,7 +119,7 @@ class Errands:
             order = self._orders.get(message.verb)
             if order is None:
                 raise RefusedError(f"no order {message.verb!r} can be given from another robot")
-            done = ErrandDone(message.number, msgspec.msgpack.encode(await order(_arguments(message))))
+            done = ErrandDone(message.number, msgspec.msgpack.encode(await order(_arguments(message), message.by)))
         except RefusedError as refusal:
             done = ErrandDone(message.number, b"", str(refusal), refusal.kind, tuple(refusal.reasons))
         except (*TROUBLE, FailoverError) as trouble:

@@ -9,6 +9,7 @@ from typing import Literal
 
 import msgspec
 
+from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Clocks
 
 
@@ -25,6 +26,7 @@ class Start(Message, frozen=True):
         isolate: in PID and time namespaces of its own.
         log_directory: where `agent.streams.OutputLogs` are.
         cgroup: a cgroup v2 directory to make the component's own cgroup in; "" for the guard's.
+        inheritance: whose rights, limits and priorities it gets; None: the guard's.
     """
 
     component: str
@@ -35,6 +37,7 @@ class Start(Message, frozen=True):
     isolate: bool
     log_directory: str
     cgroup: str = ""
+    inheritance: Inheritance | None = None
 
 
 class MakeVessel(Message, frozen=True):
@@ -44,6 +47,7 @@ class MakeVessel(Message, frozen=True):
         inner_pid: the PID that the program knows itself by; 0 for any.
         clocks: as the program read them when its snapshot was taken, ``elapsed_ns`` ago.
         totals: bytes that the program had written to its two streams.
+        user: uid and gid that the program ran as.
     """
 
     component: str
@@ -54,6 +58,7 @@ class MakeVessel(Message, frozen=True):
     totals: tuple[int, int]
     log_directory: str
     cgroup: str = ""
+    user: tuple[int, int] | None = None
 
 
 class Watch(Message, frozen=True):

@@ -10,6 +10,7 @@ import asyncio
 from typing import Any, Final, Protocol
 
 from agent.arguments import PieceArguments, arguments_of
+from agent.caller import check_right
 from agent.charge import Charge
 from agent.config import Settings
 from agent.control import Conversation
@@ -64,7 +65,7 @@ class Outflow:
             whole = over or not committed or (not follow and await self._has_ended(name))
             sent = False
             for stream in STREAMS:
-                piece = await self._read(name, elsewhere, stream, at[stream], not whole)
+                piece = await self._read(name, elsewhere, stream, at[stream], not whole, say.caller.uid)
                 if piece.content:
                     await say.output(stream, piece.offset, piece.content)
                     at[stream] = piece.offset + len(piece.content)
@@ -74,18 +75,20 @@ class Outflow:
             if not sent:
                 await asyncio.sleep(POLL_S)
 
-    async def piece(self, arguments: dict[str, Any]) -> dict[str, Any]:
+    async def piece(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """A piece of a stream for another robot: what is committed here, all of it once the component has ended."""
         wanted = arguments_of(PieceArguments, "piece", arguments)
         if wanted.stream not in STREAMS:
             raise RefusedError(f"piece: {wanted.stream} is no stream; 1 is standard output, 2 standard error")
+        view, _ = await self._view(wanted.name)
+        check_right(by, wanted.name, view.owner if view is not None else None)
         piece = self._read_here(wanted.name, wanted.stream, wanted.offset, not await self._has_ended(wanted.name))
         return {"offset": piece.offset, "content": piece.content}
 
-    async def _read(self, name: str, robot: str, stream: int, offset: int, committed: bool) -> OutputPiece:
+    async def _read(self, name: str, robot: str, stream: int, offset: int, committed: bool, by: int) -> OutputPiece:
         if not robot:
             return self._read_here(name, stream, offset, committed)
-        told = await self._lanes.errands.send(robot, "piece", {"name": name, "stream": stream, "offset": offset})
+        told = await self._lanes.errands.send(robot, "piece", {"name": name, "stream": stream, "offset": offset}, by)
         return OutputPiece(stream, told["offset"], told["content"])
 
     def _read_here(self, name: str, stream: int, offset: int, committed: bool) -> OutputPiece:

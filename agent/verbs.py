@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Any, Final, Protocol
+
+import msgspec
 
 from agent import clock
 from agent.arguments import (
@@ -20,6 +22,7 @@ from agent.arguments import (
     StopArguments,
     arguments_of,
 )
+from agent.caller import NOBODY, check_right, inheritance_for, owner_of
 from agent.charge import Charge
 from agent.config import Settings
 from agent.control import Conversation, Verb
@@ -43,6 +46,10 @@ SIGHT_PATIENCE_S: Final = 0.5
 
 START_PATIENCE_S: Final = 30.0
 """How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
+
+
+Act = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
+"""Carries an order out, for whoever may give it: its arguments → its result."""
 
 
 class Lanes(Protocol):
@@ -90,6 +97,9 @@ class Verbs:
 
     def orders(self) -> dict[str, Order]:
         """Those that are carried out where the component runs, wherever they are given."""
+        return {name: functools.partial(self._permitted, act) for name, act in self._acts().items()}
+
+    def _acts(self) -> dict[str, Act]:
         return {
             "handover": self.handover,
             "failback": self.failback,
@@ -98,7 +108,13 @@ class Verbs:
             "stop": self.stop,
         }
 
-    async def _order(self, verb: str, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+    async def _permitted(self, order: Act, arguments: dict[str, Any], by: int) -> dict[str, Any]:
+        """Carry an order out here, if whoever gives it may give it."""
+        name = await self._known(str(arguments.get("name", "")))
+        await self._check_right(by, name)
+        return await order({**arguments, "name": name})
+
+    async def _order(self, verb: str, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """Carry an order out here, or have the robot do it where the component runs."""
         name = await self._known(str(arguments.get("name", "")))
         arguments = {**arguments, "name": name}
@@ -106,8 +122,8 @@ class Verbs:
         told = await self._lanes.ask("status")
         living = {peer.robot for peer in told.status.peers if peer.state in ("alive", "suspect")} if told.status else set()
         if primary in living:
-            return await self._lanes.errands.send(primary, verb, arguments)
-        return await self.orders()[verb](arguments)
+            return await self._lanes.errands.send(primary, verb, arguments, say.caller.uid)
+        return await self.orders()[verb](arguments, say.caller.uid)
 
     async def ping(self, _say: Conversation, _arguments: dict[str, Any]) -> dict[str, Any]:
         """Who are you?"""
@@ -147,7 +163,7 @@ class Verbs:
     async def _asked(self, peer: str, question: str, arguments: dict[str, Any]) -> dict[str, Any]:
         """A peer's answer; empty when it does not come soon."""
         try:
-            return await self._lanes.errands.send(peer, question, arguments, SIGHT_PATIENCE_S)
+            return await self._lanes.errands.send(peer, question, arguments, patience_s=SIGHT_PATIENCE_S)
         except RefusedError:
             return {}
 
@@ -155,12 +171,12 @@ class Verbs:
         """What was decided, when and by whom: this robot's story and those of the robots that it hears, in one."""
         wanted = arguments_of(NameArguments, "why", arguments)
         name = await self._known(wanted.name) if wanted.name else ""
-        mine = await self.story({"name": name})
+        mine = await self.story({"name": name}, NOBODY)
         theirs = await asyncio.gather(*(self._asked(peer, "story", {"name": name}) for peer in await self._reachable()))
         whole = [*mine["story"], *(line for story in theirs for line in story.get("story", ()))]
         return {"story": sorted(whole, key=lambda line: str(line["at"]))}
 
-    async def story(self, arguments: dict[str, Any]) -> dict[str, Any]:
+    async def story(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         """What this robot decided; of one component, or all."""
         told = await self._lanes.ask("why", arguments_of(NameArguments, "story", arguments).name)
         story = [
@@ -179,9 +195,17 @@ class Verbs:
         wanted = arguments_of(RunArguments, "run", arguments)
         if not wanted.argv:
             raise RefusedError("run needs a command: failover run -- COMMAND …")
-        name = await self._fresh_name(wanted.name, wanted.argv[0])
-        launch = Launch(tuple(wanted.argv), tuple(wanted.env.items()), wanted.cwd, wanted.umask, isolate=wanted.isolate)
-        charge = await self._begin(name, launch)
+        inheritance = inheritance_for(say.caller, wanted.user)
+        name = await self._fresh_name(wanted.name, wanted.argv[0], say.caller.uid)
+        launch = Launch(
+            tuple(wanted.argv),
+            tuple(wanted.env.items()),
+            wanted.cwd,
+            wanted.umask,
+            isolate=wanted.isolate,
+            inheritance=msgspec.msgpack.encode(inheritance),
+        )
+        charge = await self._begin(name, launch, inheritance.uid)
         started: dict[str, Any] = {"name": name, "notes": list(charge.figures.notes), "reasons": list(charge.figures.reasons)}
         if charge.component is not None:
             component = charge.component
@@ -197,14 +221,15 @@ class Verbs:
         view = await self._view(name)  # it ended on another robot
         return {"name": name, "exit_status": view.get("exit_status"), "failed": view["state"] == "failed", "reason": ""}
 
-    async def protect(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+    async def protect(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """Take a running process under protection."""
         wanted = arguments_of(ProtectArguments, "protect", arguments)
+        owner = owner_of(wanted.pid, say.caller)
         for known in self._lanes.charges.values():
             if known.component is not None and known.component.pid == wanted.pid:
                 raise RefusedError(f"pid {wanted.pid} is protected already, as {known.name}; failover release lets it go")
-        name = await self._fresh_name(wanted.name, "")
-        charge = await self._begin(name, Launch(pid=wanted.pid))
+        name = await self._fresh_name(wanted.name, "", say.caller.uid)
+        charge = await self._begin(name, Launch(pid=wanted.pid), owner)
         return {"name": name, "pid": wanted.pid, "notes": list(charge.figures.notes)}
 
     async def release(self, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -265,11 +290,11 @@ class Verbs:
                 )
             await asyncio.sleep(STANDING_POLL_S)
 
-    async def standing(self, arguments: dict[str, Any]) -> dict[str, Any]:
+    async def standing(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         """How one component stands on this robot; empty where it is unknown."""
         return await self._view(arguments_of(NameArguments, "standing", arguments).name)
 
-    async def picture(self, _arguments: dict[str, Any]) -> dict[str, Any]:
+    async def picture(self, _arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         """All of this robot's own sight, for another robot's status."""
         return self._lanes.picture(await self._lanes.ask("status"))
 
@@ -284,13 +309,14 @@ class Verbs:
         """The component's output as far as no takeover can take it back; all of it once it has ended."""
         wanted = arguments_of(LogsArguments, "logs", arguments)
         name = await self._known(wanted.name)
+        await self._check_right(say.caller.uid, name)
         totals = await self._outflow.pass_on(say, name, wanted.offsets, committed=True, follow=wanted.follow)
         view = await self._view(name)
         return {"name": name, "totals": list(totals), "exit_status": view.get("exit_status")}
 
     # --- what verbs share ---
 
-    async def _begin(self, name: str, launch: Launch) -> Charge:
+    async def _begin(self, name: str, launch: Launch, owner: int) -> Charge:
         """Have a component started or taken in, and wait until it is.
 
         Raises:
@@ -303,7 +329,7 @@ class Verbs:
         charge.ended = None
         end = charge.end()
         try:
-            await self._command(lambda number: events.Run(number, ComponentSpec(name, config.robot, launch, rules)))
+            await self._command(lambda number: events.Run(number, ComponentSpec(name, config.robot, launch, rules, owner)))
         except RefusedError as refusal:
             raise RefusedError(str(refusal), refusal.kind, charge.figures.reasons) from refusal
         begun = asyncio.ensure_future(charge.started.wait())
@@ -351,8 +377,16 @@ class Verbs:
         known = ", ".join(sorted(name for name, state in names.items() if state is not State.RELEASED)) or "nothing"
         raise RefusedError(f"no component is called {wanted!r}; this team protects {known}", "UnknownComponentError")
 
-    async def _fresh_name(self, wanted: str, command: str) -> str:
-        """A name for something new: as given, under this robot's own path, or made from the command."""
+    async def _check_right(self, uid: int, name: str) -> None:
+        """Raises RefusedError: the component is somebody else's."""
+        check_right(uid, name, (await self._view(name)).get("owner"))
+
+    async def _fresh_name(self, wanted: str, command: str, uid: int) -> str:
+        """A name for something new: as given, under this robot's own path, or made from the command.
+
+        Raises:
+            RefusedError: it is no name, or one that somebody else has used and not released.
+        """
         own = f"/{self._lanes.settings.team.team}/{self._lanes.settings.config.robot}/"
         names = await self._names()
         if not wanted:
@@ -360,6 +394,8 @@ class Verbs:
             numbered = (f"{stem}-{number}" for number in range(2, len(names) + 3))
             wanted = stem if stem not in names else next(name for name in numbered if name not in names)
         name = wanted if wanted.startswith("/") else own + wanted
+        if names.get(name, State.RELEASED) not in (State.RELEASED, State.ABSENT):
+            await self._check_right(uid, name)
         try:
             return check_component(name)
         except NameFormatError as error:

@@ -129,6 +129,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings) -
         "promise": view.promise,
         "home": view.home,
         "prefer": view.prefer,
+        "owner": view.owner,
         "reasons": list(figures.reasons) if figures else [],
         "notes": [*view.notes, *(figures.notes if figures else ())],
     }

@@ -74,7 +74,9 @@ class Ward:
         def give_birth(birth: Birth) -> Born:
             return spawn_program(argv, environment, directory, order.umask, birth)
 
-        return cls._bear(order, (0, 0), Birth(isolate=order.isolate), give_birth)
+        kept = order.inheritance
+        user = (kept.uid, kept.gid) if kept is not None else None
+        return cls._bear(order, (0, 0), Birth(isolate=order.isolate, inheritance=kept), give_birth, user)
 
     @classmethod
     def make_vessel(cls, order: MakeVessel) -> Ward:
@@ -84,7 +86,7 @@ class Ward:
             RestoreError, OSError: it could not be made; nothing is left of it.
         """
         birth = Birth(order.inner_pid, order.isolate, order.clocks, order.elapsed_ns)
-        ward = cls._bear(order, order.totals, birth, spawn_vessel)
+        ward = cls._bear(order, order.totals, birth, spawn_vessel, order.user)
         ward.committed = False
         return ward
 
@@ -102,11 +104,25 @@ class Ward:
         return cls(order.component, Born(order.pid, _inner_pid(order.pid)), hold, pidfd=pidfd, notes=notes)
 
     @classmethod
-    def _bear(cls, order: Start | MakeVessel, totals: tuple[int, int], birth: Birth, act: Callable[[Birth], Born]) -> Ward:
-        """Logs, pipes and a freezer first; the process last, into all of them."""
+    def _bear(
+        cls,
+        order: Start | MakeVessel,
+        totals: tuple[int, int],
+        birth: Birth,
+        act: Callable[[Birth], Born],
+        user: tuple[int, int] | None,
+    ) -> Ward:
+        """Logs, pipes and a freezer first; the process last, into all of them.
+
+        Args:
+            user: uid and gid that the pipes shall belong to, so that the program can open /dev/stdout; None: ours.
+        """
         logs = OutputLogs(Path(order.log_directory))
         logs.truncate(totals)
         pump = Pump(logs, totals)
+        if user is not None and os.geteuid() == 0:
+            for stream in STREAMS:
+                os.fchown(pump.write_ends[stream], *user)
         hold, notes = freezing.choose(order.cgroup, f"{freezing.CGROUP_PREFIX}{secrets.token_hex(8)}")
         try:
             with open(os.devnull, "rb") as nothing, hold.birthplace():

@@ -232,6 +232,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
 
     Attributes:
         streams: the last five descriptors are the streams, as with `Protect`.
+        own_eyes: see `checkpoint.engine.RestoreOptions`.
     """
 
     pid: int
@@ -240,6 +241,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
     accept_changed: tuple[str, ...] = ()
     streams: bool = False
     robot: str = ""
+    own_eyes: bool = False
 
 
 class Resume(msgspec.Struct, frozen=True, tag=True):

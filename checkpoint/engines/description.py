@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import os
-import re
 import socket
 from typing import Final
 
@@ -16,9 +15,6 @@ from checkpoint.linux import abi, procfs
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import Stat, Status
 from checkpoint.model import Credentials, Machine, MemoryLayout
-
-LIMIT_COUNT: Final = 16
-"""RLIMIT numbers of Linux. Source: asm-generic/resource.h."""
 
 
 def layout(stat: Stat, told: Told, auxv: bytes) -> MemoryLayout:
@@ -49,23 +45,6 @@ def credentials(status: Status, told: Told) -> Credentials:
         no_new_privs=status.no_new_privs,
         securebits=told.securebits,
     )
-
-
-_LIMIT_LINE: Final = re.compile(r" (unlimited|[0-9]+) +(unlimited|[0-9]+) ")
-
-
-def limits(pid: int) -> dict[int, tuple[int, int]]:
-    """Soft and hard limits from /proc/PID/limits, whose lines stand in the order of the numbers; -1 is infinity.
-
-    prlimit(2) would need CAP_SYS_RESOURCE for a process of another user.
-    """
-    lines = procfs.read_text(pid, "limits").splitlines()[1 : LIMIT_COUNT + 1]
-    found = (_LIMIT_LINE.search(line) for line in lines)
-    return {number: (_limit(match[1]), _limit(match[2])) for number, match in enumerate(found) if match}
-
-
-def _limit(word: str) -> int:
-    return -1 if word == "unlimited" else int(word)
 
 
 def coredump_filter(pid: int) -> int:

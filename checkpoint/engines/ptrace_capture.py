@@ -502,7 +502,7 @@ class PtraceSession:
             umask=status.umask,
             credentials=description.credentials(status, told),
             personality=int(procfs.read_text(self.pid, "personality"), 16),
-            limits=description.limits(self.pid),
+            limits=procfs.limits(self.pid),
             oom_score_adj=int(procfs.read_text(self.pid, "oom_score_adj")),
             dumpable=told.dumpable,
             keep_caps=told.keep_caps,

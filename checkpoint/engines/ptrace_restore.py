@@ -147,6 +147,8 @@ class _Restore:
     def _mappings_table(self, table: CallTable, vessel: Vessel, mappings: tuple[procfs.MapsLine, ...], refuge: int) -> CallTable:
         vmas, runs = self._state.vmas, self._state.runs
         restore_process.raise_limits(table, vessel)
+        if self._options.own_eyes:
+            restore_process.own_eyes(table, self._state.process, vessel)
         restore_memory.clear(table, mappings)
         ours, theirs = restore_memory.kernel_pages(mappings), restore_memory.kernel_pages_of(vmas)
         restore_memory.move_kernel_pages(table, ours, theirs, refuge)

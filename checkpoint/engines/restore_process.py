@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import signal
 import struct
 import time
 from collections.abc import Iterable, Mapping
@@ -304,6 +305,21 @@ def limits(table: CallTable, process: ProcessState, vessel: Vessel) -> tuple[str
 
 
 # --- Rights ----------------------------------------------------------------------------------------------------------
+
+
+def own_eyes(table: CallTable, process: ProcessState, vessel: Vessel) -> None:
+    """From here on open files as the program's user, who may have put other ones in their place: see `RestoreOptions`.
+
+    Source: capabilities(7), "Effect of user ID changes on capabilities": those for files go with a file system uid other than 0.
+    """
+    if not (vessel.may(CAP_SETUID) and vessel.may(CAP_SETGID)):
+        return
+    theirs = process.credentials
+    groups = table.place(struct.pack(f"<{len(theirs.groups)}I", *theirs.groups))
+    table.call("set the groups", "setgroups", len(theirs.groups), groups)
+    table.call("set the filesystem's gid", "setfsgid", theirs.gids[3])
+    table.call("set the filesystem's uid", "setfsuid", theirs.uids[3])
+    table.call("end with the parent, still", "prctl", abi.PR_SET_PDEATHSIG, signal.SIGKILL)  # a change of user takes it back
 
 
 def rights(table: CallTable, process: ProcessState, vessel: Vessel) -> tuple[str, ...]:

@@ -351,6 +351,29 @@ def stat(pid: int) -> Stat:
     return parse_stat(read_text(pid, "stat"))
 
 
+# Limits
+
+
+LIMIT_COUNT: Final = 16
+"""RLIMIT numbers of Linux. Source: asm-generic/resource.h."""
+
+_LIMIT_LINE: Final = re.compile(r" (unlimited|[0-9]+) +(unlimited|[0-9]+) ")
+
+
+def limits(pid: int) -> dict[int, tuple[int, int]]:
+    """Soft and hard limits from /proc/PID/limits, whose lines stand in the order of the numbers; -1 is infinity.
+
+    prlimit(2) would need CAP_SYS_RESOURCE for a process of another user.
+    """
+    lines = read_text(pid, "limits").splitlines()[1 : LIMIT_COUNT + 1]
+    found = (_LIMIT_LINE.search(line) for line in lines)
+    return {number: (_limit(match[1]), _limit(match[2])) for number, match in enumerate(found) if match}
+
+
+def _limit(word: str) -> int:
+    return -1 if word == "unlimited" else int(word)
+
+
 # Descriptors
 
 

@@ -36,6 +36,7 @@ from typing import Final, NoReturn
 from checkpoint.arch import x86_64_stub as stub
 from checkpoint.errors import RestoreError
 from checkpoint.linux import namespaces
+from checkpoint.linux.inheritance import Inheritance, take_on
 from checkpoint.model import Clocks
 
 _MFD_CLOEXEC_EXEC: Final = 0x1 | 0x10
@@ -59,6 +60,7 @@ class Birth:
         stdio: our descriptors that become its 0, 1 and 2; all others are closed.
         own_session: make it the leader of a session, with standard input as its terminal if that is one.
         die_with_parent: SIGKILL it when the calling thread ends.
+        inheritance: whose rights, limits and priorities it gets; None: ours.
     """
 
     inner_pid: int = 0
@@ -68,6 +70,7 @@ class Birth:
     stdio: tuple[int, int, int] = (0, 1, 2)
     own_session: bool = True
     die_with_parent: bool = True
+    inheritance: Inheritance | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,11 +272,6 @@ def _become_first_process(lines: _Lines, watch_read: int, ready_write: int) -> N
 
 def _grow_up(lines: _Lines, birth: Birth, watch_write: int, become: Callable[[], NoReturn], keep_right: bool) -> None:
     """The child's own part, up to the execve that ends it."""
-    if birth.die_with_parent:
-        namespaces.prctl(namespaces.PR_SET_PDEATHSIG, signal.SIGKILL)
-    lines.say(inner_pid=os.getpid())  # race 1
-    with contextlib.suppress(BrokenPipeError):  # nobody watches: there is no namespace of its own
-        os.write(watch_write, str(os.getpid()).encode())
     with contextlib.suppress(OSError):  # only kernels with Yama know this; the others let our keeper in anyway
         namespaces.prctl(namespaces.PR_SET_PTRACER, -1)
     if keep_right:
@@ -285,6 +283,13 @@ def _grow_up(lines: _Lines, birth: Birth, watch_write: int, become: Callable[[],
         fcntl.ioctl(0, termios.TIOCSCTTY, 0)
     _forget_signals()
     namespaces.close_others_on_exec(3)
+    if birth.inheritance is not None:
+        take_on(birth.inheritance)
+    if birth.die_with_parent:
+        namespaces.prctl(namespaces.PR_SET_PDEATHSIG, signal.SIGKILL)  # after a change of user, which takes it back
+    lines.say(inner_pid=os.getpid())  # race 1
+    with contextlib.suppress(BrokenPipeError):  # nobody watches: there is no namespace of its own
+        os.write(watch_write, str(os.getpid()).encode())
     become()
 
 

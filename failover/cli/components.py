@@ -33,6 +33,8 @@ def run(arguments: argparse.Namespace) -> int:
     wanted |= {"isolate": arguments.isolate, "wait": not arguments.detach}
     if arguments.name:
         wanted["name"] = arguments.name
+    if arguments.user:
+        wanted["user"] = arguments.user
     follower = _Follower(arguments)
     with connect(arguments) as agent:
         if arguments.detach:

@@ -128,6 +128,7 @@ def _run(room: argparse.ArgumentParser) -> None:
     room.add_argument(
         "--no-isolate", dest="isolate", action="store_false", help="keep it in this machine's PIDs and clocks (default: its own)"
     )
+    room.add_argument("--user", metavar="USER", help="run it as this user, by name or number (only root may; default: as you)")
     room.add_argument("command", metavar="CMD", nargs="+", help="the program and its arguments, after --")
     _agent(room)
 
@@ -320,6 +321,9 @@ VERBS: Final = (
 
         While it waits, the agent may be restarted and the program may go to another robot and end there: it goes on waiting, and
         shows each byte once. An agent that does not come back within half a minute is status 3; the program runs on.
+
+        It runs as you, with your groups, limits, priorities, environment, directory and umask, as if your shell had started it.
+        Besides root only you may read its output, stop, release or move it, on any robot that knows you by the same number.
 
         Its standard output and error are pipes that belong to it, not to this terminal, and its standard input is empty: it does
         not see a terminal even where you have one. Many programs then write by the block and not by the line; python3 -u, or

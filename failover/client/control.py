@@ -12,8 +12,8 @@ verb           arguments                                                result, 
 ``ping``                                                                ``robot team pid version insecure``
 ``status``     ``watch`` false, ``every_ms`` 500, ``team`` false        see `STATUS`; with ``watch`` each picture is an Update
 ``run``        ``argv`` *must*, ``name`` = argv[0]'s, ``env``, ``cwd``,  Update ``{"started": {name, pid, inner_pid, isolated,
-               ``umask`` 18, ``isolate`` true, ``wait`` true            notes}}``; with ``wait`` Output … and Result
-                                                                        ``{name, exit_status}`` (a wait status); else at once
+               ``umask`` 18, ``isolate`` true, ``wait`` true,           notes}}``; with ``wait`` Output … and Result
+               ``user`` ""                                              ``{name, exit_status}`` (a wait status); else at once
 ``protect``    ``pid`` *must*, ``name`` *must*                          ``{name, pid, notes}``
 ``release``    ``name`` *must*                                          ``{name, pid}``; the program runs on, unprotected
 ``stop``       ``name`` *must*, ``signal`` 15                           ``{name, exit_status}`` once it has ended
@@ -52,7 +52,8 @@ peers: [{name, state, last_heard_ms, hears_us, load, beats_lost, lane, notes}]
     state: unknown | live | suspect | dead; lane: connected | connecting | refused | down
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, freeze_us, freeze_us_max, snapshot_size, dirty_bytes, snapshots,
-    restores, crashes, outage_ms, exit_status, promise, reasons, notes, elsewhere}]
+    restores, crashes, outage_ms, exit_status, promise, owner, reasons, notes, elsewhere}]
+    owner: uid of the user who may give orders about it and read its output, besides root
     role: primary | standby | none; protection: none | protected | degraded | stopped
     state: starting | running | frozen | held | restoring | ended | degraded | failed | released
     elsewhere: with ``team``: {robot: the same fields, as that robot sees the component}

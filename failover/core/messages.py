@@ -176,11 +176,13 @@ class Errand(msgspec.Struct, frozen=True, tag="errand"):
         number: chosen by the sender, never used twice in one life of it.
         verb: as on the control socket (`failover.client.control`).
         arguments: its arguments, a msgpack map.
+        by: uid of who gave it, -1: the robot by itself; whoever carries it out looks whether he may.
     """
 
     number: int
     verb: str
     arguments: bytes
+    by: int = -1
 
 
 class ErrandDone(msgspec.Struct, frozen=True, tag="errand_done"):

@@ -97,6 +97,7 @@ class Launch:
         environment: (name, value) pairs.
         pid: of a running program to protect (``failover protect``), 0 otherwise; means something on its home robot only.
         isolate: PID and time namespaces of its own.
+        inheritance: whose rights, limits and priorities it gets, packed (`checkpoint.linux.inheritance`); b"": the agent's own.
     """
 
     argv: tuple[str, ...] = ()
@@ -107,6 +108,7 @@ class Launch:
     isolate: bool = True
     engine: str = "ptrace"
     terminal: bool = False
+    inheritance: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,12 +147,14 @@ class ComponentSpec:
     Attributes:
         name: a path such as ``/lab/robot1/mapper``, see ``names.py``.
         home: robot where it was started.
+        owner: uid of the user who may give orders about it and read its output, besides root; on every robot the same user.
     """
 
     name: str
     home: str = ""
     launch: Launch = field(default_factory=Launch)
     rules: Rules = field(default_factory=Rules)
+    owner: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,6 +321,7 @@ class ComponentView:
         positions: newest acknowledged position first.
         notes: sentences: why it is degraded, waiting or failed.
         lease_until_ns: of this robot's clock; 0 acts without a lease.
+        owner: uid; None where this robot has heard no more of it than its name.
     """
 
     name: str
@@ -335,6 +340,7 @@ class ComponentView:
     period_ms: int = 0
     home: str = ""
     prefer: str = ""
+    owner: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

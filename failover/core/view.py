@@ -55,6 +55,7 @@ def _component(component: Component, turn: Turn) -> ComponentView:
         component.rules.period_ms,
         component.spec.home if component.spec else "",
         component.rules.prefer,
+        component.spec.owner if component.spec else None,
     )
 
 

@@ -164,7 +164,7 @@ class Ends:
         self.said: list[Bulk] = []
         self.errands = Errands(lambda _, message: self.said.append(message), lambda _: "", {"stop": self.stop})
 
-    async def stop(self, arguments: dict[str, Any]) -> dict[str, Any]:
+    async def stop(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         return arguments
 
 

@@ -47,11 +47,11 @@ def component(machine: Machine, name: str) -> dict[str, Any]:
         return {}
 
 
-def started(machine: Machine, name: str, script: str = COUNT) -> int:
-    """A counting component; the PID of its program, there."""
+def started(machine: Machine, name: str, script: str = COUNT, user: str = "") -> int:
+    """A counting component, somebody's; the PID of its program, there."""
     with control(machine) as link:
         argv = ["/usr/bin/python3", "-S", "-c", script]
-        return int(link.ask("run", argv=argv, name=name, env={"PATH": "/usr/bin"}, cwd="/", wait=False)["pid"])
+        return int(link.ask("run", argv=argv, name=name, env={"PATH": "/usr/bin"}, cwd="/", wait=False, user=user)["pid"])
 
 
 def counted(machine: Machine, name: str) -> list[int]:

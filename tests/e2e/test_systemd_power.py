@@ -23,6 +23,8 @@ pytestmark = [
 ADDRESSES = {"robot1": "10.9.0.1", "robot2": "10.9.0.2"}
 MORE = 20
 SNAPSHOTS = 5
+USER = "nobody"
+"""Whose the programs are: not root's."""
 
 
 @pytest.fixture
@@ -59,18 +61,23 @@ def connected(machine: Machine) -> bool:
 
 def protected(machine: Machine, name: str, script: str = COUNT) -> None:
     """Start a counting component and wait until its neighbour holds some of its snapshots."""
-    started(machine, name, script)
+    started(machine, name, script, USER)
     robots.until(lambda: int(component(machine, name).get("snapshots") or 0) >= SNAPSHOTS, "snapshots")
     robots.until(lambda: len(counted(machine, name)) > MORE, "output")
 
 
 def expect_it_to_go_on_at(machine: Machine, name: str) -> None:
-    """It runs there, and its output has no gap and no repetition."""
+    """It runs there as its owner still, and its output has no gap and no repetition."""
     robots.until(lambda: component(machine, name).get("restores", 0) >= 1, "the other robot to take over")
     before = len(counted(machine, name))
     robots.until(lambda: len(counted(machine, name)) > before + MORE, "the count to go on")
     numbers = counted(machine, name)
     assert numbers == list(range(len(numbers)))
+    found = component(machine, name)
+    lines = (machine.root / f"proc/{found['pid']}/status").read_text().splitlines()
+    uid = machine.run("id", "-u", USER).stdout.strip()
+    assert str(found["owner"]) == uid and f"Uid:\t{uid}\t{uid}\t{uid}\t{uid}" in lines
+    assert "CapEff:\t0000000000000000" in lines
 
 
 def test_a_machine_whose_power_is_cut_is_replaced_by_the_other(pair: tuple[Machine, Machine]) -> None:

@@ -1,0 +1,117 @@
+"""What a program inherits from the process that starts it, taken on by a child of another one just before its execve.
+
+A program that a service starts for somebody must not get the service's rights, limits and priorities, but those of whoever asked.
+
+Sources: execve(2), credentials(7), capabilities(7), setrlimit(2), sched(7), ioprio_set(2), proc_pid_oom_score_adj(5).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final
+
+from checkpoint.linux import abi, namespaces
+
+PR_CAPBSET_READ: Final = 23
+PR_CAPBSET_DROP: Final = 24
+PR_SET_NO_NEW_PRIVS: Final = 38
+CAPABILITIES_MAX: Final = 64
+EVERY_CAPABILITY: Final = (1 << CAPABILITIES_MAX) - 1
+
+
+@dataclass(frozen=True, slots=True)
+class Inheritance:
+    """What execve(2) does not change, besides environment, directory, umask and descriptors, which a client sends.
+
+    Attributes:
+        groups: the supplementary ones.
+        bounding: set of capabilities, bit N for capability N: what a program of root may have at most.
+        limits: RLIMIT number → (soft, hard); -1 is infinity. Numbers that are missing stay as they are.
+        affinity: processors; empty: any.
+    """
+
+    uid: int
+    gid: int
+    groups: tuple[int, ...] = ()
+    bounding: int = EVERY_CAPABILITY
+    no_new_privs: bool = False
+    limits: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    nice: int = 0
+    policy: int = os.SCHED_OTHER
+    priority: int = 0
+    affinity: tuple[int, ...] = ()
+    io_priority: int = 0
+    oom_score_adj: int = 0
+
+    def as_user(self, uid: int, gid: int, groups: tuple[int, ...]) -> Inheritance:
+        """The same for another user."""
+        return replace(self, uid=uid, gid=gid, groups=groups)
+
+
+def take_on(inheritance: Inheritance) -> None:
+    """Become what it says, for good: in a child, just before its execve.
+
+    Without rights of our own we stay the user that we are, and limits stay below our own hard ones.
+
+    Raises:
+        OSError: it names what could not be taken on.
+    """
+    privileged = os.geteuid() == 0
+    _set_oom_score(inheritance.oom_score_adj)
+    _set_scheduling(inheritance)
+    for number, (soft, hard) in inheritance.limits.items():
+        _set_limit(number, soft, hard, privileged)
+    if privileged:
+        _drop_capabilities(inheritance.bounding)
+        _become(inheritance)
+    if inheritance.no_new_privs:
+        namespaces.prctl(PR_SET_NO_NEW_PRIVS, 1)
+
+
+def _set_oom_score(score: int) -> None:
+    """Raising it is always permitted. Source: proc_pid_oom_score_adj(5)."""
+    with contextlib.suppress(PermissionError):
+        Path("/proc/self/oom_score_adj").write_text(str(score))
+
+
+def _set_scheduling(inheritance: Inheritance) -> None:
+    with contextlib.suppress(PermissionError):
+        os.setpriority(os.PRIO_PROCESS, 0, inheritance.nice)
+    if inheritance.policy != os.sched_getscheduler(0):
+        with contextlib.suppress(PermissionError):
+            os.sched_setscheduler(0, inheritance.policy, os.sched_param(inheritance.priority))
+    if inheritance.affinity:
+        with contextlib.suppress(OSError):  # processors that were there before, and are not in this machine's cpuset
+            os.sched_setaffinity(0, inheritance.affinity)
+    with contextlib.suppress(OSError):
+        abi.set_io_priority(inheritance.io_priority)
+
+
+def _set_limit(number: int, soft: int, hard: int, privileged: bool) -> None:
+    ceiling = resource.getrlimit(number)[1]
+    if not privileged and ceiling != resource.RLIM_INFINITY:
+        hard = ceiling if hard == resource.RLIM_INFINITY else min(hard, ceiling)
+        soft = hard if soft == resource.RLIM_INFINITY else min(soft, hard)
+    resource.setrlimit(number, (soft, hard))
+
+
+def _drop_capabilities(bounding: int) -> None:
+    """Have no more capabilities in reach than the bounding set says. A kernel knows fewer than 64."""
+    for capability in range(CAPABILITIES_MAX):
+        with contextlib.suppress(OSError):
+            if not bounding >> capability & 1 and namespaces.prctl(PR_CAPBSET_READ, capability):
+                namespaces.prctl(PR_CAPBSET_DROP, capability)
+
+
+def _become(inheritance: Inheritance) -> None:
+    try:
+        os.setgroups(inheritance.groups)
+        os.setresgid(inheritance.gid, inheritance.gid, inheritance.gid)
+        os.setresuid(inheritance.uid, inheritance.uid, inheritance.uid)
+    except OSError as error:
+        raise OSError(error.errno, f"cannot become user {inheritance.uid}: {error.strerror}") from error

@@ -1,0 +1,132 @@
+"""Who asks, what a program inherits from him, and what he may do."""
+
+from __future__ import annotations
+
+import os
+import resource
+import select
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from agent import caller
+from agent.births import check_rights
+from agent.caller import NOBODY, caller_of, check_right, inheritance_for, may, owner_of
+from agent.errors import RefusedError
+from checkpoint.errors import MismatchError
+from checkpoint.linux.inheritance import Inheritance
+from checkpoint.linux.vessel import Birth, spawn_program
+from checkpoint.model import Credentials
+
+SOMEBODY = 7001
+OTHER = 7002
+BOUND_S = 60.0
+SELF_PORTRAIT = "grep -E '^(Uid|Gid|Groups|CapEff|CapBnd|NoNewPrivs)' /proc/self/status; ulimit -n; nice; ionice; cat $OOM"
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root: it becomes another user")
+
+
+def credentials(uid: int, *, effective: int | None = None, capabilities: int = 0) -> Credentials:
+    seen = uid if effective is None else effective
+    return Credentials((uid, seen, seen, seen), (uid,) * 4, (), (0, capabilities, capabilities, 0, 0))
+
+
+@pytest.fixture
+def connection() -> Iterator[tuple[socket.socket, socket.socket]]:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        yield ours, theirs
+
+
+def test_the_kernel_says_who_calls_and_what_he_hands_down(connection: tuple[socket.socket, socket.socket]) -> None:
+    found = caller_of(connection[0])
+    assert (found.uid, found.gid, set(found.groups)) == (os.geteuid(), os.getegid(), set(os.getgroups()))
+    assert found.inheritance.limits[resource.RLIMIT_NOFILE] == resource.getrlimit(resource.RLIMIT_NOFILE)
+    assert found.inheritance.affinity == tuple(sorted(os.sched_getaffinity(0)))
+    assert found.inheritance.oom_score_adj == int(Path("/proc/self/oom_score_adj").read_text())
+
+
+@as_root
+def test_a_program_is_born_as_somebody_else_with_less(tmp_path: Path) -> None:
+    limits = {resource.RLIMIT_NOFILE: (50, 60)}
+    kept = Inheritance(SOMEBODY, OTHER, (OTHER,), 1 << 5, True, limits, nice=7, io_priority=2 << 13 | 6, oom_score_adj=77)
+    report = tmp_path / "report"
+    report.touch()
+    report.chmod(0o666)
+    tmp_path.chmod(0o755)
+    with report.open("wb") as out, open(os.devnull, "rb") as nothing:
+        birth = Birth(stdio=(nothing.fileno(), out.fileno(), out.fileno()), inheritance=kept)
+        born = spawn_program(
+            ["/bin/sh", "-c", SELF_PORTRAIT], {"PATH": "/usr/bin:/bin", "OOM": "/proc/self/oom_score_adj"}, "/", 0o022, birth
+        )
+        os.waitpid(born.pid, 0)
+    words = report.read_text().split()
+    assert words == [
+        *("Uid:", *["7001"] * 4, "Gid:", *["7002"] * 4, "Groups:", "7002"),
+        *("CapEff:", "0" * 16, "CapBnd:", "0" * 14 + "20", "NoNewPrivs:", "1", "50", "7", "best-effort:", "prio", "6", "77"),
+    ]
+
+
+@as_root
+def test_a_program_of_another_user_ends_with_its_parent_all_the_same() -> None:
+    """A change of user takes PR_SET_PDEATHSIG back; it is set afterwards."""
+    parent = (
+        "import sys\nfrom checkpoint.linux.inheritance import Inheritance\n"
+        "from checkpoint.linux.vessel import Birth, spawn_program\n"
+        f"birth = Birth(inheritance=Inheritance({SOMEBODY}, {SOMEBODY}))\n"
+        "print(spawn_program(['/bin/sleep', '1000'], {}, '/', 0o022, birth).pid, flush=True)\nsys.stdin.read()\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", parent], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        pidfd = os.pidfd_open(int(process.stdout.readline()))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert select.select([pidfd], [], [], BOUND_S)[0]
+    os.close(pidfd)
+
+
+@pytest.mark.parametrize(
+    ("uid", "owner", "allowed"),
+    [(0, SOMEBODY, True), (SOMEBODY, SOMEBODY, True), (OTHER, SOMEBODY, False), (OTHER, None, False), (NOBODY, 0, False)],
+)
+def test_root_and_the_owner_may_give_orders_and_nobody_else(uid: int, owner: int | None, allowed: bool) -> None:
+    assert may(uid, owner) is allowed
+    if not allowed:
+        with pytest.raises(RefusedError, match="its owner and root may give orders"):
+            check_right(uid, "/lab/r1/mapper", owner)
+
+
+def test_an_agent_without_roots_rights_runs_nobody_elses_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(caller.os, "geteuid", lambda: SOMEBODY)
+    stranger = caller.Caller(OTHER, OTHER, (), Inheritance(OTHER, OTHER))
+    with pytest.raises(RefusedError, match="runs programs of uid 7001 alone"):
+        inheritance_for(stranger, "")
+
+
+def test_somebody_elses_process_is_not_ones_own() -> None:
+    stranger = caller.Caller(OTHER, OTHER, (), Inheritance(OTHER, OTHER))
+    with pytest.raises(RefusedError, match=f"pid {os.getpid()} is not a process of uid 7002"):
+        owner_of(os.getpid(), stranger)
+
+
+@as_root
+@pytest.mark.parametrize(
+    ("found", "owner", "allowed"),
+    [
+        (credentials(SOMEBODY), SOMEBODY, True),
+        (credentials(SOMEBODY), 0, True),
+        (credentials(SOMEBODY, effective=0), SOMEBODY, False),
+        (credentials(SOMEBODY, capabilities=1 << 7), SOMEBODY, False),
+        (credentials(OTHER), SOMEBODY, False),
+    ],
+)
+def test_a_snapshot_comes_back_with_the_rights_of_its_owner_or_not_at_all(found: Credentials, owner: int, allowed: bool) -> None:
+    if allowed:
+        check_rights("/lab/r1/mapper", found, owner)
+    else:
+        with pytest.raises(MismatchError, match="other rights than those of its owner"):
+            check_rights("/lab/r1/mapper", found, owner)

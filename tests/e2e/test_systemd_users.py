@@ -1,0 +1,176 @@
+"""Several people on one robot: programs run as whoever asked for them, and each gives orders about his own.
+
+On a booted machine with the service as it is shipped, and two real users who are members of its group.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from tests.e2e import machines, robots
+from tests.e2e.machines import Machine
+from tests.e2e.service import SERVICE, component, install, make_team
+
+pytestmark = [
+    pytest.mark.root,
+    pytest.mark.slow,
+    pytest.mark.skipif(bool(machines.why_not()), reason=machines.why_not() or "-"),
+]
+
+USERS = """
+u alice 7001 "-" /tmp
+u bob 7002 "-" /tmp
+m alice failover
+m bob failover
+"""
+STRANGER = 7003
+"""No member of the group."""
+
+PORTRAIT = """
+import os, sys
+print(os.getresuid(), os.getresgid(), sorted(os.getgroups()), oct(os.umask(0)), os.getcwd())
+print(os.getpriority(os.PRIO_PROCESS, 0), os.sched_getscheduler(0), sorted(os.sched_getaffinity(0)))
+print(open("/proc/self/limits").read(), open("/proc/self/oom_score_adj").read())
+told = ("Cap", "NoNewPrivs", "Seccomp:", "SigBlk", "SigIgn", "Umask")
+print(*(line for line in open("/proc/self/status") if line.startswith(told)))
+print(sorted(os.environ.items()), sys.argv[1:])
+"""
+"""Everything that a program inherits, as it sees it itself."""
+
+ODD = "umask 027; ulimit -S -n 345; ulimit -l 99; ulimit -c 0; echo 321 >/proc/self/oom_score_adj; export COLOUR=green"
+"""What a shell may have set up before it runs something."""
+
+WRITER = """
+import time
+log = open("/var/alice/log", "a")
+number = 0
+while True:
+    number += 1
+    log.write(f"{number}\\n")
+    log.flush()
+    print(number, flush=True)
+    time.sleep(0.01)
+"""
+
+
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
+    """A robot with two people on it."""
+    with machines.booted(tmp_path_factory.mktemp("machines"), "robot1") as booted:
+        install(booted)
+        make_team(booted, robot1="127.0.0.1")
+        (booted.root / "etc/users.conf").write_text(USERS)
+        booted.run("systemd-sysusers", "/etc/users.conf")
+        booted.run("sed", "-i", 's/^#group = .*/group = "failover"/', "/etc/failover/agent.toml")
+        for name, program in {"portrait": PORTRAIT, "writer": WRITER}.items():
+            (booted.root / f"etc/{name}.py").write_text(program)
+        booted.run("install", "-d", "-m755", "-oalice", "/var/alice")  # not sticky: there the kernel itself refuses to follow
+        booted.run("systemctl", "start", SERVICE)
+        yield booted
+        print(booted.run("journalctl", "--unit", SERVICE, "--no-pager", "--lines=100", check=False).stdout)
+
+
+def as_user(machine: Machine, user: str, script: str) -> tuple[int, str]:
+    """Have somebody's shell run a script; its exit status, and all that was said."""
+    become = [] if user == "root" else ["setpriv", f"--reuid={user}", f"--regid={user}", "--init-groups"]
+    if user.isdecimal():
+        become = [*become[:-1], "--clear-groups"]
+    ran = machine.run(*become, "bash", "-c", script, check=False)
+    return ran.returncode, ran.stdout + ran.stderr
+
+
+@pytest.fixture(scope="module")
+def alices(machine: Machine) -> str:
+    """A component of Alice's that has checkpoints."""
+    status, said = as_user(machine, "alice", "cd /; failover run --name alices --detach -- python3 -S /etc/writer.py")
+    assert status == 0, said
+    robots.until(lambda: int(component(machine, "alices").get("snapshots") or 0) >= 2, "snapshots")
+    return "alices"
+
+
+@pytest.mark.parametrize("user", ["alice", "root"])
+def test_a_program_inherits_what_it_would_in_the_shell_of_whoever_asked(machine: Machine, user: str) -> None:
+    portrait = "nice -n 5 taskset 1 python3 /etc/portrait.py 'of me'"
+    _, expected = as_user(machine, user, f"cd /var; {ODD}; {portrait}")
+    _, seen = as_user(machine, user, f"cd /var; {ODD}; {portrait.replace('python3', 'failover run -- python3')}")
+    assert seen == expected
+    assert "345" in seen and "'COLOUR', 'green'" in seen  # the script did set things up
+
+
+def test_root_may_have_a_program_run_as_somebody_else(machine: Machine) -> None:
+    _, expected = as_user(machine, "bob", "id")
+    assert as_user(machine, "root", "failover run --user bob -- id") == (0, expected)
+
+
+def test_nobody_else_may_choose_a_user(machine: Machine) -> None:
+    status, said = as_user(machine, "bob", "failover run --user root -- id")
+    assert status == 1 and "only root may choose a user" in said, said
+
+
+def test_the_program_can_open_its_own_output(machine: Machine) -> None:
+    assert as_user(machine, "bob", "failover run -- sh -c 'echo again >/dev/stdout'") == (0, "again\n")
+
+
+@pytest.mark.parametrize("order", ["logs {}", "stop {}", "release {}", "handover {}", "failback {}", "prefer {} robot1"])
+def test_orders_about_another_ones_component_are_refused(machine: Machine, alices: str, order: str) -> None:
+    status, said = as_user(machine, "bob", f"failover {order.format(alices)}")
+    assert status == 1 and "belongs to uid 7001" in said, said
+
+
+def test_a_name_that_somebody_else_uses_is_refused(machine: Machine, alices: str) -> None:
+    status, said = as_user(machine, "bob", f"failover run --name {alices} -- id")
+    assert status == 1 and "belongs to uid 7001" in said, said
+
+
+def test_everybody_of_the_group_sees_how_things_stand_and_whose_they_are(machine: Machine, alices: str) -> None:
+    status, said = as_user(machine, "bob", "failover status --json")
+    assert '"owner": 7001' in said, (status, said)
+
+
+def test_a_stranger_cannot_ask_at_all(machine: Machine) -> None:
+    status, said = as_user(machine, str(STRANGER), "failover status")
+    assert status == 3 and "join the group" in said, said
+
+
+def test_one_protects_ones_own_processes_alone(machine: Machine) -> None:
+    status, said = as_user(machine, "bob", "sleep 1000 & failover protect $! --name bobs && failover release bobs; kill $!")
+    assert status == 0, said
+    status, said = as_user(machine, "bob", "failover protect 1 --name first")
+    assert status == 1 and "not a process of uid 7002" in said, said
+
+
+def rights(machine: Machine, name: str) -> list[str]:
+    """Of a component's program, as the kernel shows them; empty while it has none."""
+    try:
+        lines = (machine.root / f"proc/{component(machine, name).get('pid')}/status").read_text().splitlines()
+    except OSError:
+        return []
+    return [line for line in lines if line.startswith(("Uid", "Gid", "Groups", "Cap", "NoNew", "Seccomp:"))]
+
+
+def test_a_program_comes_back_with_the_rights_that_it_had(machine: Machine, alices: str) -> None:
+    before = rights(machine, alices)
+    assert "Uid:\t7001\t7001\t7001\t7001" in before
+    assert as_user(machine, "alice", f"kill -SEGV {component(machine, alices)['pid']}")[0] == 0
+    robots.until(lambda: component(machine, alices).get("restores") == 1 and rights(machine, alices), "it to come back")
+    assert rights(machine, alices) == before
+    assert as_user(machine, "alice", f"failover logs {alices} | grep -c .")[0] == 0
+
+
+def test_a_program_that_comes_back_opens_no_file_that_its_user_may_not(machine: Machine, alices: str) -> None:
+    """Its log is replaced by a link to a file of root's, longer than the log was: as root it would be cut."""
+    victim = machine.root / "etc/roots"
+    victim.write_text("precious\n" * 100_000)
+    pid = component(machine, alices)["pid"]
+    as_user(machine, "alice", f"kill -STOP {pid}; rm /var/alice/log; ln -s /etc/roots /var/alice/log; kill -KILL {pid}")
+    robots.until(lambda: component(machine, alices).get("state") == "failed", "it to be given up")
+    assert victim.read_text() == "precious\n" * 100_000
+    said = machine.run("journalctl", "--unit", SERVICE, "--no-pager").stdout
+    assert "cannot open /var/alice/log: Permission denied" in said
+
+
+def test_the_owner_gives_orders(machine: Machine, alices: str) -> None:
+    status, said = as_user(machine, "alice", f"failover release {alices}")
+    assert status == 0, said
