@@ -28,7 +28,7 @@ def freeze(quick: bool, directory: Path) -> list[Figure]:
     found = []
     for megabytes in SIZES_MB[: 2 if quick else None]:
         for dirty_kb in DIRTY_KB[1:2] if quick else DIRTY_KB:
-            found += _freeze_of(megabytes, dirty_kb, 20 if quick else 40, directory)
+            found += _freeze_of(megabytes, dirty_kb, 20 if quick else 30, directory)
     return found
 
 

@@ -9,7 +9,7 @@ from benchmarks.figures import Figure
 from benchmarks.running import BenchmarkError
 from failover.cli.demo.robots import RobotMachine, Stage, means
 
-CUTS = {1: 6, 2: 5, 4: 4}
+CUTS = {1: 5, 2: 4, 4: 3}
 """Programs that are taken over at once, and how often the power is cut for it."""
 
 QUICK_CUTS = {1: 2}
