@@ -61,12 +61,11 @@ def take_on(inheritance: Inheritance) -> None:
     Raises:
         OSError: it names what could not be taken on.
     """
-    privileged = os.geteuid() == 0
     _set_oom_score(inheritance.oom_score_adj)
     _set_scheduling(inheritance)
     for number, (soft, hard) in inheritance.limits.items():
-        _set_limit(number, soft, hard, privileged)
-    if privileged:
+        _set_limit(number, soft, hard)
+    if os.geteuid() == 0:
         _drop_capabilities(inheritance.bounding)
         _become(inheritance)
     if inheritance.no_new_privs:
@@ -92,12 +91,19 @@ def _set_scheduling(inheritance: Inheritance) -> None:
         abi.set_io_priority(inheritance.io_priority)
 
 
-def _set_limit(number: int, soft: int, hard: int, privileged: bool) -> None:
-    ceiling = resource.getrlimit(number)[1]
-    if not privileged and ceiling != resource.RLIM_INFINITY:
-        hard = ceiling if hard == resource.RLIM_INFINITY else min(hard, ceiling)
-        soft = hard if soft == resource.RLIM_INFINITY else min(soft, hard)
-    resource.setrlimit(number, (soft, hard))
+def _set_limit(number: int, soft: int, hard: int) -> None:
+    """As high as it is, or as we may: raising a hard one needs CAP_SYS_RESOURCE."""
+    try:
+        resource.setrlimit(number, (soft, hard))
+    except (ValueError, OSError):
+        ceiling = resource.getrlimit(number)[1]
+        resource.setrlimit(number, (_lesser(soft, ceiling), _lesser(hard, ceiling)))
+
+
+def _lesser(one: int, other: int) -> int:
+    """Of two limits."""
+    finite = [limit for limit in (one, other) if limit != resource.RLIM_INFINITY]
+    return min(finite, default=resource.RLIM_INFINITY)
 
 
 def _drop_capabilities(bounding: int) -> None:
@@ -109,9 +115,12 @@ def _drop_capabilities(bounding: int) -> None:
 
 
 def _become(inheritance: Inheritance) -> None:
+    uids, gids = (inheritance.uid,) * 3, (inheritance.gid,) * 3
+    if (os.getresuid(), os.getresgid(), sorted(os.getgroups())) == (uids, gids, sorted(inheritance.groups)):
+        return  # a container's root may have no right to change them
     try:
         os.setgroups(inheritance.groups)
-        os.setresgid(inheritance.gid, inheritance.gid, inheritance.gid)
-        os.setresuid(inheritance.uid, inheritance.uid, inheritance.uid)
+        os.setresgid(*gids)
+        os.setresuid(*uids)
     except OSError as error:
         raise OSError(error.errno, f"cannot become user {inheritance.uid}: {error.strerror}") from error

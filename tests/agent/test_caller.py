@@ -71,6 +71,18 @@ def test_a_program_is_born_as_somebody_else_with_less(tmp_path: Path) -> None:
     ]
 
 
+def test_a_limit_that_we_may_not_give_becomes_as_high_as_ours() -> None:
+    """In a process of its own, whose limits it may spoil, without the right to raise them."""
+    script = (
+        "import os, resource\nfrom checkpoint.linux.inheritance import take_on, Inheritance\n"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (50, 60))\n"
+        f"if os.geteuid() == 0: os.setresuid({SOMEBODY}, {SOMEBODY}, {SOMEBODY})\n"
+        "take_on(Inheritance(os.getuid(), os.getgid(), limits={resource.RLIMIT_NOFILE: (55, -1)}))\n"
+        "print(*resource.getrlimit(resource.RLIMIT_NOFILE))\n"
+    )
+    assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout == "55 60\n"
+
+
 @as_root
 def test_a_program_of_another_user_ends_with_its_parent_all_the_same() -> None:
     """A change of user takes PR_SET_PDEATHSIG back; it is set afterwards."""
