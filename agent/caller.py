@@ -110,7 +110,7 @@ def owner_of(pid: int, caller: Caller) -> int:
         owner = os.stat(f"/proc/{pid}").st_uid
         users = procfs.status(pid).uids
     except (OSError, CheckpointError):
-        raise RefusedError(f"there is no process {pid}", "ProcessGoneError") from None
+        raise RefusedError(f"cannot protect pid {pid}: No such process", "ProcessGoneError") from None
     if may(caller.uid, None) or {owner, *users} == {caller.uid}:
         return users[0]
     raise RefusedError(f"pid {pid} is not a process of uid {caller.uid}; its owner and root may protect it", "PermissionError")
