@@ -15,6 +15,7 @@ written meanwhile.
 from __future__ import annotations
 
 import contextlib
+import functools
 import gc
 import os
 import signal
@@ -87,6 +88,13 @@ class Frozen:
     guards: Words
     content: bytearray
     freeze_us: int
+
+
+UNACKNOWLEDGED_LIMIT: Final = 64
+"""Scans that are remembered one by one. Beyond, the oldest two become one, and the older position can be acknowledged no more: a
+standby whose disk is full for a week must not make every freeze longer."""
+
+NOWHERE: Final = Position(0, 0, b"")
 
 
 @dataclass(frozen=True, slots=True)
@@ -396,17 +404,18 @@ class PtraceSession:
             still = pages.intersection(pages.difference(last.written, scan.cleared), self._mapped())
             scan = tracking.Scan(pages.union(still, scan.written), pages.union(last.cleared, scan.cleared))
         self._unacknowledged.append(Unacknowledged(None, scan.written, scan.cleared))
+        if len(self._unacknowledged) > UNACKNOWLEDGED_LIMIT:
+            oldest, next_one, *rest = self._unacknowledged
+            self._totals_at.pop(oldest.position or NOWHERE, None)
+            self._unacknowledged = [_joined(oldest, next_one), *rest]
 
     def _since_acknowledged(self, *, base: bool) -> tuple[Words, Words]:
         """What a delta must carry: the union of all scans since. A base needs the last scan alone."""
         scans = self._unacknowledged[-1:] if base else self._unacknowledged
         if len(scans) == 1:
             return scans[0].written, scans[0].cleared
-        written, cleared = NONE, NONE
-        for one in scans:
-            written = pages.union(pages.difference(written, one.cleared), one.written) if len(written) else one.written
-            cleared = pages.union(cleared, one.cleared) if len(cleared) else one.cleared
-        return pages.intersection(written, self._mapped()), cleared
+        union = functools.reduce(_joined, scans)
+        return pages.intersection(union.written, self._mapped()), union.cleared
 
     def _mapped(self) -> Words:
         """Everything that a snapshot may carry pages of."""
@@ -528,6 +537,12 @@ def _without(guards: Words, scan: tracking.Scan) -> tracking.Scan:
     if not len(installed):
         return scan
     return tracking.Scan(pages.difference(scan.written, installed), pages.union(scan.cleared, installed))
+
+
+def _joined(earlier: Unacknowledged, later: Unacknowledged) -> Unacknowledged:
+    """Two scans as one, known by the later one's position."""
+    written = pages.union(pages.difference(earlier.written, later.cleared), later.written)
+    return Unacknowledged(later.position, written, pages.union(earlier.cleared, later.cleared))
 
 
 def _merged(copied: tuple[Words, bytearray], frozen: Frozen) -> Frozen:

@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 
 from checkpoint.engine import CaptureOrder, Session
+from checkpoint.engines import ptrace_capture
 from checkpoint.errors import UnsupportedError
 from checkpoint.model import Snapshot
 from tests.checkpoint.round_trip import Program, ended, protected, restored, start, start_tracee, transported
@@ -103,6 +104,21 @@ def test_a_base_and_its_deltas_are_the_program(ways: str, lost: float, seed: int
             chain = _chain(session, dice, lost=lost)
             tracee.kill()
     _expect_the_same_story(program, tmp_path, chain, ["mutator", WAYS[ways], seed])
+
+
+def test_scans_that_nobody_acknowledges_are_joined_and_none_is_forgotten(
+    compiled: Compiled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ptrace_capture, "UNACKNOWLEDGED_LIMIT", 3)
+    program, dice, ways = compiled("mutator", "-O2"), random.Random(8), WAYS["everything"]
+    with ended(start_tracee(program, tmp_path, ways, "8", "1000000", NAP_US)) as tracee:
+        with protected(tracee) as session:
+            chain = _chain(session, dice, lost=0.85)
+            assert isinstance(session, ptrace_capture.PtraceSession)
+            assert len(session._unacknowledged) <= 3
+            assert len(session._totals_at) <= 4
+            tracee.kill()
+    _expect_the_same_story(program, tmp_path, chain, ["mutator", ways, 8])
 
 
 def _expect_the_same_story(program: Path, directory: Path, chain: list[Snapshot], told: list[object]) -> None:
