@@ -29,7 +29,7 @@ KINDS: Final = {
 
 
 class Identities:
-    """Identities of one process's files; each file is looked at once while it stays as it is."""
+    """Identities of one process's files; each file is looked at once while it stays mapped."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
@@ -42,6 +42,8 @@ class Identities:
             flags: VmFlags by start, possibly older than ``lines``.
             guards: guard pages of all of them.
         """
+        mapped = {_key(line) for line in lines}
+        self._known = {key: identity for key, identity in self._known.items() if key in mapped}
         found = (self._vma(line, flags.get(line.start, ())) for line in lines if line.name != VSYSCALL)
         if not len(guards):
             return tuple(found)
@@ -63,7 +65,7 @@ class Identities:
 
     def of_mapping(self, line: MapsLine) -> FileIdentity:
         """The file behind a mapping."""
-        key = (line.device, line.inode, line.name)
+        key = _key(line)
         if key not in self._known:
             through = f"/proc/{self._pid}/map_files/{line.start:x}-{line.end:x}"
             deleted = line.name.endswith(DELETED)
@@ -93,6 +95,10 @@ class Identities:
             digest=files.digest_at(through, (about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns)),
             deleted=deleted,
         )
+
+
+def _key(line: MapsLine) -> tuple[int, int, str]:
+    return line.device, line.inode, line.name
 
 
 _HEADER: Final = struct.Struct("<16sHHIQQQIHHHHHH")
