@@ -38,6 +38,9 @@ TEMPORARY_PREFIX = "arriving-"
 ASIDE_FOLDER = "aside"
 """Holds what is kept for inspection only."""
 
+ASIDE_LIMIT = 4
+"""Files of one component that are kept for inspection; the oldest goes when another comes, or a bad cable would fill the disk."""
+
 LOCK_NAME = "lock"
 
 FOLD_DELTA_COUNT = 64
@@ -311,6 +314,12 @@ class Store:
         folded = self.load(component, position)
         final = self._root / ASIDE_FOLDER / f"{folder_name(component)}-{file_name(header_of(folded))}"
         self._write_whole(final, lambda file: format.encode(folded, file))
+        begin = f"{folder_name(component)}-"
+        with self._disk_trouble(f"remove what was set aside of {component}"):
+            names = (path.name for path in final.parent.iterdir())
+            ours = sorted(name for name in names if name.startswith(begin) and len(name) == len(final.name))
+            for name in ours[:-ASIDE_LIMIT]:
+                self._disk.remove(final.parent / name)
         return final
 
     def drop(self, component: str) -> None:

@@ -289,6 +289,21 @@ def test_a_history_that_lost_the_argument_is_kept_aside(tmp_path: Path) -> None:
         assert store.positions(COMPONENT) == (later.position,)
 
 
+def test_only_the_newest_of_what_lost_is_kept_aside(tmp_path: Path) -> None:
+    alike = snapshot({1: page("other")}, component=f"{COMPONENT}-2")
+    with opened(tmp_path / "store") as store:
+        put(store, alike)
+        store.set_aside(alike.component, [1])
+        for generation in range(1, 8):
+            put(store, snapshot({1: page(f"loser {generation}")}, generation=generation))
+            kept = store.set_aside(COMPONENT, [generation])
+        left = sorted((tmp_path / "store" / "aside").iterdir())
+    assert len(left) == 4 + 1
+    assert kept in left
+    generations = [format.read_header(path).position.generation for path in left if f"{COMPONENT[-6:]}-0" in path.name]
+    assert generations == [4, 5, 6, 7]
+
+
 FULL_DISK = """
 import os, sys
 from checkpoint.errors import StoreError
