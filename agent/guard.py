@@ -16,6 +16,7 @@ It listens on SOCKET_PATH (0600) for one agent at a time; a new one takes the pl
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import select
 import signal
@@ -115,7 +116,7 @@ class Guard:
         if self._listener.fileno() >= 0:  # it was not let go
             watched[self._listener.fileno()] = self._accept
         if self._agent is not None:
-            watched[self._agent.fileno()] = self._receive
+            watched[self._agent.fileno()] = functools.partial(self._receive, self._agent)
         if self._keeper is not None:
             watched[self._keeper] = self._lose_keeper
         if self._ward is not None and self._ward.pidfd is not None and self._ward.exited is None:
@@ -150,10 +151,11 @@ class Guard:
         if self._ward is not None and self._ward.exited is not None:
             self._tell(self._ward.exited)
 
-    def _receive(self) -> None:
-        assert self._agent is not None
+    def _receive(self, agent: Channel[Any]) -> None:
+        if agent is not self._agent:  # in this same turn it was found to have gone, or another one came
+            return
         try:
-            request, descriptors = self._agent.receive()
+            request, descriptors = agent.receive()
         except (ChannelError, TimeoutError):
             self._lose_agent()
             return

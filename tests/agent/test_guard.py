@@ -288,6 +288,21 @@ def test_a_lease_needs_no_agent_to_run_out(guard: GuardProcess) -> None:
     assert grows(guard)
 
 
+def test_a_lease_that_runs_out_at_the_instant_at_which_the_agent_dies_hurts_neither_guard_nor_program(
+    guard: GuardProcess,
+) -> None:
+    agent = guard.agent()
+    pid = guard.start(agent, *COUNTING).pid
+    over_ns = in_ns(SOON_NS)
+    agent.ask(Lease(over_ns))
+    guard.process.send_signal(signal.SIGSTOP)
+    agent.close()
+    until(lambda: time.monotonic_ns() > over_ns, "the lease to be over")
+    guard.process.send_signal(signal.SIGCONT)  # and both are news to it in one turn
+    assert guard.agent().describe().frozen_by == "lease"
+    assert lives(pid)
+
+
 def test_a_lease_that_is_renewed_in_time_freezes_nothing(guard: GuardProcess) -> None:
     agent = guard.agent()
     guard.start(agent, *COUNTING)
