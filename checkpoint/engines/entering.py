@@ -12,7 +12,7 @@ from typing import Final
 from checkpoint.arch import x86_64 as arch
 from checkpoint.engines.restart import Interruption, outside_critical_section, undisturbed
 from checkpoint.errors import CaptureError, ProcessGoneError
-from checkpoint.linux import dirty, procfs, remote
+from checkpoint.linux import dirty, entry, procfs, remote
 from checkpoint.linux.digests import DigestTracker
 from checkpoint.linux.dirty import SoftDirtyTracker
 from checkpoint.linux.memory import Memory
@@ -51,7 +51,7 @@ def enter(tracee: Tracee) -> Entered:
     return Entered(entered.pages, tracker, interruption, notes)
 
 
-def _try_to_enter(tracee: Tracee, interruption: Interruption, *, last: bool) -> remote.Entered | None:
+def _try_to_enter(tracee: Tracee, interruption: Interruption, *, last: bool) -> entry.Entered | None:
     """Enter once; None while the program still stands in the code of a tracer that died.
 
     Args:
@@ -62,9 +62,9 @@ def _try_to_enter(tracee: Tracee, interruption: Interruption, *, last: bool) -> 
         pending = (*tracee.pending(shared=False), *tracee.pending(shared=True))
         decoded = where_it_stands(tracee, mask, pending, tracee.rseq())
         lines = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
-        left = remote.leftovers(tracee.memory, lines)
+        left = entry.leftovers(tracee.memory, lines)
         place = decoded[arch.INSTRUCTION_POINTER]
-        stands_inside = remote.is_in_stub(place, tracee.memory, lines) or any(borrowed.holds(place) for borrowed in left)
+        stands_inside = entry.is_in_stub(place, tracee.memory, lines) or any(borrowed.holds(place) for borrowed in left)
         if stands_inside or (not last and any(borrowed.state() == remote.ARMED for borrowed in left)):
             if last:
                 raise CaptureError(f"pid {tracee.pid} does not leave the code of an earlier tracer; protect it again")
@@ -76,9 +76,9 @@ def _try_to_enter(tracee: Tracee, interruption: Interruption, *, last: bool) -> 
                 borrowed.abandon()
         free = [borrowed for borrowed in left if borrowed.state() != remote.ABANDONED]
         if free:
-            entered = remote.reenter(tracee, free[0], registers, mask)
+            entered = entry.reenter(tracee, free[0], registers, mask)
         else:
-            entered = remote.enter(tracee, lines, registers, mask)
+            entered = entry.enter(tracee, lines, registers, mask)
         batch = remote.Batch(entered.pages.table)
         batch.add("close", entered.inside)
         entered.pages.run(tracee, batch, registers, mask)
@@ -93,7 +93,7 @@ def where_it_stands(tracee: Tracee, mask: int, pending: tuple[bytes, ...], rseq:
     return undisturbed(decoded, bool(_unblocked(pending, mask)))
 
 
-def _tracker_for(pid: int, entered: remote.Entered) -> tuple[Tracker, tuple[str, ...]]:
+def _tracker_for(pid: int, entered: entry.Entered) -> tuple[Tracker, tuple[str, ...]]:
     """The best way to find written pages that this kernel has for this process, and what to say about it."""
     why = os.strerror(entered.why_not)
     if entered.faults is not None:

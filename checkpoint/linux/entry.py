@@ -1,0 +1,218 @@
+"""The first entry into a stopped tracee: where our pages come to lie, and what an earlier tracer has left.
+
+The first entry has no page yet: a stub of constants in the zero tail of the vdso's last page (writing there makes the page
+private to the process) maps the pages and opens a userfaultfd, keeping both results in registers. The tail is zeroed afterwards.
+
+Source: vdso(7), userfaultfd(2), pidfd_getfd(2).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import os
+import struct
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from checkpoint.arch import x86_64 as arch
+from checkpoint.arch.x86_64 import Call
+from checkpoint.errors import CaptureError
+from checkpoint.linux import abi, procfs
+from checkpoint.linux.memory import Memory
+from checkpoint.linux.procfs import MapsLine
+from checkpoint.linux.remote import (
+    ABANDONED,
+    BATCH_TIMEOUT_S,
+    CODE_SIZE,
+    MAGIC,
+    SIZE,
+    TABLE_SIZE,
+    Batch,
+    BorrowedPages,
+    give_back,
+    resumed,
+)
+from checkpoint.linux.tracee import Tracee
+
+
+@dataclass(frozen=True, slots=True)
+class Entered:
+    """What the first entry brought.
+
+    Attributes:
+        faults: a userfaultfd of the tracee's memory, ours now; None where the kernel refused it.
+        inside: its number in the tracee, where it must still be closed; -1 if none.
+        why_not: the errno of a refusal.
+    """
+
+    pages: BorrowedPages
+    faults: int | None
+    inside: int
+    why_not: int = 0
+
+
+def reenter(tracee: Tracee, pages: BorrowedPages, registers: bytes, mask: int) -> Entered:
+    """Use pages again that an earlier tracer left; otherwise as `enter`."""
+    batch = Batch(pages.table)
+    index = batch.add("userfaultfd", abi.O_CLOEXEC | abi.O_NONBLOCK | abi.UFFD_USER_MODE_ONLY)
+    inside = pages.run(tracee, batch, registers, mask).results[index]
+    if inside < 0:
+        return Entered(pages, None, -1, -inside)
+    return Entered(pages, _taken(tracee.pid, inside), inside)
+
+
+def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int) -> Entered:
+    """Borrow pages in a stopped tracee that has none of ours; it stands as before afterwards.
+
+    The userfaultfd is still open inside; the next batch closes `Entered.inside`.
+
+    Raises:
+        ProcessGoneError: it was killed meanwhile.
+        CaptureError: no place for the stub, or its memory limit leaves no room.
+    """
+    place, room = vdso_tail(tracee.memory, maps)
+    hole = largest_hole(maps)
+    stub = arch.entry_code(place, _entry_calls(hole), resumed(arch.decode_registers(registers)), mask)
+    if len(stub) > room:
+        raise CaptureError(
+            f"cannot enter pid {tracee.pid}: its vdso has only {room} spare bytes of {len(stub)}; upgrade the kernel"
+        )
+    tracee.memory.poke(place, stub)
+    there = arch.decode_registers(registers)
+    there[arch.INSTRUCTION_POINTER] = place + arch.ENTRY_CODE_OFFSET
+    there[arch.CALL_NUMBER] = -1
+    tracee.set_registers(arch.encode_registers(there))
+    tracee.set_signal_mask(abi.ALL_SIGNALS)
+    tracee.cont()
+    try:
+        _wait_in_call(tracee.pid, "rt_sigtimedwait")
+        tracee.freeze()
+        found = arch.decode_registers(tracee.registers())
+    except CaptureError:
+        give_back(tracee, registers, mask)
+        raise
+    code, table, inside = (ctypes.c_int64(found[name]).value for name in arch.ENTRY_REGISTERS)
+    faults = _taken(tracee.pid, inside) if inside >= 0 else None
+    tracee.set_signal_mask(mask)
+    tracee.set_registers(registers)
+    tracee.memory.poke(place, bytes(len(stub)))
+    if code != hole or table != hole + CODE_SIZE:
+        raise CaptureError(
+            f"cannot borrow pages in pid {tracee.pid}: {os.strerror(-min(code, table, 0))}; raise its limit of address space"
+        )
+    pages = BorrowedPages(tracee.memory, hole)
+    tracee.memory.poke(pages.table - len(MAGIC), MAGIC)
+    return Entered(pages, faults, inside, -inside if inside < 0 else 0)
+
+
+def _entry_calls(hole: int) -> arch.EntryCalls:
+    fixed = abi.MAP_PRIVATE | abi.MAP_ANONYMOUS | abi.MAP_FIXED_NOREPLACE
+    read_execute, read_write = abi.PROT_READ | abi.PROT_EXEC, abi.PROT_READ | abi.PROT_WRITE
+    return arch.EntryCalls(
+        code_pages=Call("mmap", (hole, CODE_SIZE, read_execute, fixed, -1, 0)),
+        table_pages=Call("mmap", (hole + CODE_SIZE, TABLE_SIZE, read_write, fixed, -1, 0)),
+        advice=Call("madvise", (hole, SIZE, abi.MADV_DONTFORK)),
+        faults=Call("userfaultfd", (abi.O_CLOEXEC | abi.O_NONBLOCK | abi.UFFD_USER_MODE_ONLY,)),
+    )
+
+
+def _wait_in_call(pid: int, name: str) -> None:
+    """Wait until the thread waits in this system call.
+
+    Source: proc_pid_syscall(5): the number is the first word.
+    """
+    deadline = time.perf_counter() + BATCH_TIMEOUT_S
+    wanted = str(arch.SYSCALLS[name])
+    while procfs.read_text(pid, "syscall").partition(" ")[0] != wanted:
+        if time.perf_counter() > deadline:
+            raise CaptureError(
+                f"pid {pid} did not run for {BATCH_TIMEOUT_S:g} s while it was looked at: it is frozen by its cgroup, or higher "
+                "priorities leave it no processor; protect it again when it runs"
+            )
+        os.sched_yield()
+
+
+def _taken(pid: int, inside: int) -> int:
+    pidfd = os.pidfd_open(pid)
+    try:
+        return abi.pidfd_getfd(pidfd, inside)
+    finally:
+        os.close(pidfd)
+
+
+USER_END: Final = 0x7FFF_FFFF_E000
+"""The first address that a program cannot have (47-bit addresses, one guard page)."""
+USER_START: Final = 1 << 20
+"""Below lie vm.mmap_min_addr and what old programs expect to be free."""
+
+
+def largest_hole(maps: Sequence[MapsLine]) -> int:
+    """An address in the middle of the largest unmapped stretch, where neither heap nor stack nor new mappings come soon.
+
+    Raises:
+        CaptureError: there is no room.
+    """
+    ends = [USER_START, *(line.end for line in maps if line.end < USER_END)]
+    starts = [*(line.start for line in maps if USER_START <= line.start < USER_END), USER_END]
+    size, begin = max((start - end, end) for end, start in zip(sorted(ends), sorted(starts), strict=False))
+    if size < 3 * SIZE:
+        raise CaptureError("cannot borrow pages: the address space has no hole left")
+    return (begin + size // 2) & -abi.PAGE_SIZE
+
+
+_ELF64_HEADER: Final = struct.Struct("<16sHHIQQQIHHHHHH")
+_SPARE_ALIGNMENT: Final = 64
+
+
+def vdso_tail(memory: Memory, maps: Sequence[MapsLine]) -> tuple[int, int]:
+    """The unused end of the vdso's last page: its address and size.
+
+    Raises:
+        CaptureError: the process has no vdso.
+    """
+    begin = vdso_image_end(memory, maps)
+    return begin, max(0, next(line.end for line in maps if line.name == "[vdso]") - begin)
+
+
+def vdso_image_end(memory: Memory, maps: Sequence[MapsLine]) -> int:
+    """Where the vdso's own content ends.
+
+    Raises:
+        CaptureError: the process has no vdso.
+
+    Source: elf(5): the section headers are the last thing in the image.
+    """
+    for line in maps:
+        if line.name == "[vdso]":
+            header = _ELF64_HEADER.unpack(memory.read(line.start, _ELF64_HEADER.size))
+            sections_end = int(header[6] + header[11] * header[12])
+            return line.start + -(-sections_end // _SPARE_ALIGNMENT) * _SPARE_ALIGNMENT
+    raise CaptureError(f"cannot enter pid {memory.pid}: it has no vdso (the kernel was started with vdso=0, or it unmapped it)")
+
+
+# What an earlier tracer left
+
+
+def leftovers(memory: Memory, maps: Sequence[MapsLine]) -> list[BorrowedPages]:
+    """Pages that earlier tracers borrowed and could not give back; those that were left to the program do not count."""
+    found = []
+    for code, table in itertools.pairwise(maps):
+        alike = code.end == table.start and code.inode == table.inode == 0 and not (code.shared or table.shared)
+        if not (alike and code.size == CODE_SIZE and code.protection == abi.PROT_READ | abi.PROT_EXEC):
+            continue
+        if table.size < TABLE_SIZE or memory.read(code.end - len(MAGIC), len(MAGIC)) != MAGIC:
+            continue
+        pages = BorrowedPages(memory, code.start)
+        if pages.state() != ABANDONED:
+            found.append(pages)
+    return found
+
+
+def is_in_stub(instruction_pointer: int, memory: Memory, maps: Sequence[MapsLine]) -> bool:
+    """Whether a thread stands in the stub of an earlier tracer's first entry: it leaves it by itself."""
+    return any(line.name == "[vdso]" and line.start <= instruction_pointer < line.end for line in maps) and (
+        instruction_pointer >= vdso_image_end(memory, maps)
+    )
