@@ -9,8 +9,8 @@ from typing import Final
 
 from checkpoint.engines.switches import Questions, Switch
 from checkpoint.linux import abi
-from checkpoint.linux.procfs import TimerLine
 from checkpoint.linux.remote import Answers, Batch
+from checkpoint.linux.timers import TimerLine
 from checkpoint.model import Clocks, IntervalTimer, PosixTimer, SignalAction
 
 SIGCHLD: Final = 17

@@ -39,6 +39,7 @@ from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, Unsupp
 from checkpoint.linux import abi, digests, pagetables, procfs, tracking
 from checkpoint.linux.digests import SharedPages
 from checkpoint.linux.procfs import MapsLine, MapsReader, Stat, Status
+from checkpoint.linux.timers import parse_timers
 from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.tracking import NONE
 from checkpoint.model import (
@@ -382,7 +383,7 @@ class PtraceSession:
 
     def _ask(self, special: int, registers: bytes, mask: int) -> Told:
         """Have the process say what only it can; the questions stay the same while its signals and timers do."""
-        timers = procfs.parse_timers(text) if (text := procfs.read_text(self.pid, "timers")) else ()
+        timers = parse_timers(text) if (text := procfs.read_text(self.pid, "timers")) else ()
         key = (special, timers)
         if self._inquiry is None or self._inquiry_key != key:
             self._inquiry, self._inquiry_key = Inquiry(self._borrowed.table, special, timers), key

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from checkpoint.engine import KEPT, REFUSED, Finding
-from checkpoint.linux import abi, procfs
-from checkpoint.linux.procfs import Descriptor
+from checkpoint.linux import abi
+from checkpoint.linux.descriptors import Descriptor, descriptors
 from checkpoint.model import Fact, Resource
 
 STREAM_NUMBERS: Final = (1, 2)
@@ -87,7 +87,7 @@ def gather(pid: int) -> tuple[OpenFile, ...]:
     """Read every descriptor, and which of them share an open file. For an exact picture the process stands still."""
     groups: list[list[Descriptor]] = []
     alike: dict[tuple[int, int, int, int], list[list[Descriptor]]] = {}
-    for one in procfs.descriptors(pid):
+    for one in descriptors(pid):
         candidates = alike.setdefault((one.device, one.inode, one.offset, one.flags & ~os.O_CLOEXEC), [])
         shared = next((group for group in candidates if _is_shared(pid, group[0], one)), None)
         if shared is not None:

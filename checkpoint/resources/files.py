@@ -18,7 +18,7 @@ from blake3 import blake3
 
 from checkpoint.errors import CaptureError
 from checkpoint.linux import procfs
-from checkpoint.linux.procfs import Descriptor
+from checkpoint.linux.descriptors import Descriptor
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile, Surroundings
 

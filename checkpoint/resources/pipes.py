@@ -24,7 +24,7 @@ from typing import Final
 from checkpoint.errors import CaptureError
 from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
-from checkpoint.linux.procfs import Descriptor
+from checkpoint.linux.descriptors import Descriptor
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile, Surroundings
 
