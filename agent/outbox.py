@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from failover.core.acts import Act, Ready
+from failover.core.acts import Act, Ready, SetLease
 from failover.core.messages import Beat
 from failover.core.types import Ballot
 
@@ -65,7 +65,8 @@ class Outbox:
             self._ordered += 1
             self._newest = ready.persist
             persist = (self._ordered, ready.persist)
-        self._acts.extend((self._ordered, act) for act in ready.act)
+        for act in ready.act:
+            self._queue(act)
         return Due(persist, self._beats(ready.send, now_ns), self._free_acts())
 
     def kept(self, number: int, ballot: Ballot, now_ns: int) -> Due:
@@ -75,6 +76,16 @@ class Outbox:
         if self.waiting or beat is None:
             return Due(acts=self._free_acts())
         return Due(beats=self._beats((beat,), now_ns), acts=self._free_acts())
+
+    def _queue(self, act: Act) -> None:
+        """Put an act last. Of the leases of one component only the newest waits: a disk may be full for a night."""
+        if self.waiting and isinstance(act, SetLease):
+            stale = (
+                (number, each) for number, each in self._acts if isinstance(each, SetLease) and each.component == act.component
+            )
+            for one in list(stale):
+                self._acts.remove(one)
+        self._acts.append((self._ordered, act))
 
     def _beats(self, beats: tuple[Beat, ...], now_ns: int) -> tuple[Beat, ...]:
         if not self.waiting:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from agent.outbox import Due, Outbox
 from checkpoint.model import Position
-from failover.core.acts import Acknowledge, Act, Ready
+from failover.core.acts import Acknowledge, Act, Ready, SetLease
 from failover.core.messages import Beat, Echo, Entry
 from failover.core.types import Ballot, Record
 
@@ -40,6 +40,14 @@ def test_acts_wait_for_the_ballot_they_depend_on_and_keep_their_order() -> None:
     assert box.take(Ready(NEW, act=(act(3),)), 3).persist == (2, NEW)
     assert box.kept(1, NEW, 4).acts == (act(1), act(2))
     assert box.kept(2, NEW, 5).acts == (act(3),)
+
+
+def test_leases_do_not_pile_up_behind_a_disk_that_is_full() -> None:
+    box = outbox()
+    box.take(Ready(NEW, act=(act(1),)), 1)
+    for instant in range(2, 1000):
+        box.take(Ready(act=(SetLease("/a", 4, instant), SetLease("/b", 1, instant))), instant)
+    assert box.kept(1, NEW, 1000).acts == (act(1), SetLease("/a", 4, 999), SetLease("/b", 1, 999))
 
 
 def test_a_later_ballot_covers_the_earlier_ones() -> None:
