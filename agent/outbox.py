@@ -80,11 +80,9 @@ class Outbox:
     def _queue(self, act: Act) -> None:
         """Put an act last. Of the leases of one component only the newest waits: a disk may be full for a night."""
         if self.waiting and isinstance(act, SetLease):
-            stale = (
-                (number, each) for number, each in self._acts if isinstance(each, SetLease) and each.component == act.component
-            )
-            for one in list(stale):
-                self._acts.remove(one)
+            for one in list(self._acts):
+                if isinstance(one[1], SetLease) and one[1].component == act.component:
+                    self._acts.remove(one)
         self._acts.append((self._ordered, act))
 
     def _beats(self, beats: tuple[Beat, ...], now_ns: int) -> tuple[Beat, ...]:
