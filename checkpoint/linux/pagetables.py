@@ -153,8 +153,6 @@ def pages_joined(found: Words) -> Words:
 _PRESENT: Final = np.uint64(1 << 63)
 _SWAPPED: Final = np.uint64(1 << 62)
 _FILE: Final = np.uint64(1 << 61)
-_GUARD: Final = np.uint64(1 << 58)
-"""Zero before Linux 6.15."""
 SOFT_DIRTY: Final = np.uint64(1 << 55)
 PAGEMAP_CHUNK: Final = 1 << 16
 """Pages whose entries (8 bytes each) are read at once."""
@@ -173,12 +171,12 @@ class PagemapFile:
 
     def existing(self, ranges: Words, *, own: bool = True) -> Words:
         """As `PageScanner.existing`; the shared page of zeros counts, too."""
-        unwanted = _FILE | _GUARD if own else _GUARD
+        unwanted = _FILE if own else np.uint64(0)
         return self._select(ranges, _PRESENT | _SWAPPED, unwanted)
 
     def guards(self, ranges: Words) -> Words:
-        """As `PageScanner.guards`."""
-        return self._select(ranges, _GUARD, np.uint64(0))
+        """None: a kernel that knows guards has PAGEMAP_SCAN, too."""
+        return NONE
 
     def soft_dirty(self, ranges: Words) -> Words:
         """Pages whose soft-dirty bit is set."""

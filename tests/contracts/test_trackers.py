@@ -21,7 +21,7 @@ from checkpoint.linux import abi, dirty, write_protection
 from checkpoint.linux.digests import DigestTracker
 from checkpoint.linux.dirty import SoftDirtyTracker
 from checkpoint.linux.memory import Memory
-from checkpoint.linux.pagetables import PagemapFile, PageScanner
+from checkpoint.linux.pagetables import PageScanner
 from checkpoint.linux.procfs import MapsLine, MapsReader
 from checkpoint.linux.tracking import Scan, Tracker, extents_of
 from checkpoint.linux.write_protection import PagemapTracker
@@ -180,11 +180,10 @@ def test_guards_are_told_and_do_not_exist(child: Child) -> None:
     assert child.numbers(child.tracker.existing(child.lines())) == {0, 1, 6, 7, 8, 9}
 
 
-@pytest.mark.parametrize("reader", [PageScanner, PagemapFile])
-def test_guards_are_found_by_either_way_to_read_page_tables(child: Child, reader: type[PageScanner | PagemapFile]) -> None:
+def test_guards_are_found_in_the_page_tables(child: Child) -> None:
     child.order("guard 2 4")
     child.order("guard 100 90")
-    tables = reader(child.process.pid)
+    tables = PageScanner(child.process.pid)
     found = tables.guards(extents_of(child.lines()))
     tables.close()
     if not len(found):
