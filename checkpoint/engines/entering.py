@@ -80,7 +80,8 @@ def _try_to_enter(tracee: Tracee, interruption: Interruption, *, last: bool) -> 
         else:
             entered = entry.enter(tracee, lines, registers, mask)
         batch = remote.Batch(entered.pages.table)
-        batch.add("close", entered.inside)
+        for number in {entered.inside, *entry.left_open(tracee.pid)}:
+            batch.add("close", number)
         entered.pages.run(tracee, batch, registers, mask)
         return entered
 

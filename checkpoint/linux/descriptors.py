@@ -42,15 +42,32 @@ class Descriptor:
 
 def descriptors(pid: int) -> tuple[Descriptor, ...]:
     """Every open descriptor, in order of number."""
+    return tuple(found for number in _numbers(pid) if (found := descriptor(pid, number)) is not None)
+
+
+def descriptors_to(pid: int, target: str) -> tuple[Descriptor, ...]:
+    """Those that lead there; of the others nothing more is read."""
+    numbers = [number for number in _numbers(pid) if _target(pid, number) == target]
+    return tuple(found for number in numbers if (found := descriptor(pid, number)) is not None)
+
+
+def _target(pid: int, number: int) -> str:
+    """Where it leads; "" when it was closed meanwhile."""
     try:
-        numbers = sorted(map(int, os.listdir(f"/proc/{pid}/fd")))
+        return os.readlink(f"/proc/{pid}/fd/{number}")
+    except FileNotFoundError:
+        return ""
+
+
+def _numbers(pid: int) -> list[int]:
+    try:
+        return sorted(map(int, os.listdir(f"/proc/{pid}/fd")))
     except (FileNotFoundError, ProcessLookupError) as error:
         raise ProcessGoneError(f"cannot list descriptors: there is no process {pid}") from error
     except PermissionError as error:
         raise ProbeError(
             f"cannot list descriptors of pid {pid}: not permitted; run as the same user or with CAP_SYS_PTRACE"
         ) from error
-    return tuple(found for number in numbers if (found := descriptor(pid, number)) is not None)
 
 
 def descriptor(pid: int, number: int) -> Descriptor | None:

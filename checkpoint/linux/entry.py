@@ -21,6 +21,7 @@ from checkpoint.arch import x86_64 as arch
 from checkpoint.arch.x86_64 import Call
 from checkpoint.errors import CaptureError
 from checkpoint.linux import abi, procfs
+from checkpoint.linux.descriptors import Descriptor, descriptors_to
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.remote import (
@@ -36,6 +37,11 @@ from checkpoint.linux.remote import (
     resumed,
 )
 from checkpoint.linux.tracee import Tracee
+
+FAULTS_FLAGS: Final = abi.O_CLOEXEC | abi.O_NONBLOCK
+"""With which the userfaultfd is opened inside."""
+FAULTS_TARGET: Final = "anon_inode:[userfaultfd]"
+"""Where /proc/PID/fd says that it leads."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +63,7 @@ class Entered:
 def reenter(tracee: Tracee, pages: BorrowedPages, registers: bytes, mask: int) -> Entered:
     """Use pages again that an earlier tracer left; otherwise as `enter`."""
     batch = Batch(pages.table)
-    index = batch.add("userfaultfd", abi.O_CLOEXEC | abi.O_NONBLOCK | abi.UFFD_USER_MODE_ONLY)
+    index = batch.add("userfaultfd", FAULTS_FLAGS | abi.UFFD_USER_MODE_ONLY)
     inside = pages.run(tracee, batch, registers, mask).results[index]
     if inside < 0:
         return Entered(pages, None, -1, -inside)
@@ -115,7 +121,7 @@ def _entry_calls(hole: int) -> arch.EntryCalls:
         code_pages=Call("mmap", (hole, CODE_SIZE, read_execute, fixed, -1, 0)),
         table_pages=Call("mmap", (hole + CODE_SIZE, TABLE_SIZE, read_write, fixed, -1, 0)),
         advice=Call("madvise", (hole, SIZE, abi.MADV_DONTFORK)),
-        faults=Call("userfaultfd", (abi.O_CLOEXEC | abi.O_NONBLOCK | abi.UFFD_USER_MODE_ONLY,)),
+        faults=Call("userfaultfd", (FAULTS_FLAGS | abi.UFFD_USER_MODE_ONLY,)),
     )
 
 
@@ -209,6 +215,20 @@ def leftovers(memory: Memory, maps: Sequence[MapsLine]) -> list[BorrowedPages]:
         if pages.state() != ABANDONED:
             found.append(pages)
     return found
+
+
+def left_open(pid: int) -> tuple[int, ...]:
+    """Userfaultfds that earlier tracers opened inside and could not close: the program was frozen by its cgroup in between."""
+    return tuple(found.number for found in descriptors_to(pid, FAULTS_TARGET) if is_left_open(found))
+
+
+def is_left_open(found: Descriptor) -> bool:
+    """Whether a descriptor is one of `left_open`: it was never set up (UFFDIO_API), which a program of its own does at once.
+
+    Source: userfaultfd_show_fdinfo() in fs/userfaultfd.c: "API: aa:0:…" before the features are agreed on.
+    """
+    alike = found.target == FAULTS_TARGET and found.flags & ~os.O_RDWR == FAULTS_FLAGS
+    return alike and found.fields.get("API", "").split(":")[1:2] == ["0"]
 
 
 def is_in_stub(instruction_pointer: int, memory: Memory, maps: Sequence[MapsLine]) -> bool:

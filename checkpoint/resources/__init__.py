@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from checkpoint.engine import KEPT, REFUSED, Finding
-from checkpoint.linux import abi
+from checkpoint.linux import abi, entry
 from checkpoint.linux.descriptors import Descriptor, descriptors
 from checkpoint.model import Fact, Resource
 
@@ -88,6 +88,8 @@ def gather(pid: int) -> tuple[OpenFile, ...]:
     groups: list[list[Descriptor]] = []
     alike: dict[tuple[int, int, int, int], list[list[Descriptor]]] = {}
     for one in descriptors(pid):
+        if entry.is_left_open(one):  # ours, and closed when it is entered
+            continue
         candidates = alike.setdefault((one.device, one.inode, one.offset, one.flags & ~os.O_CLOEXEC), [])
         shared = next((group for group in candidates if _is_shared(pid, group[0], one)), None)
         if shared is not None:

@@ -142,6 +142,31 @@ def test_a_keeper_killed_at_any_instant_leaves_the_program_unharmed(worker: Prog
     assert worker.output.splitlines() == ["ready", expected_end(turns)]
 
 
+HOLDER = """
+import ctypes, os, sys, time
+number = ctypes.CDLL(None).syscall(323, os.O_CLOEXEC | os.O_NONBLOCK | 1)  # userfaultfd(2), UFFD_USER_MODE_ONLY
+print(number, flush=True)
+print("ready", flush=True)
+while True:
+    time.sleep(0.01)
+"""
+
+
+def test_a_userfaultfd_that_a_keeper_could_not_close_is_closed_by_the_next_one(tmp_path: Path) -> None:
+    """It gives up after a second where the program is frozen by its cgroup between two calls."""
+    with ended(start([sys.executable, "-c", HOLDER], tmp_path)) as program, keeping() as keeper:
+        program.wait_for_line("ready")
+        number = int(program.output.split()[0])
+        if number < 0:
+            pytest.skip("this system gives nobody a userfaultfd")
+        answer, _ = keeper.ask(channel.Protect(program.pid, "/test/holder"))
+        assert isinstance(answer, channel.Protected), answer
+        assert str(number) not in os.listdir(f"/proc/{program.pid}/fd")
+        answer, descriptors = keeper.ask(channel.Capture(True, 1, 1))
+        assert isinstance(answer, channel.Captured), answer
+        channel.close_all(descriptors)
+
+
 def mappings_of(pid: int) -> list[str]:
     """Lines of its maps; none of a dead one."""
     return Path(f"/proc/{pid}/maps").read_text().splitlines()
