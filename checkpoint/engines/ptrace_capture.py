@@ -143,6 +143,7 @@ class PtraceSession:
         self._unacknowledged: list[Unacknowledged] = []
         self._acknowledged: Position | None = None
         self._totals_at: dict[Position, Totals] = {}
+        self._refused = False
         self._held = False
         self._before_hold: Any = None
         self._closed = False
@@ -195,6 +196,8 @@ class PtraceSession:
     def capture(self, order: CaptureOrder) -> Snapshot:
         """See ``checkpoint.engine.Session.capture``."""
         parent = None if order.base else self._acknowledged
+        if self._refused:
+            self._look_from_outside()
         try:
             copied = self._copy_running() if parent is None else None
             frozen = self._frozen_look(base=copied is not None, hold=order.hold)
@@ -212,8 +215,7 @@ class PtraceSession:
         """The snapshot of what a freeze brought home, while the program runs."""
         held = look(frozen.opened, self._outputs.surroundings if self._outputs else Surroundings())
         reasons = (*held.reasons, *self._reasons_of(frozen))
-        if reasons:
-            raise UnsupportedError(f"cannot capture {self.component} (pid {self.pid}): {'; '.join(reasons)}", reasons)
+        self._refuse(reasons)
         if copied is not None:
             frozen = _merged(copied, frozen)
         vmas = self._identities.vmas(frozen.lines, self._flags, frozen.guards)
@@ -227,6 +229,17 @@ class PtraceSession:
         self._unacknowledged[-1] = replace(self._unacknowledged[-1], position=snapshot.position)
         self._totals_at[snapshot.position] = self.totals = frozen.totals
         return snapshot
+
+    def _look_from_outside(self) -> None:
+        """What was refused once is looked at without stopping it: a program that has an epoll for a week is left in peace."""
+        with contextlib.suppress(ProcessGoneError, ProbeError):
+            held = look(gather(self.pid), self._outputs.surroundings if self._outputs else Surroundings())
+            self._refuse((*held.reasons, *unsupported.refuse_process(self.pid, procfs.status(self.pid))))
+
+    def _refuse(self, reasons: tuple[str, ...]) -> None:
+        self._refused = bool(reasons)
+        if reasons:
+            raise UnsupportedError(f"cannot capture {self.component} (pid {self.pid}): {'; '.join(reasons)}", reasons)
 
     def _gone(self, error: ProcessGoneError) -> ProcessGoneError:
         """A process that executed another program is not the one that was protected."""

@@ -226,6 +226,39 @@ wait_for("go")
 """
 
 
+WAITS_IN_EPOLL = """
+import ctypes, os, select, sys
+libc, events = ctypes.CDLL(None, use_errno=True), ctypes.create_string_buffer(64)
+def step(name):
+    print(name, flush=True)
+    while not os.path.exists(os.path.join(sys.argv[1], "after " + name)):
+        libc.usleep(2000)
+step("ready")
+epoll = select.epoll()
+print("waits", flush=True)
+while not os.path.exists(os.path.join(sys.argv[1], "after waits")):
+    if libc.epoll_wait(epoll.fileno(), events, 1, 100) < 0:
+        print("interrupted", flush=True)
+epoll.close()
+step("closed")
+"""
+
+
+def test_a_program_that_was_refused_is_not_stopped_again_while_it_would_be_refused(tmp_path: Path) -> None:
+    with ended(start([sys.executable, "-c", WAITS_IN_EPOLL, tmp_path], tmp_path)) as program, protected(program) as session:
+        program.wait_for_line("ready")
+        session.capture(CaptureOrder(sequence=1))
+        (tmp_path / "after ready").touch()
+        program.wait_for_line("waits")
+        for sequence in range(2, 30):
+            with pytest.raises(UnsupportedError, match="epoll"):
+                session.capture(CaptureOrder(sequence=sequence))
+        (tmp_path / "after waits").touch()
+        program.wait_for_line("closed")
+        assert program.output.count("interrupted") <= 1
+        assert session.capture(CaptureOrder(sequence=30)).is_base
+
+
 def test_a_stopped_program_is_still_stopped_after_a_capture(compiled: Compiled, tmp_path: Path) -> None:
     with ended(start_tracee(compiled("refused", "-O2"), tmp_path, "nothing")) as tracee:
         os.kill(tracee.pid, signal.SIGSTOP)
