@@ -18,8 +18,8 @@ SIGNAL_BITS = 0x7F
 TRIES_MAX = 3
 """Takeovers that fail here before this robot leaves it alone."""
 
-PAUSE_PER_TRY = 10
-"""Of ``retry_ms``, before a takeover that failed is tried again."""
+PAUSES = (1, 10, 10)
+"""Of ``retry_ms``, before a takeover that failed is tried again: what was in the way once may be gone at once."""
 
 _WITH_PROCESS = frozenset({State.STARTING, State.TAKING_OVER, State.PRIMARY, State.FROZEN, State.HANDING_OVER, State.RECOVERING})
 
@@ -66,7 +66,7 @@ def cannot(component: Component, turn: Turn, why: str) -> None:
     component.unable, component.tries = why, component.tries + 1
     component.move(Cause.CANNOT)
     component.until_ns = turn.now_ns + turn.config.retry_ms * MS
-    component.retry_ns = turn.now_ns + PAUSE_PER_TRY * turn.config.retry_ms * MS
+    component.retry_ns = turn.now_ns + PAUSES[min(component.tries, len(PAUSES)) - 1] * turn.config.retry_ms * MS
     turn.order(acts.Stop(component.name, component.epoch))
     turn.say(component, f"{turn.me} {Cause.CANNOT}: {why}")
 
