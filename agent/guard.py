@@ -25,6 +25,7 @@ import struct
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Final
 
 import msgspec
@@ -54,6 +55,7 @@ from agent.guard_messages import (
 from agent.ward import Ward, WardError
 from checkpoint.channel import Channel, ChannelError, close_all
 from checkpoint.errors import CheckpointError
+from checkpoint.linux.address import address_of
 
 FIRST_CALL_S: Final = 30.0
 SEND_TIMEOUT_S: Final = 1.0
@@ -319,7 +321,8 @@ def _listen(path: str) -> socket.socket:
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
     before = os.umask(0o177)
     try:
-        listener.bind(path)
+        with address_of(Path(path)) as address:
+            listener.bind(address)
     finally:
         os.umask(before)
     listener.listen()

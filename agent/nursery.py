@@ -24,6 +24,7 @@ from agent.dialogue import Dialogue
 from agent.errors import GuardError, GuardLostError, KeeperLostError
 from agent.units import Kind, in_a_unit
 from checkpoint import channel
+from checkpoint.linux.address import address_of
 
 BIRTH_S: Final = 20.0
 """How long a guard may take until it listens; a tenth of a second is usual."""
@@ -242,7 +243,8 @@ def _guard_at(path: Path, end: socket.socket) -> GuardLink:
 def _call(path: Path) -> socket.socket:
     end = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
     try:
-        end.connect(str(path))
+        with address_of(path) as address:
+            end.connect(address)
     except OSError:
         end.close()
         raise
