@@ -56,7 +56,12 @@ class LanesProcess:
         ours.setblocking(False)
         command = [sys.executable, "-m", "agent.lanes", str(self._settings.path), str(theirs.fileno())]
         try:
-            self._child = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL)
+            self._child = subprocess.Popen(
+                command,
+                pass_fds=(theirs.fileno(),),
+                stdin=subprocess.DEVNULL,
+                process_group=0,  # a Ctrl-C at the terminal is the heart's to act on
+            )
         except OSError as error:
             raise AgentError(
                 f"cannot start the lanes process: {error.strerror}; is memory or the process limit used up?"

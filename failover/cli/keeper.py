@@ -42,6 +42,7 @@ class Keeper:
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stderr=complaints,
+                process_group=0,  # a Ctrl-C at the terminal is ours to act on
             )
         return cls(process, Channel(ours, Reply), complaints)
 

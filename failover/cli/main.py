@@ -6,11 +6,11 @@ import argparse
 import importlib
 import io
 import os
-import signal
 import sys
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from checkpoint import quiet
 from checkpoint.errors import CheckpointError
 from failover.cli import parser
 from failover.errors import AgentRefusedError, FailoverError, NoAgentError
@@ -22,15 +22,13 @@ NO_AGENT: Final = 3
 
 REASONS_SHOWN: Final = 8
 
-INTERRUPTED: Final = 128 + signal.SIGINT
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command line; returns its exit status. Errors are told on standard error, never as a traceback."""
     try:
         return _main(argv)
     except KeyboardInterrupt:
-        return INTERRUPTED
+        return quiet.INTERRUPTED
 
 
 def _main(argv: Sequence[str] | None) -> int:
@@ -40,7 +38,9 @@ def _main(argv: Sequence[str] | None) -> int:
     room = parser.build()
     arguments = room.parse_args(argv)
     try:
-        status = verb_function(arguments.function)(arguments)
+        verb = verb_function(arguments.function)
+        quiet.loaded()
+        status = verb(arguments)
         sys.stdout.flush()
         return status
     except NoAgentError as error:

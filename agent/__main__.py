@@ -1,0 +1,19 @@
+"""The entry of ``failover-agent``, see `agent.main`. Ctrl-C ends it quietly until the heart takes it for an orderly end."""
+
+from __future__ import annotations
+
+import sys
+
+from checkpoint import quiet
+
+
+def main() -> int:
+    """Load and run the daemon's command line."""
+    quiet.begin()
+    from agent.main import main as run
+
+    return run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,239 @@
+"""The keeper: the tracer's own process, ``python -m checkpoint keeper FD``, or ``keeper PATH``: it listens there.
+
+One thread serves one channel; requests and answers stand in `checkpoint.channel`. It follows at most one process. When its
+peer has gone it lets go of that process, which runs on, and ends; a restore that was not resumed by then ends with it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from checkpoint import chain, channel, engine, format
+from checkpoint.channel import Channel, ChannelClosedError, ChannelError, Failed, Reply, Request
+from checkpoint.engine import CaptureOrder, Engine, Restored, RestoreOptions, Session, Streams
+from checkpoint.errors import CaptureError, CheckpointError, RestoreError
+from checkpoint.linux.address import address_of
+from checkpoint.model import Snapshot
+
+USAGE: Final = "usage: python -m checkpoint keeper FD|PATH\n"
+CALL_S: Final = 30.0
+"""How long one that listens waits for its peer."""
+
+STREAM_DESCRIPTORS: Final = 5
+"""Counters, two outputs, two logs: what a message brings along for streams."""
+
+Descriptors = tuple[int, ...]
+Answer = tuple[Reply, Descriptors]
+
+
+class Keeper:
+    """Obeys one peer, one request at a time."""
+
+    def __init__(self, link: Channel[Request], tracer: Engine) -> None:
+        self._link = link
+        self._tracer = tracer
+        self._session: Session | None = None
+        self._restored: Restored | None = None
+        self._revived: tuple[channel.Restore, Streams | None] | None = None
+        self._robot = ""
+        self._verbs: dict[type[msgspec.Struct], Callable[..., Answer | None]] = {
+            channel.Probe: self._probe,
+            channel.Protect: self._protect,
+            channel.Capture: self._capture,
+            channel.Acknowledge: self._acknowledge,
+            channel.Restore: self._restore,
+            channel.Resume: self._resume,
+            channel.Release: self._release,
+        }
+
+    def serve(self) -> None:
+        """Answer until the peer hangs up; then let go."""
+        try:
+            while True:
+                self._serve_one()
+        except ChannelClosedError:
+            pass
+        finally:
+            self._let_go()
+
+    def _serve_one(self) -> None:
+        request, descriptors = self._link.receive()
+        try:
+            answer = self._verbs[type(request)](request, descriptors)
+        except CheckpointError as error:
+            answer = Failed(type(error).__name__, str(error), getattr(error, "reasons", ())), ()
+        if answer is None:
+            return
+        reply, carried = answer
+        try:
+            self._link.send(reply, carried)
+        finally:
+            channel.close_all(carried)
+
+    def _probe(self, request: channel.Probe, _: Descriptors) -> Answer:
+        return channel.Probed(self._tracer.probe(request.pid)), ()
+
+    def _protect(self, request: channel.Protect, descriptors: Descriptors) -> Answer:
+        if self._session is not None or self._restored is not None:
+            channel.close_all(descriptors)
+            raise CaptureError(f"cannot protect pid {request.pid}: this keeper follows another one already; start another")
+        self._robot = request.robot
+        streams = streams_of(descriptors) if request.streams else None
+        self._session = self._tracer.protect(request.pid, request.component, streams)
+        return channel.Protected(self._session.notes), ()
+
+    def _capture(self, request: channel.Capture, _: Descriptors) -> Answer:
+        session = self._following("capture")
+        order = CaptureOrder(request.base, request.generation, request.sequence, request.epoch, self._robot, request.hold)
+        snapshot = session.capture(order)
+        encoded, size = encoded_in_memory(snapshot)
+        answer = channel.Captured(
+            position=snapshot.position,
+            parent=snapshot.parent,
+            size=size,
+            freeze_us=snapshot.freeze_us,
+            dirty_bytes=len(snapshot.contents),
+            notes=snapshot.notes,
+            totals=session.totals,
+        )
+        return answer, (encoded,)
+
+    def _acknowledge(self, request: channel.Acknowledge, _: Descriptors) -> None:
+        if self._session is not None:
+            self._session.acknowledge(request.position)
+
+    def _restore(self, request: channel.Restore, descriptors: Descriptors) -> Answer:
+        files, ends = descriptors, None
+        if request.streams:
+            files, last = descriptors[:-STREAM_DESCRIPTORS], descriptors[-STREAM_DESCRIPTORS:]
+            ends = streams_of(last)
+        try:
+            if self._session is not None or self._restored is not None:
+                raise RestoreError(f"cannot restore into pid {request.pid}: this keeper follows a process already")
+            state = folded(files)
+        finally:
+            channel.close_all(files)
+        options = RestoreOptions(request.elapsed_ns, request.accept_changed, request.own_eyes)
+        self._restored = self._tracer.restore(request.pid, state, options)
+        self._revived = request, ends
+        return channel.Restored(self._restored.pid, self._restored.position, self._restored.notes), ()
+
+    def _resume(self, _: channel.Resume, __: Descriptors) -> Answer:
+        restored, revived = self._restored, self._revived
+        if restored is None or revived is None:
+            raise RestoreError("cannot resume: nothing was restored by this keeper")
+        self._restored = self._revived = None
+        restored.resume()
+        request, streams = revived
+        self._robot = request.robot
+        return channel.Resumed(self._follow(restored.pid, request.component, streams)), ()
+
+    def _follow(self, pid: int, component: str, streams: Streams | None) -> tuple[str, ...]:
+        """Protect what has just been let go; that it cannot be protected again must not end it."""
+        try:
+            self._session = self._tracer.protect(pid, component, streams)
+        except CheckpointError as error:
+            return (f"{channel.UNPROTECTED}: {error}",)
+        return self._session.notes
+
+    def _release(self, _: channel.Release, __: Descriptors) -> Answer:
+        self._let_go()
+        return channel.Released(), ()
+
+    def _following(self, verb: str) -> Session:
+        if self._session is None:
+            raise CaptureError(f"cannot {verb}: this keeper follows no process; protect one first")
+        return self._session
+
+    def _let_go(self) -> None:
+        session, self._session = self._session, None
+        self._restored = self._revived = None
+        if session is not None:
+            session.close()
+
+
+def streams_of(descriptors: Descriptors) -> Streams:
+    """The guard's ends of the standard streams, in the order of the message.
+
+    Raises:
+        ChannelError: too few or too many.
+    """
+    if len(descriptors) != STREAM_DESCRIPTORS:
+        channel.close_all(descriptors)
+        raise ChannelError(f"a request with streams brings {STREAM_DESCRIPTORS} descriptors, not {len(descriptors)}")
+    counters, first_output, second_output, first_log, second_log = descriptors
+    return Streams(counters, (first_output, second_output), (first_log, second_log))
+
+
+def encoded_in_memory(snapshot: Snapshot) -> tuple[int, int]:
+    """A sealed memory file with the snapshot encoded, ours to close, and its size in bytes."""
+    descriptor = os.memfd_create("snapshot", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    try:
+        with open(descriptor, "wb", buffering=0, closefd=False) as file:
+            size = format.encode(snapshot, file)
+        channel.seal(descriptor)
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor, size
+
+
+def folded(files: Descriptors) -> Snapshot:
+    """The base that a chain's files amount to.
+
+    Raises:
+        FormatError: one of them is damaged.
+        ChainError: they do not continue each other.
+    """
+    return chain.fold([format.decode(descriptor) for descriptor in files])
+
+
+def main(arguments: list[str]) -> int:
+    """Run a keeper on an inherited socket, or for whoever calls at a path."""
+    if len(arguments) != 2 or arguments[0] != "keeper":
+        sys.stderr.write(USAGE)
+        return 2
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # a Ctrl-C at the terminal is for our peer to act on
+    gc.disable()  # no collection inside a freeze; what a capture makes is freed by counting
+    try:
+        end = socket.socket(fileno=int(arguments[1])) if arguments[1].isdigit() else called_at(arguments[1])
+    except OSError as error:
+        sys.stderr.write(f"keeper: nobody to serve at {arguments[1]}: {error.strerror or error}\n")
+        return 1
+    link: Channel[Request] = Channel(end, Request)
+    Keeper(link, engine.engine_named("ptrace")).serve()
+    return 0
+
+
+def called_at(path: str) -> socket.socket:
+    """Listen at a path (0600) until somebody connects; nobody can afterwards.
+
+    Raises:
+        OSError: it cannot be listened there, or nobody came.
+    """
+    before = os.umask(0o177)
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC) as listener:
+            with address_of(Path(path)) as address:
+                listener.bind(address)
+            os.umask(before)
+            listener.listen(1)
+            listener.settimeout(CALL_S)
+            end, _ = listener.accept()
+    finally:
+        os.umask(before)
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(path)
+    end.settimeout(None)
+    return end

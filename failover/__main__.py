@@ -1,0 +1,19 @@
+"""The entry of the command ``failover``, see `failover.cli.main`."""
+
+from __future__ import annotations
+
+import sys
+
+from checkpoint import quiet
+
+
+def main() -> int:
+    """Load and run the command line."""
+    quiet.begin()
+    from failover.cli.main import main as run
+
+    return run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,51 @@
+"""Every command from its first instant: Ctrl-C while Python still loads it is no traceback."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from checkpoint import quiet
+
+BIN = Path(sys.executable).parent
+IMPORTS = [sys.executable, "-X", "importtime"]
+"""Says on standard error what has been imported, line by line."""
+
+ENTRIES = {
+    "failover": [*IMPORTS, str(BIN / "failover"), "status"],
+    "failover-agent": [*IMPORTS, str(BIN / "failover-agent"), "--config", "/dev/null"],
+    "python -m failover": [*IMPORTS, "-m", "failover", "status"],
+    "python -m agent": [*IMPORTS, "-m", "agent", "--config", "/dev/null"],
+    "python -m checkpoint": [*IMPORTS, "-m", "checkpoint", "keeper", "0"],
+}
+
+
+@pytest.mark.parametrize("later", [3, 20, 40])
+@pytest.mark.parametrize("entry", ENTRIES)
+def test_ctrl_c_while_a_command_loads_ends_it_quietly(entry: str, later: int) -> None:
+    with subprocess.Popen(ENTRIES[entry], stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True) as command:
+        assert command.stderr is not None
+        for line in command.stderr:
+            if line.endswith(" checkpoint.quiet\n"):
+                break
+        for _ in range(later):
+            assert "import time:" in command.stderr.readline(), "still loading"
+        command.send_signal(signal.SIGINT)
+        rest = command.stderr.read()
+    assert (command.returncode, "Traceback" in rest) == (quiet.INTERRUPTED, False), rest[-2000:]
+
+
+def test_an_interruption_that_was_to_be_ignored_stays_ignored() -> None:
+    script = "from signal import *\nfrom checkpoint import quiet\nquiet.begin()\nprint(getsignal(SIGINT) == SIG_IGN)"
+    ran = subprocess.run(
+        [sys.executable, "-c", script],
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert ran.stdout == "True\n"
