@@ -17,6 +17,7 @@ from agent.caller import Caller, caller_of
 from agent.errors import AgentError, RefusedError
 from agent.mistake import end_lanes_on_mistake
 from checkpoint.errors import UNDECODABLE, CheckpointError
+from checkpoint.linux.address import address_of
 from failover.client.control import LENGTH, MESSAGE_LIMIT, Output, Refused, Reply, Request, Result, Update
 from failover.errors import FailoverError
 
@@ -79,7 +80,8 @@ class ControlServer:
         try:
             before = os.umask(0o177)
             try:
-                self._server = await asyncio.start_unix_server(self._connected, str(self._path))
+                with address_of(self._path) as address:
+                    self._server = await asyncio.start_unix_server(self._connected, address)
             finally:
                 os.umask(before)
             if self._group:
@@ -90,8 +92,7 @@ class ControlServer:
         except KeyError as error:
             raise AgentError(f"group = {self._group!r}: this system has no such group; make it, or leave it empty") from error
         except OSError as error:
-            why = error.strerror or error  # a path that is too long has no errno
-            raise AgentError(f"cannot listen on {self._path}: {why}; name another runtime_directory") from error
+            raise AgentError(f"cannot listen on {self._path}: {error.strerror}; name another runtime_directory") from error
 
     async def close(self) -> None:
         """Hang up on everybody and remove the socket."""
@@ -109,20 +110,23 @@ class ControlServer:
         self._clients.add(task)
         task.add_done_callback(self._clients.discard)
         task.add_done_callback(end_lanes_on_mistake)
-        connection = writer.get_extra_info("socket")
-        conversation = Conversation(writer, caller_of(connection))
         try:
-            if len(self._clients) > CLIENTS_LIMIT:
-                await conversation.reply(Refused("RefusedError", f"{CLIENTS_LIMIT} clients are connected; close some"))
-                return
-            while (request := await _request(reader)) is not None:
-                await self._serve(request, conversation, reader)
+            caller = caller_of(writer.get_extra_info("socket"))
+            await self._converse(reader, Conversation(writer, caller))
         except (ConnectionError, asyncio.IncompleteReadError, asyncio.CancelledError):
             pass  # the client has gone, or the agent ends; the request goes with it, the component does not
-        except RefusedError as refusal:
-            await conversation.reply(Refused(refusal.kind, str(refusal)))
         finally:
             writer.close()
+
+    async def _converse(self, reader: asyncio.StreamReader, conversation: Conversation) -> None:
+        """Request after request, until the client closes or says what is none."""
+        try:
+            if len(self._clients) > CLIENTS_LIMIT:
+                raise RefusedError(f"{CLIENTS_LIMIT} clients are connected; close some")
+            while (request := await _request(reader)) is not None:
+                await self._serve(request, conversation, reader)
+        except RefusedError as refusal:
+            await conversation.reply(Refused(refusal.kind, str(refusal)))
 
     async def _serve(self, request: Request, conversation: Conversation, reader: asyncio.StreamReader) -> None:
         """Work on one request; a client that hangs up in the middle ends it."""
