@@ -25,6 +25,10 @@ class AgentRefusedError(FailoverError):
         self.reasons = reasons
 
 
+class RequestError(FailoverError):
+    """What the agent is to be asked cannot be said to it."""
+
+
 class LostAgentError(FailoverError):
     """The agent went away in the middle of an answer."""
 

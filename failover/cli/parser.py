@@ -105,11 +105,15 @@ def _name(room: argparse.ArgumentParser) -> None:
     room.add_argument("name", metavar="NAME", help="the component's name, as failover status shows it")
 
 
+NUMBER_MAX: Final = (1 << 31) - 1
+"""What a PID can be at most."""
+
+
 def positive(text: str) -> int:
     """A whole number above zero, as a PID or a period is."""
-    number = int(text) if text.isdecimal() else 0
-    if number <= 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above zero")
+    number = int(text) if text.isdecimal() and len(text) <= len(str(NUMBER_MAX)) else 0
+    if not 0 < number <= NUMBER_MAX:
+        raise argparse.ArgumentTypeError(f"{text[:40]!r} is not a whole number above zero, or too large a one")
     return number
 
 

@@ -33,12 +33,13 @@ import socket
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import msgspec
 
 from checkpoint.errors import UNDECODABLE
-from failover.errors import AgentRefusedError, LostAgentError, NoAgentError
+from checkpoint.linux.address import address_of
+from failover.errors import AgentRefusedError, LostAgentError, NoAgentError, RequestError
 
 STATUS: Final = """
 robot, team, role, pid, lanes_pid, version: of this agent; life: count of its starts
@@ -86,8 +87,8 @@ class Update(msgspec.Struct, frozen=True, tag="update"):
 class Output(msgspec.Struct, frozen=True, tag="output"):
     """Bytes that the component wrote; ``stream`` 1 or 2, ``offset`` of the first byte in the whole stream."""
 
-    stream: int
-    offset: int
+    stream: Annotated[int, msgspec.Meta(ge=1, le=2)]
+    offset: Annotated[int, msgspec.Meta(ge=0)]
     content: bytes
 
 
@@ -106,6 +107,14 @@ class Refused(msgspec.Struct, frozen=True, tag="refused"):
 
 
 Reply = Update | Output | Result | Refused
+
+
+class Answer(dict[str, Any]):
+    """A result's value; what an agent of another version left out is an error in words."""
+
+    def __missing__(self, key: str) -> Any:
+        raise LostAgentError(f"the agent's answer has no {key!r}; agent and command are of different versions: restart the agent")
+
 
 _encoder = msgspec.msgpack.Encoder()
 _reply_decoder: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
@@ -139,7 +148,8 @@ class Control:
         link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
         link.settimeout(CONNECT_TIMEOUT_S)
         try:
-            link.connect(str(path))
+            with address_of(path) as address:
+                link.connect(address)
         except OSError as error:
             link.close()
             raise NoAgentError(_why_not(path, error)) from error
@@ -155,7 +165,7 @@ class Control:
         """
         for reply in self.stream(verb, **arguments):
             if isinstance(reply, Result):
-                return reply.value
+                return Answer(reply.value)
         raise LostAgentError(f"the agent at {self._path} ended its answer to {verb} without a result; see its log")
 
     def stream(self, verb: str, **arguments: Any) -> Iterator[Update | Output | Result]:
@@ -163,8 +173,9 @@ class Control:
 
         Raises:
             AgentRefusedError, LostAgentError: as for `ask`.
+            RequestError: it cannot be said.
         """
-        self._send(_encoder.encode(Request(verb, arguments)))
+        self._send(_encoded(Request(verb, arguments)))
         while True:
             reply = self._receive(verb)
             if isinstance(reply, Refused):
@@ -214,6 +225,21 @@ class Control:
                 raise LostAgentError(f"the agent at {self._path} went away during {verb}; components run on, see failover status")
             parts += part
         return bytes(parts)
+
+
+def _encoded(request: Request) -> bytes:
+    try:
+        body = _encoder.encode(request)
+    except (UnicodeEncodeError, OverflowError) as error:
+        odd = error.object[:ODD_SHOWN] if isinstance(error, UnicodeEncodeError) else "so large a number"
+        raise RequestError(f"cannot ask for {request.verb}: {odd!r} is not UTF-8 text, so it cannot be sent") from error
+    if len(body) > MESSAGE_LIMIT:
+        raise RequestError(f"cannot ask for {request.verb}: {len(body)} bytes of arguments are over the limit of {MESSAGE_LIMIT}")
+    return body
+
+
+ODD_SHOWN: Final = 60
+"""Characters of a text that cannot be sent, in the message about it."""
 
 
 def _why_not(path: Path, error: OSError) -> str:

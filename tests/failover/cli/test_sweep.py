@@ -1,0 +1,102 @@
+"""Every verb given what it cannot use: a sentence and an exit status, as JSON one object, never anything else."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from failover.cli import main, parser
+
+UNDER_AN_AGENT = {
+    "run": ["--", "/bin/true"],
+    "protect": ["1"],
+    "release": ["x"],
+    "stop": ["x"],
+    "logs": ["x"],
+    "status": [],
+    "why": [],
+    "handover": ["x"],
+    "failback": ["x"],
+    "prefer": ["x", "y"],
+}
+FILES = ("missing", "directory", "empty", "junk", "sparse", "/dev/null", "/dev/zero", "/proc/self/mem", "x" * 300, "locked")
+NO_PIDS = ("0", "-1", "me", "99999999999999999999")
+TEAMS = (["show"], ["enrol", "a/b", "h"], ["enrol", "r", "h:99999"], ["create", "x", "--directory", "/proc/1/team"])
+USAGE = (
+    *(["bogus"], [], ["status", "--bogus"], ["status", "--every-ms", "x"], ["completion", "x"], ["team"]),
+    ["stop", "x", "--signal", "?"],
+    *(["check", pid] for pid in NO_PIDS),
+    *(["protect", pid] for pid in NO_PIDS),
+)
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "directory").mkdir()
+    (tmp_path / "empty").touch()
+    (tmp_path / "junk").write_bytes(os.urandom(9_000))
+    (tmp_path / "locked").touch(mode=0)
+    with (tmp_path / "sparse").open("wb") as file:
+        file.truncate(1 << 40)
+
+
+def told(capsys: pytest.CaptureFixture[str], *argv: str) -> int:
+    """Run it twice, as text and as JSON; the exit status, the same of both."""
+    statuses = []
+    for asked in ([], ["--json"]):
+        verb, rest = argv[:1], argv[1:]
+        statuses.append(main.main([*verb, *asked, *rest] if verb != ("team",) else [*argv, *asked]))
+        said = capsys.readouterr()
+        if asked:
+            assert said.err == ""
+            assert set(json.loads(said.out)) >= {"error", "message", "reasons"}
+        else:
+            assert said.out == ""
+            assert said.err.startswith("failover: ")
+            assert len(said.err.splitlines()[0]) > 20, "a sentence"
+    assert statuses[0] == statuses[1]
+    return statuses[0]
+
+
+@pytest.mark.parametrize("at", ["nowhere", "junk", "directory"])
+@pytest.mark.parametrize("verb", UNDER_AN_AGENT)
+def test_without_an_agent(verb: str, at: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert told(capsys, verb, "--socket", at, *UNDER_AN_AGENT[verb]) == main.NO_AGENT
+
+
+@pytest.mark.parametrize("file", FILES)
+@pytest.mark.parametrize("verb", ["restore", "inspect"])
+def test_with_a_file_that_is_no_snapshot(verb: str, file: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert told(capsys, verb, file) == main.FAILED
+
+
+def test_with_a_process_that_cannot_be_captured(capsys: pytest.CaptureFixture[str]) -> None:
+    zombie = os.posix_spawn("/bin/true", ["true"], {})
+    os.waitid(os.P_PID, zombie, os.WEXITED | os.WNOWAIT)
+    for pid in (str(zombie), "2147483647"):
+        assert told(capsys, "capture", pid, "-o", "out") == main.FAILED
+        assert not Path("out").exists()
+    os.waitpid(zombie, 0)
+
+
+@pytest.mark.parametrize("act", TEAMS, ids=" ".join)
+def test_with_a_team_that_cannot_be(act: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    directory = [] if "--directory" in act else ["--directory", "directory"]
+    assert told(capsys, "team", *act, *directory) == main.FAILED
+
+
+@pytest.mark.parametrize("argv", USAGE, ids=" ".join)
+def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main.main(argv)
+    assert ended.value.code == main.USAGE
+    assert "error: " in capsys.readouterr().err
+
+
+def test_the_sweep_leaves_no_verb_out() -> None:
+    swept = {*UNDER_AN_AGENT, "restore", "inspect", "capture", "check", "team", "completion"}
+    assert set(parser.verbs()) - swept == {"demo"}
