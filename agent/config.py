@@ -15,7 +15,7 @@ from failover.client import strict_toml
 from failover.client import team as team_directory
 from failover.client.team import Robot, Team
 from failover.core.names import check_component
-from failover.core.types import BEATS_IN_LEASE_MIN
+from failover.core.types import BEAT_MS_MAX, BEATS_IN_LEASE_MIN, PERIOD_MS_MAX
 from failover.errors import FailoverError, NameFormatError
 
 
@@ -80,16 +80,20 @@ class Config:
         Raises:
             ValueError: says which; the reader adds file and line.
         """
-        if self.beat_ms < 1:
-            raise ValueError(f"beat_ms is {self.beat_ms}; it must be at least 1")
+        if not 1 <= self.beat_ms <= BEAT_MS_MAX:
+            raise ValueError(f"beat_ms is {self.beat_ms}; it must be at least 1 and at most {BEAT_MS_MAX}")
         if self.lease_ms < BEATS_IN_LEASE_MIN * self.beat_ms:
             least = BEATS_IN_LEASE_MIN * self.beat_ms
             raise ValueError(
                 f"lease_ms is {self.lease_ms}: one lost beat would count as a death; with beat_ms {self.beat_ms} "
                 f"give at least {least}"
             )
-        if self.snapshot_period_ms < 1:
-            raise ValueError("snapshot_period_ms must be at least 1")
+        if not 1 <= self.snapshot_period_ms <= PERIOD_MS_MAX:
+            raise ValueError(
+                f"snapshot_period_ms is {self.snapshot_period_ms}; it must be at least 1 and at most {PERIOD_MS_MAX}"
+            )
+        if self.link_mbit_s < 0:
+            raise ValueError(f"link_mbit_s is {self.link_mbit_s}; 0 means no cap")
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,5 +163,7 @@ def _check_components(path: Path, config: Config, members: Team) -> None:
             if robot not in ("", *members.robots):
                 known = ", ".join(sorted(members.robots))
                 raise ConfigError(f"{where}: {key} = {robot!r}: the team knows {known}")
-        if component.snapshot_period_ms < 0:
-            raise ConfigError(f"{where}: snapshot_period_ms is {component.snapshot_period_ms}; 0 means the agent's own")
+        if not 0 <= component.snapshot_period_ms <= PERIOD_MS_MAX:
+            raise ConfigError(
+                f"{where}: snapshot_period_ms is {component.snapshot_period_ms}; at most {PERIOD_MS_MAX}; 0 means the agent's own"
+            )

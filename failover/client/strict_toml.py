@@ -20,6 +20,7 @@ T = TypeVar("T")
 SIZE_LIMIT: Final = 1 << 20
 """Bytes; no configuration of ours comes near."""
 
+_WORD = re.compile(r"^\w+")
 _MSGSPEC_PATH = re.compile(r" - at `\$(?P<path>[^`]*)`$")
 _KEY = re.compile(r"""^\s*(?:"(?P<quoted>[^"]+)"|'(?P<literal>[^']+)'|(?P<bare>[\w\-.]+))\s*=""")
 _TABLE = re.compile(r"^\s*\[\[?(?P<path>[^\]]+)\]\]?")
@@ -100,7 +101,8 @@ def _wrong_value(path: Path, text: str, message: str) -> str:
     found = _MSGSPEC_PATH.search(message)
     keys = tuple(part for part in re.split(r"[.\[\]]+", found["path"]) if part and part != "...") if found else ()
     said = message[: found.start()] if found else message
-    line = line_of(text, keys) if keys else 1
+    named = keys or tuple(_WORD.findall(said)[:1])  # what a file refuses itself for begins with the key
+    line = line_of(text, named) if named else 1
     return f"{path}:{line}: {'.'.join(keys) + ': ' if keys else ''}{said}"
 
 

@@ -19,19 +19,22 @@ from pathlib import Path
 from typing import Final, Literal
 
 from failover.client import strict_toml
-from failover.errors import TeamFileError
+from failover.core import names
+from failover.errors import NameFormatError, TeamFileError
 
 Role = Literal["robot"]
 """Servers (they store and vote) and witnesses (they vote) are not offered yet; the key stands in team files for them."""
 
 TEAM_FILE: Final = "team.toml"
 KEY_CHARACTERS: Final = 40
+Z85: Final = "0123456789abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ.-:+=^!/*?&<>()[]{}@%$#"
 DEFAULT_BEAT_PORT: Final = 7420
 DEFAULT_BULK_PORT: Final = 7421
 ROBOT_LIMIT: Final = 64
 """Robots of one team: each beats to each, so the traffic grows with the square."""
 
-_NAME = re.compile(r"^[^\s/:\x00-\x1f\"\\.]{1,64}$")
+_ODD = re.compile(r"[:\"\\.]")
+"""Not in a robot's name: it is the name of a file, a word of TOML, and stands before addresses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,14 +86,29 @@ def check_robot(where: str, name: str, robot: Robot) -> None:
     Raises:
         TeamFileError: says which and why.
     """
-    if not _NAME.match(name):
-        raise TeamFileError(f'{where}: {name!r} cannot name a robot: 1 to 64 characters without space, / : . " or \\')
+    try:
+        names.check_robot(name)
+    except NameFormatError as error:
+        raise TeamFileError(f"{where}: {error}") from error
+    if _ODD.search(name):
+        raise TeamFileError(f'{where}: {name!r} cannot name a robot: it holds one of : . " and \\')
     if not robot.beats:
         raise TeamFileError(f"{where}: robot {name} has no beat address; give at least one host:port")
     for address in (*robot.beats, robot.bulk):
         split_address(address, f"{where}: robot {name}")
     if robot.public_key and len(robot.public_key) != KEY_CHARACTERS:
         raise TeamFileError(f"{where}: the public key of {name} has {len(robot.public_key)} characters, not {KEY_CHARACTERS}")
+    if not _is_z85(robot.public_key):
+        raise TeamFileError(f"{where}: the public key of {name} is not Z85: copy it again, every character of it")
+
+
+def _is_z85(text: str) -> bool:
+    """Whether groups of five characters are numbers of four bytes each. Source: rfc.zeromq.org/spec/32."""
+    digits = [Z85.find(character) for character in text]
+    values = (
+        sum(digit * 85 ** (4 - place) for place, digit in enumerate(digits[at : at + 5])) for at in range(0, len(digits), 5)
+    )
+    return -1 not in digits and all(value < 1 << 32 for value in values)
 
 
 def split_address(address: str, where: str) -> tuple[str, int]:

@@ -134,7 +134,7 @@ class Rules:
     standby: str = ""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.period_ms <= 3_600_000:
+        if not 1 <= self.period_ms <= PERIOD_MS_MAX:
             raise RulesError(f"period_ms = {self.period_ms}: a capture period lies between 1 ms and an hour")
         if not 0 <= self.crash_limit <= 100:
             raise RulesError(f"crash_limit = {self.crash_limit}: choose between 0 and 100")
@@ -192,7 +192,7 @@ class Config:
     restore_ms: int = 60_000
 
     def __post_init__(self) -> None:
-        if not 1 <= self.beat_ms <= 10_000:
+        if not 1 <= self.beat_ms <= BEAT_MS_MAX:
             raise RulesError(f"beat_ms = {self.beat_ms}: beats lie between 1 ms and 10 s apart")
         if self.lease_ms < BEATS_IN_LEASE_MIN * self.beat_ms:
             raise RulesError(
@@ -226,6 +226,9 @@ class Config:
         """How long a peer that was never heard in this life may be on its way; never less than the loyalty."""
         return max(self.grace_ms * MS, self.loyalty_ns)
 
+
+BEAT_MS_MAX = 10_000
+PERIOD_MS_MAX = 3_600_000
 
 BEATS_IN_LEASE_MIN = 4
 """Three beats may be lost in a row before anybody acts on it."""

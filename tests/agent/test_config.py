@@ -12,6 +12,7 @@ import pytest
 from agent import config as configuration
 from agent.config import ComponentConfig, Config
 from agent.errors import ConfigError
+from agent.transport import new_keys
 from failover.client import team
 from failover.client.team import Robot, Team
 
@@ -60,6 +61,11 @@ def test_a_whole_configuration_is_read(directory: Path) -> None:
         (('when_alone = "panic"',), 4, "Invalid enum value 'panic'"),
         (('rule = "majority"',), 4, "unknown key 'rule'"),
         (("keep_chains = 2",), 4, "unknown key 'keep_chains'"),
+        (("# fine", "beat_ms = 0"), 5, "must be at least 1"),
+        (("beat_ms = 100_000",), 4, "at most 10000"),
+        (("beat_ms = 100", "lease_ms = 200"), 5, "one lost beat would count as a death"),
+        (("# fine", "snapshot_period_ms = 0"), 5, "must be at least 1"),
+        (("link_mbit_s = -1",), 4, "0 means no cap"),
         (('[components."mapper"]', 'on_loss = "hold"'), 4, "mapper"),
         (('[components."/lab/a"]', 'prefer = "robot7"'), 4, "the team knows robot1, robot2"),
         (('[components."/lab/a"]', 'on_lost = "hold"'), 5, "did you mean 'on_loss'"),
@@ -112,3 +118,27 @@ def test_a_secret_key_that_others_can_read_is_refused(directory: Path) -> None:
     path.write_text(f'robot = "robot1"\nteam_directory = "{directory / "team"}"\n')
     with pytest.raises(ConfigError, match="chmod 600"):
         configuration.load(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "said"),
+    [
+        ("robot2", "x" * 39, "has 39 characters, not 40"),
+        ("robot2", "☃" * 40, "is not Z85"),
+        ("robot2", "#" * 40, "is not Z85"),
+        ("r" * 64, "", "cannot name a robot"),
+        ("ř" * 32, "", "cannot name a robot"),
+        ("two words", "", "cannot name a robot"),
+        ("a.b", "", "it holds one of"),
+    ],
+)
+def test_a_robot_that_no_other_could_hear_or_let_in_is_refused(directory: Path, name: str, key: str, said: str) -> None:
+    odd = Robot(ROBOT.beats, ROBOT.bulk, "robot", key)
+    team.write(directory / "team", Team("lab", {"robot1": ROBOT, name: odd}))
+    with pytest.raises(ConfigError, match=said):
+        configuration.load(written(directory))
+
+
+def test_every_key_that_is_made_is_a_key(directory: Path) -> None:
+    for _ in range(20):
+        team.enrol(Team("lab"), "robot1", Robot(ROBOT.beats, ROBOT.bulk, "robot", new_keys()[0]))
