@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from agent.component import Places, log_directory
 from agent.outflow import Outflow
+from agent.places import Places, log_directory
 from agent.streams import OutputLogs
 from failover.core.types import State
 
@@ -24,6 +24,7 @@ class Listener:
 
     def __init__(self) -> None:
         self.heard = b""
+        self.caller = SimpleNamespace(uid=0)
 
     async def output(self, _stream: int, _offset: int, content: bytes) -> None:
         self.heard += content
