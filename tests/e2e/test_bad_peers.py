@@ -172,6 +172,7 @@ def another_secret(robot: RobotMachine) -> Iterator[None]:
     right.rename(path)
 
 
+@pytest.mark.root  # an agent is started again inside its robot
 def test_a_peer_with_another_key_is_refused_in_words_at_both_robots(pair: Pair) -> None:
     first, second = pair
     with another_secret(second):
@@ -183,6 +184,7 @@ def test_a_peer_with_another_key_is_refused_in_words_at_both_robots(pair: Pair) 
     robots.start_agent(second)
 
 
+@pytest.mark.root  # an agent is started again inside its robot
 def test_a_peer_of_another_version_is_refused_in_words_at_both_robots(pair: Pair, tmp_path: Path) -> None:
     first, second = pair
     (tmp_path / "sitecustomize.py").write_text(OTHER_VERSION)
