@@ -13,12 +13,12 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from checkpoint import pages
 from checkpoint.errors import ChainError
+from checkpoint.gathering import gathered
 from checkpoint.model import OutputPiece, Position, Snapshot
-from checkpoint.pages import PageMap, Words
+from checkpoint.pages import PageMap
 from checkpoint.state import state_digest
 from checkpoint.validity import STREAMS, place
 
@@ -103,7 +103,7 @@ def fold(chain: Sequence[Snapshot]) -> Snapshot:
     newest = chain[-1]
     page_size = newest.machine.page_size
     sources = _newest_sources(chain, page_size)
-    contents = _gathered(chain, sources, page_size)
+    contents = gathered([snapshot.contents for snapshot in chain], sources, page_size)
     check_state(newest, pages.sum_of(pages.digest_pages(contents, sources.addresses, page_size)))
     return replace(
         newest,
@@ -148,31 +148,6 @@ def _newest_sources(chain: Sequence[Snapshot], page_size: int) -> PageMap:
         kept, _ = state.without(pages.extents(snapshot.vmas), pages.extents(snapshot.cleared))
         state, _ = kept.overlaid(addresses, places)
     return state
-
-
-def _gathered(chain: Sequence[Snapshot], sources: PageMap, page_size: int) -> memoryview:
-    """The content of every page, in address order: neighbours from one snapshot at once, and uncopied if that is all."""
-    carried = [np.frombuffer(snapshot.contents, dtype=np.uint8) for snapshot in chain]
-    stretches = _stretches(sources.words)
-    if len(stretches) == 1:
-        _, (index, page), count = stretches[0]
-        return carried[index][page * page_size : (page + count) * page_size].data.toreadonly()
-    gathered = np.empty(len(sources.addresses) * page_size, dtype=np.uint8)
-    for target, (index, page), count in stretches:
-        start = page * page_size
-        gathered[target * page_size : (target + count) * page_size] = carried[index][start : start + count * page_size]
-    return gathered.data.toreadonly()
-
-
-def _stretches(places: Words) -> list[tuple[int, tuple[int, int], int]]:
-    """Where places follow one another: (index of the first, its place, how many)."""
-    if not len(places):
-        return []
-    follows: NDArray[np.bool_] = (places[1:, 0] == places[:-1, 0]) & (places[1:, 1] == places[:-1, 1] + np.uint64(1))
-    firsts = np.flatnonzero(np.concatenate(([True], ~follows)))
-    counts = np.diff(np.append(firsts, len(places)))
-    sources = map(tuple, places[firsts].tolist())
-    return list(zip(firsts.tolist(), sources, counts.tolist(), strict=True))
 
 
 def _joined_output(chain: Sequence[Snapshot]) -> tuple[OutputPiece, ...]:

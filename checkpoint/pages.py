@@ -57,22 +57,31 @@ def page_runs(pages: Words) -> tuple[PageRun, ...]:
 
 def union(left: Words, right: Words) -> Words:
     """Pages of either set."""
+    if not len(right):
+        return left
+    if not len(left):
+        return right
     return _combined(left, right, np.logical_or)
 
 
 def intersection(left: Words, right: Words) -> Words:
     """Pages of both sets."""
+    if not len(left) or not len(right):
+        return left[:0]
     return _combined(left, right, np.logical_and)
 
 
 def difference(left: Words, right: Words) -> Words:
     """Pages of ``left`` that are not in ``right``."""
+    if not len(left) or not len(right):
+        return left
     return _combined(left, right, np.greater)
 
 
 def _combined(left: Words, right: Words, rule: Callable[[Flags, Flags], Flags]) -> Words:
     """Walk over every boundary of both sets; an extent opens and closes where the rule's answer changes."""
-    points = np.unique(np.concatenate((left.ravel(), right.ravel())))
+    points = np.concatenate((left.ravel(), right.ravel()))
+    points.sort()  # a boundary of both stands twice: the second one changes nothing
     inside = rule(covered(left, points), covered(right, points))
     before = np.concatenate(([False], inside[:-1]))
     return np.stack((points[inside & ~before], points[~inside & before]), axis=1)

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 FLOORS = ("checkpoint", "failover", "agent")
 
 PURE_FILES = (
-    *(f"checkpoint/{name}.py" for name in ("errors", "model", "pages", "layout", "state", "validity", "chain")),
+    *(f"checkpoint/{name}.py" for name in ("errors", "model", "pages", "layout", "state", "validity", "chain", "gathering")),
     "failover/core/",
 )
 """Here nothing opens, asks the time, rolls dice or waits: values in, values out."""

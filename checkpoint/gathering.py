@@ -1,0 +1,68 @@
+"""One buffer out of several copies of pages: each page once, from the newest copy that has it. Arithmetic, no system call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from checkpoint import pages
+from checkpoint.pages import Buffer, Flags, PageMap, Words
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Copy:
+    """A set of pages and their bytes, as they were at one moment.
+
+    Attributes:
+        content: of ``pages``, in address order.
+    """
+
+    pages: Words
+    content: Buffer
+
+
+def newest(copies: Sequence[Copy], page_size: int) -> PageMap:
+    """For every page of any copy where its newest content lies: (index of the copy, index of the page there)."""
+    found = PageMap.empty()
+    for index, copy in enumerate(copies):
+        addresses = pages.addresses_of(copy.pages, page_size)
+        places = np.empty((len(addresses), 2), dtype=np.uint64)
+        places[:, 0] = index
+        places[:, 1] = np.arange(len(addresses))
+        found, _ = found.overlaid(addresses, places)
+    return found
+
+
+def are_zero(copies: Sequence[Copy], sources: PageMap, page_size: int) -> Flags:
+    """For each page of ``sources`` whether all its bytes are zero."""
+    zero: Flags = np.zeros(len(sources.addresses), dtype=np.bool_)
+    for index, copy in enumerate(copies):
+        if len(copy.pages):
+            from_here = sources.words[:, 0] == np.uint64(index)
+            zero[from_here] = pages.zero_pages(copy.content, page_size)[sources.words[from_here, 1]]
+    return zero
+
+
+def gathered(contents: Sequence[Buffer], sources: PageMap, page_size: int) -> memoryview:
+    """The content of every page, in address order: neighbours from one copy are copied at once."""
+    carried = [memoryview(content).cast("B") for content in contents]
+    buffer = np.empty(len(sources.addresses) * page_size, dtype=np.uint8)
+    target = buffer.data
+    for first, (index, page), count in _stretches(sources.words):
+        begin, start, size = first * page_size, page * page_size, count * page_size
+        target[begin : begin + size] = carried[index][start : start + size]
+    return target.toreadonly()
+
+
+def _stretches(places: Words) -> list[tuple[int, tuple[int, int], int]]:
+    """Where places follow one another: (index of the first, its place, how many)."""
+    if not len(places):
+        return []
+    follows: NDArray[np.bool_] = (places[1:, 0] == places[:-1, 0]) & (places[1:, 1] == places[:-1, 1] + np.uint64(1))
+    firsts = np.flatnonzero(np.concatenate(([True], ~follows)))
+    counts = np.diff(np.append(firsts, len(places)))
+    sources = map(tuple, places[firsts].tolist())
+    return list(zip(firsts.tolist(), sources, counts.tolist(), strict=True))
