@@ -25,6 +25,8 @@ class DigestTracker:
     """Reads everything that exists and compares digests. Needs nothing of the kernel."""
 
     name = "digest"
+    sees_every_write = False
+    scans_running = False
 
     def __init__(self, pid: int) -> None:
         self._memory = Memory(pid)
@@ -42,6 +44,14 @@ class DigestTracker:
         digests = digests_of(self._memory, existing)
         before, self._known = self._known, PageMap(addresses, digests)
         return compared(before, self._known)
+
+    def backlog(self, lines: Sequence[MapsLine], limit: int, *, changed: bool) -> int:
+        """See `Tracker.backlog`."""
+        raise NotImplementedError("a look costs a pass over the memory")
+
+    def catch_up(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
+        """See `Tracker.catch_up`."""
+        raise NotImplementedError("a look costs a pass over the memory")
 
     def existing(self, lines: Sequence[MapsLine]) -> Words:
         """See `Tracker.existing`."""

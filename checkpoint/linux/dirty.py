@@ -29,6 +29,8 @@ class SoftDirtyTracker:
     """The soft-dirty bit: cleared for the whole process, set by the kernel with the first write and in every new mapping."""
 
     name = "soft-dirty"
+    sees_every_write = True
+    scans_running = False
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
@@ -49,6 +51,14 @@ class SoftDirtyTracker:
         self._existed = existing
         self._clear()
         return Scan(pages.union(pages.intersection(dirty, existing), fresh), gone)
+
+    def backlog(self, lines: Sequence[MapsLine], limit: int, *, changed: bool) -> int:
+        """See `Tracker.backlog`."""
+        raise NotImplementedError("clearing is a step of its own, and what is written before it would be lost")
+
+    def catch_up(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
+        """See `Tracker.catch_up`."""
+        raise NotImplementedError("clearing is a step of its own, and what is written before it would be lost")
 
     def existing(self, lines: Sequence[MapsLine]) -> Words:
         """See `Tracker.existing`."""

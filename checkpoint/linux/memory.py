@@ -75,44 +75,58 @@ class Memory:
             ProcessGoneError: the process has ended.
             CaptureError: one of them is not mapped.
         """
-        ranges = extents.copy()
-        ranges[:, 1] -= ranges[:, 0]
-        size = int(ranges[:, 1].sum())
+        size = int((extents[:, 1] - extents[:, 0]).sum())
         if buffer is None or len(buffer) < size:
             buffer = bytearray(size)
-        if not size:
-            return buffer
+        self.read_pages_into(extents, buffer)
+        return buffer
+
+    def read_pages_into(self, extents: Ranges, buffer: bytearray | memoryview) -> None:
+        """As `read_pages`, into a buffer that is long enough."""
+        if not len(extents):
+            return
+        ranges = extents.copy()
+        ranges[:, 1] -= ranges[:, 0]
         try:
             self.read_into(ranges, buffer)
         except ProcessGoneError:
             raise
         except CaptureError:
             self._peek_into(ranges, memoryview(buffer))
-        return buffer
 
     def readable_pages(self, extents: Ranges) -> tuple[Ranges, bytearray]:
-        """The pages of a set that can be read just now, as extents, and their bytes.
+        """The pages of a set that can be read just now, as extents, and their bytes. Raises as `readable_pages_into`."""
+        buffer = bytearray(pages.total_size(extents))
+        readable = self.readable_pages_into(extents, memoryview(buffer))
+        size = pages.total_size(readable)
+        return readable, buffer if size == len(buffer) else buffer[:size]
+
+    def readable_pages_into(self, extents: Ranges, buffer: memoryview) -> Ranges:
+        """Fill a buffer, as long as the whole set, with those of its pages that can be read just now: which.
 
         Raises:
             ProcessGoneError: the process has ended.
         """
         try:
-            return extents, self.read_pages(extents)
+            self.read_pages_into(extents, buffer)
         except ProcessGoneError:
             raise
         except CaptureError:
-            pass  # one of them cannot be read: find out which
-        kept, content = [], bytearray()
+            return self._read_singly(extents, buffer)
+        return extents
+
+    def _read_singly(self, extents: Ranges, buffer: memoryview) -> Ranges:
+        kept: list[int] = []
         for address in pages.addresses_of(extents, abi.PAGE_SIZE).tolist():
             page = np.array([[address, address + abi.PAGE_SIZE]], dtype=np.uint64)
             try:
-                content += self.read_pages(page)
+                self.read_pages_into(page, buffer[len(kept) * abi.PAGE_SIZE :])
             except ProcessGoneError:
                 raise
             except CaptureError:
                 continue
             kept.append(address)
-        return pages.extents_of_addresses(np.array(kept, dtype=np.uint64), abi.PAGE_SIZE), content
+        return pages.extents_of_addresses(np.array(kept, dtype=np.uint64), abi.PAGE_SIZE)
 
     def _peek_into(self, ranges: Ranges, buffer: memoryview) -> None:
         """Read whatever the protection says, through ``/proc/PID/mem``."""

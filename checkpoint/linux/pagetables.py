@@ -62,12 +62,50 @@ class PageScanner:
         """Pages written since they were last protected, and holes that never were; all are protected again.
 
         With exactly this mask the kernel takes its fast path.
+
+        Raises:
+            MappingLostError: a mapping is not protected (any more); what was found until then is lost.
         """
+        self._ask_for_written(abi.PM_SCAN_CHECK_WPASYNC | abi.PM_SCAN_WP_MATCHING)
+        return pages_joined(self._collect(ranges)[:, :2])
+
+    def written_where_protected(self, ranges: Words) -> tuple[Words, Words]:
+        """As `written`, of a process that runs and may unmap anything under our hands.
+
+        Returns:
+            What was written, and the ranges in which a mapping was not protected (any more): a part of such a range may have been
+            protected again without being told.
+        """
+        self._ask_for_written(abi.PM_SCAN_CHECK_WPASYNC | abi.PM_SCAN_WP_MATCHING)
+        refused: list[list[int]] = []
+        found = pages_joined(self._collect(ranges, refused)[:, :2])
+        return found, pages_joined(np.array(refused, dtype=np.uint64).reshape(-1, 2))
+
+    def written_count(self, ranges: Words, limit: int) -> int:
+        """How many pages `written` would find, counted no further than ``limit``; nothing is protected."""
+        self._ask_for_written(0)
+        count = 0
+        try:
+            for start, end in ranges.tolist():
+                count += self._counted(start, end, limit - count)
+                if count >= limit:
+                    break
+        finally:
+            self._order.max_pages = 0
+        return count
+
+    def _counted(self, start: int, end: int, limit: int) -> int:
         order = self._order
-        order.flags = abi.PM_SCAN_CHECK_WPASYNC | abi.PM_SCAN_WP_MATCHING
+        order.start, order.end, order.max_pages = start, end, limit
+        regions = abi.ioctl(self._pagemap, abi.PAGEMAP_SCAN, ctypes.addressof(order))
+        if regions < 0:
+            self._refused("count written")
+        return pages.total_size(self._regions[: max(regions, 0), :2]) // abi.PAGE_SIZE
+
+    def _ask_for_written(self, flags: int) -> None:
+        order = self._order
+        order.flags, order.return_mask = flags, abi.PAGE_IS_WRITTEN
         order.category_mask, order.category_inverted, order.category_anyof_mask = abi.PAGE_IS_WRITTEN, 0, 0
-        order.return_mask = abi.PAGE_IS_WRITTEN
-        return self._collect(ranges)[:, :2]
 
     def existing(self, ranges: Words, *, own: bool = True) -> Words:
         """Pages present or swapped out, but guards, which look as if they were swapped out.
@@ -105,15 +143,24 @@ class PageScanner:
         order.category_mask = order.return_mask = category
         return int(abi.ioctl(self._pagemap, abi.PAGEMAP_SCAN, ctypes.addressof(order))) >= 0
 
-    def _collect(self, ranges: Words) -> Words:
+    def _collect(self, ranges: Words, refused: list[list[int]] | None = None) -> Words:
+        """Every region that the kernel tells of.
+
+        Args:
+            refused: takes the ranges that are not protected, instead of an error.
+        """
         order, found = self._order, []
+        place = ctypes.addressof(order)
         for start, end in ranges.tolist():
             order.end = end
             while start < end:
                 order.start = start
-                count = abi.ioctl(self._pagemap, abi.PAGEMAP_SCAN, ctypes.addressof(order))
+                count = abi.ioctl(self._pagemap, abi.PAGEMAP_SCAN, place)
                 if count < 0:
                     self._refused("scan")
+                    if refused is not None:
+                        refused.append([start, end])
+                        break
                     raise MappingLostError(
                         f"cannot find written pages of pid {self._pid}: a mapping lost its protection; capture it again"
                     )

@@ -18,7 +18,8 @@ from checkpoint.errors import MapsFormatError, ProbeError, ProcessGoneError
 from checkpoint.linux import abi
 
 DELETED: Final = " (deleted)"
-READ_SIZE: Final = 1 << 20
+READ_SIZE: Final = 1 << 15
+"""Bytes asked for at once: more than the kernel gives of most files, and less than what is allocated page by page."""
 
 
 def read_bytes(pid: int, name: str) -> bytes:
@@ -284,8 +285,9 @@ def signal_sets(text: bytes) -> tuple[int, int, int]:
 
 def swapped_size(pid: int) -> int:
     """Bytes of a process that are swapped out."""
-    fields = parse_fields(read_text(pid, "status"))
-    return int((fields.get("VmSwap") or "0 kB").split()[0]) * 1024
+    text = read_bytes(pid, "status")
+    begin = text.find(b"\nVmSwap:")
+    return int(text[begin + len(b"\nVmSwap:") :].split(maxsplit=1)[0]) * 1024 if begin >= 0 else 0
 
 
 def status(pid: int) -> Status:

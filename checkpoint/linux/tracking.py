@@ -35,9 +35,17 @@ class Scan:
 
 
 class Tracker(Protocol):
-    """Finds written pages."""
+    """Finds written pages.
+
+    Attributes:
+        sees_every_write: a page that was changed and changed back counts as written. Otherwise a copy that was made between two
+            scans is of no use.
+        scans_running: `backlog` and `catch_up` are there.
+    """
 
     name: str
+    sees_every_write: bool
+    scans_running: bool
 
     def arm(self, lines: Sequence[MapsLine]) -> None:
         """Begin to follow: whatever is written from now on is in the next scan. The process may run."""
@@ -49,6 +57,17 @@ class Tracker(Protocol):
         Args:
             lines: every private mapping that is followed, in address order.
             changed: whether the lines differ from those of the last call.
+        """
+        ...
+
+    def backlog(self, lines: Sequence[MapsLine], limit: int, *, changed: bool) -> int:
+        """How many pages the next scan would find, about, and counted no further than ``limit``; the process may run."""
+        ...
+
+    def catch_up(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
+        """As `scan`, while the process runs: what is written from now on, also during the call, is in the next scan.
+
+        A page that is read after the call is as it will be found, unless the next scan names it as written or cleared.
         """
         ...
 

@@ -5,7 +5,6 @@ Source: Documentation/admin-guide/mm/userfaultfd.rst, pagemap.rst.
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import os
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ import numpy as np
 
 from checkpoint import pages
 from checkpoint.linux import abi
-from checkpoint.linux.pagetables import MappingLostError, PageScanner, pages_joined
+from checkpoint.linux.pagetables import PageScanner, pages_joined
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.tracking import NONE, Scan, extents_of
 from checkpoint.pages import Words
@@ -26,6 +25,9 @@ WINDOW: Final = 2 << 20
 """Larger ones are protected in windows of what one page table covers."""
 LONG_RUN: Final = 16 * abi.PAGE_SIZE
 """A written run longer than this is looked at for holes before it is read: reading a hole makes the kernel fill it."""
+
+SMALL_GAP: Final = 64 * abi.PAGE_SIZE
+"""Extents that are no farther apart are looked at together."""
 
 
 def windows_of(line: MapsLine, existing: Words) -> Words:
@@ -52,6 +54,8 @@ class PagemapTracker:
     """
 
     name = "pagemap"
+    sees_every_write = True
+    scans_running = True
 
     def __init__(self, pid: int, faults: int) -> None:
         self._faults = faults
@@ -60,7 +64,7 @@ class PagemapTracker:
         self._tracked: Words = NONE
         self._spans: list[tuple[int, int]] = []
         self._open: Words = NONE
-        self._protect: Words = NONE
+        self._doubtful: Words = NONE
         self._files: Words = NONE
         self._owned: Words = NONE
         self._stubborn: set[tuple[int, int]] = set()
@@ -69,16 +73,37 @@ class PagemapTracker:
     def arm(self, lines: Sequence[MapsLine]) -> None:
         """See `Tracker.arm`. A mapping that goes or comes meanwhile is found fresh by the scan."""
         self._stubborn.clear()
+        self._armed = self._doubtful = NONE
         for line in lines:
             self._register(line)
-        existing = self._scanner.existing(extents_of(lines))
-        with contextlib.suppress(MappingLostError):
-            self._protect_windows(lines, existing)
+        self._protect_windows(lines, self._scanner.existing(extents_of(lines)))
         self._learn(lines)
         self._owned = pages.intersection(self._scanner.existing(self._files), self._files)
 
     def scan(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
         """See `Tracker.scan`."""
+        return self._found(lines, changed=changed, is_running=False)
+
+    def catch_up(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
+        """See `Tracker.catch_up`.
+
+        1. Protection is renewed before it is looked which pages exist: one that comes or is written later is in the next scan.
+        2. A mapping that goes, or is put in the place of another one, loses its registration: the next scan finds it fresh.
+        3. One that does so in the middle of the scan makes the kernel break off, and pages before it may have been protected
+           without being told: they are ``_doubtful``, and the next scan finds them whatever was written.
+        """
+        return self._found(lines, changed=changed, is_running=True)
+
+    def backlog(self, lines: Sequence[MapsLine], limit: int, *, changed: bool) -> int:
+        """See `Tracker.backlog`."""
+        if changed:
+            self._learn(lines)
+        count = self._scanner.written_count(self._armed, limit)
+        if count < limit and len(self._open):
+            count += pages.total_size(self._scanner.existing(self._open)) // abi.PAGE_SIZE
+        return min(count, limit)
+
+    def _found(self, lines: Sequence[MapsLine], *, changed: bool, is_running: bool) -> Scan:
         if changed:
             self._learn(lines)
         fresh = [
@@ -90,25 +115,37 @@ class PagemapTracker:
         cleared, copied = extents_of(fresh), NONE
         if fresh:
             self._armed = pages.difference(self._armed, cleared)
-            copied = self._fresh(fresh)
+            copied = self._fresh(fresh, is_running=is_running)
             self._learn(lines)
-            written = self._scanner.written(pages.difference(self._protect, cleared))
-        else:
-            written = self._scanner.written(self._protect)
+        doubtful, self._doubtful = self._doubtful, NONE
+        written = self._written(pages.difference(self._armed, cleared), lines, is_running=is_running)
         if len(self._open):
-            appeared = self._scanner.existing(self._open)
-            if len(appeared):
-                copied = pages.union(copied, appeared)
-                self._protect_windows(lines, appeared)
-                self._learn(lines)
-        written, emptied = self._sift(written)
-        if len(copied):
-            written = pages.union(written, copied)
-        if len(given_back := self._given_back(written)):
-            emptied = pages.union(emptied, given_back)
-        if len(emptied):
-            cleared = pages.union(cleared, emptied)
-        return Scan(written, cleared)
+            appeared = self._appeared(lines, is_running=is_running)
+            copied = pages.union(copied, appeared)
+        if len(doubtful):
+            cleared = pages.union(cleared, doubtful)
+            copied = pages.union(copied, self._scanner.existing(doubtful))
+        written, emptied = self._sift(written, copied)
+        return Scan(written, pages.union(cleared, emptied))
+
+    def _written(self, ranges: Words, lines: Sequence[MapsLine], *, is_running: bool) -> Words:
+        """Written pages of what is protected; while the process runs, mapping by mapping, so that only a lost one is in doubt."""
+        if not is_running:
+            return self._scanner.written(ranges)
+        parts = [_within(ranges, line) for line in lines]
+        found, refused = self._scanner.written_where_protected(np.concatenate(parts)) if parts else (NONE, NONE)
+        self._doubtful = pages.union(self._doubtful, refused)
+        return found
+
+    def _appeared(self, lines: Sequence[MapsLine], *, is_running: bool) -> Words:
+        """Pages that have come where nothing was protected; from now on their surroundings are."""
+        appeared = self._scanner.existing(self._open)
+        if not len(appeared):
+            return NONE
+        before = self._open
+        self._protect_windows(lines, appeared)
+        self._learn(lines)
+        return self._scanner.existing(before) if is_running else appeared
 
     def existing(self, lines: Sequence[MapsLine]) -> Words:
         """See `Tracker.existing`."""
@@ -125,7 +162,7 @@ class PagemapTracker:
         self._tracked = extents_of(followed)
         self._armed = pages.intersection(self._armed, self._tracked)
         self._open = pages.difference(self._tracked, self._armed)
-        self._protect = self._armed
+        self._doubtful = pages.intersection(self._doubtful, self._tracked)
         self._files = extents_of([line for line in followed if line.has_file])
         self._spans = [(int(start), int(end)) for start, end in extents_of(lines).tolist()]
 
@@ -133,25 +170,34 @@ class PagemapTracker:
         inside = (line for line in lines if start <= line.start and line.end <= end)
         return [line for line in inside if not self._scanner.is_protected(line.start, line.end)]
 
-    def _fresh(self, lines: Sequence[MapsLine]) -> Words:
-        """Register mappings and protect them: what exists in them."""
+    def _fresh(self, lines: Sequence[MapsLine], *, is_running: bool) -> Words:
+        """Register mappings and protect them: what exists in them.
+
+        Args:
+            is_running: one that cannot be registered may be gone, and what exists is looked for once more.
+        """
         for line in lines:
-            if not self._register(line):
+            if not self._register(line) and not is_running:
                 self._stubborn.add((line.start, line.end))
-        existing = self._scanner.existing(extents_of(lines))
+        everywhere = extents_of(lines)
+        existing = self._scanner.existing(everywhere)
         self._protect_windows([line for line in lines if (line.start, line.end) not in self._stubborn], existing)
-        return existing
+        return self._scanner.existing(everywhere) if is_running else existing
 
     def _protect_windows(self, lines: Sequence[MapsLine], existing: Words) -> None:
+        """Protect what is worth it and is not protected yet: what was written there since the scan began must stay known.
+
+        Where a mapping has gone meanwhile nothing is protected, and the next scan finds out.
+        """
         parts = [
             windows_of(line, _inside(existing, line))
             for line in lines
             if line.size <= WHOLE_WINDOW or len(_inside(existing, line))
         ]
         if parts:
-            windows = pages_joined(np.concatenate(parts))
+            windows = pages.difference(pages_joined(np.concatenate(parts)), self._armed)
+            self._scanner.written_where_protected(windows)
             self._armed = pages.union(self._armed, windows)
-            self._scanner.written(windows)
 
     def _register(self, line: MapsLine) -> bool:
         """Register a mapping, and forget what an earlier registration has marked; whether the kernel agreed.
@@ -166,33 +212,31 @@ class PagemapTracker:
         unmark = abi.UffdWriteProtect(line.start, line.size, 0)
         return int(abi.ioctl(self._faults, abi.UFFDIO_WRITEPROTECT, ctypes.addressof(unmark))) == 0
 
-    def _given_back(self, written: Words) -> Words:
-        """Private copies of a file's pages that the program has dropped (MADV_DONTNEED): the file shows again.
+    def _sift(self, written: Words, copied: Words) -> tuple[Words, Words]:
+        """Tell pages that hold something from holes and from a file's own: (to read, to clear).
 
-        The kernel leaves such a page protected (zap_install_uffd_wp_if_needed() in mm/memory.c), so that no scan tells.
+        Private copies of a file's pages that the program has dropped (MADV_DONTNEED) are looked for by name, for the file shows
+        again: the kernel leaves such a page protected (zap_install_uffd_wp_if_needed() in mm/memory.c), so that no scan tells.
+
+        Args:
+            copied: exist, and are to be read in any case.
         """
-        if not len(self._files):
-            return NONE
-        now = self._scanner.existing(self._owned)
-        gone = pages.difference(self._owned, now)
-        came = written[touching(written, self._files)]
-        if len(came) or len(gone):
-            self._owned = pages.union(now, pages.intersection(came, self._files))
-        return gone
-
-    def _sift(self, written: Words) -> tuple[Words, Words]:
-        """Tell pages that hold something from holes and from a file's own: (to read, to clear)."""
-        if not len(written):
-            return NONE, NONE
         is_doubtful = (written[:, 1] - written[:, 0]) > LONG_RUN
         if len(self._files):
             is_doubtful |= touching(written, self._files)
-        doubtful = written[is_doubtful]
-        if not len(doubtful):
-            return written, NONE
-        real = self._scanner.existing(doubtful)
+        doubtful = pages.union(written[is_doubtful], self._owned)
+        real = self._scanner.existing(surroundings_of(doubtful))
         empty = pages.difference(doubtful, real)
-        return pages.difference(written, empty), empty
+        self._owned = pages.intersection(pages.union(real, copied), self._files)
+        return pages.union(pages.difference(written, empty), copied), empty
+
+
+def surroundings_of(extents: Words) -> Words:
+    """The same set with its small gaps: a few pages more cost less than a call more."""
+    if len(extents) < 2:
+        return extents
+    apart = extents[1:, 0] > extents[:-1, 1] + np.uint64(SMALL_GAP)
+    return np.stack((extents[np.concatenate(([True], apart)), 0], extents[np.concatenate((apart, [True])), 1]), axis=1)
 
 
 def touching(extents: Words, others: Words) -> pages.Flags:
@@ -207,6 +251,12 @@ def _inside(existing: Words, line: MapsLine) -> Words:
     first = np.searchsorted(existing[:, 1], np.uint64(line.start), side="right")
     last = np.searchsorted(existing[:, 0], np.uint64(line.end), side="left")
     return existing[first:last]
+
+
+def _within(ranges: Words, line: MapsLine) -> Words:
+    """The parts of a set that lie in a mapping."""
+    found = _inside(ranges, line)
+    return np.clip(found, np.uint64(line.start), np.uint64(line.end)) if len(found) else NONE
 
 
 def enable_write_protection(faults: int) -> None:

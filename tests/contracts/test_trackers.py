@@ -23,7 +23,7 @@ from checkpoint.linux.dirty import SoftDirtyTracker
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.pagetables import PageScanner
 from checkpoint.linux.procfs import MapsLine, MapsReader
-from checkpoint.linux.tracking import Scan, Tracker, extents_of
+from checkpoint.linux.tracking import NONE, Scan, Tracker, extents_of
 from checkpoint.linux.write_protection import PagemapTracker
 
 PAGE = abi.PAGE_SIZE
@@ -37,6 +37,8 @@ libc.mmap.restype = ctypes.c_void_p
 libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, ctypes.c_long]
 for name in ("madvise", "mprotect"):
     getattr(libc, name).argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
+libc.mremap.restype = ctypes.c_void_p
+libc.mremap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_size_t, ctypes.c_int, ctypes.c_void_p]
 libc.munmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t]
 count = int(sys.argv[1])
 hole = libc.mmap(None, (count + 2) * 4096, 0, 0x22, -1, 0)
@@ -62,6 +64,12 @@ for order in sys.stdin:
         continue
     elif verb == "again":
         libc.munmap(place, count * 4096); make()
+    elif verb == "replace":
+        assert libc.mmap(place + first * 4096, size * 4096, 3, 0x32, -1, 0) == place + first * 4096
+    elif verb == "swap":
+        away = libc.mmap(None, 4096, 3, 0x22, -1, 0)
+        for old, new in ((place + first * 4096, away), (place + size * 4096, place + first * 4096), (away, place + size * 4096)):
+            assert libc.mremap(old, 4096, 4096, 3, new) == new
     elif verb == "seal":
         libc.mprotect(place, count * 4096, 1)
     elif verb == "open":
@@ -93,6 +101,13 @@ class Child:
         """Look, at its mapping alone."""
         changed = self.maps.refresh()
         return self.tracker.scan(self.lines(), changed=changed)
+
+    def catch_up(self) -> Scan:
+        """As `scan`, the way it is done while the process runs; skips the test where the tracker has no such way."""
+        if not self.tracker.scans_running:
+            pytest.skip(f"{self.tracker.name} does not scan a process that runs")
+        changed = self.maps.refresh()
+        return self.tracker.catch_up(self.lines(), changed=changed)
 
     def lines(self) -> list[MapsLine]:
         """The lines of its mapping."""
@@ -214,6 +229,110 @@ def test_a_page_that_is_sealed_after_the_write_is_reported(child: Child) -> None
 
 def test_existing_pages_are_those_with_content(child: Child) -> None:
     assert child.numbers(child.tracker.existing(child.lines())) == set(range(10))
+
+
+# Scans of a process that runs
+
+
+def test_a_running_scan_reports_once_and_the_next_scan_only_what_came_later(child: Child) -> None:
+    child.order("write 3 4")
+    assert child.numbers(child.catch_up().written) == {3, 4, 5, 6}
+    child.order("write 5")
+    child.order("write 100")
+    assert child.numbers(child.scan().written) == {5, 100}
+    assert child.numbers(child.catch_up().written) == set()
+
+
+def test_the_backlog_is_what_a_scan_would_find_and_takes_nothing_away(child: Child) -> None:
+    if not child.tracker.scans_running:
+        pytest.skip(f"{child.tracker.name} does not scan a process that runs")
+    assert child.tracker.backlog(child.lines(), 50, changed=False) == 0
+    child.order("write 3 4")
+    assert child.tracker.backlog(child.lines(), 50, changed=False) == 4
+    assert child.tracker.backlog(child.lines(), 2, changed=False) == 2
+    assert child.numbers(child.scan().written) == {3, 4, 5, 6}
+
+
+def test_pages_forgotten_after_a_running_scan_are_told_by_the_next(child: Child) -> None:
+    child.order("write 2 4")
+    assert child.numbers(child.catch_up().written) == {2, 3, 4, 5}
+    child.order("forget 3 2")
+    found = child.scan()
+    assert {3, 4} <= child.numbers(found.written) | child.numbers(found.cleared)
+
+
+def test_a_mapping_replaced_after_a_running_scan_is_fresh_to_the_next(child: Child) -> None:
+    child.order("write 2 4")
+    child.catch_up()
+    child.order("again")
+    child.order("write 4")
+    found = child.scan()
+    assert 4 in child.numbers(found.written)
+    assert set(range(10)) <= child.numbers(found.cleared)
+
+
+def test_pages_that_change_places_after_a_running_scan_are_told_by_the_next(child: Child) -> None:
+    child.catch_up()
+    child.order("swap 2 7")
+    assert {2, 7} <= child.numbers(child.scan().written)
+
+
+def test_a_running_scan_follows_a_mapping_that_was_replaced(child: Child) -> None:
+    child.order("again")
+    child.order("write 4 2")
+    found = child.catch_up()
+    assert {4, 5} <= child.numbers(found.written) and set(range(10)) <= child.numbers(found.cleared)
+    child.order("write 5")
+    assert child.numbers(child.scan().written) == {5}
+
+
+@pytest.mark.parametrize("child", ["pagemap"], indirect=True)
+def test_what_a_scan_that_broke_off_may_have_protected_is_told_by_the_next(child: Child, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A part of the mapping is replaced between the check of its registration and the scan: pages before it have been scanned."""
+    child.order("write 3 4")
+    scanned = PageScanner.written_where_protected
+
+    def replaced_meanwhile(self: PageScanner, ranges: pages.Words) -> tuple[pages.Words, pages.Words]:
+        monkeypatch.undo()
+        child.order("replace 200 10")
+        _, refused = scanned(self, ranges)
+        assert len(refused), "the kernel refuses a mapping that is not registered"
+        return NONE, refused  # what was found before the kernel broke off is nothing that it promises to tell
+
+    monkeypatch.setattr(PageScanner, "written_where_protected", replaced_meanwhile)
+    told = child.numbers(child.catch_up().written)
+    told |= child.numbers(child.scan().written)
+    assert {3, 4, 5, 6} <= told
+    child.order("write 8")
+    child.scan()
+    child.order("write 9")
+    assert child.numbers(child.scan().written) == {9}
+
+
+@pytest.mark.parametrize("child", ["pagemap"], indirect=True)
+def test_what_is_written_while_newcomers_are_protected_is_told_by_the_next(child: Child, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page written between the scan and the protection of windows around others is not protected along with them."""
+    monkeypatch.setattr(write_protection, "WHOLE_WINDOW", PAGE)  # as if the mapping were too large to be protected whole
+    monkeypatch.setattr(write_protection, "WINDOW", 16 * PAGE)
+    tracker, first = child.tracker, -(child.place // PAGE) % 16
+    child.order("forget 0 10")
+    child.order(f"write {first + 20}")
+    tracker.arm(child.lines())
+    tracker.scan(child.lines(), changed=True)
+    looked = PageScanner.existing
+
+    def written_meanwhile(self: PageScanner, ranges: pages.Words, *, own: bool = True) -> pages.Words:
+        monkeypatch.undo()
+        monkeypatch.setattr(write_protection, "WHOLE_WINDOW", PAGE)
+        monkeypatch.setattr(write_protection, "WINDOW", 16 * PAGE)
+        child.order(f"write {first + 20}")
+        return looked(self, ranges, own=own)
+
+    child.order(f"write {first}")
+    child.order(f"write {first + 32}")
+    monkeypatch.setattr(PageScanner, "existing", written_meanwhile)
+    assert {first, first + 32} <= child.numbers(tracker.catch_up(child.lines(), changed=False).written)
+    assert first + 20 in child.numbers(tracker.scan(child.lines(), changed=False).written)
 
 
 def test_large_mappings_are_protected_around_what_exists() -> None:
