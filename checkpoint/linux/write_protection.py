@@ -26,6 +26,8 @@ WINDOW: Final = 2 << 20
 LONG_RUN: Final = 16 * abi.PAGE_SIZE
 """A written run longer than this is looked at for holes before it is read: reading a hole makes the kernel fill it."""
 
+NOWHERE: Final = 1 << 20
+"""An address below all that programs have. A mapping there would be registered, which it is in any case."""
 SMALL_GAP: Final = 64 * abi.PAGE_SIZE
 """Extents that are no farther apart are looked at together."""
 
@@ -79,6 +81,7 @@ class PagemapTracker:
         self._protect_windows(lines, self._scanner.existing(extents_of(lines)))
         self._learn(lines)
         self._owned = pages.intersection(self._scanner.existing(self._files), self._files)
+        self._let_writers_finish()
 
     def scan(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
         """See `Tracker.scan`."""
@@ -92,7 +95,19 @@ class PagemapTracker:
         3. One that does so in the middle of the scan makes the kernel break off, and pages before it may have been protected
            without being told: they are ``_doubtful``, and the next scan finds them whatever was written.
         """
-        return self._found(lines, changed=changed, is_running=True)
+        scan = self._found(lines, changed=changed, is_running=True)
+        self._let_writers_finish()
+        return scan
+
+    def _let_writers_finish(self) -> None:
+        """Wait until what the kernel is writing for the process has landed, for it may have looked at the protection before us.
+
+        access_remote_vm() in mm/memory.c, behind /proc/self/mem, makes a page writable and copies to it afterwards, past the page
+        tables, and holds the lock of the mappings meanwhile. userfaultfd_register() takes that lock alone, also for a place where
+        nothing is mapped, before it says so.
+        """
+        nowhere = abi.UffdRegister(NOWHERE, abi.PAGE_SIZE, abi.UFFDIO_REGISTER_MODE_WP, 0)
+        abi.ioctl(self._faults, abi.UFFDIO_REGISTER, ctypes.addressof(nowhere))
 
     def backlog(self, lines: Sequence[MapsLine], limit: int, *, changed: bool) -> int:
         """See `Tracker.backlog`."""

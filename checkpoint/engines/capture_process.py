@@ -1,0 +1,68 @@
+"""A captured process and its thread in the model's words: from what it told while it stood still, and /proc while it runs on."""
+
+from __future__ import annotations
+
+import os
+
+from checkpoint.arch import x86_64 as arch
+from checkpoint.engines import description
+from checkpoint.engines.identities import Identities
+from checkpoint.engines.standing import Standing
+from checkpoint.linux import abi, procfs
+from checkpoint.model import ProcessState, ThreadState
+
+
+def thread_state(pid: int, standing: Standing) -> ThreadState:
+    """Its one thread."""
+    place, told, stat, status = standing.place, standing.told, standing.stat, standing.status
+    return ThreadState(
+        tid=status.pids[-1],
+        name=status.name,
+        registers={"prstatus": arch.encode_registers(standing.settled), "xstate": standing.xstate},
+        signal_mask=place.mask,
+        pending=place.pending,
+        altstack=told.altstack,
+        robust_list=told.robust_list,
+        clear_tid=told.clear_tid,
+        rseq=place.rseq,
+        policy=description.policy(pid),
+        priority=stat.priority,
+        nice=stat.nice,
+        io_priority=abi.io_priority(pid),
+        affinity=description.affinity(pid),
+        timer_slack_ns=told.timer_slack_ns,
+        interrupted=standing.interrupted,
+    )
+
+
+def process_state(pid: int, standing: Standing, identities: Identities) -> ProcessState:
+    """The process as a whole."""
+    status, told = standing.status, standing.told
+    return ProcessState(
+        pid=status.pids[-1],
+        ppid=status.ppid if len(status.pids) == 1 else 0,
+        pgid=status.pgids[-1] if status.pgids else 0,
+        sid=status.sids[-1] if status.sids else 0,
+        executable=identities.executable(),
+        arguments=tuple(os.fsdecode(procfs.read_bytes(pid, "cmdline")).split("\0")[:-1]),
+        layout=description.layout(standing.stat, told, procfs.read_bytes(pid, "auxv")),
+        working_directory=procfs.read_link(pid, "cwd"),
+        root_directory=procfs.read_link(pid, "root"),
+        umask=status.umask,
+        credentials=description.credentials(status, told),
+        personality=int(procfs.read_text(pid, "personality"), 16),
+        limits=procfs.limits(pid),
+        oom_score_adj=int(procfs.read_text(pid, "oom_score_adj")),
+        dumpable=told.dumpable,
+        keep_caps=told.keep_caps,
+        child_subreaper=told.child_subreaper,
+        parent_death_signal=told.parent_death_signal,
+        thp_disabled=told.thp_disabled,
+        switches=told.switches,
+        coredump_filter=description.coredump_filter(pid),
+        signal_actions=told.actions,
+        pending=standing.place.shared_pending,
+        interval_timers=told.interval_timers,
+        posix_timers=told.posix_timers,
+        isolated=len(status.pids) > 1,
+    )

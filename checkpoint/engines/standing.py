@@ -1,0 +1,141 @@
+"""What a process is asked while it stands still, besides its memory: read unparsed as far as that can wait until it runs."""
+
+from __future__ import annotations
+
+import functools
+import os
+from dataclasses import dataclass
+from typing import Final
+
+from checkpoint.arch import x86_64 as arch
+from checkpoint.engines.entering import Entered, where_it_stands
+from checkpoint.engines.inquiry import Inquiry, Told, rearmed
+from checkpoint.engines.outputs import Outputs, Totals
+from checkpoint.errors import CaptureError
+from checkpoint.linux import procfs
+from checkpoint.linux.procfs import Stat, Status
+from checkpoint.linux.remote import Answers
+from checkpoint.linux.timers import parse_timers
+from checkpoint.linux.tracee import Tracee
+from checkpoint.model import Rseq
+from checkpoint.resources import OpenFile, gather, with_contents
+
+NOTHING_WRITTEN: Final[Totals] = (0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the thread stands.
+
+    Attributes:
+        registers: that it is given back.
+        special: signals with an action of their own, bit 0 is signal 1.
+    """
+
+    registers: arch.Registers
+    mask: int
+    special: int
+    pending: tuple[bytes, ...]
+    shared_pending: tuple[bytes, ...]
+    rseq: Rseq | None
+    status_text: bytes
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Everything that was asked; nothing in it needs the process any more.
+
+    Attributes:
+        waiting: signals that were pending after the process had been asked.
+        totals: see `Outputs.totals`.
+    """
+
+    place: Place
+    xstate: bytes
+    settled: arch.Registers
+    interrupted: str
+    stat_text: bytes
+    inquiry: Inquiry
+    answers: Answers
+    waiting: tuple[bytes, ...]
+    opened: tuple[OpenFile, ...]
+    totals: Totals
+
+    @functools.cached_property
+    def told(self) -> Told:
+        """What it said about itself."""
+        before = (*self.place.pending, *self.place.shared_pending)
+        return rearmed(self.inquiry.read(self.answers), before, self.waiting)
+
+    @functools.cached_property
+    def status(self) -> Status:
+        """Its /proc/PID/status."""
+        return procfs.parse_status(os.fsdecode(self.place.status_text))
+
+    @functools.cached_property
+    def stat(self) -> Stat:
+        """Its /proc/PID/stat."""
+        return procfs.parse_stat(os.fsdecode(self.stat_text))
+
+
+class Onlooker:
+    """Asks one process, again and again; the questions stay the same while its signals and timers do."""
+
+    def __init__(self, tracee: Tracee, entered: Entered) -> None:
+        self._tracee = tracee
+        self._borrowed = entered.pages
+        self._interruption = entered.interruption
+        self._inquiry: Inquiry | None = None
+        self._inquiry_key: tuple[int, bytes] = (0, b"")
+
+    def prepare(self) -> None:
+        """Do what the first look would do for the first time, while the program runs."""
+        if self._inquiry is None:
+            special, _, _ = procfs.signal_sets(procfs.read_bytes(self._tracee.pid, "status"))
+            self._questions(special)
+            with_contents(gather(self._tracee.pid))
+
+    def place(self) -> Place:
+        """Where it stands, before anything else is asked.
+
+        Raises:
+            CaptureError: it has not left the code of an earlier look yet.
+        """
+        tracee = self._tracee
+        status = procfs.read_bytes(tracee.pid, "status")
+        special, waits_here, waits_shared = procfs.signal_sets(status)
+        pending = tracee.pending(shared=False) if waits_here else ()
+        shared_pending = tracee.pending(shared=True) if waits_shared else ()
+        mask, rseq = tracee.signal_mask(), tracee.rseq()
+        registers = where_it_stands(tracee, mask, (*pending, *shared_pending), rseq)
+        if self._borrowed.holds(registers[arch.INSTRUCTION_POINTER]):
+            raise CaptureError(f"pid {tracee.pid} still stands in code of an earlier look; capture it again in a moment")
+        return Place(registers, mask, special, pending, shared_pending, rseq, status)
+
+    def ask(self, place: Place, outputs: Outputs | None) -> Standing:
+        """Everything else. Its system calls are made inside the process: the memory has been taken before."""
+        tracee = self._tracee
+        inquiry = self._questions(place.special)
+        answers = self._borrowed.run(tracee, inquiry.batch, arch.encode_registers(place.registers), place.mask)
+        waiting = (*tracee.pending(shared=False), *tracee.pending(shared=True))
+        settled, interrupted = self._interruption.settled(place.registers)
+        return Standing(
+            place=place,
+            xstate=tracee.xstate(),
+            settled=settled,
+            interrupted=interrupted,
+            stat_text=procfs.read_bytes(tracee.pid, "stat"),
+            inquiry=inquiry,
+            answers=answers,
+            waiting=waiting,
+            opened=with_contents(gather(tracee.pid)),
+            totals=outputs.totals() if outputs else NOTHING_WRITTEN,
+        )
+
+    def _questions(self, special: int) -> Inquiry:
+        timers = procfs.read_bytes(self._tracee.pid, "timers")
+        key = (special, timers)
+        if self._inquiry is None or self._inquiry_key != key:
+            lines = parse_timers(os.fsdecode(timers)) if timers else ()
+            self._inquiry, self._inquiry_key = Inquiry(self._borrowed.table, special, lines), key
+        return self._inquiry
