@@ -158,7 +158,7 @@ class CgroupFreezer:
 
 
 class SignalFreezer:
-    """SIGSTOP and SIGCONT to a process and its descendants."""
+    """SIGSTOP and SIGCONT to a process and its descendants; orphans among them are this process's children (subreaper)."""
 
     kind: Literal["cgroup", "SIGSTOP"] = "SIGSTOP"
 
@@ -208,10 +208,10 @@ class SignalFreezer:
         """Nothing was made."""
 
     def _everybody(self) -> list[int]:
-        """The processes and their descendants, parents before children."""
+        """The processes, their orphans and all descendants, parents before children."""
         children = _children()
         found: list[int] = []
-        waiting = list(self._roots)
+        waiting = [*self._roots, *children.get(os.getpid(), [])]
         while waiting:
             pid = waiting.pop(0)
             if pid not in found and _state(pid) != "":

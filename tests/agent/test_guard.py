@@ -144,9 +144,10 @@ def test_the_end_is_told_to_every_agent_until_one_has_noted_it(guard: GuardProce
     assert not guard.path.exists()
 
 
-def test_what_the_program_leaves_running_ends_with_it(guard: GuardProcess) -> None:
+@pytest.mark.parametrize("cgroup", ["", "/nowhere"], ids=["in_a_cgroup_if_we_may", "without_a_cgroup"])
+def test_what_the_program_leaves_running_ends_with_it(cgroup: str, guard: GuardProcess) -> None:
     agent = guard.agent()
-    guard.start(agent, "/bin/sh", "-c", "sleep 1000 & echo $!; exit 0")
+    guard.start(agent, "/bin/sh", "-c", "sleep 1000 & echo $!; exit 0", cgroup=cgroup)
     agent.event(Exited)
     left = int(guard.output())
     until(lambda: not lives(left), "its child to end")
