@@ -1,0 +1,12 @@
+"""A program's state as data: what is kept, and in which form it comes back.
+
+schema = Schema.of(Mission, default=Mission(), name="mission")
+encoded = schema.encode(mission)                # bytes, and regions for large arrays
+decoded = schema.decode(encoded)                # .value is a Mission, .notes say what changed meanwhile
+"""
+
+from failover.state.declare import MISSING, Field, Formerly, Pickled
+from failover.state.kinds import Region
+from failover.state.schema import Decoded, Encoded, Schema
+
+__all__ = ["MISSING", "Decoded", "Encoded", "Field", "Formerly", "Pickled", "Region", "Schema"]
