@@ -44,8 +44,8 @@ KINDS: Final = (STATE, ARRAY)
 """The encoded state of a program, with its size in front; raw bytes whose meaning the state tells, or the program knows."""
 
 HEAD: Final = struct.Struct("<8sIIIIQQ16s")
-ENTRY: Final = struct.Struct("<IIQQQ96s")
-MAX_NAME_SIZE: Final = 96
+ENTRY: Final = struct.Struct("<IIQQQ224s")
+MAX_NAME_SIZE: Final = 224
 TABLE_OFFSET: Final = PAGE
 NEWEST_OFFSET: Final = 256
 SUPERSEDED_OFFSET: Final = 320
@@ -59,6 +59,8 @@ BANK_BITS: Final = 8
 
 STRIDE: Final = 1 << 37
 """Between the addresses of two regions: more than a bank may hold, so that a region that grows keeps its address."""
+MAX_PLACES: Final = 1 << 20
+"""Addresses for regions in one lineage. None is given twice: a delta could not tell a new region's zeros from old pages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,13 +178,18 @@ def _check_region(region: Region) -> None:
         raise SegmentError(f"segment: a region's name has 1 to {MAX_NAME_SIZE} bytes, {region.name!r} has not")
     if not 1 <= region.size <= MAX_PAGES * PAGE:
         raise SegmentError(f"segment: region {region.name!r} has {region.size} bytes; 1 to {MAX_PAGES * PAGE} are possible")
-    if region.address % PAGE or not PAGE <= region.address < MAX_REGIONS * STRIDE + STRIDE:
+    if region.address % PAGE or not PAGE <= region.address < (MAX_PLACES + 1) * STRIDE:
         raise SegmentError(f"segment: region {region.name!r} begins at {region.address:#x}, which is no address of a page")
 
 
 def numbered(parts: Sequence[tuple[str, int, int]]) -> tuple[Region, ...]:
     """Regions with addresses by their place: (name, kind, size) each."""
-    return tuple(Region(name, kind, (index + 1) * STRIDE, size) for index, (name, kind, size) in enumerate(parts))
+    return tuple(Region(name, kind, address_of(index), size) for index, (name, kind, size) in enumerate(parts))
+
+
+def address_of(place: int) -> int:
+    """The address of the region that came as number ``place``, from 0."""
+    return (place + 1) * STRIDE
 
 
 @dataclass(frozen=True, slots=True, eq=False)

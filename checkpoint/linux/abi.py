@@ -237,6 +237,17 @@ def pidfd_getfd(pidfd: int, target: int) -> int:
     return result if result >= 0 else int(raise_errno(f"pidfd_getfd of descriptor {target}"))
 
 
+def userfaultfd(number: int, flags: int) -> int:
+    """A userfaultfd of our own memory; negative, with errno, where there is none.
+
+    Args:
+        number: of the call on this processor.
+
+    Source: userfaultfd(2).
+    """
+    return int(_syscall(number, ctypes.c_int(flags)))
+
+
 KCMP_FILES: Final = 2
 KCMP_FILE: Final = 0
 KCMP_VM: Final = 1

@@ -223,7 +223,7 @@ def test_a_segment_may_be_a_file(tmp_path: Path) -> None:
     [
         (Region("x", 9, PAGE, 1), "kind 9"),
         (Region("", STATE, PAGE, 1), "name"),
-        (Region("x" * 97, STATE, PAGE, 1), "name"),
+        (Region("x" * 225, STATE, PAGE, 1), "name"),
         (Region("x", STATE, 1, 1), "address"),
         (Region("x", STATE, PAGE, 0), "0 bytes"),
         (Region("x", STATE, PAGE, 1 << 60), "bytes"),
