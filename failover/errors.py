@@ -71,3 +71,15 @@ class FitError(StateError):
 
 class StateFormatError(StateError):
     """Bytes that are not a whole state of a version that we read; nothing was built of them."""
+
+
+class TaskError(FailoverError):
+    """A program that keeps its state used the interface in a way that cannot work; nothing was stored or lost."""
+
+
+class StateTakenError(TaskError):
+    """Another process keeps the state of this name."""
+
+
+class NotCommittedError(FailoverError, TimeoutError):
+    """A commit is not known to survive yet; the program may go on, or wait again."""
