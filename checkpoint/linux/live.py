@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import mmap
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -42,7 +42,7 @@ class Allocation:
     content: NDArray[np.uint8]
     owner: str = ""
     is_known: bool = True
-    written: Words = NONE[:, 0]
+    written: Words = field(default_factory=lambda: NONE[:, 0])
 
     @property
     def address(self) -> int:
