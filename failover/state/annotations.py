@@ -15,12 +15,12 @@ import numpy as np
 
 from failover.errors import SchemaError
 from failover.state import arrays, numbers, plain
-from failover.state.choices import AnyKind, EnumKind, FlagKind, LiteralKind, UnionKind
+from failover.state.choices import AnyKind, EnumKind, FlagKind, LabelledKind, LiteralKind, UnionKind
 from failover.state.containers import DequeKind, ListKind, MappingKind, SetKind, TupleKind
 from failover.state.declare import MISSING, Field, Formerly, Pickled
 from failover.state.dtypes import DtypeError, lower_dtype
 from failover.state.kinds import Kind
-from failover.state.pickled import PickledKind
+from failover.state.pickled import PickledKind, UnreadKind
 from failover.state.records import RecordField, RecordKind
 from failover.state.styles import Components, Member, record_of
 
@@ -67,9 +67,10 @@ class Compiler:
 
     def open(self) -> AnyKind:
         """A kind of everything stored, records as dictionaries: for migrations and for looking."""
-        return Compiler()._open(AnyKind(records=True))
+        kind = AnyKind(records=True)
+        return Compiler()._open(kind, also=(LabelledKind(kind), UnreadKind()))
 
-    def _open(self, kind: AnyKind) -> AnyKind:
+    def _open(self, kind: AnyKind, also: tuple[Kind, ...] = ()) -> AnyKind:
         self.any = kind
         containers = (
             self._of_kind(ListKind, kind),
@@ -80,7 +81,7 @@ class Compiler:
             self._mapping_of(dict, kind, kind),
         )
         dictionary = containers[-1]
-        kind.complete((arrays.ANY_SCALAR, *_ATOMS.values(), *containers), dictionary)
+        kind.complete((arrays.ANY_SCALAR, *_ATOMS.values(), *containers, *also), dictionary)
         return kind
 
     # Interning
@@ -200,7 +201,7 @@ class Compiler:
             return self.kind(arguments[0], where, default)
         if type(origin).__name__ == "TypeAliasType":
             return self.kind(origin.__value__[arguments], where, default)
-        if isinstance(origin, type):
+        if isinstance(origin, type) and origin is not collections.abc.Callable:
             return self._class(origin, arguments, where, default)
         raise SchemaError(f"cannot keep {where}: {annotation!r} is not a type that we know; {NOT_DATA}", where)
 

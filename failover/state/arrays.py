@@ -187,10 +187,11 @@ class BytesKind(Kind):
             if type(value) is np.bytes_ and self._cls is bytes:
                 return self.lower(bytes(value), walk, place)
             raise self.stranger(value, place)
-        if self._cls is bytearray:
+        if isinstance(value, bytearray):
             again = walk.meet(value, self, place)
             if again is not None:
                 return again
+            walk.meet_buffer(value, place)
         if len(value) >= walk.inline_size:
             return {self._mark: [len(value), walk.put_aside(memoryview(value), self.name, (len(value),), place)]}
         return bytes(value) if self._cls is bytes else {BYTEARRAY: bytes(value)}

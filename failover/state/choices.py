@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from dataclasses import dataclass
 from typing import Any
 
 from failover.errors import FitError, KeepError
@@ -181,6 +182,34 @@ def shape_of(wire: Wire) -> str:
     return type(wire).__name__
 
 
+@dataclass(frozen=True, slots=True)
+class Labelled:
+    """A value of a union as a migration meets it, where the wire had to say of which type it is."""
+
+    label: str
+    value: Any
+
+
+class LabelledKind(Kind):
+    """Labelled values of any declaration."""
+
+    name = "labelled"
+    types = frozenset({Labelled})
+    shapes = frozenset({AS})
+
+    def __init__(self, inner: Kind) -> None:
+        self._inner = inner
+
+    def lower(self, value: Any, walk: Walk, place: Place) -> Wire:
+        return {AS: [value.label, self._inner.lower(value.value, walk, place)]}
+
+    def lift(self, wire: Wire, build: Build, place: Place) -> Labelled:
+        payload = wire[AS]
+        if type(payload) is not list or len(payload) != 2 or type(payload[0]) is not str:
+            raise self.misfit(wire, place, "not a label and a value")
+        return Labelled(payload[0], self._inner.lift(payload[1], build, place))
+
+
 class AnyKind(Kind):
     """A value of any of the built-in kinds: what its own type says. No classes of the program: these are declared."""
 
@@ -220,8 +249,6 @@ class AnyKind(Kind):
         if shape == SAME:
             made = build.made.get(wire[SAME]) if type(wire[SAME]) is str else None
             return build.again(wire, made[1] if made is not None and made[1] in self._by_type.values() else self, place)
-        if self._records and shape == AS and type(wire[AS]) is list and len(wire[AS]) == 2:
-            return self.lift(wire[AS][1], build, place)
         kind = self._by_shape.get(shape)
         if kind is None:
             raise self.misfit(wire, place)

@@ -239,7 +239,7 @@ class MappingKind(Kind):
         depth = place[2] + 1
         for index, (stored_key, inner) in enumerate(pairs):
             key = self._key.lift(stored_key, build, (place, key_step(index), depth))
-            at = (place, entry_step(key, index), depth)
+            at = (place, stored_key if mark is None else entry_step(key, index), depth)
             try:
                 known = key in value
             except (TypeError, AttributeError) as error:  # not hashable, or not yet: part of a cycle

@@ -18,7 +18,18 @@ from typing import Any
 import numpy as np
 
 from failover.errors import FitError, KeepError
-from failover.state.wire import DATA_SIZE_MAX, DEPTH_MAX, NAME_SIZE_MAX, REGION_COUNT_MAX, SAME, Place, Wire, said, text_of
+from failover.state.wire import (
+    DATA_SIZE_MAX,
+    DEPTH_MAX,
+    NAME_SIZE_MAX,
+    REGION_COUNT_MAX,
+    SAME,
+    Place,
+    Wire,
+    path_of,
+    said,
+    text_of,
+)
 
 Allocate = Callable[[str, tuple[int, ...], "np.dtype[Any]"], "np.ndarray[Any, Any]"]
 """Makes the array of a place (name, shape, dtype) that a state is read into: C order, writable."""
@@ -128,14 +139,11 @@ class Walk:
             self.descend(place)
             self.met[id(value)] = (value, kind, place)
             return None
-        earlier = text_of(first[2])
         if first[1] is not kind:
             where = text_of(place)
-            message = (
-                f"cannot keep {where}: it is the same object as {earlier}, declared {kind.name} here and {first[1].name} there"
-            )
-            raise KeepError(f"{message}; declare both alike, or assign a copy", where)
-        return {SAME: earlier}
+            there = f"{text_of(first[2])}, declared {kind.name} here and {first[1].name} there"
+            raise KeepError(f"cannot keep {where}: it is the same object as {there}; declare both alike, or assign a copy", where)
+        return {SAME: path_of(first[2])}
 
     def descend(self, place: Place) -> None:
         """Refuse what is nested too deep.
@@ -175,16 +183,26 @@ class Walk:
         owner: Any = array
         while isinstance(owner, np.ndarray) and owner.base is not None:
             owner = owner.base
+        if isinstance(owner, memoryview):
+            owner = owner.obj
+        if owner is not array and id(owner) in self.met:
+            raise _overlap(place, self.met[id(owner)][2])
         neighbours = self._memories.setdefault(id(owner), [])
         for index in neighbours:
             if index < len(self._arrays) and _shares_memory(array, self._arrays[index][0]):
-                where = text_of(place)
-                message = (
-                    f"cannot keep {where}: it shares memory with {text_of(self._arrays[index][1])} (one is a view of the other)"
-                )
-                raise KeepError(f"{message}; keep one of them and make the other a property, or assign a copy", where)
+                raise _overlap(place, self._arrays[index][1])
         neighbours.append(len(self._arrays))
         self._arrays.append((array, place))
+
+    def meet_buffer(self, value: bytearray, place: Place) -> None:
+        """Note bytes that an array may lie over.
+
+        Raises:
+            KeepError: one does; names both places.
+        """
+        for index in self._memories.get(id(value), ()):
+            if index < len(self._arrays):
+                raise _overlap(place, self._arrays[index][1])
 
     def mark(self) -> tuple[int, int, int]:
         """How far it has come, for ``back_to``."""
@@ -201,6 +219,13 @@ class Walk:
 
 OVERLAP_WORK_MAX = 1000
 """How long numpy may think about whether two views overlap; beyond it they count as overlapping."""
+
+
+def _overlap(place: Place, other: Place) -> KeepError:
+    """The refusal of a second array over the same memory."""
+    where = text_of(place)
+    message = f"cannot keep {where}: it shares memory with {text_of(other)} (one is a view of the other)"
+    return KeepError(f"{message}; keep one of them and make the other a property, or assign a copy", where)
 
 
 def _shares_memory(left: np.ndarray[Any, Any], right: np.ndarray[Any, Any]) -> bool:
@@ -235,7 +260,7 @@ class Build:
         """
         self.descend(place)
         if self._shared:
-            self.made[text_of(place)] = (value, kind)
+            self.made[path_of(place)] = (value, kind)
 
     def descend(self, place: Place) -> None:
         """Refuse what is nested too deep.
@@ -253,12 +278,11 @@ class Build:
         Raises:
             FitError: there is no such object, or it is of another kind.
         """
-        where, there = text_of(place), wire[SAME]
-        made = self.made.get(there) if isinstance(there, str) else None
+        where, path = text_of(place), wire[SAME]
+        made = self.made.get(path) if isinstance(path, str) else None
+        there = f"{where.removesuffix(path_of(place))}{path}"[:NAME_SIZE_MAX]
         if made is None:
-            message = (
-                f"{where}: stored as the same object as {str(there)[:NAME_SIZE_MAX]}, which is not part of the state any more"
-            )
+            message = f"{where}: stored as the same object as {there}, which is not part of the state any more"
             raise FitError(f"{message}; {FIT_CURE}", where)
         if made[1] is not kind:
             raise FitError(

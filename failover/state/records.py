@@ -15,9 +15,10 @@ from operator import attrgetter
 from typing import Any
 
 from failover.errors import FitError, KeepError
+from failover.state.containers import MAP
 from failover.state.declare import MISSING
 from failover.state.kinds import FIT_CURE, Build, Kind, Walk
-from failover.state.wire import SAME, Place, Wire, mark_of, text_of
+from failover.state.wire import SAME, Place, Wire, entry_step, mark_of, text_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +101,7 @@ class PlainObjects(Style):
 class RecordKind(Kind):
     """Objects of one class with declared fields. ``complete`` follows the constructor, so that a class can contain itself."""
 
-    shapes = frozenset({"record"})
+    shapes = frozenset({"record", MAP})
 
     def __init__(self, name: str, cls: type, style: Style) -> None:
         self.name = name
@@ -154,7 +155,7 @@ class RecordKind(Kind):
         Raises:
             KeepError: names the first of them.
         """
-        surplus = [name for name in extras if name not in self._names]
+        surplus = [name for name in extras if name not in self._names and name != "__orig_class__"]  # of Generic[...]()
         if surplus:
             where = f"{text_of(place)}.{surplus[0]}"
             message = f"cannot keep {where}: it was set but is no declared field of {self.name}, and would be lost"
@@ -164,7 +165,7 @@ class RecordKind(Kind):
         mark = mark_of(wire)
         if mark == SAME:
             return build.again(wire, self, place)
-        stored = wire["$map"] if mark == "$map" else wire if mark is None else None
+        stored = wire[MAP] if mark == MAP else wire if mark is None else None
         if type(stored) is not dict:
             raise self.misfit(wire, place)
         if stored and self.fields and self._by_stored_name.keys().isdisjoint(stored):
@@ -174,18 +175,22 @@ class RecordKind(Kind):
             build.note_made(begun, self, place)
         else:
             build.descend(place)
-        value = self._style.finish(begun, self._lift_fields(stored, build, place))
+        value = self._style.finish(begun, self._lift_fields(stored, mark is None, build, place))
         if self._mutable and begun is None:
             build.note_made(value, self, place)
         return value
 
-    def _lift_fields(self, stored: dict[str, Wire], build: Build, place: Place) -> dict[str, Any]:
-        """The values of the declared fields, in stored order: a second way to an object comes after the first."""
+    def _lift_fields(self, stored: dict[str, Wire], as_record: bool, build: Build, place: Place) -> dict[str, Any]:
+        """The values of the declared fields, in stored order: a second way to an object comes after the first.
+
+        Args:
+            as_record: they were stored as a record, not as a dictionary; their places are named so.
+        """
         depth = place[2] + 1
         values: dict[str, Any] = {}
-        for name, inner in stored.items():
+        for index, (name, inner) in enumerate(stored.items()):
             field = self._by_stored_name.get(name)
-            at = (place, name, depth)
+            at = (place, name if as_record else entry_step(name, index), depth)
             if field is None:
                 build.note(f"{self.name}.{name}", f"{text_of(at)}: stored but not declared any more: dropped")
                 continue

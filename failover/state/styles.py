@@ -254,9 +254,17 @@ class Mappings(Style):
 
 
 def _typed_dict_record(cls: Any) -> Record:
-    optional = cls.__optional_keys__
-    members = [Member(name, annotation, None, name in optional) for name, annotation in _hints(cls).items()]
+    members = [
+        Member(name, annotation, None, _may_be_absent(annotation, name in cls.__optional_keys__))
+        for name, annotation in _hints(cls).items()
+    ]
     return Record(tuple(members), Mappings())
+
+
+def _may_be_absent(annotation: Any, optional: bool) -> bool:
+    """Whether a key may be absent: the class itself cannot tell where its annotations are text (PEP 563)."""
+    origin = typing.get_origin(annotation)
+    return origin is typing.NotRequired or (optional and origin is not typing.Required)
 
 
 class Components(Mappings):

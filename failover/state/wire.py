@@ -42,7 +42,7 @@ INT_BITS_MAX = 1 << 20
 """An integer beyond this is a mistake or an attack: printing one takes quadratic time."""
 
 SAME = "$same"
-"""Mark of a second way to an object that is stored elsewhere; the payload is that place."""
+"""Mark of a second way to an object that is stored elsewhere; the payload is the path of that place."""
 
 
 class Key:
@@ -85,18 +85,27 @@ def root_place(name: str) -> Place:
 
 def text_of(place: Place) -> str:
     """A place as a program would write it: ``mapper.tiles['a'][3].image``."""
+    name, path = _name_and_path(place)
+    return name + path
+
+
+def path_of(place: Place) -> str:
+    """A place without the name of the state, which may be another one elsewhere: ``.tiles['a'][3].image``."""
+    return _name_and_path(place)[1]
+
+
+def _name_and_path(place: Place) -> tuple[str, str]:
     steps: list[str] = []
-    at: Place | None = place
-    while at is not None:
+    at = place
+    while True:
         above, step, _ = at
         if above is None:
-            steps.append(step)
-        elif isinstance(step, str):
+            return step, "".join(reversed(steps))
+        if isinstance(step, str):
             steps.append(f".{step}")
         else:
             steps.append(f"[{step.text if isinstance(step, Key) else step}]")
         at = above
-    return "".join(reversed(steps))
 
 
 _MARK = re.compile(r"\$[a-z]")
