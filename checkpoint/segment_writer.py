@@ -53,11 +53,12 @@ class Source:
     """What one region holds now.
 
     Attributes:
-        content: its bytes from the beginning; it may be shorter than the region, whose rest is zeros then.
+        content: its bytes from the beginning; it may be shorter than the region, whose rest is zeros then. Few bytes are
+            written fastest as ``bytes``: numpy's calls take longer than their work.
         written: numbers of its pages that may have changed since the last commit; None where nobody knows: they are compared.
     """
 
-    content: Bytes
+    content: Bytes | bytes
     written: NDArray[np.uint64] | None = None
 
 
@@ -88,8 +89,15 @@ class SegmentWriter:
             whole[layout.versions_offset(bank) :][: layout.page_count * WORD].view(np.uint64) for bank in range(layout.banks)
         ]
         self._firsts = [layout.first_page(index) for index in range(len(layout.regions))]
+        self._counts = [region.page_count for region in layout.regions]
         self._versions = np.zeros(layout.page_count, dtype=np.uint64)
         """Of every page: the commit that changed it last."""
+        self._version_words = self._versions.data
+        self._stamp_words = [
+            memoryview(self._memory)[layout.versions_offset(bank) :][: layout.page_count * WORD].cast("Q")
+            for bank in range(layout.banks)
+        ]
+        self._starts = [layout.bank_offset(bank) for bank in range(layout.banks)]
         self._sizes = [0] * len(layout.regions)
         """Bytes that each region's source had at the last commit."""
         self._held = [0] * layout.banks
@@ -145,7 +153,9 @@ class SegmentWriter:
     def _mark(self, index: int, source: Source, number: int) -> None:
         """Note which pages of a region this commit changes."""
         first, size = self._firsts[index], len(source.content)
-        if source.written is not None:
+        if isinstance(source.content, bytes):
+            self._mark_few(source.content, first, number)
+        elif source.written is not None:
             if len(source.written):
                 self._versions[source.written + np.uint64(first)] = number
         elif self._newest < 0:
@@ -155,6 +165,14 @@ class SegmentWriter:
         if size < self._sizes[index]:
             self._versions[first + size // PAGE : first + pages_of(self._sizes[index])] = number
         self._sizes[index] = size
+
+    def _mark_few(self, content: bytes, first: int, number: int) -> None:
+        """As `_mark_different`, for few bytes."""
+        start = self._starts[self._newest] + first * PAGE
+        for offset in range(0, len(content), PAGE):
+            piece = content[offset : offset + PAGE]
+            if self._newest < 0 or self._memory[start + offset : start + offset + len(piece)] != piece:
+                self._version_words[first + offset // PAGE] = number
 
     def _mark_different(self, content: Bytes, first: int, number: int) -> None:
         """Compare with the newest commit, and with what was noted for one that found no bank."""
@@ -173,7 +191,10 @@ class SegmentWriter:
     def _copy(self, bank: int, index: int, source: Source, since: int) -> None:
         """Copy the pages of a region that this bank has missed, and their versions."""
         first, content = self._firsts[index], source.content
-        versions = self._versions[first : first + self.layout.regions[index].page_count]
+        if isinstance(content, bytes):
+            self._copy_few(bank, index, content, since)
+            return
+        versions = self._versions[first : first + self._counts[index]]
         missed = np.flatnonzero(versions > since)
         if not len(missed):
             return
@@ -188,6 +209,17 @@ class SegmentWriter:
                 rows[whole, : len(content) - whole * PAGE] = content[whole * PAGE :]
         if len(missed):
             rows[missed] = content[: whole * PAGE].reshape(-1, PAGE)[missed]
+
+    def _copy_few(self, bank: int, index: int, content: bytes, since: int) -> None:
+        """As `_copy`, for few bytes."""
+        versions, stamps = self._version_words, self._stamp_words[bank]
+        first = self._firsts[index]
+        for page in range(first, first + self._counts[index]):
+            if (version := versions[page]) > since:
+                stamps[page] = version
+                offset = (page - first) * PAGE
+                place = self._starts[bank] + page * PAGE
+                self._memory[place : place + PAGE] = content[offset : offset + PAGE].ljust(PAGE, b"\0")
 
     def _free_bank(self) -> int | None:
         """Lock a bank that is neither the newest nor held; the one that has missed least."""

@@ -29,7 +29,11 @@ FIRST_ROOM: Final = 4 * PAGE
 LIVE_SIZE_MIN: Final = 64 << 10
 """Smaller arrays are compared: that takes less time than asking the kernel."""
 
-Contents = Mapping[str, NDArray[np.uint8]]
+FEW_BYTES: Final = 16 * PAGE
+"""A state up to this size is given to the segment as bytes."""
+
+Bytes = NDArray[np.uint8]
+Contents = Mapping[str, Bytes | bytes]
 _NOTHING: Final = np.empty(0, dtype=np.uint8)
 
 
@@ -92,12 +96,12 @@ class KeptState:
             self.live.look()
         return writer.commit([self._source(region.name, contents.get(region.name, _NOTHING)) for region in writer.layout.regions])
 
-    def _source(self, name: str, content: NDArray[np.uint8]) -> Source:
+    def _source(self, name: str, content: Bytes | bytes) -> Source:
         """What a region holds now, and which of its pages were written, if the kernel can tell.
 
         It can where the region held just this memory at the last commit, or never held any: then zeros were written over.
         """
-        if name == STATE_NAME:
+        if isinstance(content, bytes) or name == STATE_NAME:
             return Source(content)
         address = content.ctypes.data if len(content) else 0
         before = self._memory_of.get(name, address)
@@ -175,9 +179,10 @@ class KeptState:
             self._writer.close()
 
 
-def contents_of(encoded: Encoded) -> dict[str, NDArray[np.uint8]]:
+def contents_of(encoded: Encoded) -> dict[str, Bytes | bytes]:
     """The bytes of every region of an encoded state, borrowed where they are arrays."""
-    contents = {STATE_NAME: np.frombuffer(len(encoded.data).to_bytes(SIZE_SIZE, "little") + encoded.data, dtype=np.uint8)}
+    state = len(encoded.data).to_bytes(SIZE_SIZE, "little") + encoded.data
+    contents: dict[str, Bytes | bytes] = {STATE_NAME: state if len(state) <= FEW_BYTES else np.frombuffer(state, dtype=np.uint8)}
     for region in encoded.regions:
         contents[region.name] = np.frombuffer(region.memory, dtype=np.uint8)
     return contents
@@ -189,11 +194,13 @@ def encoded_of(contents: Contents, name: str) -> Encoded:
     Raises:
         StateFormatError: the state region is missing or cut off.
     """
-    state = contents.get(STATE_NAME, _NOTHING).tobytes()
+    state = bytes(contents.get(STATE_NAME, b""))
     size = int.from_bytes(state[:SIZE_SIZE], "little")
     if not 0 < size <= len(state) - SIZE_SIZE:
         raise StateFormatError(f"{name}: the stored state is cut off: {len(state)} bytes say that {size} follow", name)
-    regions = [EncodedRegion(key, content.data, "", ()) for key, content in contents.items() if key != STATE_NAME]
+    regions = [
+        EncodedRegion(key, _borrowed(content), "", ()) for key, content in contents.items() if key != STATE_NAME
+    ]
     return Encoded(state[SIZE_SIZE : SIZE_SIZE + size], tuple(regions))
 
 
@@ -207,3 +214,7 @@ def _close_in_children(state: KeptState) -> None:
             known.forked()
 
     os.register_at_fork(after_in_child=forked)
+
+
+def _borrowed(content: Bytes | bytes) -> memoryview:
+    return memoryview(content) if isinstance(content, bytes) else content.data
