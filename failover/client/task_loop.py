@@ -68,12 +68,14 @@ def run_steps(task: Task, step: Step, on_resume: Step | None, period_ns: int) ->
     with stopping.listening():
         if on_resume is not None:
             on_resume()
-        while not stopping.is_asked:
+        while True:
             outcome = step()
             task.commit()
             if outcome is FINISHED:
                 return
             stopping.is_between_steps = True
+            if stopping.is_asked:  # it came during the step
+                return
             _sleep_until(task.activations.next_ns(time.monotonic_ns()))
             stopping.is_between_steps = False
 

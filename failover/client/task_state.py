@@ -198,9 +198,7 @@ def encoded_of(contents: Contents, name: str) -> Encoded:
     size = int.from_bytes(state[:SIZE_SIZE], "little")
     if not 0 < size <= len(state) - SIZE_SIZE:
         raise StateFormatError(f"{name}: the stored state is cut off: {len(state)} bytes say that {size} follow", name)
-    regions = [
-        EncodedRegion(key, _borrowed(content), "", ()) for key, content in contents.items() if key != STATE_NAME
-    ]
+    regions = [EncodedRegion(key, _borrowed(content), "", ()) for key, content in contents.items() if key != STATE_NAME]
     return Encoded(state[SIZE_SIZE : SIZE_SIZE + size], tuple(regions))
 
 
