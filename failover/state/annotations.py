@@ -15,11 +15,12 @@ import numpy as np
 
 from failover.errors import SchemaError
 from failover.state import arrays, numbers, plain
-from failover.state.choices import AnyKind, EnumKind, FlagKind, LabelledKind, LiteralKind, UnionKind
+from failover.state.choices import AnyKind, EnumKind, FlagKind, LiteralKind, UnionKind
 from failover.state.containers import DequeKind, ListKind, MappingKind, SetKind, TupleKind
 from failover.state.declare import MISSING, Field, Formerly, Pickled
 from failover.state.dtypes import DtypeError, lower_dtype
 from failover.state.kinds import Kind
+from failover.state.opened import LabelledKind, PlainRecordKind
 from failover.state.pickled import PickledKind, UnreadKind
 from failover.state.records import RecordField, RecordKind
 from failover.state.styles import Components, Member, record_of
@@ -67,8 +68,8 @@ class Compiler:
 
     def open(self) -> AnyKind:
         """A kind of everything stored, records as dictionaries: for migrations and for looking."""
-        kind = AnyKind(records=True)
-        return Compiler()._open(kind, also=(LabelledKind(kind), UnreadKind()))
+        kind = AnyKind()
+        return Compiler()._open(kind, also=(PlainRecordKind(kind), LabelledKind(kind), UnreadKind()))
 
     def _open(self, kind: AnyKind, also: tuple[Kind, ...] = ()) -> AnyKind:
         self.any = kind
@@ -80,8 +81,7 @@ class Compiler:
             self._of_kind(DequeKind, kind),
             self._mapping_of(dict, kind, kind),
         )
-        dictionary = containers[-1]
-        kind.complete((arrays.ANY_SCALAR, *_ATOMS.values(), *containers, *also), dictionary)
+        kind.complete((arrays.ANY_SCALAR, *_ATOMS.values(), *containers, *also))
         return kind
 
     # Interning

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
 from typing import Any
 
 from failover.errors import FitError, KeepError
+from failover.state.containers import TUPLE
 from failover.state.kinds import Build, Kind, Walk
 from failover.state.wire import INT_MAX, INT_MIN, SAME, Place, Wire, mark_of, text_of
 
@@ -43,7 +43,7 @@ class EnumKind(Kind):
 class FlagKind(Kind):
     """Sets of flags, by the names of their members; bits without a name as one integer at the end."""
 
-    shapes = frozenset({"list"})
+    shapes = frozenset({TUPLE})
 
     def __init__(self, cls: type[enum.Flag]) -> None:
         self.name = cls.__name__
@@ -53,23 +53,25 @@ class FlagKind(Kind):
     def lower(self, value: Any, walk: Walk, place: Place) -> Wire:
         if type(value) is not self._cls:
             raise self.stranger(value, place)
-        names = [member.name for member in value] if value.value >= 0 else []
+        members = list(value) if value.value >= 0 else []
         rest = value.value
-        for name in names:
-            rest &= ~self._cls.__members__[name].value
+        for member in members:
+            rest &= ~member.value
         if not INT_MIN <= rest <= INT_MAX:
             raise self.stranger(value, place, "its bits without a name are beyond 64; name them")
-        return [*names, rest] if rest else names
+        names = [member.name for member in members]
+        return {TUPLE: [*names, rest] if rest else names}
 
     def lift(self, wire: Wire, build: Build, place: Place) -> Any:
-        if type(wire) is not list:
+        if mark_of(wire) != TUPLE or type(wire[TUPLE]) is not list:
             raise self.misfit(wire, place)
-        bits = 0
-        for index, name in enumerate(wire):
-            member = self._cls.__members__.get(name) if type(name) is str else None
-            if member is None and not (type(name) is int and index == len(wire) - 1):
+        names: list[Wire] = wire[TUPLE]
+        rest = names[-1] if names and type(names[-1]) is int else 0
+        bits = rest
+        for name in names[:-1] if rest else names:
+            if type(name) is not str or name not in self._cls.__members__:
                 raise self.misfit(name, place, f"its members are {', '.join(list(self._cls.__members__)[:8])}")
-            bits |= name if member is None else member.value
+            bits |= self._cls.__members__[name].value
         try:
             return self._cls(bits)
         except ValueError as error:
@@ -182,52 +184,20 @@ def shape_of(wire: Wire) -> str:
     return type(wire).__name__
 
 
-@dataclass(frozen=True, slots=True)
-class Labelled:
-    """A value of a union as a migration meets it, where the wire had to say of which type it is."""
-
-    label: str
-    value: Any
-
-
-class LabelledKind(Kind):
-    """Labelled values of any declaration."""
-
-    name = "labelled"
-    types = frozenset({Labelled})
-    shapes = frozenset({AS})
-
-    def __init__(self, inner: Kind) -> None:
-        self._inner = inner
-
-    def lower(self, value: Any, walk: Walk, place: Place) -> Wire:
-        return {AS: [value.label, self._inner.lower(value.value, walk, place)]}
-
-    def lift(self, wire: Wire, build: Build, place: Place) -> Labelled:
-        payload = wire[AS]
-        if type(payload) is not list or len(payload) != 2 or type(payload[0]) is not str:
-            raise self.misfit(wire, place, "not a label and a value")
-        return Labelled(payload[0], self._inner.lift(payload[1], build, place))
-
-
 class AnyKind(Kind):
     """A value of any of the built-in kinds: what its own type says. No classes of the program: these are declared."""
 
     name = "Any"
     keeps_text = True
 
-    def __init__(self, records: bool = False) -> None:
-        """``records``: read records of any class as dictionaries (for migrations and for looking)."""
-        self._records = records
+    def __init__(self) -> None:
         self._by_type: dict[type, Kind] = {}
         self._by_shape: dict[str, Kind] = {}
 
-    def complete(self, kinds: tuple[Kind, ...], dictionary: Kind) -> None:
-        """The built-in kinds, once those that contain Any exist; ``dictionary`` is that of a dict."""
+    def complete(self, kinds: tuple[Kind, ...]) -> None:
+        """The built-in kinds, once those that contain Any exist; of two of one shape the first is meant."""
         self._by_type = {cls: kind for kind in reversed(kinds) for cls in kind.types}
         self._by_shape = {shape: kind for kind in reversed(kinds) for shape in kind.shapes}
-        if self._records:
-            self._by_shape["record"] = dictionary
         self.types = frozenset(self._by_type)
         self.shapes = frozenset(self._by_shape)
         self.exact = frozenset({type(None), bool, float})

@@ -251,10 +251,9 @@ class MappingKind(Kind):
 
     def _stored_pairs(self, wire: Wire, mark: str | None, place: Place) -> list[Any]:
         """The stored entries: of a map, of pairs, or of a record, which is a dictionary to a newer declaration."""
-        if mark is None and type(wire) is dict:
-            return list(wire.items())
-        if mark == MAP and type(wire[MAP]) is dict:
-            return list(wire[MAP].items())
+        entries = wire[MAP] if mark == MAP else wire if mark is None else None
+        if type(entries) is dict and all(type(key) is str for key in entries):
+            return list(entries.items())
         if mark == DICT and type(wire[DICT]) is list and all(type(pair) is list and len(pair) == 2 for pair in wire[DICT]):
             return list(wire[DICT])
         raise self.misfit(wire, place)

@@ -31,7 +31,7 @@ SIZE_MAX = (1 << 63) - 1
 _PLAIN = re.compile(
     r"""[<>|](?:
         b1 | i[1248] | u[1248] | f[248] | c(?:8|16)         # truth values and numbers that every machine has
-      | [mM]8(?:\[(?:\d{1,9})?(?:Y|M|W|D|h|m|s|ms|us|ns|ps|fs|as)\])?
+      | [mM]8(?:\[(?:[1-9]\d{0,8})?(?:Y|M|W|D|h|m|s|ms|us|ns|ps|fs|as)\])?
       | [SUV]\d{1,7}
     )""",
     re.VERBOSE,

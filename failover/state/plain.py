@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from failover.errors import FitError, KeepError
 from failover.state.kinds import Build, Kind, Walk
 from failover.state.numbers import INT, TEXT, lower_text
 from failover.state.wire import Place, Wire, mark_of, root_place
@@ -149,11 +150,17 @@ _BUILD = Build({}, lambda name, shape, dtype: np.empty(shape, dtype), shared=Fal
 
 def _whole(*numbers: int) -> list[Wire]:
     """Integers of any size."""
-    return [INT.lower(number, Walk(0), root_place("integer")) for number in numbers]
+    try:
+        return [INT.lower(number, Walk(0), root_place("integer")) for number in numbers]
+    except KeepError as error:
+        raise ValueError("one of its integers is too large") from error
 
 
 def _integers(wire: Wire, count: int) -> list[int]:
-    return [INT.lift(part, _BUILD, root_place("integer")) for part in _parts(wire, *[object] * count)]
+    try:
+        return [INT.lift(part, _BUILD, root_place("integer")) for part in _parts(wire, *[object] * count)]
+    except FitError as error:
+        raise ValueError(f"not {count} integers") from error
 
 
 def _lift_fraction(wire: Wire) -> Fraction:
@@ -179,7 +186,10 @@ def _lift_uuid(wire: Wire) -> uuid.UUID:
 
 
 def _lift_text(wire: Wire) -> str:
-    return str(TEXT.lift(wire, _BUILD, root_place("path")))
+    try:
+        return str(TEXT.lift(wire, _BUILD, root_place("path")))
+    except FitError as error:
+        raise ValueError("not text") from error
 
 
 def _path_kind(mark: str, cls: type[pathlib.PurePath]) -> MarkedKind:

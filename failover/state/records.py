@@ -166,7 +166,7 @@ class RecordKind(Kind):
         if mark == SAME:
             return build.again(wire, self, place)
         stored = wire[MAP] if mark == MAP else wire if mark is None else None
-        if type(stored) is not dict:
+        if type(stored) is not dict or not all(type(name) is str for name in stored):
             raise self.misfit(wire, place)
         if stored and self.fields and self._by_stored_name.keys().isdisjoint(stored):
             raise self.misfit(wire, place, f"none of its fields is declared, which are {', '.join(sorted(self._names)[:8])}")

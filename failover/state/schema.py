@@ -30,8 +30,8 @@ VERSION_MAX = (1 << 31) - 1
 _PACKED_SAME = msgspec.msgpack.encode(SAME)
 
 Migration = Callable[[Any], Any]
-"""State of one version → state of the next, on plain values: records are dicts, enums text, flags lists of text; values of
-a union may be ``Labelled``, pickled ones are ``Unread``; everything else is itself."""
+"""State of one version → state of the next, on plain values: enums are text, flags tuples of text, records ``PlainRecord``
+(a dict), values of a union ``Labelled`` where it takes that, pickled ones ``Unread``; everything else is itself."""
 
 
 @dataclass(frozen=True, slots=True)
