@@ -35,12 +35,14 @@ class Allocation:
     Attributes:
         content: all of it, whole pages; zeros at first.
         owner: what it was last kept as.
+        is_followed: the kernel tells which pages are written.
         is_known: every page written since it was last kept is in ``written``; otherwise it must be compared.
         written: numbers of its pages written since then.
     """
 
     content: NDArray[np.uint8]
     owner: str = ""
+    is_followed: bool = True
     is_known: bool = True
     written: Words = field(default_factory=lambda: NONE[:, 0])
 
@@ -53,7 +55,7 @@ class Allocation:
         """The pages written since ``owner`` took them last, None where they must be compared; they are its own from now on."""
         is_known = self.is_known and self.owner in ("", owner)
         written, self.written = self.written, NONE[:, 0]
-        self.owner, self.is_known = owner, True
+        self.owner, self.is_known = owner, self.is_followed
         return written if is_known else None
 
 
@@ -123,12 +125,13 @@ class LiveMemory:
     def _follow(self, made: Allocation) -> None:
         if not self._allocations and not self.note:
             self._open()
-        made.is_known = self._scanner is not None
+        made.is_followed = made.is_known = self._scanner is not None
         if self._scanner is None:
             return
         start, end = made.address, made.address + len(made.content)
         order = abi.UffdRegister(start, end - start, abi.UFFDIO_REGISTER_MODE_WP, 0)
         if abi.ioctl(self._faults, abi.UFFDIO_REGISTER, ctypes.addressof(order)) != 0:
+            made.is_followed = made.is_known = False
             self._give_up(f"the kernel does not follow this memory: {os.strerror(ctypes.get_errno())}")
             return
         mine = np.array([[start, end]], dtype=np.uint64)
@@ -161,4 +164,5 @@ class LiveMemory:
         """From now on everything is compared."""
         self.note = f"written pages are compared: {why}"
         self.close()
-        self.distrust()
+        for held in self._allocations.values():
+            held.is_followed = held.is_known = False
