@@ -14,10 +14,10 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 
-from benchmarks import engine, machine, outage
+from benchmarks import engine, machine, outage, task
 from benchmarks.figures import Figure, table
 
-BENCHMARKS = {"freeze": engine.freeze, "restore": engine.restore, "outage": outage.outage}
+BENCHMARKS = {"freeze": engine.freeze, "restore": engine.restore, "outage": outage.outage, "task": task.task}
 
 
 def main() -> int:

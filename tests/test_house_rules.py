@@ -156,9 +156,7 @@ def impurities(path: Path, tree: ast.AST) -> list[str]:
 def is_pure_name(module: str) -> bool:
     """Whether a dotted name lies in a pure file or room, or in the error families."""
     path = module.replace(".", "/")
-    return path.startswith(
-        ("failover/errors", *(pure.removesuffix(".py").rstrip("/") for pure in PURE_FILES))
-    )
+    return path.startswith(("failover/errors", *(pure.removesuffix(".py").rstrip("/") for pure in PURE_FILES)))
 
 
 def test_the_pure_rooms_are_pure() -> None:
