@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import random
@@ -144,6 +145,24 @@ def test_a_bank_that_is_being_written_is_said_to_be_busy() -> None:
             reader.read()
         fcntl.fcntl(writer.descriptor, fcntl.F_OFD_SETLK, lock_of(fcntl.F_UNLCK, 0))
         assert reader.read() is not None
+
+
+def test_a_bank_that_was_torn_between_the_look_and_the_lock_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The writer names another bank, begins this one again and is killed: all while the reader has only looked."""
+    state = Telling()
+    with opened(layout()) as (writer, reader):
+        writer.commit(state.sources(1))
+        honest = SegmentReader._held
+
+        def overtaken(self: SegmentReader, bank: int) -> contextlib.AbstractContextManager[bool]:
+            monkeypatch.undo()
+            writer.commit(state.sources(2))
+            writer._words[(segment.RECORDS_OFFSET + bank * segment.RECORD_SIZE) // 8] = 0
+            return honest(self, bank)
+
+        monkeypatch.setattr(SegmentReader, "_held", overtaken)
+        found = reader.read()
+        assert found is not None and number_read(found) == 2
 
 
 def test_a_writer_killed_at_any_instant_leaves_one_whole_commit_no_older_than_what_was_read() -> None:

@@ -228,6 +228,25 @@ def test_arrays_that_come_grow_and_go_are_what_they_were() -> None:
             assert all(np.array_equal(state.images[name], kept[name]) for name in kept)
 
 
+def test_a_live_array_that_goes_and_comes_back_or_changes_places_is_what_it_was() -> None:
+    state = failover.resume("maps", default=Maps(images={name: np.full(200_000, 7, dtype=np.uint8) for name in "ab"}))
+    failover.commit()
+    again()
+    state = failover.resume("maps", default=Maps())  # now they lie in live memory
+    failover.commit()
+    absent = state.images.pop("a")
+    failover.commit()
+    state.images["a"] = absent
+    failover.commit()
+    state.images["b"][5] = 8
+    state.images = {"a": state.images["b"], "b": state.images["a"]}
+    failover.commit()
+    again()
+    state = failover.resume("maps", default=Maps())
+    assert state.images["a"][5] == 8 and (np.delete(state.images["a"], 5) == 7).all()
+    assert (state.images["b"] == 7).all()
+
+
 def test_a_forked_child_may_not_commit_the_state_of_its_parent() -> None:
     mission = failover.resume("mission", default=Mission())
     failover.commit()
