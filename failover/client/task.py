@@ -15,6 +15,7 @@ import atexit
 import os
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ from checkpoint.model import Snapshot
 from failover.client.task_file import Recorder, StateFile, folder_of
 from failover.client.task_rhythm import Activations
 from failover.client.task_state import KeptState
-from failover.errors import TaskError
+from failover.errors import NotCommittedError, TaskError
 from failover.state import Schema
 
 S = TypeVar("S")
@@ -79,6 +80,9 @@ class Task:
         self.value = value
         self.resumed = resumed
         self._recorder = Recorder(state, file)
+        self._is_missing = False
+        """The last commit found every bank held."""
+        _close_in_children(file)
         self.activations = Activations(0, 0)
         self._open_transaction: int | None = None
         """The thread that is in the middle of a change."""
@@ -95,7 +99,7 @@ class Task:
         return self._commit()
 
     def _commit(self) -> int:
-        self.state.commit(self.value)
+        self._is_missing = not self.state.commit(self.value)
         self._recorder.notice()
         return self.state.number
 
@@ -117,6 +121,8 @@ class Task:
         Raises:
             NotCommittedError: it is not, in time; says why.
         """
+        if self._is_missing:
+            raise NotCommittedError(f"the last commit of {self.name} was not made: readers held all its memory; commit again")
         self._recorder.wait(self.state.number, timeout)
 
     @property
@@ -163,6 +169,18 @@ def open_task(
         file.close()
         raise
     return Task(name, state, file, decoded.value, _resumed(snapshot, file, decoded.notes))
+
+
+def _close_in_children(file: StateFile) -> None:
+    """A forked child shares the lock on the folder: it would keep it after the death of its parent."""
+    remembered = weakref.ref(file)
+
+    def forked() -> None:
+        known = remembered()
+        if known is not None:
+            known.close()
+
+    os.register_at_fork(after_in_child=forked)
 
 
 def _contents(snapshot: Snapshot, file: StateFile) -> dict[str, Any]:

@@ -74,6 +74,7 @@ class StateFile:
         newest = self._store.newest(component)
         self.generation = newest.generation + 1 if newest else 1
         self._sequence = 0
+        self._is_closed = False
         self.notices = tuple(self._store.notices)
 
     def load(self) -> Snapshot | None:
@@ -112,8 +113,10 @@ class StateFile:
         return session.commit_at(snapshot.position)
 
     def close(self) -> None:
-        """Let another process have it."""
-        self._store.close()
+        """Let another process have it; nothing else may be called afterwards."""
+        if not self._is_closed:
+            self._is_closed = True
+            self._store.close()
 
 
 class Recorder:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import os
 import re
@@ -82,6 +83,25 @@ def test_waiting_for_a_commit_says_that_it_survives(folder: Path) -> None:
     failover.commit()
     failover.wait_committed(30)
     assert len(list(folder.glob("mission.state/@*/*.base"))) == 1
+
+
+def test_waiting_for_a_commit_that_was_not_made_says_so() -> None:
+    mission = failover.resume("mission", default=Mission())
+    failover.commit()
+    failover.wait_committed(30)
+    assert PROCESS.task is not None
+    readers = [PROCESS.task.state.open_reader() for _ in range(3)]
+    with contextlib.ExitStack() as held:
+        for bank, reader in enumerate(readers):
+            held.enter_context(reader._held(bank))
+        mission.leg = 1
+        assert failover.commit() == 1
+        with pytest.raises(failover.NotCommittedError, match="commit again"):
+            failover.wait_committed(30)
+    assert failover.commit() == 2
+    failover.wait_committed(30)
+    for reader in readers:
+        reader.close()
 
 
 def test_a_full_disk_costs_age_and_is_said(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -501,6 +521,29 @@ def test_two_processes_do_not_keep_one_state(folder: Path) -> None:
             failover.resume("counter", default={"n": 0})
         process.communicate()
     failover.resume("counter", default={"n": 0})
+
+
+def test_a_child_that_outlives_its_parent_does_not_keep_the_state_from_the_next_one(folder: Path) -> None:
+    path = program(
+        folder,
+        """
+        import failover, os, sys
+        state = failover.resume("counter", default={"n": 0})
+        state["n"] = 5
+        failover.commit()
+        failover.wait_committed(60)
+        if os.fork() == 0:
+            print("child", flush=True)
+            sys.stdin.read()
+            os._exit(0)
+        sys.stdin.read()
+        """,
+    )
+    with started(path) as process:
+        assert process.stdout is not None and process.stdout.readline() == "child\n"
+        process.kill()
+        process.wait()
+        assert failover.resume("counter", default={"n": 0}) == {"n": 5}
 
 
 def test_the_end_of_a_program_writes_its_last_commit_and_sigterm_ends_it_between_steps(folder: Path) -> None:
