@@ -75,7 +75,11 @@ class StateFile:
         self.generation = newest.generation + 1 if newest else 1
         self._sequence = 0
         self._is_closed = False
-        self.notices = tuple(self._store.notices)
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What was found damaged or left over: one sentence each."""
+        return tuple(self._store.notices)
 
     def load(self) -> Snapshot | None:
         """The newest state that is intact; None where there is none.
@@ -83,12 +87,13 @@ class StateFile:
         Raises:
             TaskError: there was one, and nothing of it is intact.
         """
+        if self._store.newest(self.component) is None and not any(self.folder.glob("@*/*.base")):
+            return None
         try:
-            return self._store.load(self.component) if self._store.newest(self.component) else None
+            return self._store.load(self.component)
         except StoreError as error:
-            raise TaskError(
-                f"cannot resume {self.component} from {self.folder}: {'; '.join(self._store.notices) or error}"
-            ) from error
+            why = "; ".join(self.notices) or str(error)
+            raise TaskError(f"cannot resume {self.component}: {why}; to begin anew, move {self.folder} away") from error
 
     def write(self, session: CooperativeSession) -> int:
         """Keep the newest commit; when this returns it survives a power cut.
@@ -158,7 +163,7 @@ class Recorder:
             while self.durable < number:
                 self._hurry.set()
                 left = None if deadline is None else deadline - time.monotonic()
-                if not self._thread.is_alive():
+                if self._thread.ident is not None and not self._thread.is_alive():
                     raise NotCommittedError(f"commit {number} is not safe: the thread that writes {self._file.folder} has ended")
                 if left is not None and left <= 0:
                     why = self.trouble or f"the disk has taken commit {self.durable}"

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ import pytest
 from numpy.typing import NDArray
 
 import failover
+from checkpoint.disk import Disk
 from failover.client.task import PROCESS
 from failover.client.task_rhythm import Activations
 from failover.errors import FitError, KeepError, SchemaError
@@ -83,6 +85,46 @@ def test_waiting_for_a_commit_says_that_it_survives(folder: Path) -> None:
     failover.commit()
     failover.wait_committed(30)
     assert len(list(folder.glob("mission.state/@*/*.base"))) == 1
+
+
+def test_a_damaged_state_is_refused_and_never_taken_for_a_beginning(folder: Path) -> None:
+    failover.resume("mission", default=Mission(leg=7))
+    failover.commit()
+    again()
+    stored = next(folder.glob("mission.state/@*/*.base"))
+    content = bytearray(stored.read_bytes())
+    content[len(content) // 2] ^= 4
+    stored.write_bytes(content)
+    for _ in range(2):
+        with pytest.raises(failover.TaskError, match=r"to begin anew, move .*mission.state away"):
+            failover.resume("mission", default=Mission())
+    assert stored.exists()
+
+
+def test_a_disk_that_hangs_costs_age_and_not_a_single_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    hangs, goes_on = threading.Event(), threading.Event()
+    honest = Disk.sync_file
+
+    def hanging(self: Disk, descriptor: int) -> None:
+        hangs.set()
+        goes_on.wait(60)
+        honest(self, descriptor)
+
+    monkeypatch.setattr(Disk, "sync_file", hanging)
+    mission = failover.resume("mission", default=Mission())
+    try:
+        failover.commit()
+        assert hangs.wait(60)
+        for leg in range(1000):
+            mission.leg = leg
+            failover.commit()
+        with pytest.raises(failover.NotCommittedError):
+            failover.wait_committed(0.01)
+    finally:
+        goes_on.set()
+    failover.wait_committed(60)
+    again()
+    assert failover.resume("mission", default=Mission()).leg == 999
 
 
 def test_waiting_for_a_commit_that_was_not_made_says_so() -> None:
@@ -546,16 +588,17 @@ def test_a_child_that_outlives_its_parent_does_not_keep_the_state_from_the_next_
         assert failover.resume("counter", default={"n": 0}) == {"n": 5}
 
 
-def test_the_end_of_a_program_writes_its_last_commit_and_sigterm_ends_it_between_steps(folder: Path) -> None:
+@pytest.mark.parametrize("way", ["def", "async def"])
+def test_the_end_of_a_program_writes_its_last_commit_and_sigterm_ends_it_between_steps(folder: Path, way: str) -> None:
     path = program(
         folder,
-        """
+        f"""
         import failover
 
         @failover.component(name="slow", every=3600)
         class Slow:
             count: int = failover.kept(default=0)
-            def step(self) -> None:
+            {way} step(self) -> None:
                 self.count += 1
                 print("stepped", flush=True)
 
