@@ -282,7 +282,8 @@ class Compiler:
             raise SchemaError(f"{message}; define what it names where the class's module can see it", where) from error
         if record is None:
             raise SchemaError(f"cannot keep {where}: a {cls.__module__}.{cls.__qualname__} cannot be kept: {NOT_DATA}", where)
-        kind = RecordKind(cls.__name__, dict if typing.is_typeddict(cls) else cls, record.style)
+        name = f"{cls.__name__}[{', '.join(map(_spelled, arguments))}]" if arguments else cls.__name__
+        kind = RecordKind(name, dict if typing.is_typeddict(cls) else cls, record.style)
         self._made[key] = kind
         variables = dict(zip(getattr(cls, "__parameters__", ()), arguments, strict=False))
         fields = tuple(self._member(member, variables, f"{where}.{member.name}") for member in record.members)
@@ -294,6 +295,10 @@ class Compiler:
         default = member.default() if annotation is MISSING and member.default is not None else MISSING
         kind = self.any if annotation is MISSING and default is MISSING else self.kind(annotation, where, default)
         return RecordField(member.name, kind, member.default, _formerly(annotation), member.optional)
+
+
+def _spelled(annotation: Any) -> str:
+    return annotation.__name__ if isinstance(annotation, type) else str(annotation)
 
 
 def _factory_of(arguments: tuple[Any, ...]) -> Callable[[], Any] | None:

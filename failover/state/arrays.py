@@ -77,6 +77,7 @@ class ArrayKind(Kind):
         array = build.allocate(text_of(place), stored_shape, dtype)
         if size:
             array.reshape(-1).view(np.uint8)[:] = np.frombuffer(memory, np.uint8)
+        self._check_content(array, wire, place)
         value = array if order == "C" else array.T
         build.note_made(value, self, place)
         return value
@@ -94,6 +95,10 @@ class ArrayKind(Kind):
             raise self.misfit(wire, place, f"its shape {shape} overflows")
         return dtype, shape, parts[2], parts[3]
 
+    def _check_content(self, array: Array, wire: Wire, place: Place) -> None:
+        if not is_sound(array):
+            raise self.misfit(wire, place, "its bytes are no truth values or no text")
+
     def _memory(self, content: Wire, size: int, build: Build, place: Place) -> memoryview:
         if type(content) is bytes and len(content) == size:
             return memoryview(content)
@@ -102,7 +107,7 @@ class ArrayKind(Kind):
         return build.fetch(content, size, self, place)
 
     def description(self) -> str:
-        return self.name
+        return self.name if self._dtype is None else f"array of {lower_dtype(self._dtype)} {self._shape}"
 
 
 def _flat(value: Array) -> tuple[memoryview, str]:
@@ -119,6 +124,22 @@ def _flat(value: Array) -> tuple[memoryview, str]:
 
 
 ANY_ARRAY = ArrayKind()
+
+LETTER_MAX = 0x10FFFF
+"""The last code point of Unicode."""
+
+
+def is_sound(array: Array) -> bool:
+    """Whether every element is one: a truth value is 0 or 1, a letter a code point. Every other plain type takes any bytes."""
+    dtype = array.dtype
+    if dtype.names is not None:
+        return all(is_sound(array[name]) for name in dtype.names)
+    if dtype.kind == "b":
+        return not array.size or int(array.view(np.uint8).max()) <= 1
+    if dtype.kind == "U" and array.size and dtype.itemsize:
+        letters = np.ascontiguousarray(array).reshape(-1).view(np.dtype(np.uint32).newbyteorder(dtype.byteorder))
+        return int(letters.max()) <= LETTER_MAX
+    return True
 
 
 def lower_scalar(value: Any, kind: Kind, place: Place) -> Wire:
@@ -143,6 +164,8 @@ def lift_scalar(wire: Wire, kind: Kind, place: Place) -> Any:
     holder = np.zeros(1, dtype)
     if dtype.itemsize:
         holder.view(np.uint8)[:] = np.frombuffer(parts[1], np.uint8)
+    if not is_sound(holder):
+        raise kind.misfit(wire, place, "its bytes are no truth value or no text")
     return holder[0]
 
 
@@ -153,7 +176,7 @@ class ScalarKind(Kind):
     evident = True
 
     def __init__(self, cls: type) -> None:
-        self.name = cls.__name__ if cls is not np.generic else "a numpy scalar"
+        self.name = "numpy." + cls.__name__.rstrip("_")  # numpy 1 has bool_, numpy 2 has bool
         self._cls = cls
         self.types = frozenset({cls})
 

@@ -69,14 +69,25 @@ def attribute_reader(names: tuple[str, ...]) -> Callable[[Any], tuple[Any, ...]]
     return lambda value: tuple(getattr(value, name) for name in names)
 
 
+def undeclared(cls: type, value: Any) -> tuple[str, ...]:
+    """What lies in an object's dictionary, if it has one, besides what cached properties left there."""
+    found = getattr(value, "__dict__", ())
+    return tuple(name for name in found if not isinstance(getattr(cls, name, None), cached_property))
+
+
 class PlainObjects(Style):
     """Objects of ordinary classes: dataclasses and attrs, with or without slots, frozen or not."""
 
-    def __init__(self, cls: type, mutable: bool, preset: Mapping[str, Any] | None = None) -> None:
-        """``preset``: attributes that are no fields and must be there."""
+    def __init__(self, cls: type, mutable: bool, preset: Mapping[str, Any] | None = None, slots: tuple[str, ...] = ()) -> None:
+        """
+        Args:
+            preset: attributes that are no fields and must be there.
+            slots: names of slots that are no fields.
+        """
         self.mutable = mutable
         self._cls = cls
         self._preset = dict(preset or {})
+        self._slots = slots
         self._has_dict = bool(getattr(cls, "__dictoffset__", 0))
 
     def reader(self, names: tuple[str, ...]) -> Callable[[Any], tuple[Any, ...]]:
@@ -93,9 +104,18 @@ class PlainObjects(Style):
         return begun
 
     def extras(self, value: Any, count: int) -> tuple[str, ...]:
+        if self._slots:
+            return (*(name for name in self._slots if hasattr(value, name)), *undeclared(self._cls, value))
         if not self._has_dict or len(vars(value)) <= count:
             return ()
-        return tuple(name for name in vars(value) if not isinstance(getattr(self._cls, name, None), cached_property))
+        return undeclared(self._cls, value)
+
+
+def foreign_slots(cls: type, fields: set[str]) -> tuple[str, ...]:
+    """Slots of a class and its bases that are no fields."""
+    declared = [vars(base).get("__slots__", ()) for base in cls.__mro__]
+    names = [name for slots in declared for name in ((slots,) if isinstance(slots, str) else slots)]
+    return tuple(dict.fromkeys(name for name in names if name not in fields and name not in ("__weakref__", "__dict__")))
 
 
 class RecordKind(Kind):

@@ -193,6 +193,9 @@ class Schema:
             raise KeepError(
                 f"cannot keep {self.name}: nested too deep for this stack; keep a flat list and indices", self.name
             ) from error
+        except RuntimeError as error:  # "dictionary changed size during iteration"
+            message = f"cannot keep {self.name}: another thread changes it meanwhile ({error})"
+            raise KeepError(f"{message}; commit in the thread that changes it, or hold its lock", self.name) from error
         if len(packed) > DATA_SIZE_MAX:
             refuse_size(len(packed), self.name)
         return Encoded(packed, tuple(walk.regions))

@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 
 from failover.state.declare import MISSING
-from failover.state.records import PlainObjects, Style, attribute_reader
+from failover.state.records import PlainObjects, Style, attribute_reader, foreign_slots, undeclared
 
 FIELDS_SET = "__fields_set__"
 
@@ -88,7 +88,8 @@ def _dataclass_record(cls: Any) -> Record:
         elif field.default_factory is not dataclasses.MISSING:
             default = field.default_factory
         members.append(Member(field.name, hints.get(field.name, MISSING), default))
-    return Record(tuple(members), PlainObjects(cls, mutable=not cls.__dataclass_params__.frozen))
+    slots = foreign_slots(cls, {member.name for member in members})
+    return Record(tuple(members), PlainObjects(cls, mutable=not cls.__dataclass_params__.frozen, slots=slots))
 
 
 # attrs
@@ -127,6 +128,9 @@ class Structs(Style):
 
     def reader(self, names: tuple[str, ...]) -> Callable[[Any], tuple[Any, ...]]:
         return attribute_reader(names)
+
+    def extras(self, value: Any, count: int) -> tuple[str, ...]:
+        return undeclared(self._cls, value)
 
     def begin(self) -> Any:
         """Empty, so that a cycle can lead back to it; not where its ``__post_init__`` wants to see the contents."""
@@ -223,6 +227,9 @@ class NamedTuples(Style):
 
     def begin(self) -> Any:
         return None
+
+    def extras(self, value: Any, count: int) -> tuple[str, ...]:
+        return undeclared(self._cls, value)
 
     def finish(self, begun: Any, values: dict[str, Any]) -> Any:
         return tuple.__new__(self._cls, [values[name] for name in self._cls._fields])

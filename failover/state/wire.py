@@ -29,8 +29,8 @@ REGION_COUNT_MAX = 4096
 DEPTH_MAX = 100
 """How deep a state may be nested; far from the recursion limit of Python, also inside a program's own calls."""
 
-NAME_SIZE_MAX = 1024
-"""Bytes of the name of a region."""
+NAME_SIZE_MAX = 224
+"""Bytes of the name of a region: as many as a segment has room for."""
 
 KEY_TEXT_MAX = 40
 """Characters of a dictionary's key in the name of a place."""

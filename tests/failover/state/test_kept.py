@@ -149,6 +149,7 @@ KEPT: list[tuple[Any, Any]] = [
     (Slotted, Slotted(Pose(), {Cell(0, 0)})),
     (Box[int], Box(3, [4])),
     (Box[Pose], Box(Pose(1, 2, 3), [Pose()])),
+    (Box[int] | Box[str], Box("a")),
     (Node, Node("a", Node("b"), [Node("c", None, [Node("d")])])),
     (Reading, Reading(0.5, (1, 2))),
     (Settings, {"rate": 0.5}),

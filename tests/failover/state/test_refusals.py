@@ -10,12 +10,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated, Any, NamedTuple
 
+import msgspec
 import numpy as np
 import pytest
 
+from checkpoint import segment
 from failover.errors import FailoverError, FitError, KeepError, SchemaError, StateError, StateFormatError
 from failover.state import MISSING, Field, Formerly, Pickled, Schema
-from failover.state.wire import DATA_SIZE_MAX, DEPTH_MAX, REGION_COUNT_MAX
+from failover.state.wire import DATA_SIZE_MAX, DEPTH_MAX, NAME_SIZE_MAX, REGION_COUNT_MAX
 from tests.failover.state.models import Cell, Derived, Mode, Node, Pose, Settings
 from tests.failover.state.sameness import moved, resumed
 
@@ -144,6 +146,47 @@ def test_what_was_set_but_not_declared_is_refused_by_name() -> None:
         resumed(Derived, value)
 
 
+class Base:
+    __slots__ = ("cache",)
+
+
+@dataclass(slots=True)
+class Above(Base):
+    count: int = 0
+
+
+class Loose(msgspec.Struct, dict=True):
+    count: int = 0
+
+
+class Named(NamedTuple("Named", [("count", int)])):
+    pass
+
+
+@pytest.mark.parametrize("cls", [Above, Loose, Named])
+def test_what_lies_beside_the_fields_is_refused_by_name(cls: Any) -> None:
+    value = cls(count=3)
+    assert resumed(cls, value) == value
+    value.cache = 1
+    with pytest.raises(KeepError, match=r"kept\.cache: it was set but is no declared field"):
+        resumed(cls, value)
+
+
+def test_a_value_that_changes_while_it_is_committed_is_refused() -> None:
+    value: dict[Any, Any] = {}
+
+    class Meddler(threading.local):
+        """Its conversion, in the middle of the commit, changes what is committed."""
+
+        def __reduce__(self) -> tuple[Any, ...]:
+            value["more"] = 1
+            return (int, ())
+
+    value.update({"a": Meddler(), "b": 2})
+    with pytest.raises(KeepError, match=r"kept: another thread changes it meanwhile \(dictionary changed size"):
+        Schema.of(dict[str, Annotated[Any, Pickled()]], name="kept").encode(value)
+
+
 def test_a_field_that_was_never_set_is_refused_by_name() -> None:
     value = Derived(2.0)
     del value.area
@@ -183,6 +226,15 @@ def test_a_state_that_is_too_large_besides_its_arrays_is_refused() -> None:
 def test_too_many_arrays_are_refused() -> None:
     with pytest.raises(KeepError, match=rf"kept\[{REGION_COUNT_MAX}\]: more than {REGION_COUNT_MAX} arrays of 4096 bytes"):
         Schema.of(list[bytes], name="kept").encode([bytes(4096)] * (REGION_COUNT_MAX + 1))
+
+
+def test_an_array_at_too_long_a_path_is_refused_by_it() -> None:
+    assert NAME_SIZE_MAX == segment.MAX_NAME_SIZE
+    value: dict[str, Any] = {"x": np.zeros(1000)}
+    for _ in range(50):
+        value = {"x": value}
+    with pytest.raises(KeepError, match=r"cannot keep kept\['x'\].*…: its name is longer than 224 bytes; keep it at a shorter"):
+        resumed(Any, value)
 
 
 def test_errors_are_of_one_family_and_know_the_place() -> None:
