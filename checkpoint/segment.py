@@ -14,7 +14,7 @@ import os
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Final
 
 import numpy as np
@@ -123,9 +123,9 @@ class Layout:
         """Bytes of the whole segment."""
         return self.bank_offset(self.banks)
 
-    def first_page(self, index: int) -> int:
-        """The number, in a bank, of a region's first page."""
-        return sum(region.page_count for region in self.regions[:index])
+    def first_pages(self) -> list[int]:
+        """The number, in a bank, of each region's first page."""
+        return list(accumulate((region.page_count for region in self.regions[:-1]), initial=0))
 
     def addresses(self) -> Words:
         """The address of every page of a bank."""
@@ -157,13 +157,13 @@ class Layout:
         head = HEAD.pack(
             MAGIC, VERSION, PAGE, len(self.regions), self.banks, self.page_count, self.file_size, self.lineage
         )  # fmt: skip
-        entries = [self._entry(index) for index in range(len(self.regions))]
+        entries = [_entry(region, first) for region, first in zip(self.regions, self.first_pages(), strict=True)]
         return head.ljust(TABLE_OFFSET, b"\0") + b"".join(entries)
 
-    def _entry(self, index: int) -> bytes:
-        region = self.regions[index]
-        name = region.name.encode()
-        return ENTRY.pack(region.kind, len(name), region.address, region.size, self.first_page(index), name)
+
+def _entry(region: Region, first_page: int) -> bytes:
+    name = region.name.encode()
+    return ENTRY.pack(region.kind, len(name), region.address, region.size, first_page, name)
 
 
 def _whole(size: int) -> int:
@@ -212,7 +212,7 @@ class Committed:
     def region(self, index: int) -> bytearray:
         """The bytes of one region, where the whole state was read; pages never written are zeros."""
         wanted = self.layout.regions[index]
-        first = self.layout.first_page(index)
+        first = self.layout.first_pages()[index]
         low, high = np.searchsorted(self.pages, [first, first + wanted.page_count])
         found = bytearray(wanted.page_count * PAGE)
         rows = np.frombuffer(found, dtype=np.uint8).reshape(-1, PAGE)

@@ -150,7 +150,7 @@ class SegmentReader:
 
     def _read_layout(self) -> Layout:
         head = self._exactly(HEAD.size, 0)
-        magic, version, page, region_count, banks, page_count, file_size, lineage = HEAD.unpack(head)
+        magic, version, page, region_count, banks, _, _, lineage = HEAD.unpack(head)
         if magic != MAGIC:
             raise SegmentError(f"segment: it begins with {magic!r}, not with {MAGIC!r}")
         if (version, page) != (VERSION, PAGE):
@@ -160,10 +160,7 @@ class SegmentReader:
         packed = self._exactly(region_count * ENTRY.size, TABLE_OFFSET)
         layout = Layout(tuple(_region(entry) for entry in ENTRY.iter_unpack(packed)), lineage, banks)
         layout.check()
-        if layout.packed() != head.ljust(TABLE_OFFSET, b"\0") + packed or (page_count, file_size) != (
-            layout.page_count,
-            layout.file_size,
-        ):
+        if layout.packed() != head.ljust(TABLE_OFFSET, b"\0") + packed:
             raise SegmentError("segment: its header and its table of regions contradict one another")
         if os.fstat(self._file).st_size < layout.file_size:
             raise SegmentError(f"segment: {os.fstat(self._file).st_size} bytes where {layout.file_size} belong")

@@ -88,7 +88,7 @@ class SegmentWriter:
         self._stamps = [
             whole[layout.versions_offset(bank) :][: layout.page_count * WORD].view(np.uint64) for bank in range(layout.banks)
         ]
-        self._firsts = [layout.first_page(index) for index in range(len(layout.regions))]
+        self._firsts = layout.first_pages()
         self._counts = [region.page_count for region in layout.regions]
         self._versions = np.zeros(layout.page_count, dtype=np.uint64)
         """Of every page: the commit that changed it last."""

@@ -31,8 +31,8 @@ log = logging.getLogger("failover.task")
 SUFFIX: Final = ".state"
 SMALL_PAGES: Final = 64
 """A state of no more pages is written whole each time: one file is read at a restart, none is folded."""
-REST_PART: Final = 4
-"""After a write the thread rests this many times as long as the write took, so that it takes a fifth of a processor at most…"""
+REST_PART: Final = 9
+"""After a write the thread rests this many times as long as it took: it takes a tenth of a processor, and of Python, at most…"""
 REST_S_MAX: Final = 0.1
 """…but not longer than this, which is what a crash loses of a program that commits without pause."""
 RETRY_S: Final = 0.5
