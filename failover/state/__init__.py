@@ -28,7 +28,8 @@ Refused by name, at declaration or at the commit: locks, files, sockets, functio
 attributes that are no fields, views that share memory, nesting deeper than 100, more than 64 MiB besides arrays.
 
 An object that is reached by two paths is one object again, and cycles are cycles: a second way to a mutable object is stored as
-the path of the first. That costs one look into a dictionary for each mutable object; refusing it would forbid ``current = plan[3]``.
+the path of the first. That costs one look into a dictionary for each mutable object; refusing it would forbid
+``current = plan[3]``.
 
 Evolution: an added field takes its default, a removed one is dropped (both noted), ``Annotated[float, Formerly("theta")]`` finds
 a former name; ``version`` and ``migrations`` change the rest, on plain values (``PlainRecord``, ``Labelled``, ``Unread``).

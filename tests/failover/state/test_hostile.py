@@ -199,6 +199,7 @@ RECORD = {"names": ["a", "b"], "formats": ["<f8", "<i4"], "offsets": [0, 8], "it
         array(RECORD | {"offsets": [0, 9]}, [1], bytes(12)),
         array(RECORD | {"offsets": [-8, 0]}, [1], bytes(12)),
         array(RECORD | {"itemsize": 1 << 40}, [1], bytes(12)),
+        array(RECORD | {"itemsize": 1 << 21}, [0], b""),
         array(RECORD | {"itemsize": -1}, [1], bytes(12)),
         array(RECORD | {"names": ["a", "a"]}, [1], bytes(12)),
         array(RECORD | {"names": ["a", ""]}, [1], bytes(12)),
