@@ -6,6 +6,7 @@ A commit that is cut off anywhere leaves the bank that it wrote with the number 
 from __future__ import annotations
 
 import ctypes
+import errno
 import fcntl
 import mmap
 import os
@@ -31,6 +32,7 @@ from checkpoint.segment import (
     WORD,
     Layout,
     lock_of,
+    stretches,
 )
 
 Bytes = NDArray[np.uint8]
@@ -43,9 +45,20 @@ COMPARE_SIZE: Final = 1 << 18
 
 _NEWEST: Final = NEWEST_OFFSET // WORD
 
-_memcmp = ctypes.CDLL(None).memcmp
+RUNS_MAX: Final = 1024
+"""Stretches of pages that are copied one by one; more are copied by numpy."""
+
+# These calls keep the interpreter: whoever lets it go in the middle of a commit, be it for a microsecond, may get it back from
+# the thread that writes the file only after sys.getswitchinterval(), 5 ms.
+_libc = ctypes.PyDLL(None, use_errno=True)
+_memcmp = _libc.memcmp
 _memcmp.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t)
 _memcmp.restype = ctypes.c_int
+_memcpy = _libc.memcpy
+_memcpy.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t)
+_memcpy.restype = ctypes.c_void_p
+_fcntl = _libc.fcntl
+_fcntl.restype = ctypes.c_int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,7 +139,7 @@ class SegmentWriter:
         try:
             self._write(bank, number, sources)
         finally:
-            fcntl.fcntl(self.descriptor, fcntl.F_OFD_SETLK, self._unlocks[bank])
+            _fcntl(self.descriptor, fcntl.F_OFD_SETLK, self._unlocks[bank])
         self._words[_NEWEST] = number << BANK_BITS | bank
         self.number, self._newest = number, bank
         return True
@@ -208,7 +221,7 @@ class SegmentWriter:
             if rest[0] == whole:
                 rows[whole, : len(content) - whole * PAGE] = content[whole * PAGE :]
         if len(missed):
-            rows[missed] = content[: whole * PAGE].reshape(-1, PAGE)[missed]
+            _copy_pages(rows, content, missed)
 
     def _copy_few(self, bank: int, index: int, content: bytes, since: int) -> None:
         """As `_copy`, for few bytes."""
@@ -225,11 +238,10 @@ class SegmentWriter:
         """Lock a bank that is neither the newest nor held; the one that has missed least."""
         for bank in sorted(range(len(self._held)), key=self._held.__getitem__, reverse=True):
             if bank != self._newest:
-                try:
-                    fcntl.fcntl(self.descriptor, fcntl.F_OFD_SETLK, self._locks[bank])
-                except BlockingIOError:
-                    continue
-                return bank
+                if _fcntl(self.descriptor, fcntl.F_OFD_SETLK, self._locks[bank]) == 0:
+                    return bank
+                if ctypes.get_errno() not in (errno.EAGAIN, errno.EACCES):
+                    raise OSError(ctypes.get_errno(), "cannot lock a bank of a segment")
         return None
 
     def grown(self, layout: Layout) -> SegmentWriter:
@@ -271,6 +283,17 @@ class SegmentWriter:
     def close(self) -> None:
         """Give the descriptor back; the memory goes with the last view of it."""
         os.close(self.descriptor)
+
+
+def _copy_pages(rows: Bytes, content: Bytes, numbers: NDArray[np.intp]) -> None:
+    """Copy whole pages, by their numbers, in order."""
+    runs = stretches(numbers.view(np.uint64))
+    if len(runs) > RUNS_MAX:
+        rows[numbers] = content[: len(content) // PAGE * PAGE].reshape(-1, PAGE)[numbers]
+        return
+    target, origin = rows.ctypes.data, content.ctypes.data
+    for first, count in runs:
+        _memcpy(target + first * PAGE, origin + first * PAGE, count * PAGE)
 
 
 def pages_of(size: int) -> int:

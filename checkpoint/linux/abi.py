@@ -211,6 +211,11 @@ ioctl = _libc.ioctl
 ioctl.argtypes = (ctypes.c_int, ctypes.c_ulong, ctypes.c_void_p)
 ioctl.restype = ctypes.c_int
 
+ioctl_held = ctypes.PyDLL(None, use_errno=True).ioctl
+"""As `ioctl`, but other threads of the interpreter wait: for a short call in the middle of what must not be late."""
+ioctl_held.argtypes = ioctl.argtypes
+ioctl_held.restype = ioctl.restype
+
 _syscall = _libc.syscall
 _syscall.restype = ctypes.c_long
 

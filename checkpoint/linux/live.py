@@ -153,7 +153,7 @@ class LiveMemory:
             return
         try:
             enable_write_protection(self._faults)
-            scanner = PageScanner(os.getpid())
+            scanner = PageScanner(os.getpid(), abi.ioctl_held)
             scanner.is_protected(0, abi.PAGE_SIZE)
         except (OSError, CheckpointError) as error:
             self._give_up(str(error))
