@@ -31,7 +31,6 @@ class ArrayKind(Kind):
         self._dtype = dtype
         self._shape = shape
         self.name = f"array{'' if dtype is None else f' of {dtype}'}{'' if shape is None else f' {shape}'}"
-        self._lowered: dict[Dtype, Wire] = {}
 
     def lower(self, value: Any, walk: Walk, place: Place) -> Wire:
         if type(value) is not np.ndarray:
@@ -47,7 +46,7 @@ class ArrayKind(Kind):
         shape = list(value.shape)
         if flat.nbytes < walk.inline_size:
             return {ARRAY: [lowered, shape, flat.tobytes(), order]}
-        return {ARRAY: [lowered, shape, walk.put_aside(flat, str(value.dtype), value.shape, place), order]}
+        return {ARRAY: [lowered, shape, walk.put_aside(flat, value.dtype.str, value.shape, place), order]}
 
     def _check(self, value: Array, place: Place) -> None:
         if (self._dtype is not None and value.dtype != self._dtype) or (self._shape is not None and value.shape != self._shape):

@@ -19,7 +19,7 @@ TUPLE, SET, FROZENSET, DEQUE, MAP, DICT = "$tuple", "$set", "$frozenset", "$dequ
 
 def _lower_all(values: Any, element: Kind, walk: Walk, place: Place) -> list[Wire]:
     """Every element's wire value."""
-    if element.exact.issuperset(map(type, values)):
+    if element.are_wires(values):
         return values if type(values) is list else list(values)
     depth = place[2] + 1
     return [element.lower(value, walk, (place, index, depth)) for index, value in enumerate(values)]
@@ -206,7 +206,7 @@ class MappingKind(Kind):
         if again is not None:
             return again
         if self._is_map(value):
-            if self._value.exact.issuperset(map(type, value.values())):
+            if self._value.are_wires(value.values()):
                 return {MAP: dict(value)}
             depth = place[2] + 1
             pairs = enumerate(value.items())

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,9 @@ DTYPE_DEPTH_MAX = 8
 
 SIZE_MAX = (1 << 63) - 1
 
+REMEMBERED_MAX = 256
+"""Dtypes whose wire values are remembered: a program has a few, and asks at every commit."""
+
 _PLAIN = re.compile(
     r"""[<>|](?:
         b1 | i[1248] | u[1248] | f[248] | c(?:8|16)         # truth values and numbers that every machine has
@@ -42,6 +46,7 @@ class DtypeError(ValueError):
     """An element type that is not kept; the message says which and why."""
 
 
+@lru_cache(maxsize=REMEMBERED_MAX)
 def lower_dtype(dtype: Dtype, depth: int = DTYPE_DEPTH_MAX) -> Wire:
     """A dtype as a wire value.
 
@@ -59,6 +64,8 @@ def lower_dtype(dtype: Dtype, depth: int = DTYPE_DEPTH_MAX) -> Wire:
         return {"base": lower_dtype(base, depth - 1), "shape": list(shape)}
     if dtype.names is not None and dtype.fields is not None:
         fields = [dtype.fields[name] for name in dtype.names]
+        if any(len(field) > 2 for field in fields):
+            raise DtypeError("dtype has titles beside its names; they are not kept, drop them")
         if len(fields) > FIELD_COUNT_MAX:
             raise DtypeError(f"dtype of {len(fields)} fields: more than {FIELD_COUNT_MAX}")
         lowered = {

@@ -11,7 +11,7 @@ been two, silently. Immutable values may be split, for nobody can tell.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,6 +71,10 @@ class Kind(ABC):
         Raises:
             FitError: it is not of the declared type; names the place.
         """
+
+    def are_wires(self, values: Iterable[Any]) -> bool:
+        """Whether all of these are their own wire values: much faster to ask at once than one by one."""
+        return self.exact.issuperset(map(type, values))
 
     def parts(self) -> tuple[Kind, ...]:
         """The kinds inside, for a description."""

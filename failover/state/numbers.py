@@ -7,6 +7,7 @@ back as exactly what it was.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,12 @@ class NumberKind(Kind):
         if isinstance(value, self._scalar):
             return arrays.lower_scalar(value, self, place)
         raise self.stranger(value, place)
+
+    def are_wires(self, values: Iterable[Any]) -> bool:
+        kinds = set(map(type, values))
+        if kinds <= self.exact:
+            return True
+        return kinds == {int} and int in self._plain and min(values) >= INT_MIN and max(values) <= INT_MAX
 
     def lift(self, wire: Wire, build: Build, place: Place) -> Any:
         kind = type(wire)
@@ -116,6 +123,9 @@ class TextKind(Kind):
                 return arrays.lower_scalar(value, self, place)
             raise self.stranger(value, place)
         return value if value.isascii() else lower_text(value)
+
+    def are_wires(self, values: Iterable[Any]) -> bool:
+        return set(map(type, values)) <= self.types and all(map(str.isascii, values))
 
     def lift(self, wire: Wire, build: Build, place: Place) -> str:
         if type(wire) is str:

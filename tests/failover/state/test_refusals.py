@@ -117,6 +117,7 @@ def test_a_component_names_the_field_that_cannot_be_kept(field: Field, sentence:
             np.zeros(1, np.longdouble),
             r"kept: .* is not the same on every machine; convert it, for example",
         ),
+        (np.ndarray, np.zeros(1, [(("title", "a"), "i4")]), r"kept: .* dtype has titles beside its names"),
         (np.ndarray, np.ma.masked_array([1]), r"kept: it holds a MaskedArray, declared array; keep numpy.asarray"),
         (np.ndarray, [1], r"kept: it holds a list, declared array"),
         (dt.datetime, dt.datetime(2026, 1, 1, tzinfo=type("Zone", (dt.tzinfo,), {})()), r"kept: .*; its time zone is neither"),
