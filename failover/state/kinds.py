@@ -1,7 +1,6 @@
 """The contract of a kind: how values of one declared type become wire values and come back.
 
-A schema is compiled once into a tree of kinds; a commit then only walks it. Kinds are values of a program's start: nothing in
-them changes after ``annotations.compiled``.
+A schema is compiled once into a tree of kinds; a commit then only walks it. Nothing in a kind changes once the schema is made.
 
 Lowering (value → wire) meets every mutable object once: a second way to it is stored as such (``$same`` and the place of the
 first), so an object that is reached by two paths is one object again after a resume, cycles included; a plain copy would have

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import pickle
 import random
+import sys
 import tracemalloc
 from collections.abc import Iterator
 from typing import Annotated, Any
@@ -396,3 +398,48 @@ def test_values_put_in_the_place_of_others_are_refused_or_read(seed: int) -> Non
             damaged = replaced(damaged, dice.choice(spots), new)
         outcomes.add(survives(forged(damaged, *whole.regions)))
     assert outcomes == {True, False}
+
+
+RUNNING = frozenset(
+    {"exec", "compile", "import", "open", "os.exec", "os.system", "subprocess.Popen", "pickle.find_class", "socket.connect"}
+)
+"""Audit events of code that runs, is loaded or reaches out (PEP 578)."""
+
+
+class Watch:
+    """Audit events of a while; the hook itself cannot be taken out again."""
+
+    def __init__(self) -> None:
+        self.seen: list[str] = []
+        self._watching = False
+        sys.addaudithook(self._look)
+
+    def _look(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if self._watching and event in RUNNING:
+            self.seen.append(event)
+
+    def __enter__(self) -> Watch:
+        self._watching = True
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._watching = False
+
+
+def test_reading_a_hostile_state_runs_and_opens_nothing() -> None:
+    whole = carried(SCHEMA.encode(mission()))
+    wire = msgspec.msgpack.decode(whole.data)[3]
+    nasty = ({"$pickled": pickle.dumps(os.system)}, "os.system", {"$as": ["os.system", "true"]})
+    states = [forged(replaced(wire, path, new), *whole.regions) for path in places(wire) for new in nasty]
+    with Watch() as watch:
+        accepted = sum(map(survives, states))
+    assert watch.seen == []
+    assert 0 < accepted < len(states)
+
+
+def test_the_watch_sees_what_pickle_loads() -> None:
+    """A check that cannot fail is worse than none."""
+    state = forged({"$pickled": pickle.dumps(os.system)})
+    with Watch() as watch:
+        Schema.of(Annotated[Any, Pickled()], name="kept").decode(state)
+    assert "pickle.find_class" in watch.seen
