@@ -304,7 +304,9 @@ def transaction(state: S) -> Iterator[S]:
 
 
 def wait_committed(timeout: float | None = None) -> None:
-    """Return when the newest commit would survive: a power cut here or, with an agent, the loss of this robot.
+    """Return when the newest commit would survive a power cut.
+
+    In an asyncio loop: ``await asyncio.to_thread(failover.wait_committed, 1.0)``.
 
     Args:
         timeout: seconds.

@@ -52,6 +52,10 @@ def again() -> None:
     PROCESS.release()
 
 
+def test_every_public_name_is_there() -> None:
+    assert all(getattr(failover, name) is not None for name in failover.__all__)
+
+
 # The plain form
 
 
