@@ -124,7 +124,11 @@ class Schema:
         """
         compiler = Compiler()
         declared = Field(annotation, default, pickled=pickled)
-        return cls._made(compiler, compiler.field(declared, name), default_of(declared), name, version, migrations or {})
+        try:
+            kind = compiler.field(declared, name)
+        except RecursionError as error:
+            raise _endless(name) from error
+        return cls._made(compiler, kind, default_of(declared), name, version, migrations or {})
 
     @classmethod
     def of_fields(
@@ -141,7 +145,10 @@ class Schema:
             SchemaError: one cannot be kept; names it.
         """
         compiler = Compiler()
-        kind = compiler.component(name, fields)
+        try:
+            kind = compiler.component(name, fields)
+        except RecursionError as error:
+            raise _endless(name) from error
         return cls._made(compiler, kind, lambda: _fresh_fields(kind.fields, name), name, version, migrations or {})
 
     @classmethod
@@ -260,6 +267,13 @@ class Schema:
         except Exception as error:
             message = f"{self.name}: its migration from version {start} failed: {type(error).__name__}: {error}"
             raise FitError(f"{message}; mend it, the state is still stored", self.name) from error
+
+
+def _endless(name: str) -> SchemaError:
+    """The refusal of a type alias that contains itself."""
+    return SchemaError(
+        f"cannot keep {name}: a type in it is made of itself without end; put a class between, or declare Any", name
+    )
 
 
 def read(data: bytes | memoryview, name: str = "state") -> Stored:

@@ -7,9 +7,11 @@ from collections import defaultdict, deque
 from decimal import Decimal
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from failover.state import Encoded, Region, Schema
+from failover.state.wire import FORMAT
 
 
 def same(left: Any, right: Any) -> bool:
@@ -54,3 +56,8 @@ def moved(old: Any, value: Any, new: Any, **declared: Any) -> Any:
     stored = Schema.of(old, name="kept").encode(value)
     decoded = Schema.of(new, name="kept", **declared).decode(carried(stored))
     return decoded.value, decoded.notes
+
+
+def forged(wire: Any, *regions: Region, version: int = 1) -> Encoded:
+    """A state in our format that holds any wire value."""
+    return Encoded(msgspec.msgpack.encode([FORMAT, version, bytes(16), wire]), regions)

@@ -77,6 +77,16 @@ def test_what_cannot_be_kept_is_refused_when_it_is_declared(declared: Any, sente
         Schema.of(declared, name="kept")
 
 
+def test_a_type_that_is_made_of_itself_is_refused() -> None:
+    endless = type("TypeAliasType", (), {})()  # ``type Endless = list[Endless]``, as Python 3.12 has it
+    endless.__value__ = list[endless]
+    for declare in (lambda: Schema.of(endless, name="kept"), lambda: Schema.of_fields({"x": Field(endless)}, name="kept")):
+        with pytest.raises(
+            SchemaError, match="cannot keep kept: a type in it is made of itself without end; put a class between"
+        ):
+            declare()
+
+
 @pytest.mark.parametrize(
     ("field", "sentence"),
     [
