@@ -12,10 +12,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from checkpoint.errors import SegmentError
 from checkpoint.linux.live import LiveMemory
-from checkpoint.segment import ARRAY, MAX_NAME_SIZE, PAGE, STATE, Layout, Region, address_of
+from checkpoint.segment import ARRAY, MAX_NAME_SIZE, MAX_PLACES, PAGE, STATE, Layout, Region, address_of
 from checkpoint.segment_reader import SegmentReader
-from checkpoint.segment_writer import SegmentWriter, Source
+from checkpoint.segment_writer import SegmentWriter, Source, pages_of
 from failover.errors import KeepError, StateFormatError, TaskError
 from failover.state import Decoded, Encoded, Schema
 from failover.state import Region as EncodedRegion
@@ -54,8 +55,8 @@ class KeptState:
         """Bytes that each region of the segment has."""
         self._places = {STATE_NAME: 0}
         self._next_place = 1
-        self._memory_of: dict[str, int] = {}
-        """Where the content of each region lay at the last commit."""
+        self._memory_of: dict[str, tuple[int, int]] = {}
+        """Where the content of each region lay at the last commit, and its size."""
         self._is_forked = False
         _close_in_children(self)
 
@@ -83,6 +84,9 @@ class KeptState:
             encoded = self._schema.encode(value)
             try:
                 return self._commit(encoded)
+            except SegmentError as error:
+                self.live.distrust()
+                raise KeepError(f"cannot keep {self._schema.name}: {error}", self._schema.name) from error
             except BaseException:
                 self.live.distrust()
                 raise
@@ -103,44 +107,60 @@ class KeptState:
         """
         if isinstance(content, bytes) or name == STATE_NAME:
             return Source(content)
-        address = content.ctypes.data if len(content) else 0
-        before = self._memory_of.get(name, address)
-        self._memory_of[name] = address
-        live = self.live.at(address)
+        memory = (content.ctypes.data, len(content)) if len(content) else (0, 0)
+        before = self._memory_of.get(name, memory)
+        self._memory_of[name] = memory
+        live = self.live.at(memory[0])
         if live is None:
             return Source(content)
         written = live.take(name)
-        return Source(content, written if before == address else None)
+        if written is None or before != memory:
+            return Source(content)
+        return Source(content, written[written < pages_of(len(content))])
 
     def _has_room(self, contents: Contents) -> bool:
         return all(len(content) <= self._rooms.get(name, 0) for name, content in contents.items())
 
     def _make_room(self, contents: Contents) -> SegmentWriter:
         """Go on in a larger segment; regions that are not used any more go."""
-        for name in [name for name in self._places if name not in contents]:
-            del self._places[name]
-            self._memory_of.pop(name, None)
         for name in contents:
             if len(name.encode()) > MAX_NAME_SIZE:
                 raise KeepError(
                     f"cannot keep {name[:60]}…: the way to it is longer than {MAX_NAME_SIZE} bytes; keep it flatter", name
                 )
+        if self._next_place + len(contents) > MAX_PLACES:
+            self._begin_lineage()
+        for name in [name for name in self._places if name not in contents]:
+            del self._places[name]
+            self._memory_of.pop(name, None)
+        for name in contents:
             if name not in self._places:
                 self._places[name] = self._next_place
                 self._next_place += 1
-        self._rooms = {
-            name: self._room_for(name, len(contents[name])) for name in sorted(self._places, key=self._places.__getitem__)
-        }
+        rooms = {name: self._room_for(name, len(contents[name])) for name in sorted(self._places, key=self._places.__getitem__)}
         regions = [
             Region(name, STATE if name == STATE_NAME else ARRAY, address_of(self._places[name]), size)
-            for name, size in self._rooms.items()
+            for name, size in rooms.items()
         ]
         layout = Layout(tuple(regions), self._lineage)
-        old, self._writer = self._writer, self._writer.grown(layout) if self._writer else SegmentWriter(layout)
+        old, self._writer = self._writer, self._grown(layout)
+        self._rooms = rooms
         if old is not None:
             old.supersede()
             old.close()
         return self._writer
+
+    def _grown(self, layout: Layout) -> SegmentWriter:
+        if self._writer is None or self._writer.layout.lineage != layout.lineage:
+            return SegmentWriter(layout, number=self.number)
+        return self._writer.grown(layout)
+
+    def _begin_lineage(self) -> None:
+        """All addresses were given to some region: begin again, with a whole state."""
+        self._lineage = secrets.token_bytes(16)
+        self._places, self._next_place = {STATE_NAME: 0}, 1
+        self._memory_of.clear()
+        self.live.distrust()
 
     def _room_for(self, name: str, size: int) -> int:
         """What a region gets: what it needs, and twice as much when it turns out that it grows."""

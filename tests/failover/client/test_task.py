@@ -313,6 +313,55 @@ def test_a_live_array_that_goes_and_comes_back_or_changes_places_is_what_it_was(
     assert (state.images["b"] == 7).all()
 
 
+def test_a_part_of_a_live_array_is_kept_as_that_part_whatever_its_size_was_before() -> None:
+    state = failover.resume("maps", default=Maps(images={"a": np.ones(400_000, dtype=np.uint8)}))
+    failover.commit()
+    again()
+    state = failover.resume("maps", default=Maps())
+    whole = state.images["a"]
+    for size in (400_000, 150_000, 300_000, 70_000):
+        state.images["a"] = whole[:size]
+        whole[size - 1 :: 4096] = size % 251
+        failover.commit()
+        expected = whole[:size].copy()
+    again()
+    state = failover.resume("maps", default=Maps())
+    assert np.array_equal(state.images["a"], expected)
+
+
+def test_when_all_addresses_were_used_a_new_lineage_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("failover.client.task_state.MAX_PLACES", 6)
+    state = failover.resume("maps", default=Maps(images={"fixed": np.ones(100_000, dtype=np.uint8)}))
+    for number in range(20):
+        state.images.pop(f"image {number - 1}", None)
+        state.images[f"image {number}"] = np.full(9000, number, dtype=np.uint8)
+        state.images["fixed"][number] = number
+        assert failover.commit() == number + 1
+        failover.wait_committed(30)
+    again()
+    images = failover.resume("maps", default=Maps()).images
+    assert images.keys() == {"fixed", "image 19"}
+    assert (images["image 19"] == 19).all() and images["fixed"][:21].tolist() == [*range(20), 1]
+
+
+def test_more_arrays_than_a_segment_has_regions_are_refused_and_the_last_commit_stands() -> None:
+    state = failover.resume("maps", default=Maps(number=1))
+    failover.commit()
+    state.images = {f"image {number}": np.ones(5000, dtype=np.uint8) for number in range(1100)}
+    with pytest.raises(KeepError, match="regions"):
+        failover.commit()
+    again()
+    state = failover.resume("maps", default=Maps())
+    assert state == Maps(number=1)
+    state.images = {f"image {number}": np.ones(5000, dtype=np.uint8) for number in range(1100)}
+    with pytest.raises(KeepError, match="regions"):
+        failover.commit()
+    state.images = {"image 7": np.full(5000, 7, dtype=np.uint8)}
+    failover.commit()
+    again()
+    assert (failover.resume("maps", default=Maps()).images["image 7"] == 7).all()
+
+
 def test_a_forked_child_may_not_commit_the_state_of_its_parent() -> None:
     mission = failover.resume("mission", default=Mission())
     failover.commit()
