@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from benchmarks import beside, encoding, engine, interference, machine, outage, results
+from benchmarks import beside, encoding, engine, interference, machine, outage, results, task
 from benchmarks.figures import Absent, Findings
 from benchmarks.running import BenchmarkError
 from checkpoint.errors import CheckpointError
@@ -66,6 +66,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "throughput": interference.throughput,
     "beats": interference.beats,
     "encoding": encoding.encoding,
+    "task": task.task,
 }
 
 

@@ -69,3 +69,11 @@ class StoreError(CheckpointError):
 
 class MapsFormatError(CheckpointError):
     """A line of /proc/PID/maps is not of the documented form."""
+
+
+class SegmentError(CheckpointError):
+    """A segment is not as SEGMENT.md says, or its program does not keep the rules; nothing of it was used."""
+
+
+class SegmentBusyError(SegmentError):
+    """The newest bank could not be held just now; ask again later."""

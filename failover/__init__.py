@@ -6,6 +6,15 @@ Applications import from here; each name is loaded when it is first used, so tha
 
     with Control.open() as agent:
         print(agent.ask("status")["promise"])
+
+and a program that says what must survive:
+
+    import failover
+
+    state = failover.resume("mission", default=Mission())
+    while state.leg < 10:
+        state.leg += 1
+        failover.commit()
 """
 
 from __future__ import annotations
@@ -15,19 +24,68 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from failover.client.control import Control
-    from failover.errors import AgentRefusedError, FailoverError, LostAgentError, NoAgentError
+    from failover.client.task import Resumed, activations, commit, resume, resumed, transaction, wait_committed
+    from failover.client.task_component import component, kept, run
+    from failover.client.task_loop import FINISHED
+    from failover.client.task_resumable import resumable
+    from failover.errors import (
+        AgentRefusedError,
+        FailoverError,
+        LostAgentError,
+        NoAgentError,
+        NotCommittedError,
+        StateTakenError,
+        TaskError,
+    )
 
 __version__ = "0.1.0"
 
-__all__ = ["AgentRefusedError", "Control", "FailoverError", "LostAgentError", "NoAgentError", "__version__"]
-
 _HOMES = {
     "Control": "failover.client.control",
+    "Resumed": "failover.client.task",
+    "activations": "failover.client.task",
+    "commit": "failover.client.task",
+    "resume": "failover.client.task",
+    "resumed": "failover.client.task",
+    "transaction": "failover.client.task",
+    "wait_committed": "failover.client.task",
+    "component": "failover.client.task_component",
+    "kept": "failover.client.task_component",
+    "run": "failover.client.task_component",
+    "FINISHED": "failover.client.task_loop",
+    "resumable": "failover.client.task_resumable",
     "AgentRefusedError": "failover.errors",
     "FailoverError": "failover.errors",
     "LostAgentError": "failover.errors",
     "NoAgentError": "failover.errors",
+    "NotCommittedError": "failover.errors",
+    "StateTakenError": "failover.errors",
+    "TaskError": "failover.errors",
 }
+
+__all__ = [
+    "FINISHED",
+    "AgentRefusedError",
+    "Control",
+    "FailoverError",
+    "LostAgentError",
+    "NoAgentError",
+    "NotCommittedError",
+    "Resumed",
+    "StateTakenError",
+    "TaskError",
+    "__version__",
+    "activations",
+    "commit",
+    "component",
+    "kept",
+    "resumable",
+    "resume",
+    "resumed",
+    "run",
+    "transaction",
+    "wait_committed",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -47,3 +47,43 @@ class RulesError(FailoverError):
 
 class NameFormatError(FailoverError):
     """A name of a robot, a team or a component is not of the documented form."""
+
+
+class StateError(FailoverError):
+    """Something about the state that a program keeps (``failover.state``) does not work.
+
+    Attributes:
+        place: where in the state, as the program would write it: "mapper.plan[3].image"; "" for the state as a whole.
+    """
+
+    def __init__(self, message: str, place: str = "") -> None:
+        super().__init__(message)
+        self.place = place
+
+
+class SchemaError(StateError):
+    """A program declares to keep what cannot be kept; found when it starts, before anything is stored."""
+
+
+class KeepError(StateError):
+    """A value cannot be kept as it was declared; the commit was not made, and the last one stands."""
+
+
+class FitError(StateError):
+    """A stored state does not fit what the program declares; nothing was built of it, and it is still stored."""
+
+
+class StateFormatError(StateError):
+    """Bytes that are not a whole state of a version that we read; nothing was built of them."""
+
+
+class TaskError(FailoverError):
+    """A program that keeps its state used the interface in a way that cannot work; nothing was stored or lost."""
+
+
+class StateTakenError(TaskError):
+    """Another process keeps the state of this name."""
+
+
+class NotCommittedError(FailoverError, TimeoutError):
+    """A commit is not known to survive yet; the program may go on, or wait again."""

@@ -213,6 +213,11 @@ ioctl = _libc.ioctl
 ioctl.argtypes = (ctypes.c_int, ctypes.c_ulong, ctypes.c_void_p)
 ioctl.restype = ctypes.c_int
 
+ioctl_held = ctypes.PyDLL(None, use_errno=True).ioctl
+"""As `ioctl`, but other threads of the interpreter wait: for a short call in the middle of what must not be late."""
+ioctl_held.argtypes = ioctl.argtypes
+ioctl_held.restype = ioctl.restype
+
 _syscall = _libc.syscall
 _syscall.restype = ctypes.c_long
 
@@ -237,6 +242,17 @@ def pidfd_getfd(pidfd: int, target: int) -> int:
     """
     result = int(_syscall(NR_PIDFD_GETFD, ctypes.c_int(pidfd), ctypes.c_int(target), ctypes.c_uint(0)))
     return result if result >= 0 else int(raise_errno(f"pidfd_getfd of descriptor {target}"))
+
+
+def userfaultfd(number: int, flags: int) -> int:
+    """A userfaultfd of our own memory; negative, with errno, where there is none.
+
+    Args:
+        number: of the call on this processor.
+
+    Source: userfaultfd(2).
+    """
+    return int(_syscall(number, ctypes.c_int(flags)))
 
 
 KCMP_FILES: Final = 2

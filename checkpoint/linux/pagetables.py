@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+from collections.abc import Callable
 from typing import Final, Protocol
 
 import numpy as np
@@ -32,13 +33,17 @@ class MappingLostError(CaptureError):
 class PageScanner:
     """PAGEMAP_SCAN on one process's pagemap.
 
+    Args:
+        ioctl: makes the call; ``abi.ioctl_held`` keeps the interpreter meanwhile.
+
     Raises:
         ProcessGoneError: it ended, or it became another program (exec).
         ProbeError: not permitted: it ended just now, or became another user's.
     """
 
-    def __init__(self, pid: int) -> None:
+    def __init__(self, pid: int, ioctl: Callable[[int, int, int], int] = abi.ioctl) -> None:
         self._pid = pid
+        self._ioctl = ioctl
         self._pagemap = procfs.opened(pid, "pagemap")
         self._regions = np.zeros((REGION_COUNT, 3), dtype=np.uint64)
         self._order = abi.PageScan(size=ctypes.sizeof(abi.PageScan), vec=self._regions.ctypes.data, vec_len=REGION_COUNT)
@@ -155,7 +160,7 @@ class PageScanner:
             order.end = end
             while start < end:
                 order.start = start
-                count = abi.ioctl(self._pagemap, abi.PAGEMAP_SCAN, place)
+                count = self._ioctl(self._pagemap, abi.PAGEMAP_SCAN, place)
                 if count < 0:
                     self._refused("scan")
                     if refused is not None:

@@ -1,0 +1,298 @@
+"""The cooperative engine: snapshots of what a program has committed to its segment. Nobody is frozen, nobody traced.
+
+A cooperative snapshot is one like any other: its mappings are the segment's regions at made-up addresses, its runs the pages that
+changed. It has no threads; what it says of the process is what ``/proc`` tells everybody. A resource of kind "task" says what
+the pages mean:
+
+    arguments   of the program, as it was started
+    directory   its working directory
+    commit      number of the commit, in its lineage
+    regions     [kind, size] of each region, in the order of the mappings
+
+A delta is made against what was acknowledged, as everywhere: pages whose version is later than the acknowledged commit.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import socket
+import time
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from checkpoint import pages
+from checkpoint.chain import position_of
+from checkpoint.engine import CaptureOrder
+from checkpoint.errors import CaptureError, RestoreError, SegmentError
+from checkpoint.linux import abi, procfs
+from checkpoint.model import (
+    Clocks,
+    Credentials,
+    Fact,
+    FileIdentity,
+    Machine,
+    MemoryLayout,
+    Position,
+    ProcessState,
+    Resource,
+    Snapshot,
+    Vma,
+    VmaKind,
+)
+from checkpoint.pages import PageTable, Words
+from checkpoint.segment import PAGE, Committed, Layout, Region
+from checkpoint.segment_reader import SegmentReader
+from checkpoint.segment_writer import NAME as SEGMENT_NAME
+from checkpoint.segment_writer import SegmentWriter, Source
+
+NAME: Final = "cooperative"
+KIND: Final = "task"
+MAX_WAITING: Final = 64
+"""Captures that wait for their acknowledgement; of older ones none is expected any more."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Mark:
+    """A commit that was captured.
+
+    Attributes:
+        commit: its number.
+        lineage: in which that number counts.
+    """
+
+    position: Position
+    commit: int
+    lineage: bytes
+    table: PageTable
+
+
+class CooperativeSession:
+    """One segment that is followed. See `checkpoint.engine.Session`; every call comes from one thread."""
+
+    totals = (0, 0)
+    notes: tuple[str, ...] = ()
+
+    def __init__(self, reader: SegmentReader, pid: int, component: str) -> None:
+        self._reader = reader
+        self._component = component
+        self._process = describe_process(pid)
+        self._directory = self._process.working_directory
+        self._waiting: deque[_Mark] = deque(maxlen=MAX_WAITING)
+        self._acknowledged: _Mark | None = None
+
+    @property
+    def reader(self) -> SegmentReader:
+        """The segment that is read now."""
+        return self._reader
+
+    def go_on_in(self, reader: SegmentReader) -> None:
+        """The program has handed over another segment, which takes the place of this one."""
+        self._reader.close()
+        self._reader = reader
+
+    def capture(self, order: CaptureOrder) -> Snapshot:
+        """Make a snapshot of the newest commit.
+
+        Raises:
+            CaptureError: nothing was committed yet.
+            SegmentError: the program does not keep the rules of its segment, or the bank was busy.
+        """
+        layout = self._reader.layout
+        parent = None if order.base else self._acknowledged
+        if parent is not None and parent.lineage != layout.lineage:
+            parent = None
+        committed = self._reader.read(parent.commit if parent else 0)
+        if committed is None and parent is None:
+            raise CaptureError(f"cannot capture {self._component}: it has committed nothing yet")
+        committed = committed or _nothing_since(parent, layout)
+        snapshot, table = self._snapshot(committed, parent, order)
+        self._waiting.append(_Mark(snapshot.position, committed.number, layout.lineage, table))
+        return snapshot
+
+    def acknowledge(self, position: Position) -> None:
+        """See `checkpoint.engine.Session.acknowledge`."""
+        for mark in self._waiting:
+            if mark.position == position:
+                self._acknowledged = mark
+
+    def commit_at(self, position: Position) -> int:
+        """The number of the commit that a capture of this session holds; 0 if it is none of the last ones."""
+        return next((mark.commit for mark in self._waiting if mark.position == position), 0)
+
+    def close(self) -> None:
+        """See `checkpoint.engine.Session.close`."""
+        self._reader.close()
+
+    def _snapshot(self, committed: Committed, parent: _Mark | None, order: CaptureOrder) -> tuple[Snapshot, PageTable]:
+        runs = pages.page_runs(pages.extents_of_addresses(committed.layout.addresses()[committed.pages.astype(np.int64)], PAGE))
+        vmas = tuple(_vma(region) for region in committed.layout.regions)
+        table = (parent.table if parent else PageTable.empty(PAGE)).apply((), runs, committed.contents, vmas)
+        made = Snapshot(
+            component=self._component,
+            engine=NAME,
+            position=Position(order.generation, order.sequence, bytes(16)),
+            parent=parent.position if parent else None,
+            machine=this_machine(order.robot),
+            clocks=committed.clocks,
+            process=self._process,
+            threads=(),
+            vmas=vmas,
+            resources=(Resource(KIND, self._component, self._facts(committed)),),
+            runs=runs,
+            contents=committed.contents,
+            page_sum=table.page_sum,
+            epoch=order.epoch,
+        )
+        return replace(made, position=position_of(made, order.generation, order.sequence)), table
+
+    def _facts(self, committed: Committed) -> dict[str, Fact]:
+        return {
+            "arguments": list(self._process.arguments),
+            "commit": committed.number,
+            "directory": self._directory,
+            "regions": [[region.kind, region.size] for region in committed.layout.regions],
+        }
+
+
+def _nothing_since(parent: _Mark | None, layout: Layout) -> Committed:
+    """The commit that was acknowledged, once more."""
+    assert parent is not None, "a whole state is something"
+    return Committed(layout, parent.commit, now(), np.empty(0, dtype=np.uint64), memoryview(b""))
+
+
+def now() -> Clocks:
+    """This machine's clocks."""
+    return Clocks(*(time.clock_gettime_ns(clock) for clock in (time.CLOCK_REALTIME, time.CLOCK_MONOTONIC, time.CLOCK_BOOTTIME)))
+
+
+def _vma(region: Region) -> Vma:
+    return Vma(region.address, region.end, abi.PROT_READ | abi.PROT_WRITE, False, VmaKind.ANONYMOUS, name=region.name)
+
+
+def this_machine(robot: str) -> Machine:
+    """Where we run. The page size is the segment's, so that machines with other pages can take a snapshot up."""
+    about = os.uname()
+    with open("/proc/sys/kernel/random/boot_id") as file:
+        boot_id = file.read().strip()
+    return Machine(about.machine, PAGE, about.release, boot_id, socket.gethostname(), robot=robot)
+
+
+def describe_process(pid: int) -> ProcessState:
+    """What is true of a program whose memory is not carried: who it is and how it was started.
+
+    Raises:
+        ProcessGoneError: it ended.
+    """
+    status = procfs.status(pid)
+    arguments = procfs.read_bytes(pid, "cmdline").rstrip(b"\0").split(b"\0")
+    return ProcessState(
+        pid=pid,
+        ppid=0,
+        pgid=0,
+        sid=0,
+        executable=FileIdentity(procfs.read_link(pid, "exe")),
+        arguments=tuple(word.decode(errors="replace") for word in arguments),
+        layout=MemoryLayout(*(0,) * 11),
+        working_directory=procfs.read_link(pid, "cwd"),
+        root_directory="/",
+        umask=0,
+        credentials=Credentials(status.uids, status.gids, status.groups),
+    )
+
+
+# Finding the segment of a program that has handed it to nobody
+
+
+def open_segment(pid: int) -> SegmentReader:
+    """The segment that a process commits to, found among its descriptors.
+
+    Raises:
+        CaptureError: it has none, or several, or is another user's.
+    """
+    folder = f"/proc/{pid}/fd"
+    try:
+        found = [name for name in os.listdir(folder) if SEGMENT_NAME in _link(f"{folder}/{name}")]
+    except OSError as error:
+        raise CaptureError(f"cannot look for the segment of pid {pid}: {error.strerror}") from error
+    for name in sorted(found, key=int, reverse=True):
+        descriptor = os.open(f"{folder}/{name}", os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            reader = SegmentReader(descriptor)
+        finally:
+            os.close(descriptor)
+        if not reader.is_superseded:
+            return reader
+        reader.close()
+    raise CaptureError(f"pid {pid} has no segment: it keeps no state by failover, or has not committed yet")
+
+
+def _link(path: str) -> str:
+    try:
+        return os.readlink(path)
+    except FileNotFoundError:
+        return ""
+
+
+# Back from a snapshot
+
+
+def regions_of(state: Snapshot) -> tuple[tuple[Region, NDArray[np.uint8]], ...]:
+    """The regions of a folded base, each with its bytes (whole pages).
+
+    Raises:
+        RestoreError: it is no snapshot of this engine, or contradicts itself.
+    """
+    if state.engine != NAME or not state.is_base:
+        raise RestoreError(
+            f"cannot restore {state.component}: it is no whole snapshot of the {NAME} engine but of {state.engine}"
+        )
+    regions = tuple(_region(vma, kind, size) for vma, (kind, size) in zip(state.vmas, _sizes(state), strict=True))
+    try:
+        Layout(regions, bytes(16)).check()
+    except SegmentError as error:
+        raise RestoreError(f"cannot restore {state.component}: {error}") from error
+    contents = np.frombuffer(state.contents, dtype=np.uint8)
+    addresses = pages.addresses_of(pages.extents(state.runs), PAGE)
+    return tuple((region, _filled(region, addresses, contents)) for region in regions)
+
+
+def _sizes(state: Snapshot) -> list[tuple[int, int]]:
+    facts = next((held.facts for held in state.resources if held.kind == KIND), {})
+    listed = facts.get("regions")
+    pairs = [pair for pair in listed if isinstance(pair, list) and len(pair) == 2] if isinstance(listed, list) else []
+    sizes = [(kind, size) for kind, size in pairs if isinstance(kind, int) and isinstance(size, int)]
+    if len(sizes) != len(state.vmas) or state.machine.page_size != PAGE:
+        raise RestoreError(f"cannot restore {state.component}: its snapshot does not say what its pages mean")
+    return sizes
+
+
+def _region(vma: Vma, kind: int, size: int) -> Region:
+    region = Region(vma.name, kind, vma.start, size)
+    if region.end != vma.end:
+        raise RestoreError(f"cannot restore region {vma.name!r}: {size} bytes do not fill the pages that its snapshot has")
+    return region
+
+
+def _filled(region: Region, addresses: Words, contents: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    found = np.zeros(region.page_count * PAGE, dtype=np.uint8)
+    low, high = np.searchsorted(addresses, np.array([region.address, region.end], dtype=np.uint64))
+    places = ((addresses[low:high] - np.uint64(region.address)) // np.uint64(PAGE)).astype(np.int64)
+    found.reshape(-1, PAGE)[places] = contents.reshape(-1, PAGE)[low:high]
+    return found
+
+
+def fill_segment(state: Snapshot) -> SegmentWriter:
+    """A segment that holds the state of a folded base as its first commit: what a waiting program is handed.
+
+    Raises:
+        RestoreError: it is no snapshot of this engine, or contradicts itself.
+    """
+    regions = regions_of(state)
+    writer = SegmentWriter(Layout(tuple(region for region, _ in regions), secrets.token_bytes(16)))
+    assert writer.commit([Source(content[: region.size]) for region, content in regions]), "nobody reads it yet"
+    return writer
