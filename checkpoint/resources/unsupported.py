@@ -22,7 +22,9 @@ from checkpoint.resources import OpenFile, Surroundings
 
 KIND: Final = "unsupported"
 
-_ADVICE: Final = "is not kept yet: protect the program while it has none"
+_ADVICE: Final = (
+    "is not kept yet: protect the program while it has none, or let the program keep its state itself (docs/decorator.md)"
+)
 
 ANONYMOUS_INODES: Final[Mapping[str, str]] = {
     "eventpoll": "an epoll instance",
