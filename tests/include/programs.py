@@ -89,7 +89,8 @@ def number_told(found: Committed) -> int:
     """Which step a commit of telling.c is of; fails unless it is just that one."""
     number = int.from_bytes(found.region(0), "little")
     assert found.region(1) == array_at(number, PAGES) + bytes(5), f"step {number} is torn"
-    assert found.region(2) == array_at(number, LARGE), f"step {number} is torn"
+    ends = number.to_bytes(8, "little")
+    assert found.region(2) == ends + array_at(number, LARGE) + ends, f"step {number} is torn"
     return number
 
 

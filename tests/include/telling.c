@@ -10,7 +10,7 @@ static struct {
     char before[5];
     unsigned char bytes[PAGES * 4096 + 5]; /* neither begins nor ends with a page */
 } few;
-static unsigned char *large; /* followed by the kernel, where it can */
+static unsigned char *large; /* followed by the kernel, where it can, but for both ends: there the number stands alone */
 
 #ifdef DISK_LOG
 void disk_log_safe(uint64_t commit);
@@ -29,8 +29,10 @@ static void step(void)
     number++;
     for (uint64_t factor = 1; factor <= 19; factor += 6) {
         stamp(few.bytes, number * factor % PAGES);
-        stamp(large, number * factor % LARGE);
+        stamp(large + 8, number * factor % LARGE);
     }
+    memcpy(large, &number, 8);
+    memcpy(large + 8 + LARGE * 4096, &number, 8);
 }
 
 static void tell_resumed(const failover_resumption *resumed, void *context)
@@ -48,7 +50,7 @@ int main(int count, char **words)
     setvbuf(stdout, NULL, _IOLBF, 0);
     failover_region(&number, sizeof number, "number");
     failover_region(few.bytes, sizeof few.bytes, "few");
-    failover_region(large + 24, LARGE * 4096, "large");
+    failover_region(large + 24, 8 + LARGE * 4096 + 8, "large");
     large += 24;
     failover_on_resume(tell_resumed, &number);
     if (failover_open("telling") < 0) {

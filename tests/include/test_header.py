@@ -29,7 +29,7 @@ from tests.include.programs import (
 
 pytestmark = pytest.mark.compiler
 
-KILLS = int(os.environ.get("FAILOVER_HEADER_KILLS", "60"))
+KILLS = int(os.environ.get("FAILOVER_HEADER_KILLS", "40"))
 SEED = int(os.environ.get("FAILOVER_SEED", str(random.randrange(1 << 32))))
 FOLLOWED, COMPARED = "telling", "telling_compared"
 
