@@ -84,7 +84,6 @@ async def restore(
     places: Places,
     *,
     outage_ns: int,
-    lease_until_ns: int = 0,
     owner: int | None = None,
     laps: Laps | None = None,
 ) -> Component:
@@ -127,8 +126,6 @@ async def restore(
         order = channel.Restore(component.pid, name, outage_ns, streams=True, robot=places.robot, own_eyes=owner != ROOT)
         restored, _ = await component.ask_keeper(order, (*chain, *component.streams))
         laps.lap("restore")
-        if lease_until_ns:
-            await component.lease(lease_until_ns)
     except (CheckpointError, GuardError, KeeperLostError):
         await component.undo()
         raise

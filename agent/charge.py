@@ -20,7 +20,7 @@ import msgspec
 from agent import births, clock, lost
 from agent.births import Program
 from agent.component import Component
-from agent.errors import AgentError, KeeperLostError
+from agent.errors import AgentError, GuardError, KeeperLostError
 from agent.figures import Figures, shortened
 from agent.mistake import end_lanes_on_mistake
 from agent.places import Places
@@ -80,6 +80,14 @@ class Charge:
     _queue: asyncio.Queue[Act] = field(default_factory=asyncio.Queue)
     _tasks: set[asyncio.Task[None]] = field(default_factory=set)
     _stopping: bool = False
+    _coming: Component | None = None
+    """One that is being restored: it has a lease already."""
+    _lease_until_ns: int = 0
+    """What the core said last, whether or not the guard knows."""
+    _is_held: bool = False
+    """Whether the core wants it to stand still, whatever is still in the queue."""
+    _is_thaw_owed: bool = False
+    """A thaw was refused, for its lease was over by then; the next lease brings it."""
 
     def begin(self) -> None:
         """Start to carry acts out."""
@@ -87,10 +95,21 @@ class Charge:
 
     def order(self, act: Act) -> None:
         """Take an act in."""
+        self._note_lease(act)
         if isinstance(act, acts.SetLease | acts.Freeze):
             self._task(self._at_once(act))
         else:
             self._queue.put_nowait(act)
+
+    def _note_lease(self, act: Act) -> None:
+        """Leases and freezes overtake what waits in the queue: a thaw or a restore must not bring an older lease back."""
+        match act:
+            case acts.SetLease():
+                self._lease_until_ns = act.until_ns
+            case acts.Start() | acts.Restore() | acts.Thaw():
+                self._lease_until_ns, self._is_held, self._is_thaw_owed = act.lease_until_ns, False, False
+            case acts.Freeze():
+                self._is_held, self._is_thaw_owed = True, False
 
     def adopt(self, component: Component, epoch: int) -> None:
         """A guard was found alive after a restart."""
@@ -174,13 +193,16 @@ class Charge:
                 self.around.tell(events.ActFailed(self.name, act.epoch, message))
 
     async def _at_once(self, act: acts.SetLease | acts.Freeze) -> None:
-        if self.component is None or act.epoch < self.epoch:
+        component = self.component or self._coming
+        if component is None or act.epoch < self.epoch:
             return
         try:
-            if isinstance(act, acts.SetLease):
-                await self.component.lease(act.until_ns)
-            else:
-                await self.component.freeze()
+            if isinstance(act, acts.Freeze):
+                await component.freeze()
+                return
+            await component.lease(act.until_ns)
+            if self._is_thaw_owed:
+                await self._thaw_under_its_lease(component)
         except TROUBLE as trouble:
             log.warning("%s: %s: %s", self.name, type(act).__name__, trouble)
 
@@ -189,7 +211,7 @@ class Charge:
         self.around.records.note(self.name, act.epoch)
         if self.component is None:
             self.component = await self._begun(act.spec.launch)
-        await self.component.lease(act.lease_until_ns)
+        await self.component.lease(self._lease_until_ns)
         await self._protect(refuse=act.spec.launch.pid != 0)
         self.started.set()
         self.around.tell(events.Started(self.name, act.epoch))
@@ -231,14 +253,13 @@ class Charge:
         try:
             outage_ns, read_ns = clock.age_ns(descriptors[-1]), clock.now_ns()
             owner = act.spec.owner if act.spec is not None else None
-            until_ns = act.lease_until_ns
             component = await births.restore(
-                self.name, descriptors, self.around.places, outage_ns=outage_ns, lease_until_ns=until_ns, owner=owner, laps=laps
+                self.name, descriptors, self.around.places, outage_ns=outage_ns, owner=owner, laps=laps
             )
         finally:
             close_all(tuple(descriptors))
         self.around.records.note(self.name, act.epoch)
-        await component.resume()
+        await self._let_it_run(component)
         laps.lap("letting it go")
         self.component = component
         self.figures.restores += 1
@@ -254,6 +275,19 @@ class Charge:
         self.started.set()
         self.around.tell(events.Restored(self.name, act.epoch, act.position, outage_ns + clock.now_ns() - read_ns))
         self._watch_the_end()
+
+    async def _let_it_run(self, component: Component) -> None:
+        """Give it the newest lease, and those that come while it is resumed; then it runs, or nothing of it is left."""
+        self._coming = component
+        try:
+            if self._lease_until_ns:
+                await component.lease(self._lease_until_ns)
+            await component.resume()
+        except GuardError:
+            await component.undo()
+            raise
+        finally:
+            self._coming = None
 
     async def _capture(self, act: acts.Capture) -> None:
         component = self._present()
@@ -281,8 +315,16 @@ class Charge:
     async def _thaw(self, act: acts.Thaw) -> None:
         component = self._present()
         self.around.records.note(self.name, act.epoch)
-        await component.lease(act.lease_until_ns)
+        if self._is_held:
+            return  # by a newer order
+        await component.lease(self._lease_until_ns)
+        await self._thaw_under_its_lease(component)
+
+    async def _thaw_under_its_lease(self, component: Component) -> None:
+        """Let it go on; the guard refuses where the lease has run out by now, and the core renews it while it acts."""
+        self._is_thaw_owed = True
         await component.thaw()
+        self._is_thaw_owed = False
 
     async def _end(self, component: Component, number: int) -> None:
         try:

@@ -13,6 +13,9 @@ from failover.core.types import State
 TELL_SHARE = 4
 """The guard is told of a new lease when it is longer by this part of a lease: not for every beat."""
 
+ACTING = frozenset({State.PRIMARY, State.STARTING, State.RECOVERING, State.TAKING_OVER})
+"""It runs here, or is about to: a restore may take longer than a lease."""
+
 RACE_SHARE = 16
 """What the guard knows counts as over this part of a lease early: a longer one could reach it too late."""
 
@@ -32,7 +35,7 @@ def watch(component: Component, turn: Turn) -> None:
         component.due_ns = turn.now_ns
         turn.order(acts.Thaw(component.name, component.epoch, component.lease_ns))
         turn.say(component, f"{turn.me} lets it run: it may act")
-    elif component.state is State.PRIMARY:
+    elif component.state in ACTING:
         _tell(component, turn)
 
 

@@ -68,14 +68,14 @@ for my $i (1..600) {
 """
 GAWK = """BEGIN {
     srand(7)
-    for (i = 0; i < 600; i++) { a[i] = rand(); s = 0; for (k = 0; k < 4000; k++) s += sin(k * a[i]); print i, s; fflush() }
+    for (i = 0; i < 600; i++) { a[i] = rand(); s = 0; for (k = 0; k < 20000; k++) s += sin(k * a[i]); print i, s; fflush() }
 }"""
 # Some builds of mawk take their dice from arc4random(3), whatever the seed (Ubuntu's 1.3.4 20240123): no rand() here.
 MAWK = """BEGIN {
     x = 0.4
     for (i = 0; i < 600; i++) {
         x = 3.9 * x * (1 - x); a[i] = x; s = 0
-        for (k = 0; k < 4000; k++) s += sin(k * a[i])
+        for (k = 0; k < 20000; k++) s += sin(k * a[i])
         print i, s; fflush()
     }
 }"""
@@ -84,7 +84,7 @@ local t = {}
 for i = 1, 900 do
     t[#t + 1] = math.sin(i)
     local s = 0
-    for k = 1, #t do for j = 1, 40 do s = s + t[k] * j end end
+    for k = 1, #t do for j = 1, 250 do s = s + t[k] * j end end
     print(i, s) io.flush()
 end
 """
@@ -171,7 +171,7 @@ with open("numbers.txt") as numbers, open("log.txt", "a") as log, open("blocks.b
 PHP = """
 $x = 3; $seen = [];
 for ($round = 0; $round < 300; $round++) {
-    for ($i = 0; $i < 9000; $i++) { $x = ($x * 48271 + $i) % 2147483647; $seen["k" . ($x % 701)] = $i; }
+    for ($i = 0; $i < 20000; $i++) { $x = ($x * 48271 + $i) % 2147483647; $seen["k" . ($x % 701)] = $i; }
     ksort($seen);
     printf("%d %d %s\\n", $round, $x, md5(implode(",", array_slice($seen, 0, 40))));
 }

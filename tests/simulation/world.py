@@ -88,6 +88,7 @@ class Robot:
     keeper: dict[str, Position] = field(default_factory=dict)
     admitted: dict[str, tuple[str, int]] = field(default_factory=dict)
     serial: dict[str, int] = field(default_factory=dict)
+    leases: dict[str, int] = field(default_factory=dict)
     capturing: set[str] = field(default_factory=set)
     inbox: list[Event] = field(default_factory=list)
     receiver: wire.Receiver = field(default_factory=lambda: wire.Receiver(TEAM))
@@ -345,6 +346,8 @@ class World:
 
     def _guard(self, robot: Robot, act: acts.Freeze | acts.Thaw | acts.SetLease | acts.End | acts.LetGo) -> None:
         program = robot.programs.get(act.component)
+        if isinstance(act, acts.SetLease):
+            robot.leases[act.component] = act.until_ns
         if program is None or program.exit_status is not None:
             return
         self._settle(robot, program)
@@ -376,6 +379,8 @@ class World:
         name, life = act.component, robot.life
         robot.serial[name] = serial = robot.serial.get(name, 0) + 1
         robot.capturing.discard(name)
+        if not isinstance(act, acts.Stop):
+            robot.leases[name] = act.lease_until_ns
         if not isinstance(act, acts.Start):
             robot.programs.pop(name, None)
             robot.keeper.pop(name, None)
@@ -387,7 +392,7 @@ class World:
                 case acts.Stop():
                     self._feed(robot, Stopped(name, act.epoch))
                 case acts.Start():
-                    robot.programs[name] = Program(act.epoch, act.lease_until_ns, since_ns=self.now_ns)
+                    robot.programs[name] = Program(act.epoch, robot.leases[name], since_ns=self.now_ns)
                     self._feed(robot, Started(name, act.epoch))
                 case acts.Restore():
                     self._restored(robot, act)
@@ -398,7 +403,7 @@ class World:
         if act.position not in robot.store.get(act.component, []):
             self._feed(robot, ActFailed(act.component, act.epoch, f"{act.position} is not in the store"))
             return
-        program = Program(act.epoch, act.lease_until_ns, self.values[act.position], since_ns=self.now_ns)
+        program = Program(act.epoch, robot.leases[act.component], self.values[act.position], since_ns=self.now_ns)
         robot.programs[act.component] = program
         self.note(f"{robot.name}: {act.component} goes on from {act.position.generation}/{act.position.sequence}")
         self._feed(robot, Restored(act.component, act.epoch, act.position))

@@ -1,0 +1,93 @@
+"""Leases and freezes overtake what waits in a component's queue: what waits must not bring an older word back."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+from agent.charge import Charge, Surroundings
+from agent.component import Component
+from agent.errors import GuardError
+from agent.records import Records
+from failover.core import acts
+
+NAME = "/lab/robot1/mapper"
+LATE_NS, NEWER_NS = 100, 200
+
+
+class Told:
+    """Stands for a guard whose clock shows `now_ns`: what it was told, and whether the program runs."""
+
+    def __init__(self) -> None:
+        self.lease_ns = 0
+        self.now_ns = 0
+        self.runs = False
+        self.refused = 0
+
+    async def lease(self, until_ns: int) -> None:
+        self.lease_ns = until_ns
+
+    async def freeze(self) -> None:
+        self.runs = False
+
+    async def thaw(self) -> None:
+        if self.lease_ns <= self.now_ns:
+            self.refused += 1
+            raise GuardError("its lease is over")
+        self.runs = True
+
+
+def carried_out(orders: Callable[[Charge, Told], Any], directory: Path) -> Told:
+    """What the guard was told in the end."""
+    guard = Told()
+
+    async def run() -> None:
+        around = Surroundings(cast(Any, None), cast(Any, None), Records(directory), lambda _: None, cast(Any, None))
+        charge = Charge(NAME, around, cast(Component, guard), epoch=3)
+        orders(charge, guard)
+        charge.begin()
+        await settled()
+        guard.now_ns = LATE_NS + 1
+        if guard.refused:
+            charge.order(acts.SetLease(NAME, 3, NEWER_NS))
+            await settled()
+        for task in tuple(charge._tasks):
+            task.cancel()
+
+    asyncio.run(run())
+    return guard
+
+
+async def settled() -> None:
+    """Everything that can go on has gone on."""
+    for _ in range(20):
+        await asyncio.sleep(0)
+
+
+def test_a_thaw_that_waited_does_not_bring_its_older_lease_back(tmp_path: Path) -> None:
+    def orders(charge: Charge, guard: Told) -> None:
+        guard.now_ns = LATE_NS + 1
+        charge.order(acts.Thaw(NAME, 3, LATE_NS))
+        charge.order(acts.SetLease(NAME, 3, NEWER_NS))
+
+    guard = carried_out(orders, tmp_path)
+    assert (guard.runs, guard.lease_ns, guard.refused) == (True, NEWER_NS, 0)
+
+
+def test_a_thaw_that_came_too_late_for_its_lease_comes_with_the_next(tmp_path: Path) -> None:
+    def orders(charge: Charge, guard: Told) -> None:
+        guard.now_ns = LATE_NS + 1
+        charge.order(acts.Thaw(NAME, 3, LATE_NS))
+
+    guard = carried_out(orders, tmp_path)
+    assert (guard.runs, guard.lease_ns, guard.refused) == (True, NEWER_NS, 1)
+
+
+def test_a_thaw_that_waited_does_not_undo_a_later_freeze(tmp_path: Path) -> None:
+    def orders(charge: Charge, _: Told) -> None:
+        charge.order(acts.Thaw(NAME, 3, LATE_NS))
+        charge.order(acts.Freeze(NAME, 3))
+
+    assert not carried_out(orders, tmp_path).runs
