@@ -117,6 +117,7 @@ enum {
     FAILOVER_MAX_NAME_ = 224,
     FAILOVER_ARRAY_ = 2,
     FAILOVER_NEWEST_OFFSET_ = 256,
+    FAILOVER_GENERATION_OFFSET_ = 384, /* in a file beside a program */
     FAILOVER_RECORDS_OFFSET_ = 512,
     FAILOVER_RECORD_SIZE_ = 64,
     FAILOVER_BANK_BITS_ = 8,
@@ -144,8 +145,8 @@ typedef struct failover_entry_ {
 } failover_entry_;
 
 typedef struct failover_record_ {
-    uint64_t number, realtime, monotonic, boottime; /* all that a segment in memory has */
-    uint64_t sum, generation, unused[2];            /* of a file */
+    uint64_t number, realtime, monotonic, boottime, others[3];
+    uint64_t sum; /* in a file beside a program */
 } failover_record_;
 
 /* --- What this process keeps ------------------------------------------------------------------------------------------------------ */
@@ -742,14 +743,13 @@ static inline uint64_t failover_table_sum_(const failover_layout_ *layout)
     return failover_mix_(failover_mix_(0, &layout->head, sizeof layout->head), layout->entries, layout->head.regions * sizeof(failover_entry_));
 }
 
-static inline uint64_t failover_record_sum_(uint64_t table_sum, const failover_record_ *record)
+static inline uint64_t failover_record_sum_(uint64_t table_sum, uint64_t generation, const failover_record_ *record)
 {
-    uint64_t sum = failover_mix_(table_sum, record, offsetof(failover_record_, sum));
-    return failover_mix_(sum, &record->generation, sizeof record->generation);
+    return failover_mix_(failover_mix_(table_sum, &generation, sizeof generation), record, offsetof(failover_record_, sum));
 }
 
 /* Whether a bank of a file is whole: 1, 0, or -errno. */
-static inline int failover_is_whole_(int file, const failover_layout_ *layout, uint32_t bank, failover_record_ *record)
+static inline int failover_is_whole_(int file, const failover_layout_ *layout, uint64_t generation, uint32_t bank, failover_record_ *record)
 {
     const failover_head_ *head = &layout->head;
     unsigned char content[4096];
@@ -766,7 +766,7 @@ static inline int failover_is_whole_(int file, const failover_layout_ *layout, u
     }
     if (failed != 0)
         return failed;
-    return record->number != 0 && record->sum == sum + failover_record_sum_(failover_table_sum_(layout), record);
+    return record->number != 0 && record->sum == sum + failover_record_sum_(failover_table_sum_(layout), generation, record);
 }
 
 /* --- The file beside the program: two banks in turn, each step on the disk before the next --------------------------------------- */
@@ -793,6 +793,8 @@ static inline int failover_begin_file_(failover_task_ *task)
         failed = -posix_fallocate(file, 0, (off_t)failover_bank_at_(head, 2));
     if (failed == 0)
         failed = failover_write_(file, head, sizeof *head, 0);
+    if (failed == 0)
+        failed = failover_write_(file, &task->generation, sizeof task->generation, FAILOVER_GENERATION_OFFSET_);
     if (failed == 0)
         failed = failover_write_(file, task->layout.entries, head->regions * sizeof(failover_entry_), FAILOVER_PAGE_);
     if (failed != 0) {
@@ -856,9 +858,7 @@ static inline int failover_write_bank_(failover_task_ *task, uint32_t from, fail
         failed = failover_transfer_all_(task, from, file, bank);
     if (failed != 0)
         return failed;
-    memset(record->unused, 0, sizeof record->unused);
-    record->generation = task->generation;
-    record->sum = task->sum + failover_record_sum_(task->table_sum, record);
+    record->sum = task->sum + failover_record_sum_(task->table_sum, task->generation, record);
     return failover_step_(task, failover_write_(file, record, sizeof *record, failover_record_at_(bank)), "writing a record");
 }
 
@@ -1072,16 +1072,18 @@ static inline int failover_match_(failover_task_ *task, const failover_layout_ *
 /* The newest whole bank of a file: 0, or -errno with a sentence. A damaged one is passed over, and that is noted. */
 static inline int failover_choose_(failover_task_ *task, const failover_layout_ *stored, uint32_t *bank, failover_record_ *record)
 {
-    uint64_t newest;
+    uint64_t newest = 0;
     int best = -1;
     int failed = failover_read_(task->file, &newest, sizeof newest, FAILOVER_NEWEST_OFFSET_);
+    if (failed == 0)
+        failed = failover_read_(task->file, &task->generation, sizeof task->generation, FAILOVER_GENERATION_OFFSET_);
     *bank = (uint32_t)(newest & 0xff);
-    if (failed == 0 && *bank < stored->head.banks && failover_is_whole_(task->file, stored, *bank, record) == 1 &&
+    if (failed == 0 && *bank < stored->head.banks && failover_is_whole_(task->file, stored, task->generation, *bank, record) == 1 &&
         record->number == newest >> FAILOVER_BANK_BITS_)
         return 0;
     for (uint32_t other = 0; other < stored->head.banks && failed == 0; other++) {
         failover_record_ found;
-        if (failover_is_whole_(task->file, stored, other, &found) != 1 || (best >= 0 && found.number < record->number))
+        if (failover_is_whole_(task->file, stored, task->generation, other, &found) != 1 || (best >= 0 && found.number < record->number))
             continue;
         *record = found;
         best = (int)other;
@@ -1125,7 +1127,7 @@ static inline int failover_load_(failover_task_ *task)
     if (failed != 0)
         return failed;
     const uint64_t now = failover_clock_(CLOCK_REALTIME);
-    task->generation = record.generation + 1;
+    task->generation++;
     task->is_resumed = true;
     task->resumption.commit = record.number;
     task->resumption.generation = task->generation;

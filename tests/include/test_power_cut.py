@@ -188,7 +188,8 @@ def test_the_sum_of_a_bank_is_that_of_the_document(tmp_path: Path) -> None:
     table = content[4096 : 4096 + 256 * regions]
     versions = -(-8 * pages // 4096) * 4096
     start = 4096 + -(-256 * regions // 4096) * 4096 + banks * versions + bank * 4096 * pages
-    total = summed(0, content[:56] + table + record[:32] + record[40:48])
+    total = summed(0, content[:56] + table + content[384:392] + record[:56])
     for page in range(pages):
         total += summed((page + 1) * 0x9E3779B97F4A7C15 % 2**64, content[start + 4096 * page :][:4096])
-    assert struct.unpack_from("<QQ", record, 32) == (total % 2**64, 1)
+    assert struct.unpack_from("<Q", record, 56) == (total % 2**64,)
+    assert struct.unpack_from("<Q", content, 384) == (1,)
