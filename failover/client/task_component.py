@@ -139,6 +139,8 @@ def component(
         version: of what is kept; raise it when a migration is needed.
         migrations: by the version that they start from, see ``failover.state``.
     """
+    if cls is not None and not isinstance(cls, type):
+        raise TaskError(f"@failover.component({cls!r}) is above no class: write @failover.component(name={cls!r})")
     if every is not None and not 0 < every < 1e6:
         raise TaskError(f"every={every} is no period: say how many seconds lie between the beginnings of two steps")
 

@@ -63,7 +63,7 @@ class StateFile:
             if "another process" in str(error):
                 raise StateTakenError(
                     f"cannot keep {component} in {folder}: another process has it; end that one, or use another name"
-                ) from error
+                ) from None
             raise TaskError(f"cannot keep {component} in {folder}: {error}") from error
         strangers = [name for name in self._store.components() if name != component]
         if strangers:

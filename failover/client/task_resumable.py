@@ -18,6 +18,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from typing import Any, Protocol, TypeVar, overload
 
 from failover.client.task import PROCESS, commit, resume
+from failover.errors import TaskError
 
 S = TypeVar("S")
 
@@ -52,6 +53,9 @@ def resumable(function: Any = None, /, *, name: str = "") -> Any:
     Returns:
         The function; it answers the state after its end.
     """
+
+    if function is not None and not callable(function):
+        raise TaskError(f"@failover.resumable({function!r}) is above no function: write @failover.resumable(name={function!r})")
 
     def made(chosen: Callable[[Any], Any]) -> Callable[[Any], Any]:
         title = name or chosen.__name__

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import textwrap
 import threading
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -483,6 +483,12 @@ def test_a_component_may_be_asynchronous() -> None:
 def test_a_class_that_is_no_component_is_refused_with_what_it_lacks(body: dict[str, object], why: str) -> None:
     with pytest.raises(failover.TaskError, match=why):
         failover.component(type("Lacking", (), body))
+
+
+@pytest.mark.parametrize("decorator", [failover.component, failover.resumable])
+def test_a_name_that_is_not_said_to_be_one_is_refused_with_what_to_write(decorator: Callable[[str], object]) -> None:
+    with pytest.raises(failover.TaskError, match=r"\(name='mapper'\)"):
+        decorator("mapper")
 
 
 def test_a_class_that_is_not_declared_is_not_run() -> None:
