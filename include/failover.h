@@ -189,7 +189,7 @@ typedef struct failover_task_ {
     /* the file: the recorder's, but for what is marked atomic */
     pthread_t recorder;
     bool has_recorder;
-    int source, folder, file;
+    int source, folder, file, fresh; /* fresh: a file that is begun aside, else -1 */
     bool is_file_ours; /* the file was begun by this run; else it is what we resumed from */
     int file_newest;
     uint64_t file_held[FAILOVER_BANKS_], sum, *sums, *stamps;
@@ -205,6 +205,8 @@ typedef struct failover_task_ {
 /* One of each in a program, however many of its files include this one. */
 __attribute__((weak)) failover_task_ failover_the_task_;
 __attribute__((weak)) __thread char failover_sentence_[768];
+/* Held for the moment in which a file is opened or changes its place, and by fork(): a child must know what to close. */
+__attribute__((weak)) pthread_mutex_t failover_files_ = PTHREAD_MUTEX_INITIALIZER;
 
 static inline const char *failover_error(void) { return failover_sentence_; }
 
@@ -779,13 +781,32 @@ static inline int failover_step_(failover_task_ *task, int outcome, const char *
     return outcome;
 }
 
+/* Open a fresh file; close it, or put it in the place of the old one. No fork() sees that half done. */
+static inline int failover_open_fresh_(failover_task_ *task)
+{
+    pthread_mutex_lock(&failover_files_);
+    task->fresh = openat(task->folder, task->fresh_name, O_RDWR | O_CREAT | O_TRUNC | O_CLOEXEC | O_NOFOLLOW, 0600);
+    int outcome = task->fresh < 0 ? -errno : task->fresh;
+    pthread_mutex_unlock(&failover_files_);
+    return outcome;
+}
+
+static inline void failover_end_fresh_(failover_task_ *task, bool is_taken)
+{
+    pthread_mutex_lock(&failover_files_);
+    close(is_taken ? task->file : task->fresh);
+    task->file = is_taken ? task->fresh : task->file;
+    task->fresh = -1;
+    pthread_mutex_unlock(&failover_files_);
+}
+
 /* Begin a file aside, with room for two banks; it takes the place of the old one when it holds a commit. Answers it, or -errno. */
 static inline int failover_begin_file_(failover_task_ *task)
 {
     const failover_head_ *head = &task->layout.head;
-    int file = openat(task->folder, task->fresh_name, O_RDWR | O_CREAT | O_TRUNC | O_CLOEXEC | O_NOFOLLOW, 0600);
+    int file = failover_open_fresh_(task);
     if (file < 0)
-        return failover_step_(task, -errno, "making a file");
+        return failover_step_(task, file, "making a file");
     int failed = failover_lock_(file, F_WRLCK, FAILOVER_OWNER_BYTE_);
     if (failed == 0 && ftruncate(file, (off_t)head->size) != 0)
         failed = -errno;
@@ -798,7 +819,7 @@ static inline int failover_begin_file_(failover_task_ *task)
     if (failed == 0)
         failed = failover_write_(file, task->layout.entries, head->regions * sizeof(failover_entry_), FAILOVER_PAGE_);
     if (failed != 0) {
-        close(file);
+        failover_end_fresh_(task, false);
         return failover_step_(task, failed, "making room in a file");
     }
     memset(task->file_held, 0, sizeof task->file_held);
@@ -879,8 +900,7 @@ static inline int failover_adopt_file_(failover_task_ *task, int file)
 {
     if (fsync(file) != 0 || renameat(task->folder, task->fresh_name, task->folder, task->file_name) != 0 || fsync(task->folder) != 0)
         return failover_step_(task, -errno, "putting a file in its place");
-    close(task->file);
-    task->file = file;
+    failover_end_fresh_(task, true);
     task->is_file_ours = true;
     return 0;
 }
@@ -893,8 +913,11 @@ static inline int failover_store_held_(failover_task_ *task, uint32_t from, fail
     if (file < 0)
         return file;
     int bank = failover_free_bank_(file, task->file_held, task->file_newest);
-    if (bank < 0)
+    if (bank < 0) {
+        if (file != task->file)
+            failover_end_fresh_(task, false);
         return -EBUSY;
+    }
     int failed = failover_write_bank_(task, from, record, file, (uint32_t)bank);
     if (failed == 0)
         failed = failover_name_bank_(task, file, (uint32_t)bank, record->number);
@@ -902,7 +925,7 @@ static inline int failover_store_held_(failover_task_ *task, uint32_t from, fail
         failed = failover_adopt_file_(task, file);
     if (failed != 0) {
         if (file != task->file)
-            close(file);
+            failover_end_fresh_(task, false);
         else
             failover_lock_(file, F_UNLCK, bank);
         task->is_file_ours = false;
@@ -1141,7 +1164,7 @@ static inline int failover_load_(failover_task_ *task)
 
 static inline void failover_release_(failover_task_ *task)
 {
-    const int files[] = {task->segment, task->source, task->folder, task->file};
+    const int files[] = {task->segment, task->source, task->folder, task->file, task->fresh};
     const bool is_registered = task->is_registered;
     failover_stop_following_(task);
     for (size_t index = 0; index < sizeof files / sizeof *files; index++)
@@ -1159,13 +1182,18 @@ static inline void failover_release_(failover_task_ *task)
     task->is_registered = is_registered;
 }
 
+static inline void failover_forking_(void) { pthread_mutex_lock(&failover_files_); }
+
+static inline void failover_fork_made_(void) { pthread_mutex_unlock(&failover_files_); }
+
 /* In a child: give up descriptors, since locks belong to openings, which it shares with its parent. */
 static inline void failover_forked_(void)
 {
     failover_task_ *task = &failover_the_task_;
+    pthread_mutex_unlock(&failover_files_);
     if (!task->is_open || task->is_forked)
         return;
-    const int files[] = {task->segment, task->source, task->folder, task->file, task->faults, task->pagemap};
+    const int files[] = {task->segment, task->source, task->folder, task->file, task->fresh, task->faults, task->pagemap};
     task->is_forked = true;
     for (size_t index = 0; index < sizeof files / sizeof *files; index++)
         if (files[index] >= 0)
@@ -1237,7 +1265,7 @@ static inline int failover_open(const char *name)
     failover_task_ *task = &failover_the_task_;
     if (task->is_open)
         return failover_fail_(EBUSY, "cannot open state '%.200s': one is open, and a process keeps one", name == NULL ? "" : name);
-    task->segment = task->source = task->folder = task->file = task->faults = task->pagemap = -1;
+    task->segment = task->source = task->folder = task->file = task->fresh = task->faults = task->pagemap = -1;
     int failed = task->refusal != 0 ? failover_fail_(-task->refusal, "%s", task->refused) : 0;
     if (failed == 0 && task->count == 0)
         failed = failover_fail_(EINVAL, "cannot open state '%.200s': no region is registered", name == NULL ? "" : name);
@@ -1251,7 +1279,7 @@ static inline int failover_open(const char *name)
     task->is_open = true;
     if (!task->is_registered) {
         task->is_registered = true;
-        pthread_atfork(NULL, NULL, failover_forked_);
+        pthread_atfork(failover_forking_, failover_fork_made_, failover_forked_);
         atexit(failover_at_exit_);
     }
     if (task->is_resumed && task->on_resume != NULL)

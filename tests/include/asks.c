@@ -59,6 +59,19 @@ int main(int count, char **words)
         value++;
         say("commit", failover_commit());
     }
+    if (is(what, "orphan")) {
+        fflush(stdout);
+        if (fork() == 0) {
+            say("child", 0);
+            fflush(stdout);
+            while (getchar() != EOF)
+                continue;
+            _exit(0);
+        }
+        say("wait", failover_wait(20000));
+        fflush(stdout);
+        pause();
+    }
     if (is(what, "stay")) {
         fflush(stdout);
         say("wait", failover_wait(20000));
