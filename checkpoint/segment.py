@@ -51,7 +51,7 @@ NEWEST_OFFSET: Final = 256
 SUPERSEDED_OFFSET: Final = 320
 RECORDS_OFFSET: Final = 512
 RECORD_SIZE: Final = 64
-RECORD: Final = struct.Struct("<4Q")
+RECORD: Final = struct.Struct("<7Q")
 WORD: Final = 8
 
 BANK_BITS: Final = 8
@@ -201,6 +201,7 @@ class Committed:
         clocks: the machine's, at the commit.
         pages: numbers of the pages that changed since, in order; of the whole state, those that were ever written.
         contents: their bytes, in the same order.
+        outputs: bytes that the program had written to its standard output and error at the commit; None where it does not say.
     """
 
     layout: Layout
@@ -208,6 +209,7 @@ class Committed:
     clocks: Clocks
     pages: Words
     contents: memoryview
+    outputs: tuple[int, int] | None = None
 
     def region(self, index: int) -> bytearray:
         """The bytes of one region, where the whole state was read; pages never written are zeros."""

@@ -110,14 +110,15 @@ class SegmentReader:
 
     def _read_bank(self, bank: int, at_least: int, since: int) -> Committed | None:
         before = self._exactly(RECORD_SIZE, RECORDS_OFFSET + bank * RECORD_SIZE)
-        number, realtime, monotonic, boottime = RECORD.unpack_from(before)
+        number, realtime, monotonic, boottime, counted, first, second = RECORD.unpack_from(before)
         if number < at_least:
             return None
         pages = self._changed(bank, number, since)
         contents = self._contents(bank, pages)
         if self._exactly(RECORD_SIZE, RECORDS_OFFSET + bank * RECORD_SIZE) != before:
             raise SegmentError(f"segment: bank {bank} was written while it was held; the program does not keep the rules")
-        return Committed(self.layout, number, Clocks(realtime, monotonic, boottime), pages, contents)
+        outputs = (first, second) if counted == 1 else None
+        return Committed(self.layout, number, Clocks(realtime, monotonic, boottime), pages, contents, outputs)
 
     def _changed(self, bank: int, number: int, since: int) -> Words:
         """The numbers of the pages whose version is later than ``since``."""

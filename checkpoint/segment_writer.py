@@ -119,11 +119,12 @@ class SegmentWriter:
         self._locks = [lock_of(fcntl.F_WRLCK, bank) for bank in range(layout.banks)]
         self._unlocks = [lock_of(fcntl.F_UNLCK, bank) for bank in range(layout.banks)]
 
-    def commit(self, sources: Sequence[Source]) -> bool:
+    def commit(self, sources: Sequence[Source], outputs: tuple[int, int] | None = None) -> bool:
         """Make what the sources hold the newest commit, as one.
 
         Args:
             sources: one for every region, in their order.
+            outputs: bytes written to standard output and error until now; None where nobody counts them.
 
         Returns:
             False when every bank but the newest is held by readers; nothing was forgotten, the next call makes up for it.
@@ -137,18 +138,18 @@ class SegmentWriter:
         if bank is None:
             return False
         try:
-            self._write(bank, number, sources)
+            self._write(bank, number, sources, outputs)
         finally:
             _fcntl(self.descriptor, fcntl.F_OFD_SETLK, self._unlocks[bank])
         self._words[_NEWEST] = number << BANK_BITS | bank
         self.number, self._newest = number, bank
         return True
 
-    def _write(self, bank: int, number: int, sources: Sequence[Source]) -> None:
+    def _write(self, bank: int, number: int, sources: Sequence[Source], outputs: tuple[int, int] | None) -> None:
         """Bring a bank that we hold up to date.
 
         1. Its record says that it holds nothing, before the first byte of it changes.
-        2. Pages and versions; then the times; then the commit's number: the bank is whole.
+        2. Pages and versions; then the times and the bytes of output; then the commit's number: the bank is whole.
         3. The lock ends, and only then the newest word names the bank: no reader that follows it meets the lock, and
            whoever gets the lock sees all of this.
         """
@@ -160,6 +161,8 @@ class SegmentWriter:
         self._words[record + 1] = time.clock_gettime_ns(time.CLOCK_REALTIME)
         self._words[record + 2] = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
         self._words[record + 3] = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        self._words[record + 4] = outputs is not None
+        self._words[record + 5], self._words[record + 6] = outputs or (0, 0)
         self._words[record] = number
         self._held[bank] = number
 
@@ -262,7 +265,7 @@ class SegmentWriter:
                 new._take(index, self, self._firsts[old], count)
         record = RECORDS_OFFSET // WORD
         mine = (RECORDS_OFFSET + self._newest * RECORD_SIZE) // WORD
-        new._words[record : record + 4] = self._words[mine : mine + 4]
+        new._words[record : record + 7] = self._words[mine : mine + 7]
         new._held[0], new._newest = self.number, 0
         new._stamps[0][:] = new._versions
         new._words[_NEWEST] = self.number << BANK_BITS

@@ -5,12 +5,7 @@ The guard counts a byte when it takes it out of the pipe, and writes it to the l
 
 from __future__ import annotations
 
-import array
-import fcntl
-import mmap
 import os
-import struct
-import termios
 import time
 from typing import Final
 
@@ -18,19 +13,12 @@ from checkpoint.engine import Streams
 from checkpoint.errors import CaptureError
 from checkpoint.model import OutputPiece
 from checkpoint.resources import Surroundings, pipes_of
+from checkpoint.stream_counts import StreamCounts, Totals
 
-COUNTERS: Final = struct.Struct("<QQQQQQ")
-FIRSTS: Final = 4
-"""Place of the first bytes that the logs had when the guard began."""
-STREAM_NUMBERS: Final = (1, 2)
-COUNT_TIMEOUT_S: Final = 0.05
-"""How long the guard may be between taking bytes and counting them: microseconds, unless it was preempted."""
 LOG_TIMEOUT_S: Final = 2.0
 """How long the guard may take to write to its log what it has read; not during a freeze."""
 BACKLOG_LIMIT: Final = 16 << 20
 """Bytes of output that one snapshot carries at most: earlier ones are in the log alone."""
-
-Totals = tuple[int, int]
 
 
 class Outputs:
@@ -38,8 +26,8 @@ class Outputs:
 
     def __init__(self, streams: Streams) -> None:
         self._streams = streams
-        self._counters = mmap.mmap(streams.counters, COUNTERS.size, prot=mmap.PROT_READ)
-        self._firsts = COUNTERS.unpack(self._counters[: COUNTERS.size])[FIRSTS:]
+        self._counts = StreamCounts(streams.counters, streams.outputs)
+        self._firsts = self._counts.firsts
         self.surroundings = Surroundings(pipes_of(streams.outputs))
 
     def totals(self) -> Totals:
@@ -48,20 +36,10 @@ class Outputs:
         Raises:
             CaptureError: the guard does not come to an end with counting.
         """
-        first, second = (self._total(index) for index in range(len(STREAM_NUMBERS)))
-        return first, second
-
-    def _total(self, index: int) -> int:
-        deadline = time.perf_counter() + COUNT_TIMEOUT_S
-        while True:
-            before = COUNTERS.unpack(self._counters[: COUNTERS.size])[2 * index : 2 * index + 2]
-            unread = _unread(self._streams.outputs[index])
-            after = COUNTERS.unpack(self._counters[: COUNTERS.size])[2 * index : 2 * index + 2]
-            if before == after and not before[0]:
-                return int(before[1]) + unread
-            if time.perf_counter() > deadline:
-                raise CaptureError("the guard stands in the middle of reading the component's output; capture it again")
-            os.sched_yield()
+        totals = self._counts.totals()
+        if totals is None:
+            raise CaptureError("the guard stands in the middle of reading the component's output; capture it again")
+        return totals
 
     def pieces(self, since: Totals, until: Totals) -> tuple[OutputPiece, ...]:
         """The bytes between two totals, as far as they are here; one piece for each stream, empty where nothing was written.
@@ -91,13 +69,6 @@ class Outputs:
 
     def close(self) -> None:
         """Give the descriptors back."""
-        self._counters.close()
+        self._counts.close()
         for descriptor in (self._streams.counters, *self._streams.outputs, *self._streams.logs):
             os.close(descriptor)
-
-
-def _unread(descriptor: int) -> int:
-    """Bytes that wait in a pipe or terminal. Source: ioctl_tty(2), FIONREAD; pipe(7)."""
-    found = array.array("i", [0])
-    fcntl.ioctl(descriptor, termios.FIONREAD, found)
-    return found[0]

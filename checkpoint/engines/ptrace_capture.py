@@ -32,7 +32,7 @@ from checkpoint.engines.capture_memory import MemoryCapture, RunningCopy, Taken
 from checkpoint.engines.capture_process import process_state, thread_state
 from checkpoint.engines.entering import Entered
 from checkpoint.engines.identities import Identities
-from checkpoint.engines.outputs import Outputs, Totals
+from checkpoint.engines.outputs import Outputs
 from checkpoint.engines.standing import Onlooker, Standing
 from checkpoint.errors import ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import abi, procfs
@@ -42,6 +42,7 @@ from checkpoint.linux.tracking import NONE
 from checkpoint.model import Position, Snapshot
 from checkpoint.pages import PageTable
 from checkpoint.resources import Surroundings, gather, look, unsupported
+from checkpoint.stream_counts import Totals
 
 NS_PER_US: Final = 1000
 

@@ -10,7 +10,7 @@ from typing import Final
 from checkpoint.arch import x86_64 as arch
 from checkpoint.engines.entering import Entered, where_it_stands
 from checkpoint.engines.inquiry import Inquiry, Told, rearmed
-from checkpoint.engines.outputs import Outputs, Totals
+from checkpoint.engines.outputs import Outputs
 from checkpoint.errors import CaptureError
 from checkpoint.linux import procfs
 from checkpoint.linux.procfs import Stat, Status
@@ -19,6 +19,7 @@ from checkpoint.linux.timers import parse_timers
 from checkpoint.linux.tracee import Tracee
 from checkpoint.model import Rseq
 from checkpoint.resources import OpenFile, gather, with_contents
+from checkpoint.stream_counts import Totals
 
 NOTHING_WRITTEN: Final[Totals] = (0, 0)
 

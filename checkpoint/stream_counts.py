@@ -1,0 +1,73 @@
+"""How many bytes a guarded program has written to its output streams until now: those counted, and those still in the pipe.
+
+The guard takes bytes out of a pipe and counts them as one act (ARCHITECTURE §4); what is unread, either end of the pipe tells.
+"""
+
+from __future__ import annotations
+
+import array
+import fcntl
+import mmap
+import os
+import struct
+import termios
+import time
+from typing import Final
+
+COUNTERS: Final = struct.Struct("<QQQQQQ")
+FIRSTS: Final = 4
+"""Place of the first bytes that the logs had when the guard began."""
+STREAMS: Final = 2
+COUNT_TIMEOUT_S: Final = 0.05
+"""How long the guard may be between taking bytes and counting them: microseconds, unless it was preempted."""
+
+Totals = tuple[int, int]
+
+
+class StreamCounts:
+    """The guard's counters, seen from another process.
+
+    Args:
+        counters: the memfd of the guard; it stays the caller's.
+        pipes: one end of each stream's pipe (or the master of its terminal); they stay the caller's.
+    """
+
+    def __init__(self, counters: int, pipes: tuple[int, int]) -> None:
+        self._counters = mmap.mmap(counters, COUNTERS.size, prot=mmap.PROT_READ)
+        self._pipes = pipes
+        first, second = COUNTERS.unpack(self._counters[: COUNTERS.size])[FIRSTS:]
+        self.firsts: Totals = (first, second)
+
+    def totals(self) -> Totals | None:
+        """Bytes written until now; None when the guard does not come to an end with counting.
+
+        Raises:
+            OSError: an end is no pipe and no terminal.
+        """
+        first, second = (self._total(index) for index in range(STREAMS))
+        return None if first is None or second is None else (first, second)
+
+    def _total(self, index: int) -> int | None:
+        deadline = 0.0
+        while True:
+            before = COUNTERS.unpack(self._counters[: COUNTERS.size])[2 * index : 2 * index + 2]
+            unread = _unread(self._pipes[index])
+            after = COUNTERS.unpack(self._counters[: COUNTERS.size])[2 * index : 2 * index + 2]
+            if before == after and not before[0]:
+                return int(before[1]) + unread
+            now = time.perf_counter()
+            deadline = deadline or now + COUNT_TIMEOUT_S
+            if now > deadline:
+                return None
+            os.sched_yield()
+
+    def close(self) -> None:
+        """Give the memory back."""
+        self._counters.close()
+
+
+def _unread(descriptor: int) -> int:
+    """Bytes that wait in a pipe or terminal. Source: ioctl_tty(2), FIONREAD; pipe(7)."""
+    found = array.array("i", [0])
+    fcntl.ioctl(descriptor, termios.FIONREAD, found)
+    return found[0]
