@@ -205,6 +205,7 @@ class Protect(msgspec.Struct, frozen=True, tag=True):
     component: str
     streams: bool = False
     robot: str = ""
+    engine: str = "ptrace"
 
 
 class Capture(msgspec.Struct, frozen=True, tag=True):
@@ -244,6 +245,12 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
     own_eyes: bool = False
 
 
+class Fill(msgspec.Struct, frozen=True, tag=True):
+    """Make a segment that holds the state of a cooperative chain; with descriptors: its files, oldest first. Answer: `Filled`."""
+
+    component: str
+
+
 class Resume(msgspec.Struct, frozen=True, tag=True):
     """Let the restored program go on. Answer: `Resumed`; it is protected from now on."""
 
@@ -273,7 +280,8 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
     Attributes:
         size: bytes of the encoded snapshot.
         dirty_bytes: of the pages that it carries, before compression.
-        totals: bytes that the component had written to standard output and standard error at the freeze.
+        totals: bytes that the component had written to standard output and standard error at the freeze, or the commit.
+        commit: its number, of a cooperative snapshot.
     """
 
     position: Position
@@ -283,6 +291,13 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
     dirty_bytes: int
     notes: tuple[str, ...] = ()
     totals: tuple[int, int] = (0, 0)
+    commit: int = 0
+
+
+class Filled(msgspec.Struct, frozen=True, tag=True):
+    """The segment, as a descriptor."""
+
+    position: Position
 
 
 class Restored(msgspec.Struct, frozen=True, tag=True):
@@ -320,5 +335,5 @@ class Failed(msgspec.Struct, frozen=True, tag=True):
     reasons: tuple[str, ...] = ()
 
 
-Request = Probe | Protect | Capture | Acknowledge | Restore | Resume | Release
-Reply = Probed | Protected | Captured | Restored | Resumed | Released | Failed
+Request = Probe | Protect | Capture | Acknowledge | Restore | Fill | Resume | Release
+Reply = Probed | Protected | Captured | Restored | Filled | Resumed | Released | Failed

@@ -118,8 +118,11 @@ class RestoreOptions:
 class Session(Protocol):
     """One protected process. Every call comes from the thread that opened it."""
 
-    totals: tuple[int, int]
-    """Bytes that the component had written to its standard output and error at the last capture."""
+    @property
+    def totals(self) -> tuple[int, int]:
+        """Bytes that the component had written to its standard output and error at the last capture."""
+        ...
+
     notes: tuple[str, ...]
     """What is not as it could be: a fallback that was taken, something that will differ."""
 
@@ -200,8 +203,12 @@ def engine_named(name: str) -> Engine:
     Raises:
         ProbeError: there is none of that name.
     """
+    if name == "cooperative":
+        from checkpoint.engines.guarded_task import CooperativeEngine
+
+        return CooperativeEngine()
     if name != "ptrace":
-        raise ProbeError(f"no engine is called {name!r}: choose ptrace")
+        raise ProbeError(f"no engine is called {name!r}: choose ptrace or cooperative")
     from checkpoint.engines.ptrace import PtraceEngine
 
     return PtraceEngine()

@@ -23,7 +23,7 @@ from checkpoint.channel import Channel, ChannelClosedError, ChannelError, Failed
 from checkpoint.engine import CaptureOrder, Engine, Restored, RestoreOptions, Session, Streams
 from checkpoint.errors import CaptureError, CheckpointError, RestoreError
 from checkpoint.linux.address import address_of
-from checkpoint.model import Snapshot
+from checkpoint.model import Position, Snapshot
 
 USAGE: Final = "usage: python -m checkpoint keeper FD|PATH\n"
 CALL_S: Final = 30.0
@@ -52,6 +52,7 @@ class Keeper:
             channel.Capture: self._capture,
             channel.Acknowledge: self._acknowledge,
             channel.Restore: self._restore,
+            channel.Fill: self._fill,
             channel.Resume: self._resume,
             channel.Release: self._release,
         }
@@ -89,7 +90,8 @@ class Keeper:
             raise CaptureError(f"cannot protect pid {request.pid}: this keeper follows another one already; start another")
         self._robot = request.robot
         streams = streams_of(descriptors) if request.streams else None
-        self._session = self._tracer.protect(request.pid, request.component, streams)
+        chosen = self._tracer if request.engine == self._tracer.name else engine.engine_named(request.engine)
+        self._session = chosen.protect(request.pid, request.component, streams)
         return channel.Protected(self._session.notes), ()
 
     def _capture(self, request: channel.Capture, _: Descriptors) -> Answer:
@@ -105,6 +107,7 @@ class Keeper:
             dirty_bytes=len(snapshot.contents),
             notes=snapshot.notes,
             totals=session.totals,
+            commit=_commit_at(session, snapshot.position),
         )
         return answer, (encoded,)
 
@@ -127,6 +130,16 @@ class Keeper:
         self._restored = self._tracer.restore(request.pid, state, options)
         self._revived = request, ends
         return channel.Restored(self._restored.pid, self._restored.position, self._restored.notes), ()
+
+    def _fill(self, request: channel.Fill, descriptors: Descriptors) -> Answer:
+        try:
+            state = folded(descriptors)
+        finally:
+            channel.close_all(descriptors)
+        from checkpoint.engines.cooperative import fill_segment
+
+        segment = fill_segment(state)
+        return channel.Filled(state.position), (segment.descriptor,)
 
     def _resume(self, _: channel.Resume, __: Descriptors) -> Answer:
         restored, revived = self._restored, self._revived
@@ -160,6 +173,13 @@ class Keeper:
         self._restored = self._revived = None
         if session is not None:
             session.close()
+
+
+def _commit_at(session: Session, position: Position) -> int:
+    """The number of the commit that a cooperative capture holds."""
+    from checkpoint.engines.guarded_task import GuardedTask
+
+    return session.commit_at(position) if isinstance(session, GuardedTask) else 0
 
 
 def streams_of(descriptors: Descriptors) -> Streams:

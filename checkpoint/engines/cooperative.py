@@ -9,6 +9,10 @@ the pages mean:
     commit      number of the commit, in its lineage
     regions     [kind, size] of each region, in the order of the mappings
 
+The output that a snapshot carries ends where the program stood at its commit, which its record tells: what was printed later is
+printed again after a restore, what was printed before is not. Of a commit that does not tell, it ends where the
+stream stood before the commit was read.
+
 A delta is made against what was acknowledged, as everywhere: pages whose version is later than the acknowledged commit.
 """
 
@@ -20,7 +24,7 @@ import socket
 import time
 from collections import deque
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +53,10 @@ from checkpoint.segment import PAGE, Committed, Layout, Region
 from checkpoint.segment_reader import SegmentReader
 from checkpoint.segment_writer import NAME as SEGMENT_NAME
 from checkpoint.segment_writer import SegmentWriter, Source
+from checkpoint.stream_counts import Totals
+
+if TYPE_CHECKING:
+    from checkpoint.engines.outputs import Outputs  # which loads the keeper's library: a program that keeps its state has none
 
 NAME: Final = "cooperative"
 KIND: Final = "task"
@@ -63,21 +71,24 @@ class _Mark:
     Attributes:
         commit: its number.
         lineage: in which that number counts.
+        totals: bytes of output at that commit.
     """
 
     position: Position
     commit: int
     lineage: bytes
     table: PageTable
+    totals: Totals
 
 
 class CooperativeSession:
     """One segment that is followed. See `checkpoint.engine.Session`; every call comes from one thread."""
 
-    totals = (0, 0)
     notes: tuple[str, ...] = ()
 
-    def __init__(self, reader: SegmentReader, pid: int, component: str) -> None:
+    def __init__(self, reader: SegmentReader, pid: int, component: str, outputs: Outputs | None = None) -> None:
+        self.totals: Totals = (0, 0)
+        self._outputs = outputs
         self._reader = reader
         self._component = component
         self._process = describe_process(pid)
@@ -106,13 +117,34 @@ class CooperativeSession:
         parent = None if order.base else self._acknowledged
         if parent is not None and parent.lineage != layout.lineage:
             parent = None
+        until_now = self._outputs.totals() if self._outputs else (0, 0)
         committed = self._reader.read(parent.commit if parent else 0)
         if committed is None and parent is None:
             raise CaptureError(f"cannot capture {self._component}: it has committed nothing yet")
         committed = committed or _nothing_since(parent, layout)
-        snapshot, table = self._snapshot(committed, parent, order)
-        self._waiting.append(_Mark(snapshot.position, committed.number, layout.lineage, table))
+        totals = self._totals_of(committed, until_now) if self._outputs else (0, 0)
+        snapshot, table = self._snapshot(committed, parent, order, totals)
+        self._waiting.append(_Mark(snapshot.position, committed.number, layout.lineage, table, totals))
+        self.totals = totals
         return snapshot
+
+    def _totals_of(self, committed: Committed, until_now: Totals) -> Totals:
+        """Where the output of a commit ends.
+
+        Raises:
+            CaptureError: it says that it wrote more than there is, or takes back what it said.
+        """
+        assert self._outputs is not None, "somebody counts"
+        if committed.outputs is None:
+            return until_now
+        now_written = self._outputs.totals()
+        for end, before, most in zip(committed.outputs, self.totals, now_written, strict=True):
+            if not before <= end <= most:
+                raise CaptureError(
+                    f"cannot capture {self._component}: commit {committed.number} claims {end} bytes of output, where {before} "
+                    f"to {most} were written; the program does not keep the rules of its segment"
+                )
+        return committed.outputs
 
     def acknowledge(self, position: Position) -> None:
         """See `checkpoint.engine.Session.acknowledge`."""
@@ -128,7 +160,9 @@ class CooperativeSession:
         """See `checkpoint.engine.Session.close`."""
         self._reader.close()
 
-    def _snapshot(self, committed: Committed, parent: _Mark | None, order: CaptureOrder) -> tuple[Snapshot, PageTable]:
+    def _snapshot(
+        self, committed: Committed, parent: _Mark | None, order: CaptureOrder, totals: Totals
+    ) -> tuple[Snapshot, PageTable]:
         runs = pages.page_runs(pages.extents_of_addresses(committed.layout.addresses()[committed.pages.astype(np.int64)], PAGE))
         vmas = tuple(_vma(region) for region in committed.layout.regions)
         table = (parent.table if parent else PageTable.empty(PAGE)).apply((), runs, committed.contents, vmas)
@@ -147,6 +181,7 @@ class CooperativeSession:
             contents=committed.contents,
             page_sum=table.page_sum,
             epoch=order.epoch,
+            output=self._outputs.pieces(parent.totals if parent else (0, 0), totals) if self._outputs else (),
         )
         return replace(made, position=position_of(made, order.generation, order.sequence)), table
 
@@ -162,7 +197,7 @@ class CooperativeSession:
 def _nothing_since(parent: _Mark | None, layout: Layout) -> Committed:
     """The commit that was acknowledged, once more."""
     assert parent is not None, "a whole state is something"
-    return Committed(layout, parent.commit, now(), np.empty(0, dtype=np.uint64), memoryview(b""))
+    return Committed(layout, parent.commit, now(), np.empty(0, dtype=np.uint64), memoryview(b""), parent.totals)
 
 
 def now() -> Clocks:
@@ -220,7 +255,7 @@ def open_segment(pid: int) -> SegmentReader:
     except OSError as error:
         raise CaptureError(f"cannot look for the segment of pid {pid}: {error.strerror}") from error
     for name in sorted(found, key=int, reverse=True):
-        descriptor = os.open(f"{folder}/{name}", os.O_RDONLY | os.O_CLOEXEC)
+        descriptor = os.open(f"{folder}/{name}", os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # whatever it is, never wait
         try:
             reader = SegmentReader(descriptor)
         finally:

@@ -1,0 +1,87 @@
+"""The cooperative engine behind a keeper: a program under a guard, whose segment is looked for whenever a capture is wanted.
+
+A program that has only begun has committed nothing yet, and one whose state grows goes on in another segment: so it is asked for
+nothing, and each capture looks where its commits go now.
+"""
+
+from __future__ import annotations
+
+from checkpoint.engine import NOTED, CaptureOrder, Finding, Report, Restored, RestoreOptions, Session, Streams
+from checkpoint.engines.cooperative import NAME, CooperativeSession, open_segment
+from checkpoint.engines.outputs import Outputs
+from checkpoint.errors import ProcessGoneError, RestoreError
+from checkpoint.linux import procfs
+from checkpoint.model import Position, Snapshot
+
+
+class GuardedTask:
+    """See `checkpoint.engine.Session`."""
+
+    notes: tuple[str, ...] = ()
+
+    def __init__(self, pid: int, component: str, streams: Streams | None) -> None:
+        self.pid = pid
+        self.component = component
+        self._outputs = Outputs(streams) if streams else None
+        self._session: CooperativeSession | None = None
+
+    @property
+    def totals(self) -> tuple[int, int]:
+        """See `checkpoint.engine.Session.totals`."""
+        return self._session.totals if self._session else (0, 0)
+
+    def capture(self, order: CaptureOrder) -> Snapshot:
+        """See `checkpoint.engine.Session.capture`."""
+        if procfs.status(self.pid).state in "ZX":
+            raise ProcessGoneError(f"{self.component} (pid {self.pid}) has ended")
+        return self._following().capture(order)
+
+    def commit_at(self, position: Position) -> int:
+        """The number of the commit that a capture holds; 0 if it is none of the last ones."""
+        return self._session.commit_at(position) if self._session else 0
+
+    def acknowledge(self, position: Position) -> None:
+        """See `checkpoint.engine.Session.acknowledge`."""
+        if self._session:
+            self._session.acknowledge(position)
+
+    def close(self) -> None:
+        """See `checkpoint.engine.Session.close`."""
+        if self._session:
+            self._session.close()
+        if self._outputs:
+            self._outputs.close()
+        self._session = self._outputs = None
+
+    def _following(self) -> CooperativeSession:
+        """The session, on the segment that commits go to now.
+
+        Raises:
+            CaptureError: there is none.
+        """
+        if self._session is None:
+            self._session = CooperativeSession(open_segment(self.pid), self.pid, self.component, self._outputs)
+        elif self._session.reader.is_superseded:
+            self._session.go_on_in(open_segment(self.pid))
+        return self._session
+
+
+class CooperativeEngine:
+    """See `checkpoint.engine.Engine`. To restore is to start a program again with what `fill_segment` makes."""
+
+    name = NAME
+
+    def probe(self, pid: int) -> Report:
+        """See `checkpoint.engine.Engine.probe`: nothing stands in the way of a program that keeps its state itself."""
+        arguments = procfs.read_bytes(pid, "cmdline").rstrip(b"\0").split(b"\0")
+        command = " ".join(word.decode(errors="replace") for word in arguments)
+        text = "only what it commits comes back; the program is started again and resumes from that"
+        return Report(pid, command, 0, "versions", (Finding("process", f"pid {pid}", NOTED, text),))
+
+    def protect(self, pid: int, component: str, streams: Streams | None) -> Session:
+        """See `checkpoint.engine.Engine.protect`."""
+        return GuardedTask(pid, component, streams)
+
+    def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
+        """Refused: see the class."""
+        raise RestoreError(f"cannot restore {state.component} into pid {vessel_pid}: a {NAME} program is started again")
