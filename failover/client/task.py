@@ -25,6 +25,7 @@ from typing import Any, Final, TypeVar
 from checkpoint.engines.cooperative import regions_of, this_machine
 from checkpoint.errors import CheckpointError
 from checkpoint.model import Snapshot
+from failover.client.task_agent import Guarded, guarded
 from failover.client.task_file import Recorder, StateFile, folder_of
 from failover.client.task_rhythm import Activations
 from failover.client.task_state import KeptState
@@ -50,8 +51,8 @@ class Resumed:
     Attributes:
         robot: name of the robot, or of the host, where it was committed.
         epoch: number of the primacy under which this program runs now: the fencing token. 0 without an agent.
-        generation: of this run; every resume opens a new one.
-        why: "restarted": the same robot, from the folder beside the program.
+        generation: of this run; every resume opens a new one. Under an agent: of the checkpoint that it goes on from.
+        why: "restarted" on the same robot, from its agent's store or the folder beside the program; "taken over" from another.
         age_s: seconds since that commit.
         notes: what does not come back as it was: fields that were added or dropped, a damaged file that was passed over.
     """
@@ -74,15 +75,14 @@ class Task:
         activations: its steps, where it has any.
     """
 
-    def __init__(self, name: str, state: KeptState, file: StateFile, value: Any, resumed: Resumed | None) -> None:
+    def __init__(self, name: str, state: KeptState, keeping: Recorder | Guarded, value: Any, resumed: Resumed | None) -> None:
         self.name = name
         self.state = state
         self.value = value
         self.resumed = resumed
-        self._recorder = Recorder(state, file)
+        self._keeping = keeping
         self._is_missing = False
         """The last commit found every bank held."""
-        _close_in_children(file)
         self.activations = Activations(0, 0)
         self._open_transaction: int | None = None
         """The thread that is in the middle of a change."""
@@ -100,7 +100,7 @@ class Task:
 
     def _commit(self) -> int:
         self._is_missing = not self.state.commit(self.value)
-        self._recorder.notice()
+        self._keeping.notice()
         return self.state.number
 
     @contextmanager
@@ -123,16 +123,16 @@ class Task:
         """
         if self._is_missing:
             raise NotCommittedError(f"the last commit of {self.name} was not made: readers held all its memory; commit again")
-        self._recorder.wait(self.state.number, timeout)
+        self._keeping.wait(self.state.number, timeout)
 
     @property
     def trouble(self) -> str:
         """Why the last write to the disk failed; "" while all is well."""
-        return self._recorder.trouble
+        return self._keeping.trouble
 
     def close(self) -> None:
         """Write the newest commit and let the state go."""
-        self._recorder.close()
+        self._keeping.close()
         self.state.live.close()
 
 
@@ -159,16 +159,37 @@ def open_task(
         raise TaskError(f"cannot keep a state under the name {name!r}: choose a word, or a path such as /lab/robot1/mapper")
     schema = schema_of(name)
     state = KeptState(schema)
+    guard = guarded()
+    if guard is not None:
+        return _open_guarded(name, state, guard, lambda: begin(state, schema))
     file = StateFile(folder_of(name, folder or Path(os.environ.get(FOLDER_VARIABLE) or Path.cwd())), name)
     try:
         snapshot = file.load()
         if snapshot is None:
-            return Task(name, state, file, begin(state, schema), None)
+            return _beside(name, state, file, begin(state, schema), None)
         decoded = state.decode(_contents(snapshot, file))
     except BaseException:
         file.close()
         raise
-    return Task(name, state, file, decoded.value, _resumed(snapshot, file, decoded.notes))
+    return _beside(name, state, file, decoded.value, _resumed(snapshot, file, decoded.notes))
+
+
+def _beside(name: str, state: KeptState, file: StateFile, value: Any, resumed: Resumed | None) -> Task:
+    """A task whose state is kept in a file beside the program."""
+    _close_in_children(file)
+    return Task(name, state, Recorder(state, file), value, resumed)
+
+
+def _open_guarded(name: str, state: KeptState, guard: Guarded, begin: Callable[[], Any]) -> Task:
+    """A task under an agent. What its checkpoint holds and does not fit any more is still stored there."""
+    state.outputs = guard.totals
+    kept, origin = guard.handed.state, guard.handed.begin.origin
+    if kept is None or origin is None:
+        return Task(name, state, guard, begin(), None)
+    decoded = state.decode({region.name: bytes(kept.region(index)) for index, region in enumerate(kept.layout.regions)})
+    epoch = guard.handed.begin.epoch
+    resumed = Resumed(origin.robot, epoch, origin.generation, origin.why, origin.age_ns / 1e9, decoded.notes)
+    return Task(name, state, guard, decoded.value, resumed)
 
 
 def _close_in_children(file: StateFile) -> None:

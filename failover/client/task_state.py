@@ -6,7 +6,7 @@ import os
 import secrets
 import threading
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +17,7 @@ from checkpoint.linux.live import LiveMemory
 from checkpoint.segment import ARRAY, MAX_NAME_SIZE, MAX_PLACES, PAGE, STATE, Layout, Region, address_of
 from checkpoint.segment_reader import SegmentReader
 from checkpoint.segment_writer import SegmentWriter, Source, pages_of
+from checkpoint.stream_counts import Totals
 from failover.errors import KeepError, StateFormatError, TaskError
 from failover.state import Decoded, Encoded, Schema
 from failover.state import Region as EncodedRegion
@@ -57,6 +58,8 @@ class KeptState:
         self._next_place = 1
         self._memory_of: dict[str, tuple[int, int]] = {}
         """Where the content of each region lay at the last commit, and its size."""
+        self.outputs: Callable[[], Totals | None] = _nobody_counts
+        """Bytes of output until now, where somebody counts them."""
         self._is_forked = False
         _close_in_children(self)
 
@@ -98,7 +101,8 @@ class KeptState:
             writer = self._make_room(contents)
         if encoded.regions:
             self.live.look()
-        return writer.commit([self._source(region.name, contents.get(region.name, _NOTHING)) for region in writer.layout.regions])
+        sources = [self._source(region.name, contents.get(region.name, _NOTHING)) for region in writer.layout.regions]
+        return writer.commit(sources, self.outputs())
 
     def _source(self, name: str, content: Bytes | bytes) -> Source:
         """What a region holds now, and which of its pages were written, if the kernel can tell.
@@ -220,6 +224,11 @@ def encoded_of(contents: Contents, name: str) -> Encoded:
         raise StateFormatError(f"{name}: the stored state is cut off: {len(state)} bytes say that {size} follow", name)
     regions = [EncodedRegion(key, _borrowed(content), "", ()) for key, content in contents.items() if key != STATE_NAME]
     return Encoded(state[SIZE_SIZE : SIZE_SIZE + size], tuple(regions))
+
+
+def _nobody_counts() -> None:
+    """The output of a program without a guard."""
+    return
 
 
 def _close_in_children(state: KeptState) -> None:
