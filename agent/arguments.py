@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import msgspec
 
@@ -49,6 +49,7 @@ class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
     isolate: bool = True
     wait: bool = True
     user: str = ""
+    engine: Literal["ptrace", "cooperative"] = "ptrace"
 
 
 class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):

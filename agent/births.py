@@ -17,7 +17,7 @@ from typing import Any
 from agent import guard_messages
 from agent.caller import ROOT
 from agent.clock import Laps
-from agent.component import Component
+from agent.component import COOPERATIVE, PTRACE, Component, Prepared
 from agent.errors import GuardError, GuardLostError, KeeperLostError
 from agent.nursery import KeeperLink, connect
 from agent.places import Places, complete_logs, log_directory
@@ -26,6 +26,7 @@ from checkpoint import channel, format
 from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Credentials
+from checkpoint.task_channel import RESTARTED, TAKEN_OVER, Origin
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +39,10 @@ class Program:
     umask: int = 0o022
     isolate: bool = True
     inheritance: Inheritance | None = None
+    engine: str = PTRACE
 
 
-async def start(name: str, program: Program, places: Places) -> Component:
+async def start(name: str, program: Program, places: Places, epoch: int = 0) -> Component:
     """Start a guard and under it the program. It runs, and is not protected yet.
 
     Raises:
@@ -53,7 +55,15 @@ async def start(name: str, program: Program, places: Places) -> Component:
         guard.dialogue.close()
         raise GuardError(f"{name}: cannot begin its output anew in {error.filename}: {error.strerror}") from error
     component = Component(name, guard, places)
-    request = guard_messages.Start(
+    component.engine = program.engine
+    task = guard_messages.Task(epoch) if program.engine == COOPERATIVE else None
+    return await _born(component, _starting(name, program, places, task))
+
+
+def _starting(
+    name: str, program: Program, places: Places, task: guard_messages.Task | None, totals: tuple[int, int] = (0, 0)
+) -> guard_messages.Start:
+    return guard_messages.Start(
         component=name,
         argv=program.argv,
         environment=program.environment,
@@ -63,8 +73,9 @@ async def start(name: str, program: Program, places: Places) -> Component:
         log_directory=str(log_directory(name, places)),
         cgroup=places.cgroup,
         inheritance=program.inheritance,
+        task=task,
+        totals=totals,
     )
-    return await _born(component, request)
 
 
 async def watch(name: str, pid: int, places: Places) -> Component:
@@ -130,6 +141,45 @@ async def restore(
         await component.undo()
         raise
     component.notes = (*component.notes, *restored.notes)
+    return component
+
+
+async def begin_again(
+    name: str,
+    program: Program,
+    chain: Sequence[int],
+    places: Places,
+    *,
+    outage_ns: int,
+    owner: int,
+    epoch: int,
+) -> Component:
+    """Prepare a program that keeps its state to go on from a chain of the cooperative engine; `resume` starts it.
+
+    Whatever fails, and whoever dies before `resume`: nothing of it is left.
+
+    Raises:
+        checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
+    """
+    outline = await asyncio.to_thread(format.read_outline, chain[-1])
+    inherited = program.inheritance.uid if program.inheritance is not None else os.geteuid()
+    if owner not in (ROOT, inherited):
+        reason = f"it is to run as uid {inherited}, which is not its owner, uid {owner}; start it as that user"
+        raise MismatchError(f"cannot restore {name}: {reason}", (reason,))
+    await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
+    component = Component(name, await places.nursery.guard(), places)
+    component.engine = COOPERATIVE
+    try:
+        await component.give_keeper()
+        filled, (segment,) = await component.ask_keeper(channel.Fill(name), tuple(chain))
+    except (CheckpointError, GuardError, KeeperLostError):
+        await component.undo()
+        raise
+    why = RESTARTED if outline.machine.robot == places.robot else TAKEN_OVER
+    origin = Origin(outline.machine.robot, filled.position.generation, why, outage_ns)
+    task = guard_messages.Task(epoch, origin)
+    start = _starting(name, program, places, task, total_of(outline.output))
+    component.prepared = Prepared(start, segment)
     return component
 
 

@@ -19,7 +19,7 @@ import msgspec
 
 from agent import births, clock, lost
 from agent.births import Program
-from agent.component import Component
+from agent.component import COOPERATIVE, Component
 from agent.errors import AgentError, GuardError, KeeperLostError
 from agent.figures import Figures, shortened
 from agent.mistake import end_lanes_on_mistake
@@ -210,7 +210,7 @@ class Charge:
         adopted = self.component is not None
         self.around.records.note(self.name, act.epoch)
         if self.component is None:
-            self.component = await self._begun(act.spec.launch)
+            self.component = await self._begun(act.spec.launch, act.epoch)
         await self.component.lease(self._lease_until_ns)
         await self._protect(refuse=act.spec.launch.pid != 0)
         self.started.set()
@@ -218,18 +218,10 @@ class Charge:
         if not adopted:
             self._watch_the_end()
 
-    async def _begun(self, launch: Launch) -> Component:
+    async def _begun(self, launch: Launch, epoch: int) -> Component:
         if launch.pid:
             return await births.watch(self.name, launch.pid, self.around.places)
-        program = Program(
-            tuple(os.fsencode(argument) for argument in launch.argv),
-            tuple(os.fsencode(f"{name}={value}") for name, value in launch.environment),
-            os.fsencode(launch.directory),
-            launch.umask,
-            launch.isolate,
-            msgspec.msgpack.decode(launch.inheritance, type=Inheritance) if launch.inheritance else None,
-        )
-        return await births.start(self.name, program, self.around.places)
+        return await births.start(self.name, program_of(launch), self.around.places, epoch)
 
     async def _protect(self, *, refuse: bool) -> None:
         """Give it a keeper. A program that was started here runs on unprotected where it cannot have one; a guest is refused."""
@@ -252,10 +244,7 @@ class Charge:
         laps.lap(f"opening {len(descriptors)} snapshots")
         try:
             outage_ns, read_ns = clock.age_ns(descriptors[-1]), clock.now_ns()
-            owner = act.spec.owner if act.spec is not None else None
-            component = await births.restore(
-                self.name, descriptors, self.around.places, outage_ns=outage_ns, owner=owner, laps=laps
-            )
+            component = await self._brought_back(act, descriptors, outage_ns, laps)
         finally:
             close_all(tuple(descriptors))
         self.around.records.note(self.name, act.epoch)
@@ -288,6 +277,17 @@ class Charge:
             raise
         finally:
             self._coming = None
+
+    async def _brought_back(self, act: acts.Restore, chain: list[int], outage_ns: int, laps: clock.Laps) -> Component:
+        """The component by the engine that its program was started for."""
+        places = self.around.places
+        if act.spec is None or act.spec.launch.engine != COOPERATIVE:
+            owner = act.spec.owner if act.spec is not None else None
+            return await births.restore(self.name, chain, places, outage_ns=outage_ns, owner=owner, laps=laps)
+        program = program_of(act.spec.launch)
+        return await births.begin_again(
+            self.name, program, chain, places, outage_ns=outage_ns, owner=act.spec.owner, epoch=act.epoch
+        )
 
     async def _capture(self, act: acts.Capture) -> None:
         component = self._present()
@@ -418,3 +418,16 @@ class Charge:
         if self.component is component and not self._stopping:
             self.figures.crashes += bool(status and os.WIFSIGNALED(status))
             self.around.tell(events.Exited(self.name, self.epoch, status or 0))
+
+
+def program_of(launch: Launch) -> Program:
+    """What to start."""
+    return Program(
+        tuple(os.fsencode(argument) for argument in launch.argv),
+        tuple(os.fsencode(f"{name}={value}") for name, value in launch.environment),
+        os.fsencode(launch.directory),
+        launch.umask,
+        launch.isolate,
+        msgspec.msgpack.decode(launch.inheritance, type=Inheritance) if launch.inheritance else None,
+        launch.engine,
+    )

@@ -20,7 +20,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import signal
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -34,6 +36,10 @@ from checkpoint import channel, errors
 from checkpoint.channel import Failed, close_all
 from checkpoint.errors import CheckpointError, RestoreError
 from checkpoint.model import Position
+
+PTRACE: Final = "ptrace"
+COOPERATIVE: Final = "cooperative"
+"""The engines; `checkpoint.engine.engine_named`."""
 
 TOTALS_LIMIT: Final = 64
 """Captures whose acknowledgement may still come; the core has one under way."""
@@ -59,6 +65,18 @@ class Captured:
 
 
 @dataclass(frozen=True, slots=True)
+class Prepared:
+    """A program that keeps its state, before it is started again.
+
+    Attributes:
+        segment: descriptor of its state; ours to close.
+    """
+
+    start: guard_messages.Start
+    segment: int
+
+
+@dataclass(frozen=True, slots=True)
 class Standing:
     """How a component stands, for ``status``. ``notes`` are whole sentences: what is missing or degraded, and why."""
 
@@ -80,6 +98,8 @@ class Component:
     Attributes:
         name, pid, inner_pid, isolated: as the guard said.
         logs: its output; `OutputLogs.read` serves ``failover logs``.
+        engine: by which it is captured: `PTRACE` or `COOPERATIVE`.
+        prepared: a program that is to be started with a state, by `resume`.
         streams: what its guard gave of them: counters, two read ends, two logs; none of somebody else's child.
         ended: the wait status once the program has ended (None: it was not our child); GuardLostError if the guard died first.
     """
@@ -96,6 +116,10 @@ class Component:
         self._keeper: KeeperLink | None = None
         self.streams: tuple[int, ...] = ()
         self._totals: dict[Position, tuple[int, int]] = {}
+        self._commits: dict[Position, int] = {}
+        self.engine = PTRACE
+        self.prepared: Prepared | None = None
+        self._lease_until_ns = 0
         self._held = False
         guard.dialogue.heard = self._heard
         guard.dialogue.ended = self._guard_lost
@@ -106,6 +130,9 @@ class Component:
         Raises:
             RestoreError, GuardError, KeeperLostError: it did not get that far; nothing of it is left.
         """
+        if self.prepared is not None:
+            await self._begin_again(self.prepared)
+            return
         try:
             await self.ask_guard(guard_messages.Commit())
             resumed, _ = await self.ask_keeper(channel.Resume())
@@ -115,6 +142,21 @@ class Component:
         self.notes = (*self.notes, *resumed.notes)
         if any(note.startswith(channel.UNPROTECTED) for note in resumed.notes):
             self._drop_keeper()  # the next capture tries with a new one
+
+    async def _begin_again(self, prepared: Prepared) -> None:
+        """Start the program with the state that waits for it."""
+        self.prepared = None
+        try:
+            born, streams = await self.ask_guard(prepared.start, (prepared.segment,))
+            self.take(born, streams)
+            await self.lease(self._lease_until_ns)
+            with contextlib.suppress(CheckpointError, KeeperLostError):  # the next capture tries with a new one
+                await self._follow()
+        except GuardError:
+            await self.undo()
+            raise
+        finally:
+            os.close(prepared.segment)
 
     # --- protection ---
 
@@ -128,7 +170,11 @@ class Component:
         if self._keeper is not None and self._keeper.dialogue.open:
             return ()
         await self.give_keeper()
-        order = channel.Protect(self.pid, self.name, bool(self.streams), self._places.robot)
+        return await self._follow()
+
+    async def _follow(self) -> tuple[str, ...]:
+        """Have a keeper that follows nothing yet follow the program; it ends if it cannot."""
+        order = channel.Protect(self.pid, self.name, bool(self.streams), self._places.robot, self.engine)
         try:
             protected, _ = await self.ask_keeper(order, self.streams)
         except (CheckpointError, KeeperLostError):
@@ -147,11 +193,15 @@ class Component:
         """
         await self.protect()
         order = channel.Capture(base, generation, sequence, epoch, hold)
-        captured, (snapshot,) = await self.ask_keeper(order)
-        self._held = hold
+        async with self._standing_still(hold and self.engine == COOPERATIVE):
+            captured, (snapshot,) = await self.ask_keeper(order)
+        self._held = hold and self.engine != COOPERATIVE
+        self._commits[captured.position] = captured.commit
         self._totals[captured.position] = captured.totals
         while len(self._totals) > TOTALS_LIMIT:
             del self._totals[next(iter(self._totals))]
+        while len(self._commits) > TOTALS_LIMIT:
+            del self._commits[next(iter(self._commits))]
         return Captured(
             captured.position,
             captured.parent,
@@ -169,12 +219,29 @@ class Component:
             self.logs.commit(totals)
         if self._keeper is not None and self._keeper.dialogue.open:
             self._keeper.dialogue.tell(channel.Acknowledge(position))
+        if commit := self._commits.pop(position, 0):
+            self._guard.dialogue.tell(guard_messages.CommitSafe(commit))
+
+    @contextlib.asynccontextmanager
+    async def _standing_still(self, wanted: bool) -> AsyncIterator[None]:
+        """Have the guard hold the program, as the keeper of another engine would; let it go on if the body fails."""
+        if not wanted or (await self.describe()).frozen_by:
+            yield
+            return
+        await self.freeze()
+        try:
+            yield
+        except BaseException:
+            await self.thaw()
+            raise
 
     # --- holding still ---
 
     async def lease(self, until_ns: int) -> None:
         """The program may run until CLOCK_MONOTONIC passes ``until_ns``; renew in time. 0 for ever. Thaws what a lease froze."""
-        await self.ask_guard(guard_messages.Lease(until_ns))
+        self._lease_until_ns = until_ns
+        if self.prepared is None:  # else it is given with the start
+            await self.ask_guard(guard_messages.Lease(until_ns))
 
     async def freeze(self, *, exposed: bool = False) -> None:
         """Hold the program still; it is when this returns. Held ``exposed`` it can be captured all the same."""
@@ -239,6 +306,9 @@ class Component:
         """Let go of guard and keeper without changing anything for the program: what a stopping agent does."""
         self._drop_keeper()
         self._guard.dialogue.close()
+        if self.prepared is not None:
+            os.close(self.prepared.segment)
+            self.prepared = None
         close_all(self.streams)
         self.streams = ()
 
@@ -248,6 +318,8 @@ class Component:
         """Note what the guard said of it."""
         self.pid, self.inner_pid, self.isolated, self.notes = born.pid, born.inner_pid, born.isolated, born.notes
         self.streams = streams
+        if isinstance(born, Described):
+            self.engine = COOPERATIVE if born.keeps_state else PTRACE
 
     async def ask_guard(self, request: Any, descriptors: tuple[int, ...] = ()) -> Any:
         """The guard's reply, and descriptors that are ours now.

@@ -28,6 +28,7 @@ class Figures:
     outage_ms: float | None = None
     reasons: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    engine: str = "ptrace"
 
     def captured(self, captured: Captured) -> None:
         """Count one snapshot that was taken here."""
@@ -38,10 +39,10 @@ class Figures:
         self.newest = captured.position
         self.notes = captured.notes
 
-    def stored(self, position: Position, size: int) -> None:
+    def stored(self, position: Position, size: int, engine: str) -> None:
         """Count one snapshot that came from the primary."""
         self.snapshots += 1
-        self.newest, self.snapshot_size = position, size
+        self.newest, self.snapshot_size, self.engine = position, size, engine
 
 
 def shortened(reasons: tuple[str, ...]) -> str:

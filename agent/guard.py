@@ -33,6 +33,7 @@ import msgspec
 from agent import kernel
 from agent.guard_messages import (
     Commit,
+    CommitSafe,
     Describe,
     Described,
     Done,
@@ -88,6 +89,7 @@ class Guard:
             Lease: self._lease,
             Freeze: lambda request, _: self._act(lambda ward: ward.freeze(exposed=request.exposed)),
             Thaw: lambda _, __: self._act(lambda ward: ward.thaw()),
+            CommitSafe: self._commit_safe,
             Kill: lambda request, _: self._act(lambda ward: ward.kill(request.signal)),
             Describe: lambda _, __: self._reply(self._description(), self._ward.descriptors() if self._ward is not None else ()),
             LetGo: self._let_go,
@@ -208,9 +210,9 @@ class Guard:
 
     # --- what it is asked ---
 
-    def _start(self, request: Start, _: tuple[int, ...]) -> None:
+    def _start(self, request: Start, descriptors: tuple[int, ...]) -> None:
         self._check_free()
-        self._ward = ward = Ward.start(request)
+        self._ward = ward = Ward.start(request, descriptors)
         born = ward.born
         self._reply(Started(born.pid, born.inner_pid, born.isolated, self._all_notes()), ward.descriptors())
 
@@ -230,6 +232,10 @@ class Guard:
         self._guarded().commit()
         self._drop_keeper()
         self._reply(Done())
+
+    def _commit_safe(self, request: CommitSafe, _: tuple[int, ...]) -> None:
+        if self._ward is not None and self._ward.task is not None:
+            self._ward.task.tell_safe(request.commit)
 
     def _lease(self, request: Lease, _: tuple[int, ...]) -> None:
         self._guarded().set_lease(request.until_ns)

@@ -11,10 +11,18 @@ import msgspec
 
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Clocks
+from checkpoint.task_channel import Origin
 
 
 class Message(msgspec.Struct, frozen=True, tag=True):
     """The base of them all: a frozen struct, told apart by its class name."""
+
+
+class Task(msgspec.Struct, frozen=True):
+    """What a program that keeps its state is told (`checkpoint.task_channel`)."""
+
+    epoch: int
+    origin: Origin | None = None
 
 
 class Start(Message, frozen=True):
@@ -27,6 +35,8 @@ class Start(Message, frozen=True):
         log_directory: where `agent.streams.OutputLogs` are.
         cgroup: a cgroup v2 directory to make the component's own cgroup in; "" for the guard's.
         inheritance: whose rights, limits and priorities it gets; None: the guard's.
+        task: for a program that keeps its state; with a descriptor, if it has an origin: the state as a segment.
+        totals: bytes that it had written to its two streams by then.
     """
 
     component: str
@@ -38,6 +48,8 @@ class Start(Message, frozen=True):
     log_directory: str
     cgroup: str = ""
     inheritance: Inheritance | None = None
+    task: Task | None = None
+    totals: tuple[int, int] = (0, 0)
 
 
 class MakeVessel(Message, frozen=True):
@@ -90,6 +102,12 @@ class Freeze(Message, frozen=True):
 
 class Thaw(Message, frozen=True):
     """Let it go on; refused while its lease is over."""
+
+
+class CommitSafe(Message, frozen=True):
+    """A standby holds this commit of a program that keeps its state; told to it. No answer."""
+
+    commit: int
 
 
 class Kill(Message, frozen=True):
@@ -148,6 +166,7 @@ class Described(Message, frozen=True):
         totals: bytes written to the two streams so far.
         freezes_by: "cgroup" (invisible to the program) or "SIGSTOP".
         blocked: why output is held back, "" if it is not.
+        keeps_state: it was started as a program that keeps its state: the cooperative engine's.
     """
 
     component: str
@@ -164,6 +183,7 @@ class Described(Message, frozen=True):
     freezes_by: Literal["", "cgroup", "SIGSTOP"]
     blocked: str
     notes: tuple[str, ...]
+    keeps_state: bool = False
 
 
 class Refused(Message, frozen=True):
@@ -189,6 +209,6 @@ class FrozenByLease(Message, frozen=True):
     """The lease ran out and the guard froze the component; an event."""
 
 
-Request = Start | MakeVessel | Watch | Commit | Lease | Freeze | Thaw | Kill | Describe | LetGo | Forget
+Request = Start | MakeVessel | Watch | Commit | Lease | Freeze | Thaw | CommitSafe | Kill | Describe | LetGo | Forget
 Reply = Started | VesselReady | Watching | Done | Described | Refused
 Event = Exited | FrozenByLease

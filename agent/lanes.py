@@ -347,7 +347,7 @@ class Lanes:
         self._say(HearKey(peer, hello.beat_key))
 
     def _stored(self, component: str, snapshot: Snapshot, size: int) -> None:
-        self.charge(component).figures.stored(snapshot.position, size)
+        self.charge(component).figures.stored(snapshot.position, size, snapshot.engine)
 
     async def _silence_ns(self, component: str) -> int:
         """For how long the robot that sent this component's snapshots has been silent; 0 if there is none."""

@@ -43,6 +43,7 @@ class Counters:
 
     def __init__(self, totals: tuple[int, int], firsts: tuple[int, int] = (0, 0)) -> None:
         self.descriptor = os.memfd_create("failover-streams", os.MFD_CLOEXEC)
+        os.fchmod(self.descriptor, 0o600)  # a program that keeps its state reads it, and must not open it for writing
         os.ftruncate(self.descriptor, COUNTERS_SIZE)
         self._mapping = mmap.mmap(self.descriptor, COUNTERS_SIZE)
         self._words = memoryview(self._mapping).cast("Q")  # an item is stored by one eight-byte move, never in parts

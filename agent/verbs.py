@@ -204,6 +204,7 @@ class Verbs:
             wanted.umask,
             isolate=wanted.isolate,
             inheritance=msgspec.msgpack.encode(inheritance),
+            engine=wanted.engine,
         )
         charge = await self._begin(name, launch, inheritance.uid)
         started: dict[str, Any] = {"name": name, "notes": list(charge.figures.notes), "reasons": list(charge.figures.reasons)}

@@ -109,7 +109,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings) -
         "epoch": view.epoch,
         "generation": newest.generation if newest else None,
         "sequence": newest.sequence if newest else None,
-        "engine": "ptrace",
+        "engine": (running.engine if running is not None else figures.engine) if figures else "ptrace",
         "pid": running.pid if running is not None else None,
         "inner_pid": running.inner_pid if running is not None else None,
         "isolated": running.isolated if running is not None else None,

@@ -28,6 +28,7 @@ from agent.freezer import Freezer
 from agent.guard_messages import Described, Exited, MakeVessel, Start, Watch
 from agent.pump import Pump
 from agent.streams import STREAMS, OutputLogs
+from agent.task_end import TaskEnd
 from checkpoint.linux.vessel import Birth, Born, spawn_program, spawn_vessel
 
 DRAIN_S: Final = 2.0
@@ -57,12 +58,16 @@ class Ward:
     lease_until_ns: int = 0
     exited: Exited | None = None
     notes: list[str] = field(default_factory=list)
+    task: TaskEnd | None = None
 
     # --- birth ---
 
     @classmethod
-    def start(cls, order: Start) -> Ward:
+    def start(cls, order: Start, segment: tuple[int, ...] = ()) -> Ward:
         """Start a program.
+
+        Args:
+            segment: the state that it goes on with, if it keeps one and has one.
 
         Raises:
             OSError: it cannot be executed, or its logs cannot be written; nothing is left of it.
@@ -72,11 +77,13 @@ class Ward:
         directory = os.fsdecode(order.working_directory)
 
         def give_birth(birth: Birth) -> Born:
-            return spawn_program(argv, environment, directory, order.umask, birth)
+            named = environment if task is None else environment | task.environment
+            return spawn_program(argv, named, directory, order.umask, birth)
 
+        task = TaskEnd(order.component, order.task, segment) if order.task is not None else None
         kept = order.inheritance
         user = (kept.uid, kept.gid) if kept is not None else None
-        return cls._bear(order, (0, 0), Birth(isolate=order.isolate, inheritance=kept), give_birth, user)
+        return cls._bear(order, order.totals, Birth(isolate=order.isolate, inheritance=kept), give_birth, user, task)
 
     @classmethod
     def make_vessel(cls, order: MakeVessel) -> Ward:
@@ -111,6 +118,7 @@ class Ward:
         birth: Birth,
         act: Callable[[Birth], Born],
         user: tuple[int, int] | None,
+        task: TaskEnd | None = None,
     ) -> Ward:
         """Logs, pipes and a freezer first; the process last, into all of them.
 
@@ -127,14 +135,20 @@ class Ward:
         try:
             with open(os.devnull, "rb") as nothing, hold.birthplace():
                 ends = pump.write_ends
+                if task is not None:
+                    birth = replace(birth, passed=task.begin(pump.counters.descriptor, (ends[1], ends[2])))
                 born = act(replace(birth, stdio=(nothing.fileno(), ends[1], ends[2])))
         except BaseException:
             hold.close()
+            if task is not None:
+                task.close()
             raise
+        if task is not None:
+            task.born()
         hold.add(born.pid)
         pump.start()
         said = [*notes, *born.notes, *([] if logs.trims else [NO_TRIM])]
-        return cls(order.component, born, hold, order.log_directory, pump, notes=said)
+        return cls(order.component, born, hold, order.log_directory, pump, notes=said, task=task)
 
     def descriptors(self) -> tuple[int, ...]:
         """What the keeper needs of the streams: counters, two read ends, two logs. They stay ours."""
@@ -285,6 +299,7 @@ class Ward:
             freezes_by=self.freezer.kind,
             blocked=self.pump.blocked if self.pump is not None else "",
             notes=(*self.notes, *more_notes),
+            keeps_state=self.task is not None,
         )
 
     def _check_alive(self, what: str) -> None:

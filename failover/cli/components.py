@@ -30,7 +30,7 @@ RECONNECT_EVERY_S: Final = 0.2
 def run(arguments: argparse.Namespace) -> int:
     """Start a program under protection; its output and exit status become ours."""
     wanted: dict[str, Any] = {"argv": arguments.command, "env": dict(os.environ), "cwd": os.getcwd(), "umask": _umask()}
-    wanted |= {"isolate": arguments.isolate, "wait": not arguments.detach}
+    wanted |= {"engine": arguments.engine, "isolate": arguments.isolate, "wait": not arguments.detach}
     if arguments.name:
         wanted["name"] = arguments.name
     if arguments.user:

@@ -132,6 +132,13 @@ def _run(room: argparse.ArgumentParser) -> None:
     room.add_argument(
         "--no-isolate", dest="isolate", action="store_false", help="keep it in this machine's PIDs and clocks (default: its own)"
     )
+    room.add_argument(
+        "--engine",
+        choices=("ptrace", "cooperative"),
+        default="ptrace",
+        help="cooperative: the program says by itself what must survive (failover.resume, failover.component), and is started "
+        "again from that (default: ptrace, for a program that nobody prepared)",
+    )
     room.add_argument("--user", metavar="USER", help="run it as this user, by name or number (only root may; default: as you)")
     room.add_argument("command", metavar="CMD", nargs="+", help="the program and its arguments, after --")
     _agent(room)
@@ -335,6 +342,7 @@ VERBS: Final = (
 
           failover run -- python3 mapper.py --map hall.yaml
           failover run --name /lab/robot1/mapper --detach -- ./mapper
+          failover run --engine cooperative -- python3 counter.py
         """,
         _run,
         "failover.cli.components:run",

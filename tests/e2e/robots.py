@@ -81,11 +81,13 @@ def connected(robot: RobotMachine) -> bool:
     return bool(peer["state"] == "live" and peer["hears_us"] and peer["lane"] == "connected")
 
 
-def run(robot: RobotMachine, name: str, *argv: str, env: dict[str, str] | None = None, cwd: str = "/") -> dict[str, Any]:
+def run(
+    robot: RobotMachine, name: str, *argv: str, env: dict[str, str] | None = None, cwd: str = "/", engine: str = "ptrace"
+) -> dict[str, Any]:
     """Start a program under protection; returns what `failover run` says at once."""
     with robot.control() as link:
         environment = {"PATH": "/usr/bin:/bin", "LC_ALL": "C", **(env or {})}
-        return link.ask("run", argv=list(argv), name=name, env=environment, cwd=cwd, wait=False)
+        return link.ask("run", argv=list(argv), name=name, env=environment, cwd=cwd, wait=False, engine=engine)
 
 
 def failover(robot: RobotMachine, verb: str, *arguments: str) -> subprocess.CompletedProcess[str]:

@@ -1,0 +1,221 @@
+"""A program that keeps its state, with a real guard and a real keeper: captures of its commits, and going on from them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from agent import births, nursery
+from agent.births import Program
+from agent.component import COOPERATIVE, Captured, Component
+from agent.errors import GuardError
+from agent.places import Places, guard_sockets
+from checkpoint.errors import CaptureError, MismatchError
+from tests.agent.guards import PATIENCE_S
+from tests.agent.test_component import Captures, live, output, piece_of, until
+
+NAME: Final = "/test/robot1/one"
+BEGIN = """
+import sys, time
+import failover
+from failover.client.task import resumed
+state = failover.resume("state", default={"step": 0})
+"""
+PRINTS = BEGIN + "print('before')\nfailover.commit()\nprint('after', flush=True)\ntime.sleep(1000)\n"
+WAITS = (
+    BEGIN
+    + "failover.commit()\nprint('committed', flush=True)\nfailover.wait_committed()\n"
+    + "print('safe', flush=True)\ntime.sleep(1000)\n"
+)
+STEPS = (
+    BEGIN
+    + "print(resumed(), flush=True)\nwhile True:\n    print(state['step'])\n    state['step'] += 1\n    failover.commit()\n"
+    + "    time.sleep(0.001)\n"
+)
+SILENT = "import time\nprint('here', flush=True)\ntime.sleep(1000)\n"
+
+
+@pytest.fixture(autouse=True)
+def _no_spares(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody waits in advance for a takeover here."""
+    monkeypatch.setattr(nursery, "REFILL_S", 10 * PATIENCE_S)
+
+
+def program(script: str) -> Program:
+    environment = (b"PATH=/usr/bin:/bin", b"PYTHONPATH=" + os.fsencode(Path(__file__).parents[2]))
+    return Program((os.fsencode(sys.executable), b"-c", os.fsencode(script)), environment, b"/", engine=COOPERATIVE)
+
+
+@asynccontextmanager
+async def gone_afterwards(component: Component) -> AsyncIterator[Component]:
+    try:
+        yield component
+    finally:
+        with contextlib.suppress(GuardError):
+            await component.stop(signal.SIGKILL)
+            await component.forget()
+
+
+async def started(places: Places, script: str) -> Component:
+    return await births.start(NAME, program(script), places, 3)
+
+
+async def again(places: Places, captures: Captures, script: str) -> Component:
+    return await births.begin_again(NAME, program(script), captures.chain, places, outage_ns=5, owner=0, epoch=4)
+
+
+async def held(component: Component) -> Captured:
+    return await component.capture(base=True, generation=1, sequence=99, epoch=3, hold=True)
+
+
+def test_a_snapshot_carries_the_output_as_it_stood_at_the_commit_and_freezes_nobody(tmp_path: Path) -> None:
+    async def story(places: Places) -> None:
+        async with gone_afterwards(await started(places, PRINTS)) as component:
+            await until(lambda: output(component) == b"before\nafter\n", "both lines")
+            captures = Captures(component)
+            captured = await captures.take()
+            assert piece_of(captured).content == b"before\n", "flushed by the commit, and not a byte beyond"
+            assert captured.freeze_us == 0
+            captures.close()
+
+    live(tmp_path, story)
+
+
+def test_a_program_that_has_committed_nothing_is_told_so(tmp_path: Path) -> None:
+    async def story(places: Places) -> None:
+        async with gone_afterwards(await started(places, SILENT)) as component:
+            await until(lambda: output(component) == b"here\n", "its output")
+            with pytest.raises(CaptureError, match="has not committed yet"):
+                await Captures(component).take()
+
+    live(tmp_path, story)
+
+
+def test_a_commit_is_safe_for_its_program_when_it_was_acknowledged_and_not_before(tmp_path: Path) -> None:
+    async def story(places: Places) -> None:
+        async with gone_afterwards(await started(places, WAITS)) as component:
+            await until(lambda: output(component) == b"committed\n", "the commit")
+            captured = await component.capture(base=True, generation=1, sequence=1, epoch=3)
+            os.close(captured.snapshot)
+            assert output(component) == b"committed\n"
+            await component.acknowledge(captured.position)
+            await until(lambda: output(component) == b"committed\nsafe\n", "the program to hear of it")
+
+    live(tmp_path, story)
+
+
+def test_a_program_goes_on_exactly_after_what_its_last_snapshot_carries(tmp_path: Path) -> None:
+    async def story(places: Places) -> None:
+        async with gone_afterwards(await started(places, STEPS)) as first:
+            await until(lambda: output(first).count(b"\n") > 10, "some steps")
+            captures = Captures(first)
+            for _ in range(5):
+                captured = await captures.take()
+        end = piece_of(captured).offset + len(piece_of(captured).content)
+        second = await again(replace(places, robot="robot2"), captures, STEPS)
+        await second.resume()
+        async with gone_afterwards(second):
+            await until(lambda: len(output(second)) > end + 200, "it to go on")
+            told = output(second)[end:].splitlines()[0].decode()
+            assert "robot='robot1', epoch=4, generation=1, why='taken over'" in told
+            numbers = [int(line) for line in output(second).splitlines()[:-1] if line.isdigit()]
+            assert numbers == list(range(len(numbers)))
+            await captures_go_on(second)
+        captures.close()
+
+    live(tmp_path, story)
+
+
+async def captures_go_on(component: Component) -> None:
+    """The program that was started again is protected as it was before."""
+    captures = Captures(component)
+    assert (await captures.take()).parent is None
+    assert (await captures.take()).parent is not None
+    captures.close()
+
+
+def test_a_program_that_is_held_stands_still_until_it_is_thawed(tmp_path: Path) -> None:
+    async def story(places: Places) -> None:
+        async with gone_afterwards(await started(places, STEPS)) as component:
+            await until(lambda: output(component).count(b"\n") > 10, "some steps")
+            os.close((await held(component)).snapshot)
+            assert (await component.describe()).state == "frozen"
+            await component.thaw()
+            before = len(output(component))
+            await until(lambda: len(output(component)) > before, "it to go on")
+
+    live(tmp_path, story)
+
+
+def test_a_program_that_cannot_be_held_for_its_capture_is_let_go(tmp_path: Path) -> None:
+    async def story(places: Places) -> None:
+        async with gone_afterwards(await started(places, SILENT)) as component:
+            await until(lambda: output(component) == b"here\n", "its output")
+            with pytest.raises(CaptureError):
+                await held(component)
+            assert (await component.describe()).state == "running"
+
+    live(tmp_path, story)
+
+
+def test_an_agent_that_comes_back_goes_on_with_the_same_engine(tmp_path: Path) -> None:
+    async def story(places: Places) -> None:
+        first = await started(places, STEPS)
+        await until(lambda: output(first).count(b"\n") > 10, "some steps")
+        first.close()
+        async with gone_afterwards(await births.reconnect(guard_sockets(places)[0], places)) as found:
+            assert found.engine == COOPERATIVE
+            await captures_go_on(found)
+
+    live(tmp_path, story)
+
+
+def test_what_was_prepared_and_never_resumed_leaves_nothing(tmp_path: Path) -> None:
+    async def story(places: Places) -> None:
+        async with gone_afterwards(await started(places, STEPS)) as first:
+            await until(lambda: output(first).count(b"\n") > 10, "some steps")
+            captures = Captures(first)
+            await captures.take()
+        (await again(places, captures, STEPS)).close()
+        await until(lambda: not guard_sockets(places), "the guard to end")
+        captures.close()
+
+    live(tmp_path, story)
+
+
+def test_a_program_that_is_not_here_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
+    async def story(places: Places) -> None:
+        async with gone_afterwards(await started(places, STEPS)) as first:
+            await until(lambda: output(first).count(b"\n") > 10, "some steps")
+            captures = Captures(first)
+            await captures.take()
+        missing = replace(program(STEPS), argv=(b"/nowhere/mapper",))
+        second = await births.begin_again(NAME, missing, captures.chain, places, outage_ns=0, owner=0, epoch=4)
+        with pytest.raises(GuardError, match="cannot start /nowhere/mapper: No such file or directory"):
+            await second.resume()
+        await until(lambda: not guard_sockets(places), "the guard to end")
+        captures.close()
+
+    live(tmp_path, story)
+
+
+def test_a_chain_is_not_started_as_somebody_who_does_not_own_it(tmp_path: Path) -> None:
+    async def story(places: Places) -> None:
+        async with gone_afterwards(await started(places, STEPS)) as first:
+            await until(lambda: output(first).count(b"\n") > 10, "some steps")
+            captures = Captures(first)
+            await captures.take()
+        with pytest.raises(MismatchError, match="not its owner, uid 12345"):
+            await births.begin_again(NAME, program(STEPS), captures.chain, places, outage_ns=0, owner=12345, epoch=4)
+        captures.close()
+
+    live(tmp_path, story)

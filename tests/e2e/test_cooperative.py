@@ -1,0 +1,116 @@
+"""Two robots and a program that says by itself what must survive: a component like any other, and never frozen."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.e2e import robots
+from tests.e2e.robots import RobotMachine
+
+COUNTER = """
+import time
+from dataclasses import dataclass
+import failover
+
+@dataclass
+class Count:
+    value: int = 0
+
+count = failover.resume("count", default=Count())
+origin = failover.resumed()
+if origin is not None:
+    print("#", origin.robot, origin.epoch, origin.why.replace(" ", "-"))
+while True:
+    print(count.value)
+    count.value += 1
+    failover.commit()
+    time.sleep(0.01)
+"""
+SNAPSHOTS = 5
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> Iterator[tuple[RobotMachine, RobotMachine]]:
+    with robots.two_robots(tmp_path) as both:
+        yield both
+
+
+def start_counting(robot: RobotMachine, folder: Path) -> None:
+    program = folder / "counter.py"
+    program.write_text(COUNTER)
+    robots.run(robot, "count", sys.executable, str(program), cwd=str(folder), engine="cooperative")
+
+
+def protected(first: RobotMachine, second: RobotMachine, folder: Path) -> int:
+    """Start it and wait for checkpoints at the standby; how many numbers are safe there."""
+    start_counting(first, folder)
+    robots.until(lambda: robots.checkpoints(second, "count") >= SNAPSHOTS, "checkpoints at robot2")
+    return len(numbers(second))
+
+
+def lines(robot: RobotMachine) -> list[str]:
+    return robots.output(robot, "count").decode().splitlines()
+
+
+def numbers(robot: RobotMachine) -> list[int]:
+    return [int(line) for line in lines(robot) if not line.startswith("#")]
+
+
+def origins(robot: RobotMachine) -> list[str]:
+    return [line for line in lines(robot) if line.startswith("#")]
+
+
+def went_on(robot: RobotMachine, before: int, why: str) -> None:
+    """It was resumed here, and its numbers have no gap and no repetition, from the first to those of its new life."""
+    robots.until(lambda: origins(robot), "the program to say that it was resumed")
+    resumed_at = lines(robot).index(origins(robot)[0])
+    assert resumed_at >= before, "what was safe is still there"
+    robots.until(lambda: len(numbers(robot)) > resumed_at + 20, "the count to go on")
+    counted = numbers(robot)
+    assert counted == list(range(len(counted)))
+    assert [line.split()[1::2] for line in origins(robot)] == [["robot1", why]]
+
+
+def shown(robot: RobotMachine) -> dict[str, Any]:
+    return robots.component(robot, "count")
+
+
+def test_a_program_that_keeps_its_state_outlives_its_robot(pair: tuple[RobotMachine, RobotMachine], tmp_path: Path) -> None:
+    first, second = pair
+    before = protected(first, second, tmp_path)
+    told = shown(first)
+    assert (told["engine"], told["freeze_us"], told["reasons"]) == ("cooperative", 0, [])
+    assert told["lag_ms"] is not None
+    assert shown(second)["engine"] == "cooperative"
+    assert not list(tmp_path.glob("*.state")), "no file beside a program that has an agent"
+    first.cut_power()
+    robots.until(lambda: shown(second).get("role") == "primary", "robot2 to take over")
+    went_on(second, before, "taken-over")
+    assert (shown(second)["restores"], shown(second)["epoch"]) == (1, 2)
+    assert origins(second)[0].split()[2] == "2", "the program knows the epoch that it runs in"
+
+
+def test_a_program_that_keeps_its_state_goes_on_in_place_after_a_crash(
+    pair: tuple[RobotMachine, RobotMachine], tmp_path: Path
+) -> None:
+    first, second = pair
+    before = protected(first, second, tmp_path)
+    os.kill(robots.host_pid(first, shown(first)["pid"]), signal.SIGSEGV)
+    robots.until(lambda: shown(first).get("restores") == 1, "robot1 to resume it")
+    went_on(first, before, "restarted")
+
+
+def test_a_program_that_keeps_its_state_is_handed_over(pair: tuple[RobotMachine, RobotMachine], tmp_path: Path) -> None:
+    first, second = pair
+    before = protected(first, second, tmp_path)
+    done = robots.failover(first, "handover", "count")
+    assert done.returncode == 0, done.stdout + done.stderr
+    robots.until(lambda: shown(second).get("role") == "primary", "robot2 to run it")
+    went_on(second, before, "taken-over")
