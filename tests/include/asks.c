@@ -59,7 +59,9 @@ int main(int count, char **words)
         value++;
         say("commit", failover_commit());
     }
-    if (is(what, "orphan")) {
+    if (is(what, "orphan") || is(what, "late orphan")) {
+        if (is(what, "late orphan"))
+            failover_wait(20000);
         fflush(stdout);
         if (fork() == 0) {
             say("child", 0);

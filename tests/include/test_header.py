@@ -164,8 +164,9 @@ def test_a_child_does_not_commit_and_does_not_keep_the_locks(tmp_path: Path) -> 
     assert lines[3].startswith("commit 2") and lines[4].startswith("close 0")
 
 
-def test_a_child_that_outlives_the_program_does_not_keep_its_state_taken(tmp_path: Path) -> None:
-    with running(program("asks"), tmp_path, "orphan") as started:
+@pytest.mark.parametrize("word", ["orphan", "late orphan"])
+def test_a_child_that_outlives_the_program_does_not_keep_its_state_taken(word: str, tmp_path: Path) -> None:
+    with running(program("asks"), tmp_path, word) as started:
         assert started.stdout is not None
         awaited = {"wait", "child"}
         while awaited:
