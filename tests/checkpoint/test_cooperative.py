@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -113,8 +114,12 @@ def test_the_segment_of_a_process_is_found_and_read_after_its_death() -> None:
 
 
 def test_a_process_without_a_segment_is_said_to_have_none() -> None:
-    with pytest.raises(CaptureError, match="no segment"):
-        open_segment(os.getppid())
+    with subprocess.Popen(["/bin/sleep", "60"]) as other:
+        try:
+            with pytest.raises(CaptureError, match="no segment"):
+                open_segment(other.pid)
+        finally:
+            other.kill()
 
 
 def test_a_snapshot_of_another_engine_is_not_restored() -> None:
