@@ -75,6 +75,33 @@ def until(condition: Callable[[], T], what: str, patience_s: float = PATIENCE_S)
         time.sleep(POLL_S)
 
 
+def until_protected(robot: RobotMachine, name: str = "count") -> None:
+    """Until its standby holds a checkpoint of this component."""
+    until(lambda: component(robot, name).get("protection") == "protected", "a checkpoint at the standby")
+
+
+def until_status(robot: RobotMachine, returncode: int, *words: str) -> str:
+    """What `failover status` shows there, once it ends with this exit status and says all the words."""
+    shown: subprocess.CompletedProcess[str] | None = None
+
+    def says() -> bool:
+        nonlocal shown
+        shown = failover(robot, "status")
+        return shown.returncode == returncode and all(word in shown.stdout for word in words)
+
+    try:
+        until(says, f"status {returncode} and {words}")
+    except AssertionError as error:
+        raise AssertionError(f"{error}; it shows {shown}") from error
+    assert shown is not None
+    return shown.stdout
+
+
+def numbers(robot: RobotMachine, name: str = "count") -> list[int]:
+    """What a component that counts has written, as this robot has it."""
+    return [int(line) for line in output(robot, name).split()]
+
+
 def connected(robot: RobotMachine) -> bool:
     """Whether it hears its peer's beats and has a bulk lane to it."""
     (peer,) = robot.status()["peers"]

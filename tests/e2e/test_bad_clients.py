@@ -70,7 +70,7 @@ Pair = tuple[RobotMachine, RobotMachine]
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
     with robots.two_robots(tmp_path_factory.mktemp("clients")) as both:
         robots.run(both[0], "sleeper", "/bin/sleep", "1000000")
-        robots.until(lambda: robots.component(both[0], "sleeper").get("protection") == "protected", "a checkpoint at robot2")
+        robots.until_protected(both[0], "sleeper")
         yield both
 
 

@@ -58,49 +58,29 @@ def fill(descriptor: int) -> None:
                 os.write(descriptor, bytes(size))
 
 
-def until_status(robot: RobotMachine, returncode: int, *words: str) -> str:
-    """What `failover status` shows there, once it ends with this exit status and says all the words."""
-    shown = subprocess.CompletedProcess("", 0, "")
-
-    def says() -> bool:
-        nonlocal shown
-        shown = robots.failover(robot, "status")
-        return shown.returncode == returncode and all(word in shown.stdout for word in words)
-
-    try:
-        robots.until(says, f"status {returncode} and {words}")
-    except AssertionError as error:
-        raise AssertionError(f"{error}; it shows {shown}") from error
-    return str(shown.stdout)
-
-
-def numbers(robot: RobotMachine) -> list[int]:
-    return [int(line) for line in robots.output(robot, "count").split()]
-
-
 def test_a_full_standby_is_named_with_the_age_of_what_it_holds_and_mends_itself(pair: Pair) -> None:
     first, second = pair
     with full(second):
-        until_status(first, 1, "degraded", "No space left on device", "the last checkpoint is")
-        until_status(second, 1, "degraded", "No space left on device")
+        robots.until_status(first, 1, "degraded", "No space left on device", "the last checkpoint is")
+        robots.until_status(second, 1, "degraded", "No space left on device")
         robots.until(lambda: robots.component(first, "count")["lag_ms"] > 3_000, "the checkpoint to grow old")
         age_s = robots.component(first, "count")["lag_ms"] / 1_000
         tries = first.log.read_text().count("No space left") + second.log.read_text().count("No space left")
         assert tries < 2 * TRIES_A_SECOND * age_s, f"{tries} tries in {age_s:.1f} s"
-        before = len(numbers(first))
+        before = len(robots.numbers(first))
     for robot in pair:
-        until_status(robot, 0)
-    robots.until(lambda: len(numbers(first)) > before, "the program to have run on")
-    assert numbers(first) == list(range(len(numbers(first))))
+        robots.until_status(robot, 0)
+    robots.until(lambda: len(robots.numbers(first)) > before, "the program to have run on")
+    assert robots.numbers(first) == list(range(len(robots.numbers(first))))
 
 
 def test_a_full_standby_takes_over_from_what_it_holds(pair: Pair) -> None:
     first, second = pair
     with full(second):
-        until_status(second, 1, "No space left on device")
-        kept = len(numbers(second))
+        robots.until_status(second, 1, "No space left on device")
+        kept = len(robots.numbers(second))
         first.cut_power()
         robots.until(lambda: robots.component(second, "count").get("role") == "primary", "robot2 to take over")
         robots.until(lambda: robots.component(second, "count").get("pid") is not None, "the program to run")
-    robots.until(lambda: len(numbers(second)) > kept, "its output, once there is room for it")
-    assert numbers(second) == list(range(len(numbers(second))))
+    robots.until(lambda: len(robots.numbers(second)) > kept, "its output, once there is room for it")
+    assert robots.numbers(second) == list(range(len(robots.numbers(second))))

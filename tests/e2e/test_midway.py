@@ -67,17 +67,13 @@ def left_over(robot: RobotMachine) -> list[str]:
     return [path.name for path in files if path.suffix not in (".base", ".delta") and path.name != "lock"]
 
 
-def numbers(robot: RobotMachine) -> list[int]:
-    return [int(line) for line in robots.output(robot, "count").split()]
-
-
 def test_a_primary_that_goes_in_the_middle_is_taken_over_from_the_last_whole_snapshot(pair: Pair) -> None:
     first, second = pair
-    kept = len(numbers(second))
+    kept = len(robots.numbers(second))
     first.cut_power()
     robots.until(lambda: robots.component(second, "count").get("state") == "running", "robot2 to take over")
-    robots.until(lambda: len(numbers(second)) > kept + 10, "the program to go on")
-    counted = numbers(second)
+    robots.until(lambda: len(robots.numbers(second)) > kept + 10, "the program to go on")
+    counted = robots.numbers(second)
     assert counted == list(range(len(counted)))
     robots.until(lambda: arriving(second) == [], "the half snapshot to be dropped")
     assert left_over(second) == []
@@ -86,12 +82,12 @@ def test_a_primary_that_goes_in_the_middle_is_taken_over_from_the_last_whole_sna
 def test_a_standby_that_goes_in_the_middle_is_named_and_gets_all_when_it_is_back(pair: Pair) -> None:
     first, second = pair
     os.kill(lanes_of(second), signal.SIGKILL)  # its heart beats on, and starts another
-    before = len(numbers(first))
+    before = len(robots.numbers(first))
     robots.until(lambda: "the connection was lost" in robots.failover(first, "why", "count").stdout, "the loss to be told")
-    robots.until(lambda: len(numbers(first)) > before, "the program to run on")
+    robots.until(lambda: len(robots.numbers(first)) > before, "the program to run on")
     stored = robots.checkpoints(second, "count")
     robots.until(lambda: robots.answers(second) and robots.checkpoints(second, "count") > stored + 1, "checkpoints to arrive")
     robots.until(lambda: robots.component(first, "count").get("protection") == "protected", "it to be protected again")
     assert left_over(second) == []
-    counted = numbers(first)
+    counted = robots.numbers(first)
     assert counted == list(range(len(counted)))

@@ -34,7 +34,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
     """Two robots for all of these tests, with a component called "sleeper" at the first: nothing here changes either."""
     with robots.two_robots(tmp_path_factory.mktemp("verbs")) as both:
         robots.run(both[0], "sleeper", "/bin/sleep", "100000")
-        robots.until(lambda: robots.component(both[0], "sleeper").get("protection") == "protected", "a checkpoint at robot2")
+        robots.until_protected(both[0], "sleeper")
         yield both
 
 

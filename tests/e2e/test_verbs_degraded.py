@@ -6,7 +6,6 @@ import contextlib
 import os
 import resource
 import signal
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -60,33 +59,8 @@ def flag(pair: Pair, tmp_path: Path) -> Path:
 def start(pair: Pair, tmp_path: Path, kind: str) -> Path:
     path = tmp_path / "flag"
     robots.run(pair[0], "count", "/usr/bin/python3", "-S", "-c", CHANGING, str(path), kind)
-    until_protected(pair[0])
+    robots.until_protected(pair[0])
     return path
-
-
-def until_protected(robot: RobotMachine) -> None:
-    robots.until(lambda: robots.component(robot, "count").get("protection") == "protected", "a checkpoint at the standby")
-
-
-def until_status(robot: RobotMachine, returncode: int, *words: str) -> str:
-    """What `failover status` shows there, once it ends with this exit status and says all the words."""
-    shown: subprocess.CompletedProcess[str] | None = None
-
-    def says() -> bool:
-        nonlocal shown
-        shown = robots.failover(robot, "status")
-        return shown.returncode == returncode and all(word in shown.stdout for word in words)
-
-    try:
-        robots.until(says, f"status {returncode} and {words}")
-    except AssertionError as error:
-        raise AssertionError(f"{error}; it shows {shown}") from error
-    assert shown is not None
-    return shown.stdout
-
-
-def numbers(robot: RobotMachine) -> list[int]:
-    return [int(line) for line in robots.output(robot, "count").split()]
 
 
 @pytest.mark.parametrize(("kind", "named"), [("socket", "is a socket"), ("thread", "it has 2 threads")])
@@ -94,12 +68,12 @@ def test_what_a_program_turned_into_is_named_and_it_recovers(pair: Pair, tmp_pat
     flag = start(pair, tmp_path, kind)
     flag.touch()
     for robot in pair:
-        shown = until_status(robot, 1, "degraded", "not captured: ", named, "the last checkpoint is")
+        shown = robots.until_status(robot, 1, "degraded", "not captured: ", named, "the last checkpoint is")
         assert shown.count(named) <= 2, "each robot says it once"
     flag.unlink()
     for robot in pair:
-        until_status(robot, 0)
-    until_protected(pair[0])
+        robots.until_status(robot, 0)
+    robots.until_protected(pair[0])
 
 
 def test_a_takeover_from_an_old_checkpoint_says_how_old_it_is(pair: Pair, flag: Path) -> None:
@@ -109,10 +83,10 @@ def test_a_takeover_from_an_old_checkpoint_says_how_old_it_is(pair: Pair, flag: 
     robots.until(lambda: robots.component(first, "count")["lag_ms"] > 2_500, "the checkpoint to grow old")
     first.cut_power()
     robots.until(lambda: robots.component(second, "count").get("role") == "primary", "robot2 to take over")
-    until_status(second, 1, "from a checkpoint that was ", " s old")
+    robots.until_status(second, 1, "from a checkpoint that was ", " s old")
     told = robots.failover(second, "why", "count").stdout
     assert "s old, at robot2" in told, told
-    counted = numbers(second)
+    counted = robots.numbers(second)
     assert counted == list(range(len(counted)))
 
 
@@ -120,7 +94,7 @@ def test_a_takeover_from_an_old_checkpoint_says_how_old_it_is(pair: Pair, flag: 
 def test_protection_that_was_given_up_is_said_and_nothing_is_taken_over(pair: Pair, flag: Path) -> None:
     first, second = pair
     flag.touch()
-    until_status(first, 1, "protected no longer", "a socket", "failover release, then protect, begins anew")
+    robots.until_status(first, 1, "protected no longer", "a socket", "failover release, then protect, begins anew")
     robots.until(lambda: robots.component(second, "count").get("standby") == "", "robot2 to forget its checkpoints")
     flag.unlink()
     shown = robots.component(first, "count")
@@ -130,7 +104,7 @@ def test_protection_that_was_given_up_is_said_and_nothing_is_taken_over(pair: Pa
     robots.until(lambda: robots.failover(second, "status").returncode == 0, "nothing to be amiss any more")
     again = robots.failover(first, "protect", str(shown["pid"]), "--name", "count")
     assert again.returncode == 0, again
-    until_protected(first)
+    robots.until_protected(first)
     assert robots.component(first, "count")["notes"] == []
 
 
@@ -151,17 +125,17 @@ def full_disk(robot: RobotMachine) -> Iterator[None]:
 def test_a_standby_that_cannot_write_is_named_at_both_robots(pair: Pair, flag: Path) -> None:
     with full_disk(pair[1]):
         for robot in pair:
-            until_status(robot, 1, "degraded", "snapshots do not arrive", "was not stored at robot2")
+            robots.until_status(robot, 1, "degraded", "snapshots do not arrive", "was not stored at robot2")
     for robot in pair:
-        until_status(robot, 0)
+        robots.until_status(robot, 0)
 
 
 def test_a_primary_that_cannot_write_is_named_at_both_robots(pair: Pair, flag: Path) -> None:
     with full_disk(pair[0]):
         for robot in pair:
-            until_status(robot, 1, "degraded", "not captured: ", "the last checkpoint is")
+            robots.until_status(robot, 1, "degraded", "not captured: ", "the last checkpoint is")
     for robot in pair:
-        until_status(robot, 0)
+        robots.until_status(robot, 0)
 
 
 def test_a_standby_that_falls_silent_leaves_its_primary_unprotected_and_said_so(pair: Pair, flag: Path) -> None:
@@ -169,7 +143,7 @@ def test_a_standby_that_falls_silent_leaves_its_primary_unprotected_and_said_so(
     for pid in second.processes():
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGSTOP)
-    shown = until_status(first, 1, "dead", "running, unprotected")
+    shown = robots.until_status(first, 1, "dead", "running, unprotected")
     assert "hears nobody" in shown
     before = len(robots.output(first, "count"))
     robots.until(lambda: len(robots.output(first, "count")) > before, "the program to run on")

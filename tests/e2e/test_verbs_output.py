@@ -44,10 +44,6 @@ def program(limit: int) -> tuple[str, ...]:
     return ("/usr/bin/python3", "-S", "-c", BOTH.format(limit=limit))
 
 
-def until_protected(robot: RobotMachine) -> None:
-    robots.until(lambda: robots.component(robot, "both").get("protection") == "protected", "a checkpoint at the standby")
-
-
 def lines(path: Path) -> list[int]:
     """The program's whole lines in a file that is being written; what the command itself says about it left out."""
     whole = path.read_text().rpartition("\n")[0].splitlines()
@@ -57,7 +53,7 @@ def lines(path: Path) -> list[int]:
 def test_whoever_watches_from_the_standby_sees_every_byte_once_across_a_takeover(pair: Pair, tmp_path: Path) -> None:
     first, second = pair
     robots.run(first, "both", *program(ENDLESS))
-    until_protected(first)
+    robots.until_protected(first, "both")
     out, err = tmp_path / "out", tmp_path / "err"
     with out.open("wb") as stdout, err.open("wb") as stderr:
         watching = subprocess.Popen(command(second, "logs", "--follow", "both"), stdout=stdout, stderr=stderr)
@@ -89,7 +85,7 @@ def test_run_stays_with_its_program_when_that_is_handed_over(pair: Pair, tmp_pat
     out, err = tmp_path / "out", tmp_path / "err"
     with out.open("wb") as stdout, err.open("wb") as stderr:
         running = subprocess.Popen(command(first, "run", "--name", "both", "--", *program(BRIEF)), stdout=stdout, stderr=stderr)
-    until_protected(first)
+    robots.until_protected(first, "both")
     moved = robots.failover(first, "handover", "both")
     assert moved.returncode == 0, moved
     assert robots.component(second, "both")["state"] == "running", "the move is over when its answer comes"
@@ -101,7 +97,7 @@ def test_run_stays_with_its_program_when_that_is_handed_over(pair: Pair, tmp_pat
 def test_whoever_watches_goes_on_when_the_agent_is_back(pair: Pair, tmp_path: Path) -> None:
     first, _ = pair
     robots.run(first, "both", *program(ENDLESS))
-    until_protected(first)
+    robots.until_protected(first, "both")
     out, err = tmp_path / "out", tmp_path / "err"
     with out.open("wb") as stdout, err.open("wb") as stderr:
         watching = subprocess.Popen(command(first, "logs", "--follow", "both"), stdout=stdout, stderr=stderr)

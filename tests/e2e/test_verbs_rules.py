@@ -31,17 +31,13 @@ def settings(text: str) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("pair", [text], indirect=True, ids=[text.strip().splitlines()[-1]])
 
 
-def until_protected(robot: RobotMachine) -> None:
-    robots.until(lambda: robots.component(robot, "count").get("protection") == "protected", "a checkpoint at the standby")
-
-
 def crash(robot: RobotMachine) -> None:
     os.kill(robots.host_pid(robot, robots.component(robot, "count")["pid"]), signal.SIGSEGV)
 
 
 @settings(TABLE + 'prefer = "robot2"\n')
 def test_failback_goes_to_the_robot_that_is_preferred(pair: Pair) -> None:
-    until_protected(pair[0])  # by itself it would go there after ten seconds
+    robots.until_protected(pair[0])  # by itself it would go there after ten seconds
     moved = robots.failover(pair[0], "failback", "count")
     assert moved.returncode == 0, moved
     shown = robots.component(pair[1], "count")
@@ -50,7 +46,7 @@ def test_failback_goes_to_the_robot_that_is_preferred(pair: Pair) -> None:
 
 @settings(TABLE + 'on_crash = "leave"\n')
 def test_a_crash_that_is_to_be_left_is_not_resumed(pair: Pair) -> None:
-    until_protected(pair[0])
+    robots.until_protected(pair[0])
     crash(pair[0])
     for robot in pair:
         robots.until(lambda at=robot: robots.component(at, "count").get("state") == "failed", "the failure to be known")  # type: ignore[misc]
@@ -62,7 +58,7 @@ def test_a_crash_that_is_to_be_left_is_not_resumed(pair: Pair) -> None:
 @settings(TABLE + 'on_loss = "hold"\n')
 def test_a_component_that_is_to_be_held_is_not_taken_over(pair: Pair) -> None:
     first, second = pair
-    until_protected(first)
+    robots.until_protected(first)
     first.cut_power()
     robots.until(lambda: second.status()["peers"][0]["state"] == "dead", "the loss to be noticed")
     held = robots.component(second, "count")
@@ -77,7 +73,7 @@ def test_a_component_that_is_to_be_held_is_not_taken_over(pair: Pair) -> None:
 @settings('when_alone = "freeze"\n')
 def test_a_program_stands_still_while_its_robot_is_alone(pair: Pair) -> None:
     first, second = pair
-    until_protected(first)
+    robots.until_protected(first)
     for pid in second.processes():
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGSTOP)
@@ -88,5 +84,5 @@ def test_a_program_stands_still_while_its_robot_is_alone(pair: Pair) -> None:
 
 @settings("snapshot_period_ms = 1000\n")
 def test_snapshots_are_as_far_apart_as_the_operator_says(pair: Pair) -> None:
-    until_protected(pair[0])
+    robots.until_protected(pair[0])
     assert robots.component(pair[0], "count")["period_ms"] == 1000
