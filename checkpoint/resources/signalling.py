@@ -18,8 +18,6 @@ from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile
 
-F_SETSIG: Final = 10
-F_GETSIG: Final = 11
 F_SETOWN_EX: Final = 15
 F_GETOWN_EX: Final = 16
 F_OWNER_PID: Final = 1
@@ -50,7 +48,7 @@ def rebuild(table: CallTable, descriptor: int, held: Resource, inner_pid: int) -
         owner = table.place(_OWNER.pack(F_OWNER_PID, inner_pid))
         table.call(f"own the signals of {held.name}", "fcntl", descriptor, F_SETOWN_EX, owner)
     if held.facts.get("signal"):
-        table.call(f"choose the signal of {held.name}", "fcntl", descriptor, F_SETSIG, int(str(held.facts["signal"])))
+        table.call(f"choose the signal of {held.name}", "fcntl", descriptor, fcntl.F_SETSIG, int(str(held.facts["signal"])))
 
 
 def _asked(held: OpenFile) -> tuple[int, int, int] | None:
@@ -58,7 +56,7 @@ def _asked(held: OpenFile) -> tuple[int, int, int] | None:
     if held.first.flags & O_PATH:
         return None
     with contextlib.suppress(OSError), _copy(held) as descriptor:
-        signal = fcntl.fcntl(descriptor, F_GETSIG)
+        signal = fcntl.fcntl(descriptor, fcntl.F_GETSIG)
         kind, owner = _OWNER.unpack(fcntl.fcntl(descriptor, F_GETOWN_EX, bytes(_OWNER.size)))
         return (signal, kind, owner) if signal or owner else None
     return None

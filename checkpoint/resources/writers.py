@@ -18,7 +18,6 @@ from typing import Final
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import procfs
 
-F_SETSIG: Final = 10
 DESCRIPTORS_MAX: Final = 100_000
 """Descriptors of other processes that are looked at: about half a second; beyond that a writer is not known by name."""
 
@@ -31,7 +30,7 @@ def may_be_written(path: str) -> bool:
         return True
     try:
         # Whoever opens the file in these microseconds waits for us, and we would be sent SIGIO, which kills: SIGURG does not.
-        fcntl.fcntl(descriptor, F_SETSIG, signal.SIGURG)
+        fcntl.fcntl(descriptor, fcntl.F_SETSIG, signal.SIGURG)
         fcntl.fcntl(descriptor, fcntl.F_SETLEASE, fcntl.F_RDLCK)
         fcntl.fcntl(descriptor, fcntl.F_SETLEASE, fcntl.F_UNLCK)
     except OSError:

@@ -179,12 +179,18 @@ def test_an_agent_that_comes_back_goes_on_with_the_same_engine(tmp_path: Path) -
     live(tmp_path, story)
 
 
+async def left_behind(places: Places) -> Captures:
+    """One snapshot of a program that has made some steps, and is gone."""
+    async with gone_afterwards(await started(places, STEPS)) as first:
+        await until(lambda: output(first).count(b"\n") > 10, "some steps")
+        captures = Captures(first)
+        await captures.take()
+    return captures
+
+
 def test_what_was_prepared_and_never_resumed_leaves_nothing(tmp_path: Path) -> None:
     async def story(places: Places) -> None:
-        async with gone_afterwards(await started(places, STEPS)) as first:
-            await until(lambda: output(first).count(b"\n") > 10, "some steps")
-            captures = Captures(first)
-            await captures.take()
+        captures = await left_behind(places)
         (await again(places, captures, STEPS)).close()
         await until(lambda: not guard_sockets(places), "the guard to end")
         captures.close()
@@ -194,10 +200,7 @@ def test_what_was_prepared_and_never_resumed_leaves_nothing(tmp_path: Path) -> N
 
 def test_a_program_that_is_not_here_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
     async def story(places: Places) -> None:
-        async with gone_afterwards(await started(places, STEPS)) as first:
-            await until(lambda: output(first).count(b"\n") > 10, "some steps")
-            captures = Captures(first)
-            await captures.take()
+        captures = await left_behind(places)
         missing = replace(program(STEPS), argv=(b"/nowhere/mapper",))
         second = await births.begin_again(NAME, missing, captures.chain, places, outage_ns=0, owner=0, epoch=4)
         with pytest.raises(GuardError, match="cannot start /nowhere/mapper: No such file or directory"):
@@ -210,10 +213,7 @@ def test_a_program_that_is_not_here_is_refused_and_leaves_nothing(tmp_path: Path
 
 def test_a_chain_is_not_started_as_somebody_who_does_not_own_it(tmp_path: Path) -> None:
     async def story(places: Places) -> None:
-        async with gone_afterwards(await started(places, STEPS)) as first:
-            await until(lambda: output(first).count(b"\n") > 10, "some steps")
-            captures = Captures(first)
-            await captures.take()
+        captures = await left_behind(places)
         with pytest.raises(MismatchError, match="not its owner, uid 12345"):
             await births.begin_again(NAME, program(STEPS), captures.chain, places, outage_ns=0, owner=12345, epoch=4)
         captures.close()
