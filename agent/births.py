@@ -17,12 +17,13 @@ from typing import Any
 from agent import guard_messages
 from agent.caller import ROOT
 from agent.clock import Laps
-from agent.component import COOPERATIVE, PTRACE, Component, Prepared
+from agent.component import Component, Prepared
 from agent.errors import GuardError, GuardLostError, KeeperLostError
 from agent.nursery import KeeperLink, connect
 from agent.places import Places, complete_logs, log_directory
 from agent.streams import discard, total_of
 from checkpoint import channel, format
+from checkpoint.engine import COOPERATIVE, PTRACE
 from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Credentials

@@ -19,13 +19,14 @@ import msgspec
 
 from agent import births, clock, lost
 from agent.births import Program
-from agent.component import COOPERATIVE, Component
+from agent.component import Component
 from agent.errors import AgentError, GuardError, KeeperLostError
 from agent.figures import Figures, shortened
 from agent.mistake import end_lanes_on_mistake
 from agent.places import Places
 from agent.records import Records
 from checkpoint.channel import close_all, content_of
+from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CheckpointError, UnsupportedError
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Position

@@ -34,12 +34,9 @@ from agent.places import Places, log_directory
 from agent.streams import OutputLogs
 from checkpoint import channel, errors
 from checkpoint.channel import Failed, close_all
+from checkpoint.engine import COOPERATIVE, PTRACE
 from checkpoint.errors import CheckpointError, RestoreError
 from checkpoint.model import Position
-
-PTRACE: Final = "ptrace"
-COOPERATIVE: Final = "cooperative"
-"""The engines; `checkpoint.engine.engine_named`."""
 
 TOTALS_LIMIT: Final = 64
 """Captures whose acknowledgement may still come; the core has one under way."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from agent.component import Captured
+from checkpoint.engine import PTRACE
 from checkpoint.model import Position
 
 REASONS_TOLD: Final = 3
@@ -28,7 +29,7 @@ class Figures:
     outage_ms: float | None = None
     reasons: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    engine: str = "ptrace"
+    engine: str = PTRACE
 
     def captured(self, captured: Captured) -> None:
         """Count one snapshot that was taken here."""

@@ -11,6 +11,7 @@ from agent.charge import Charge
 from agent.config import Settings
 from agent.door import Life, Told
 from agent.transport import Link, LinkState
+from checkpoint.engine import PTRACE
 from failover.core.types import ComponentView, PeerView, Protection, State
 
 NANOSECONDS_A_MILLISECOND: Final = 1_000_000
@@ -109,7 +110,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings) -
         "epoch": view.epoch,
         "generation": newest.generation if newest else None,
         "sequence": newest.sequence if newest else None,
-        "engine": (running.engine if running is not None else figures.engine) if figures else "ptrace",
+        "engine": (running.engine if running is not None else figures.engine) if figures else PTRACE,
         "pid": running.pid if running is not None else None,
         "inner_pid": running.inner_pid if running is not None else None,
         "isolated": running.isolated if running is not None else None,

@@ -17,7 +17,7 @@ from typing import Any, Final, Generic, TypeVar
 
 import msgspec
 
-from checkpoint.engine import Report
+from checkpoint.engine import PTRACE, Report
 from checkpoint.errors import UNDECODABLE, CheckpointError
 from checkpoint.model import Position
 
@@ -205,7 +205,7 @@ class Protect(msgspec.Struct, frozen=True, tag=True):
     component: str
     streams: bool = False
     robot: str = ""
-    engine: str = "ptrace"
+    engine: str = PTRACE
 
 
 class Capture(msgspec.Struct, frozen=True, tag=True):

@@ -12,6 +12,10 @@ from typing import Final, Protocol
 from checkpoint.errors import ProbeError
 from checkpoint.model import Position, Snapshot
 
+PTRACE: Final = "ptrace"
+COOPERATIVE: Final = "cooperative"
+"""Names of the engines, see `engine_named`."""
+
 KEPT: Final = "kept"
 REFUSED: Final = "refused"
 NOTED: Final = "noted"
@@ -203,12 +207,12 @@ def engine_named(name: str) -> Engine:
     Raises:
         ProbeError: there is none of that name.
     """
-    if name == "cooperative":
+    if name == COOPERATIVE:
         from checkpoint.engines.guarded_task import CooperativeEngine
 
         return CooperativeEngine()
-    if name != "ptrace":
-        raise ProbeError(f"no engine is called {name!r}: choose ptrace or cooperative")
+    if name != PTRACE:
+        raise ProbeError(f"no engine is called {name!r}: choose {PTRACE} or {COOPERATIVE}")
     from checkpoint.engines.ptrace import PtraceEngine
 
     return PtraceEngine()

@@ -232,7 +232,7 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"keeper: nobody to serve at {arguments[1]}: {error.strerror or error}\n")
         return 1
     link: Channel[Request] = Channel(end, Request)
-    Keeper(link, engine.engine_named("ptrace")).serve()
+    Keeper(link, engine.engine_named(engine.PTRACE)).serve()
     return 0
 
 

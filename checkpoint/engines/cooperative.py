@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from checkpoint import pages
 from checkpoint.chain import position_of
-from checkpoint.engine import CaptureOrder
+from checkpoint.engine import COOPERATIVE, CaptureOrder
 from checkpoint.errors import CaptureError, RestoreError, SegmentError
 from checkpoint.linux import abi, procfs
 from checkpoint.model import (
@@ -58,7 +58,6 @@ from checkpoint.stream_counts import Totals
 if TYPE_CHECKING:
     from checkpoint.engines.outputs import Outputs  # which loads the keeper's library: a program that keeps its state has none
 
-NAME: Final = "cooperative"
 KIND: Final = "task"
 MAX_WAITING: Final = 64
 """Captures that wait for their acknowledgement; of older ones none is expected any more."""
@@ -168,7 +167,7 @@ class CooperativeSession:
         table = (parent.table if parent else PageTable.empty(PAGE)).apply((), runs, committed.contents, vmas)
         made = Snapshot(
             component=self._component,
-            engine=NAME,
+            engine=COOPERATIVE,
             position=Position(order.generation, order.sequence, bytes(16)),
             parent=parent.position if parent else None,
             machine=this_machine(order.robot),
@@ -282,9 +281,9 @@ def regions_of(state: Snapshot) -> tuple[tuple[Region, NDArray[np.uint8]], ...]:
     Raises:
         RestoreError: it is no snapshot of this engine, or contradicts itself.
     """
-    if state.engine != NAME or not state.is_base:
+    if state.engine != COOPERATIVE or not state.is_base:
         raise RestoreError(
-            f"cannot restore {state.component}: it is no whole snapshot of the {NAME} engine but of {state.engine}"
+            f"cannot restore {state.component}: it is no whole snapshot of the {COOPERATIVE} engine but of {state.engine}"
         )
     regions = tuple(_region(vma, kind, size) for vma, (kind, size) in zip(state.vmas, _sizes(state), strict=True))
     try:

@@ -6,8 +6,8 @@ nothing, and each capture looks where its commits go now.
 
 from __future__ import annotations
 
-from checkpoint.engine import NOTED, CaptureOrder, Finding, Report, Restored, RestoreOptions, Session, Streams
-from checkpoint.engines.cooperative import NAME, CooperativeSession, open_segment
+from checkpoint.engine import COOPERATIVE, NOTED, CaptureOrder, Finding, Report, Restored, RestoreOptions, Session, Streams
+from checkpoint.engines.cooperative import CooperativeSession, open_segment
 from checkpoint.engines.outputs import Outputs
 from checkpoint.errors import ProcessGoneError, RestoreError
 from checkpoint.linux import procfs
@@ -69,7 +69,7 @@ class GuardedTask:
 class CooperativeEngine:
     """See `checkpoint.engine.Engine`. To restore is to start a program again with what `fill_segment` makes."""
 
-    name = NAME
+    name = COOPERATIVE
 
     def probe(self, pid: int) -> Report:
         """See `checkpoint.engine.Engine.probe`: nothing stands in the way of a program that keeps its state itself."""
@@ -84,4 +84,4 @@ class CooperativeEngine:
 
     def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
         """Refused: see the class."""
-        raise RestoreError(f"cannot restore {state.component} into pid {vessel_pid}: a {NAME} program is started again")
+        raise RestoreError(f"cannot restore {state.component} into pid {vessel_pid}: a {COOPERATIVE} program is started again")

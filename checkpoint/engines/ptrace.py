@@ -5,7 +5,7 @@ Imported by the keeper alone, and at once: a keeper that waits in advance must n
 
 from __future__ import annotations
 
-from checkpoint.engine import Report, Restored, RestoreOptions, Session, Streams
+from checkpoint.engine import PTRACE, Report, Restored, RestoreOptions, Session, Streams
 from checkpoint.engines.probe import probe
 from checkpoint.engines.ptrace_capture import PtraceSession
 from checkpoint.engines.ptrace_restore import restore
@@ -15,7 +15,7 @@ from checkpoint.model import Snapshot
 class PtraceEngine:
     """Captures and restores single-threaded Linux processes that nobody prepared."""
 
-    name = "ptrace"
+    name = PTRACE
 
     def probe(self, pid: int) -> Report:
         """See ``checkpoint.engine.Engine.probe``."""

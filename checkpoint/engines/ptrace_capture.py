@@ -25,7 +25,7 @@ from typing import Any, Final
 
 from checkpoint import pages
 from checkpoint.chain import position_of
-from checkpoint.engine import CaptureOrder, Streams
+from checkpoint.engine import PTRACE, CaptureOrder, Streams
 from checkpoint.engines import description, entering
 from checkpoint.engines import probe as probing
 from checkpoint.engines.capture_memory import MemoryCapture, RunningCopy, Taken
@@ -255,7 +255,7 @@ class PtraceSession:
         standing, taken = frozen.standing, frozen.taken
         return Snapshot(
             component=self.component,
-            engine="ptrace",
+            engine=PTRACE,
             position=Position(order.generation, order.sequence, bytes(16)),
             parent=parent,
             machine=replace(description.this_machine(), robot=order.robot, xstate_mask=description.xstate_mask(standing.xstate)),

@@ -16,9 +16,10 @@ import pytest
 
 from agent import births, nursery
 from agent.births import Program
-from agent.component import COOPERATIVE, Captured, Component
+from agent.component import Captured, Component
 from agent.errors import GuardError
 from agent.places import Places, guard_sockets
+from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CaptureError, MismatchError
 from tests.agent.guards import PATIENCE_S
 from tests.agent.test_component import Captures, live, output, piece_of, until
