@@ -11,29 +11,25 @@ stands behind a snapshot that is being written, proved or folded.
 
 from __future__ import annotations
 
-import errno
 import logging
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import count
 from pathlib import Path
 
 from checkpoint import chain, format
-from checkpoint.disk import Disk, DiskFile, lock_exclusively
+from checkpoint.disk import Disk, lock_exclusively
 from checkpoint.errors import ChainError, FormatError, StoreError
 from checkpoint.model import OutputPiece, Position, Snapshot
 from checkpoint.pages import PageTable
 from checkpoint.shelf import BASE_SUFFIX, DELTA_SUFFIX, FOLDER_PREFIX, Entry, Shelf, file_name, folder_name, order_of_name
 from checkpoint.state import header_of
 from checkpoint.validity import place
+from checkpoint.whole_files import TEMPORARY_PREFIX, WholeFiles, disk_trouble
 
 log = logging.getLogger("failover.store")
-
-TEMPORARY_PREFIX = "arriving-"
-"""Begins the name of a file that is not whole yet; such files are removed when the store is opened."""
 
 ASIDE_FOLDER = "aside"
 """Holds what is kept for inspection only."""
@@ -73,15 +69,12 @@ class Store:
 
     def __init__(self, root: Path, disk: Disk, lock: int) -> None:
         self._root = root
-        self._disk = disk
+        self._files = WholeFiles(disk)
         self._lock_descriptor = lock
         self._lock = threading.RLock()
         self._changing: dict[str, threading.RLock] = {}
         self._shelves: dict[str, Shelf] = {}
         self._proved: dict[str, _Proved] = {}
-        self._damaged: set[Path] = set()
-        """Files that are never offered; pruned by the order in their names. A whole file put under such a name is not damaged."""
-        self._serial = count()
         self.notices: list[str] = []
         """What was found damaged or left over: one sentence each."""
 
@@ -124,7 +117,7 @@ class Store:
         """
         opened: list[int] = []
         try:
-            with self._lock, self._disk_trouble(f"open the chain of {component}"):
+            with self._lock, disk_trouble(f"open the chain of {component}"):
                 for entry in self.chain_of(component, position):
                     opened.append(os.open(entry.path, os.O_RDONLY | os.O_CLOEXEC))
         except StoreError:
@@ -190,7 +183,7 @@ class Store:
             proved = self._prove(shelf, snapshot) if prove else None
             final = self._root / folder_name(header.component) / file_name(header)
             if all(entry.path != final for entry in shelf.entries):
-                size = self._write_whole(final, lambda file: file.copy_from(source), source)
+                size = self._files.write(final, lambda file: file.copy_from(source), source)
                 self._add(snapshot.component, _entry_of(final, snapshot, size))
             if proved is not None:
                 self._proved[snapshot.component] = proved
@@ -279,10 +272,10 @@ class Store:
         folded = self.load(component, position)
         folded = replace(folded, output=_newest_output(folded.output))
         final = self._root / folder_name(component) / file_name(header_of(folded))
-        size = self._write_whole(final, lambda file: format.encode(folded, file))
+        size = self._files.write(final, lambda file: format.encode(folded, file))
         with self._change_of(component):
             if self._shelf(component).order_of(position) is None:  # dropped or set aside meanwhile
-                self._disk.remove(final)
+                self._files.remove(final)
             else:
                 self._add(component, _entry_of(final, folded, size))
 
@@ -313,13 +306,13 @@ class Store:
     def _write_aside(self, component: str, position: Position) -> Path:
         folded = self.load(component, position)
         final = self._root / ASIDE_FOLDER / f"{folder_name(component)}-{file_name(header_of(folded))}"
-        self._write_whole(final, lambda file: format.encode(folded, file))
+        self._files.write(final, lambda file: format.encode(folded, file))
         begin = f"{folder_name(component)}-"
-        with self._disk_trouble(f"remove what was set aside of {component}"):
+        with disk_trouble(f"remove what was set aside of {component}"):
             names = (path.name for path in final.parent.iterdir())
             ours = sorted(name for name in names if name.startswith(begin) and len(name) == len(final.name))
             for name in ours[:-ASIDE_LIMIT]:
-                self._disk.remove(final.parent / name)
+                self._files.remove(final.parent / name)
         return final
 
     def drop(self, component: str) -> None:
@@ -336,69 +329,24 @@ class Store:
 
     # The disk
 
-    def _write_whole(self, final: Path, fill: Callable[[DiskFile], object], unnamed: int | None = None) -> int:
-        """Make a file appear under its name, whole and durable, or not at all; answer its size.
-
-        1. Written under a temporary name, so that its own name never stands for a part.
-        2. Its content is synced before it is renamed: a name that survived has its content.
-        3. The folder is synced before we return: an acknowledgement outlives a power cut.
-        """
-        with self._disk_trouble(f"write {final}"):
-            self._ensure_folder(final.parent)
-            temporary = final.parent / f"{TEMPORARY_PREFIX}{next(self._serial)}"
-            try:
-                size = self._write_temporary(temporary, fill, unnamed)
-                with self._lock:
-                    self._disk.rename(temporary, final)
-                    self._damaged.discard(final)
-            except BaseException:
-                self._disk.remove(temporary)
-                raise
-            self._disk.sync_folder(final.parent)
-            return size
-
-    def _write_temporary(self, temporary: Path, fill: Callable[[DiskFile], object], unnamed: int | None) -> int:
-        """Write and sync, or sync and name what is written already."""
-        if unnamed is not None and self._disk.is_unnamed(unnamed):
-            self._disk.sync_file(unnamed)
-            if self._disk.name(unnamed, temporary):
-                return os.fstat(unnamed).st_size
-        descriptor = self._disk.create(temporary)
-        try:
-            fill(DiskFile(self._disk, descriptor))
-            self._disk.sync_file(descriptor)
-            return os.fstat(descriptor).st_size
-        finally:
-            os.close(descriptor)
-
-    def _ensure_folder(self, folder: Path) -> None:
-        with self._lock:  # the one for what is set aside belongs to all components
-            if not folder.is_dir():
-                self._disk.make_folder(folder)
-                self._disk.sync_folder(folder.parent)
-
     def _remove(self, component: str, entries: tuple[Entry, ...]) -> None:
         """Remove files, the youngest first: what is left at any instant is whole chains."""
-        with self._disk_trouble(f"remove snapshots of {component}"):
+        with disk_trouble(f"remove snapshots of {component}"):
             for entry in sorted(entries, key=lambda entry: entry.order, reverse=True):
                 with self._lock:
                     self._shelves[component] = self._shelf(component).without((entry,))
-                self._disk.remove(entry.path)  # who opens a chain has opened it, or does not know this file any more
+                self._files.remove(entry.path)  # who opens a chain has opened it, or does not know this file any more
 
     def _remove_damaged(self, component: str, is_old: Callable[[Path], bool]) -> None:
-        """Remove files that were set out of use; one that has been put again since is no longer among them."""
-        folder = self._root / folder_name(component)
-        with self._lock, self._disk_trouble(f"remove damaged snapshots of {component}"):
-            for path in [path for path in self._damaged if path.parent == folder and is_old(path)]:
-                self._disk.remove(path)
-                self._damaged.discard(path)
+        with disk_trouble(f"remove damaged snapshots of {component}"):
+            self._files.remove_damaged(self._root / folder_name(component), is_old)
 
     def _set_out_of_use(self, component: str, entry: Entry, why: str) -> None:
         """Never offer this file again; it stays where it is, for whoever wants to look, until it is pruned."""
         with self._lock:
             shelf = self._shelf(component)
             if entry in shelf.entries:
-                self._damaged.add(entry.path)
+                self._files.set_out_of_use(entry.path)
             self._shelves[component] = shelf.without((entry,))
             self._proved.pop(component, None)
             newest = self.newest(component)
@@ -411,20 +359,11 @@ class Store:
     def _shelf(self, component: str) -> Shelf:
         return self._shelves.get(component) or Shelf(component)
 
-    @contextmanager
-    def _disk_trouble(self, tried: str) -> Iterator[None]:
-        """Turn what the kernel says into one sentence."""
-        try:
-            yield
-        except OSError as error:
-            cure = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
-            raise StoreError(f"cannot {tried}: {error.strerror}{cure}; what the store held is intact") from error
-
     # Opening
 
     def read_folders(self) -> None:
         """Find out what is there: remove leftovers, verify every file, keep what is intact."""
-        with self._disk_trouble(f"read the store {self._root}"):
+        with disk_trouble(f"read the store {self._root}"):
             for folder in sorted(self._root.iterdir()):
                 if folder.is_dir():
                     self._read_folder(folder)
@@ -432,7 +371,7 @@ class Store:
     def _read_folder(self, folder: Path) -> None:
         for path in sorted(folder.iterdir()):
             if path.name.startswith(TEMPORARY_PREFIX):
-                self._disk.remove(path)
+                self._files.remove(path)
                 self._notice(f"{path} had not arrived whole and was removed")
             elif folder.name.startswith(FOLDER_PREFIX) and path.suffix in (BASE_SUFFIX, DELTA_SUFFIX):
                 self._read_file(path)
@@ -441,7 +380,7 @@ class Store:
         try:
             header = format.verify(path)
         except FormatError as error:
-            self._damaged.add(path)
+            self._files.set_out_of_use(path)
             self._notice(f"{error}; it is not used")
             return
         if (path.parent.name, path.name) != (folder_name(header.component), file_name(header)):
