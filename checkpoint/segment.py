@@ -10,6 +10,7 @@ This file says what the bytes mean; `segment_writer` writes them, `segment_reade
 
 from __future__ import annotations
 
+import enum
 import os
 import struct
 from collections.abc import Sequence
@@ -192,6 +193,24 @@ def address_of(place: int) -> int:
     return (place + 1) * STRIDE
 
 
+class Pending(enum.Enum):
+    """What a commit says of its output that had no room in its pipes: part of it lies in the program's buffers still.
+
+    How much that is nobody knows. Whoever carries output passes such a commit over; a later one tells it all.
+    """
+
+    PENDING = 2
+
+
+PENDING: Final = Pending.PENDING
+NOT_TOLD: Final = 0
+TOLD: Final = 1
+"""The other things that a record says of its program's output."""
+
+Outputs = tuple[int, int] | Pending | None
+"""Bytes that a program had written to its standard output and error at a commit; None where nobody counts them."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Committed:
     """What a program committed, whole or since an earlier commit.
@@ -201,7 +220,7 @@ class Committed:
         clocks: the machine's, at the commit.
         pages: numbers of the pages that changed since, in order; of the whole state, those that were ever written.
         contents: their bytes, in the same order.
-        outputs: bytes that the program had written to its standard output and error at the commit; None where it does not say.
+        outputs: what the program had written by then.
     """
 
     layout: Layout
@@ -209,7 +228,7 @@ class Committed:
     clocks: Clocks
     pages: Words
     contents: memoryview
-    outputs: tuple[int, int] | None = None
+    outputs: Outputs = None
 
     def region(self, index: int) -> bytearray:
         """The bytes of one region, where the whole state was read; pages never written are zeros."""

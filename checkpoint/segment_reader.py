@@ -26,11 +26,13 @@ from checkpoint.segment import (
     MAX_REGIONS,
     NEWEST_OFFSET,
     PAGE,
+    PENDING,
     RECORD,
     RECORD_SIZE,
     RECORDS_OFFSET,
     SUPERSEDED_OFFSET,
     TABLE_OFFSET,
+    TOLD,
     VERSION,
     WORD,
     Committed,
@@ -117,7 +119,7 @@ class SegmentReader:
         contents = self._contents(bank, pages)
         if self._exactly(RECORD_SIZE, RECORDS_OFFSET + bank * RECORD_SIZE) != before:
             raise SegmentError(f"segment: bank {bank} was written while it was held; the program does not keep the rules")
-        outputs = (first, second) if counted == 1 else None
+        outputs = PENDING if counted == PENDING.value else (first, second) if counted == TOLD else None
         return Committed(self.layout, number, Clocks(realtime, monotonic, boottime), pages, contents, outputs)
 
     def _changed(self, bank: int, number: int, since: int) -> Words:

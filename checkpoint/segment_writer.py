@@ -24,13 +24,16 @@ from checkpoint.segment import (
     BANK_BITS,
     MAX_NUMBER,
     NEWEST_OFFSET,
+    NOT_TOLD,
     PAGE,
     RECORD_SIZE,
     RECORDS_OFFSET,
     SUPERSEDED_OFFSET,
     TABLE_OFFSET,
+    TOLD,
     WORD,
     Layout,
+    Outputs,
     lock_of,
     stretches,
 )
@@ -119,12 +122,12 @@ class SegmentWriter:
         self._locks = [lock_of(fcntl.F_WRLCK, bank) for bank in range(layout.banks)]
         self._unlocks = [lock_of(fcntl.F_UNLCK, bank) for bank in range(layout.banks)]
 
-    def commit(self, sources: Sequence[Source], outputs: tuple[int, int] | None = None) -> bool:
+    def commit(self, sources: Sequence[Source], outputs: Outputs = None) -> bool:
         """Make what the sources hold the newest commit, as one.
 
         Args:
             sources: one for every region, in their order.
-            outputs: bytes written to standard output and error until now; None where nobody counts them.
+            outputs: written until now.
 
         Returns:
             False when every bank but the newest is held by readers; nothing was forgotten, the next call makes up for it.
@@ -145,7 +148,7 @@ class SegmentWriter:
         self.number, self._newest = number, bank
         return True
 
-    def _write(self, bank: int, number: int, sources: Sequence[Source], outputs: tuple[int, int] | None) -> None:
+    def _write(self, bank: int, number: int, sources: Sequence[Source], outputs: Outputs) -> None:
         """Bring a bank that we hold up to date.
 
         1. Its record says that it holds nothing, before the first byte of it changes.
@@ -161,8 +164,8 @@ class SegmentWriter:
         self._words[record + 1] = time.clock_gettime_ns(time.CLOCK_REALTIME)
         self._words[record + 2] = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
         self._words[record + 3] = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
-        self._words[record + 4] = outputs is not None
-        self._words[record + 5], self._words[record + 6] = outputs or (0, 0)
+        told, counts = (TOLD, outputs) if isinstance(outputs, tuple) else (outputs.value if outputs else NOT_TOLD, (0, 0))
+        self._words[record + 4], self._words[record + 5], self._words[record + 6] = told, *counts
         self._words[record] = number
         self._held[bank] = number
 

@@ -38,25 +38,29 @@ class StreamCounts:
         first, second = COUNTERS.unpack(self._counters[: COUNTERS.size])[FIRSTS:]
         self.firsts: Totals = (first, second)
 
-    def totals(self) -> Totals | None:
-        """Bytes written until now; None when the guard does not come to an end with counting.
+    def totals(self, patience_s: float = COUNT_TIMEOUT_S) -> Totals | None:
+        """Bytes written until now; None when the guard does not come to an end with counting in ``patience_s`` a stream.
 
         Raises:
             OSError: an end is no pipe and no terminal.
         """
-        first, second = (self._total(index) for index in range(STREAMS))
+        first, second = (self._total(index, patience_s) for index in range(STREAMS))
         return None if first is None or second is None else (first, second)
 
-    def _total(self, index: int) -> int | None:
+    def words(self) -> bytes:
+        """The guard's counters as they are: while it does nothing, they stay the same."""
+        return self._counters[: COUNTERS.size]
+
+    def _total(self, index: int, patience_s: float) -> int | None:
         deadline = 0.0
         while True:
             before = COUNTERS.unpack(self._counters[: COUNTERS.size])[2 * index : 2 * index + 2]
-            unread = _unread(self._pipes[index])
+            unread = unread_in(self._pipes[index])
             after = COUNTERS.unpack(self._counters[: COUNTERS.size])[2 * index : 2 * index + 2]
             if before == after and not before[0]:
                 return int(before[1]) + unread
             now = time.perf_counter()
-            deadline = deadline or now + COUNT_TIMEOUT_S
+            deadline = deadline or now + patience_s
             if now > deadline:
                 return None
             os.sched_yield()
@@ -66,7 +70,7 @@ class StreamCounts:
         self._counters.close()
 
 
-def _unread(descriptor: int) -> int:
+def unread_in(descriptor: int) -> int:
     """Bytes that wait in a pipe or terminal. Source: ioctl_tty(2), FIONREAD; pipe(7)."""
     found = array.array("i", [0])
     fcntl.ioctl(descriptor, termios.FIONREAD, found)

@@ -49,7 +49,7 @@ from checkpoint.model import (
     VmaKind,
 )
 from checkpoint.pages import PageTable, Words
-from checkpoint.segment import PAGE, Committed, Layout, Region
+from checkpoint.segment import PAGE, PENDING, Committed, Layout, Pending, Region
 from checkpoint.segment_reader import SegmentReader
 from checkpoint.segment_writer import NAME as SEGMENT_NAME
 from checkpoint.segment_writer import SegmentWriter, Source
@@ -120,7 +120,8 @@ class CooperativeSession:
         committed = self._reader.read(parent.commit if parent else 0)
         if committed is None and parent is None:
             raise CaptureError(f"cannot capture {self._component}: it has committed nothing yet")
-        committed = committed or _nothing_since(parent, layout)
+        if committed is None or (parent is not None and self._outputs and committed.outputs is PENDING):
+            committed = _nothing_since(parent, layout)
         totals = self._totals_of(committed, until_now) if self._outputs else (0, 0)
         snapshot, table = self._snapshot(committed, parent, order, totals)
         self._waiting.append(_Mark(snapshot.position, committed.number, layout.lineage, table, totals))
@@ -131,9 +132,14 @@ class CooperativeSession:
         """Where the output of a commit ends.
 
         Raises:
-            CaptureError: it says that it wrote more than there is, or takes back what it said.
+            CaptureError: it does not know; it says that it wrote more than there is, or takes back what it said.
         """
         assert self._outputs is not None, "somebody counts"
+        if isinstance(committed.outputs, Pending):
+            raise CaptureError(
+                f"cannot capture {self._component}: at its commit {committed.number} its output had no room in the pipe to its "
+                "guard; it is captured with its next commit, once the guard has emptied the pipe"
+            )
         if committed.outputs is None:
             return until_now
         now_written = self._outputs.totals()

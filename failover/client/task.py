@@ -182,7 +182,7 @@ def _beside(name: str, state: KeptState, file: StateFile, value: Any, resumed: R
 
 def _open_guarded(name: str, state: KeptState, guard: Guarded, begin: Callable[[], Any]) -> Task:
     """A task under an agent. What its checkpoint holds and does not fit any more is still stored there."""
-    state.outputs = guard.totals
+    state.outputs = guard.outputs
     kept, origin = guard.handed.state, guard.handed.begin.origin
     if kept is None or origin is None:
         return Task(name, state, guard, begin(), None)

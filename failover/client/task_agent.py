@@ -6,21 +6,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import select
 import socket
 import stat
-import sys
 import threading
 import time
 from dataclasses import dataclass
 
 from checkpoint.channel import Channel, ChannelClosedError, ChannelError, close_all
-from checkpoint.segment import Committed
+from checkpoint.segment import PENDING, Committed, Outputs
 from checkpoint.segment_reader import SegmentReader
-from checkpoint.stream_counts import StreamCounts, Totals
 from checkpoint.task_channel import VARIABLE, Begin, Message, Safe
+from failover.client.task_output import OwnOutput
 from failover.errors import NotCommittedError, TaskError
 
 
@@ -39,12 +37,11 @@ class Handed:
 class Guarded:
     """This program's end of the socket. Belongs to this process alone: no child, and nothing it executes, gets it."""
 
-    trouble = ""
-
     def __init__(self, end: socket.socket) -> None:
         self._channel: Channel[Message] = Channel(end, Message)
         self._lock = threading.Lock()
-        self._counts: StreamCounts | None = None
+        self._output: OwnOutput | None = None
+        self._is_pending = False
         self.durable = 0
         """Number of the newest commit that a standby holds."""
         self.handed = self._receive_begin()
@@ -58,19 +55,21 @@ class Guarded:
             if not isinstance(begin, Begin) or len(descriptors) != 1 + (begin.origin is not None):
                 raise TaskError("cannot keep a state under the agent: its guard says something else than how to begin")
             if _has_pipes(begin.pipes):
-                self._counts = StreamCounts(descriptors[0], (1, 2))
+                self._output = OwnOutput(descriptors[0])
             return Handed(begin, _state_in(descriptors[1]) if begin.origin is not None else None)
         finally:
             close_all(descriptors)
 
-    def totals(self) -> Totals | None:
-        """Bytes that this program has written to its output until now, with what its buffers held; None where nobody knows."""
-        if self._counts is None:
-            return None
-        for stream in (sys.stdout, sys.stderr):
-            with contextlib.suppress(AttributeError, ValueError):  # there is none, or it is closed
-                stream.flush()
-        return self._counts.totals()
+    def outputs(self) -> Outputs:
+        """What this program has written until now, for its commit."""
+        outputs = self._output.totals() if self._output is not None else None
+        self._is_pending = outputs is PENDING
+        return outputs
+
+    @property
+    def trouble(self) -> str:
+        """Why the newest commit does not travel; "" while all is well."""
+        return "its output pipe is full, the guard takes nothing from it; a later commit will do" if self._is_pending else ""
 
     def notice(self) -> None:
         """There is a new commit: whoever takes it looks by himself."""
@@ -86,10 +85,8 @@ class Guarded:
             while self.durable < number:
                 left = None if deadline is None else deadline - time.monotonic()
                 if left is not None and left <= 0:
-                    raise NotCommittedError(
-                        f"commit {number} is not safe after {timeout} s: the standby holds commit {self.durable}; "
-                        "failover status says how it stands"
-                    )
+                    why = self.trouble or f"the standby holds commit {self.durable}; failover status says how it stands"
+                    raise NotCommittedError(f"commit {number} is not safe after {timeout} s: {why}")
                 self._hear(left)
 
     def _hear(self, left: float | None) -> None:

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from checkpoint.errors import SegmentError
 from checkpoint.linux.live import LiveMemory
-from checkpoint.segment import ARRAY, MAX_NAME_SIZE, MAX_PLACES, PAGE, STATE, Layout, Region, address_of
+from checkpoint.segment import ARRAY, MAX_NAME_SIZE, MAX_PLACES, PAGE, STATE, Layout, Outputs, Region, address_of
 from checkpoint.segment_reader import SegmentReader
 from checkpoint.segment_writer import SegmentWriter, Source, pages_of
-from checkpoint.stream_counts import Totals
 from failover.errors import KeepError, StateFormatError, TaskError
 from failover.state import Decoded, Encoded, Schema
 from failover.state import Region as EncodedRegion
@@ -58,8 +57,8 @@ class KeptState:
         self._next_place = 1
         self._memory_of: dict[str, tuple[int, int]] = {}
         """Where the content of each region lay at the last commit, and its size."""
-        self.outputs: Callable[[], Totals | None] = _nobody_counts
-        """Bytes of output until now, where somebody counts them."""
+        self.outputs: Callable[[], Outputs] = _nobody_counts
+        """What was written until now, where somebody counts it."""
         self._is_forked = False
         _close_in_children(self)
 

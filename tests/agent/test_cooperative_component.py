@@ -21,6 +21,7 @@ from agent.errors import GuardError
 from agent.places import Places, guard_sockets
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CaptureError, MismatchError
+from checkpoint.linux import procfs
 from tests.agent.guards import PATIENCE_S
 from tests.agent.test_component import Captures, live, output, piece_of, until
 
@@ -41,6 +42,32 @@ STEPS = (
     BEGIN
     + "print(resumed(), flush=True)\nwhile True:\n    print(state['step'])\n    state['step'] += 1\n    failover.commit()\n"
     + "    time.sleep(0.001)\n"
+)
+FILLS = (
+    BEGIN
+    + """
+import os, pathlib
+def until(name):
+    while not pathlib.Path(name).exists():
+        time.sleep(0.002)
+def commit():
+    state["step"] += 1
+    began = time.perf_counter()
+    failover.commit()
+    return time.perf_counter() - began
+commit(); print("begun", flush=True)
+until("FLAGS/stopped")
+pipe = os.open("/proc/self/fd/1", os.O_WRONLY | os.O_NONBLOCK)
+try:
+    while True:
+        os.write(pipe, b"." * 1023 + b"\\n")
+except BlockingIOError:
+    print("printed before the commits", state["step"])  # it stays in Python's buffer
+pathlib.Path("FLAGS/took").write_text(" ".join(str(commit()) for _ in range(500)))
+until("FLAGS/goes-on")
+commit(); print("printed after it", flush=True)
+time.sleep(1000)
+"""
 )
 SILENT = "import time\nprint('here', flush=True)\ntime.sleep(1000)\n"
 
@@ -110,6 +137,38 @@ def test_a_commit_is_safe_for_its_program_when_it_was_acknowledged_and_not_befor
             assert output(component) == b"committed\n"
             await component.acknowledge(captured.position)
             await until(lambda: output(component) == b"committed\nsafe\n", "the program to hear of it")
+
+    live(tmp_path, story)
+
+
+def test_a_guard_that_stands_still_holds_up_no_commit_and_costs_no_output(tmp_path: Path) -> None:
+    async def story(places: Places) -> None:
+        script = FILLS.replace("FLAGS", str(tmp_path))
+        first = await births.start(NAME, replace(program(script), isolate=False), places, 3)
+        async with gone_afterwards(first):
+            await until(lambda: output(first) == b"begun\n", "its first commit")
+            captures = Captures(first)
+            base = await captures.take()
+            guard = procfs.status(first.pid).ppid
+            os.kill(guard, signal.SIGSTOP)
+            try:
+                (tmp_path / "stopped").touch()
+                await until((tmp_path / "took").exists, "five hundred commits whose output nobody takes")
+                while_stopped = await first.capture(base=False, generation=1, sequence=50, epoch=1)
+                os.close(while_stopped.snapshot)
+                assert while_stopped.dirty_bytes == 0, "commits that cannot tell their output are passed over"
+                with pytest.raises(CaptureError, match="had no room in the pipe"):
+                    await first.capture(base=True, generation=1, sequence=51, epoch=1)
+            finally:
+                os.kill(guard, signal.SIGCONT)
+            (tmp_path / "goes-on").touch()
+            await until(lambda: output(first).endswith(b"printed after it\n"), "the guard to take it all")
+            captured = await captures.take()
+            assert captured.parent == base.position
+            carried = piece_of(captured)
+            assert carried.content.endswith(b".\nprinted before the commits 1\n"), "all that was printed before, nothing after"
+            assert output(first)[: carried.offset + len(carried.content)].endswith(carried.content)
+        captures.close()
 
     live(tmp_path, story)
 

@@ -17,7 +17,7 @@ import pytest
 
 from checkpoint import segment
 from checkpoint.errors import SegmentBusyError, SegmentError
-from checkpoint.segment import ARRAY, PAGE, STATE, Layout, Region, lock_of, numbered
+from checkpoint.segment import ARRAY, PAGE, PENDING, STATE, Layout, Region, lock_of, numbered
 from checkpoint.segment_reader import SegmentReader
 from checkpoint.segment_writer import SegmentWriter
 from tests.checkpoint.segments import LINEAGE, Telling, committing_child, layout, number_read, source
@@ -58,6 +58,14 @@ def test_a_commit_is_read_as_it_was_written() -> None:
         assert bytes(found.region(1)) == b"a" * 3 * PAGE
         assert bytes(found.region(2)) == b"b" * (2 * PAGE + 5)
         assert abs(found.clocks.realtime_ns - time.time_ns()) < 60e9
+
+
+@pytest.mark.parametrize("outputs", [None, (0, 0), (7, 9), PENDING])
+def test_a_commit_says_what_its_program_had_written(outputs: segment.Outputs) -> None:
+    with opened(layout()) as (writer, reader):
+        writer.commit([source(b"state"), source(b"")], outputs)
+        found = reader.read()
+        assert found is not None and found.outputs == outputs
 
 
 def test_only_what_changed_since_the_last_reading_is_read_again() -> None:
