@@ -223,7 +223,7 @@ class Stage:
         self._write_team()
         for name in NAMES:
             with self.interruption.held():
-                self.robots.append(self._start_robot(name))
+                self.robots.append(self.start_robot(name))
         if self.means.own_network:
             self._join()
         for robot in self.robots:
@@ -245,7 +245,8 @@ class Stage:
         for name in NAMES:
             team.write(self.directory / name / "team", members)
 
-    def _start_robot(self, name: str) -> RobotMachine:
+    def start_robot(self, name: str) -> RobotMachine:
+        """The host of a robot, with its configuration; it waits to be switched on. Its disk is as it was left, if it had one."""
         directory = self.directory / name
         for part in ("state", "run"):
             (directory / part).mkdir(exist_ok=True)  # a test may have put a disk of its own there
