@@ -11,10 +11,10 @@ and a program that says what must survive:
 
     import failover
 
-    state = failover.resume("mission", default=Mission())
-    while state.leg < 10:
-        state.leg += 1
-        failover.commit()
+    state = failover.resume("counter", default={"n": 0})
+    for _ in failover.every(0.1):
+        state["n"] += 1
+        print(state["n"], flush=True)
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from failover.client.control import Control
     from failover.client.task import Resumed, activations, commit, resume, resumed, transaction, wait_committed
     from failover.client.task_component import component, kept, run
-    from failover.client.task_loop import FINISHED
+    from failover.client.task_loop import FINISHED, every
     from failover.client.task_resumable import resumable
     from failover.errors import (
         AgentRefusedError,
@@ -53,6 +53,7 @@ _HOMES = {
     "kept": "failover.client.task_component",
     "run": "failover.client.task_component",
     "FINISHED": "failover.client.task_loop",
+    "every": "failover.client.task_loop",
     "resumable": "failover.client.task_resumable",
     "AgentRefusedError": "failover.errors",
     "FailoverError": "failover.errors",
@@ -78,6 +79,7 @@ __all__ = [
     "activations",
     "commit",
     "component",
+    "every",
     "kept",
     "resumable",
     "resume",

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from failover.client.task import PROCESS, Resumed, Task, open_task
-from failover.client.task_loop import run_steps
+from failover.client.task_loop import LONGEST_PERIOD_S, run_steps
 from failover.client.task_state import KeptState
 from failover.errors import SchemaError, TaskError
 from failover.state import MISSING, Field, Schema
@@ -141,7 +141,7 @@ def component(
     """
     if cls is not None and not isinstance(cls, type):
         raise TaskError(f"@failover.component({cls!r}) is above no class: write @failover.component(name={cls!r})")
-    if every is not None and not 0 < every < 1e6:
+    if every is not None and not 0 < every < LONGEST_PERIOD_S:
         raise TaskError(f"every={every} is no period: say how many seconds lie between the beginnings of two steps")
 
     def declared(chosen: type[C]) -> type[C]:

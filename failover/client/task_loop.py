@@ -1,19 +1,21 @@
-"""Steps at their times, each followed by a commit: in a thread, or in an asyncio loop where the step is a coroutine."""
+"""Turns at their times, each followed by a commit: of the program's own loop, or the steps of a component."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import enum
 import inspect
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from failover.client.task import Task
+from failover.client.task import PROCESS, Task
 from failover.client.task_rhythm import Activations
+from failover.errors import TaskError
 
 
 class Finished(enum.Enum):
@@ -23,6 +25,8 @@ class Finished(enum.Enum):
 
 
 FINISHED: Final = Finished.FINISHED
+
+LONGEST_PERIOD_S: Final = 1e6
 
 Step = Callable[[], object]
 
@@ -58,49 +62,88 @@ class _Stopping:
                 signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
+class Turns:
+    """The turns of a loop at their times: each is committed when its body has come to its end. See `every`.
+
+    Iterated by ``for`` or by ``async for``; what a turn yields is its number in this run, from 0. SIGTERM ends the loop after the
+    turn under way, committed like the others. A body that raises, or leaves the loop by itself, is not committed.
+    """
+
+    def __init__(self, task: Task, period_ns: int) -> None:
+        self._task = task
+        self._period_ns = period_ns
+
+    def __iter__(self) -> Iterator[int]:
+        task, stopping = self._task, _Stopping()
+        task.activations = Activations(self._period_ns, time.monotonic_ns())
+        with stopping.listening():
+            while True:
+                yield task.activations.steps
+                task.commit()
+                stopping.is_between_steps = True
+                if stopping.is_asked:  # it came during the turn
+                    return
+                _sleep_until(task.activations.next_ns(time.monotonic_ns()))
+                stopping.is_between_steps = False
+
+    async def __aiter__(self) -> AsyncIterator[int]:
+        task, stopped = self._task, asyncio.Event()
+        task.activations = Activations(self._period_ns, time.monotonic_ns())
+        with _asyncio_sigterm(stopped):
+            while not stopped.is_set():
+                yield task.activations.steps
+                task.commit()
+                left = task.activations.next_ns(time.monotonic_ns()) - time.monotonic_ns()
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(stopped.wait(), max(left, 0) / 1e9)
+
+
+def every(period: float) -> Turns:
+    """A loop that is committed at the end of each turn: ``for _ in failover.every(0.1):``, or ``async for`` in an asyncio loop.
+
+    It is the same as a commit at the end of the body, and a sleep until the next turn is due. A body that takes longer than its
+    period misses beginnings, which `failover.activations` counts. SIGTERM ends the loop after the turn under way. A turn that
+    raises or is left by ``break`` or ``return`` is not committed: call `failover.commit` there if it should be.
+
+    Args:
+        period: seconds from the beginning of a turn to that of the next one; 0: at once.
+
+    Raises:
+        TaskError: this process keeps no state yet, or the period is none.
+    """
+    task = PROCESS.the_task("commit each turn of a loop")
+    if not 0 <= period < LONGEST_PERIOD_S:
+        raise TaskError(f"every({period}) is no period: say how many seconds lie between the beginnings of two turns; 0: at once")
+    return Turns(task, round(period * 1e9))
+
+
 def run_steps(task: Task, step: Step, on_resume: Step | None, period_ns: int) -> None:
     """Call ``on_resume``, then the step again and again, committing each, until it returns `FINISHED` or SIGTERM comes."""
-    task.activations = Activations(period_ns, time.monotonic_ns())
+    turns = Turns(task, period_ns)
     if inspect.iscoroutinefunction(step):
-        asyncio.run(_run_in_loop(task, step, on_resume))
+        asyncio.run(_run_in_loop(turns, task, step, on_resume))
         return
-    stopping = _Stopping()
-    with stopping.listening():
-        if on_resume is not None:
+    for turn in turns:
+        if turn == 0 and on_resume is not None:
             on_resume()
-        while True:
-            outcome = step()
+        if step() is FINISHED:
             task.commit()
-            if outcome is FINISHED:
-                return
-            stopping.is_between_steps = True
-            if stopping.is_asked:  # it came during the step
-                return
-            _sleep_until(task.activations.next_ns(time.monotonic_ns()))
-            stopping.is_between_steps = False
+            return
+
+
+async def _run_in_loop(turns: Turns, task: Task, step: Step, on_resume: Step | None) -> None:
+    async for turn in turns:
+        if turn == 0 and on_resume is not None:
+            await _finished(on_resume())
+        if await _finished(step()) is FINISHED:
+            task.commit()
+            return
 
 
 def _sleep_until(deadline_ns: int) -> None:
     left = deadline_ns - time.monotonic_ns()
     if left > 0:
         time.sleep(left / 1e9)
-
-
-async def _run_in_loop(task: Task, step: Step, on_resume: Step | None) -> None:
-    stopped = asyncio.Event()
-    with _asyncio_sigterm(stopped):
-        if on_resume is not None:
-            await _finished(on_resume())
-        while not stopped.is_set():
-            outcome = await _finished(step())
-            task.commit()
-            if outcome is FINISHED:
-                return
-            left = task.activations.next_ns(time.monotonic_ns()) - time.monotonic_ns()
-            try:
-                await asyncio.wait_for(stopped.wait(), max(left, 0) / 1e9)
-            except TimeoutError:
-                continue
 
 
 async def _finished(outcome: object) -> object:
