@@ -177,6 +177,27 @@ class LetGo:
 
 
 @dataclass(frozen=True, slots=True)
+class Warm:
+    """Start the program in advance: it waits before its first step, under no epoch and no lease, until Restore uses it. → Warmed.
+
+    One that waits already is replaced. Whatever becomes of it, it is tried again until `Cool`; Start, Restore and Stop end it
+    where they do not use it.
+    """
+
+    component: str
+    epoch: int
+    spec: ComponentSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Cool:
+    """What waits of this component on this robot ends. No answer."""
+
+    component: str
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True)
 class Prune:
     """Snapshots that are not needed to restore ``oldest`` or a later position may go."""
 
@@ -236,6 +257,8 @@ Act = (
     | End
     | Stop
     | LetGo
+    | Warm
+    | Cool
     | Prune
     | Drop
     | ReportExit

@@ -9,7 +9,19 @@ from dataclasses import dataclass, field
 from checkpoint.model import Position
 from failover.core.acts import Act
 from failover.core.membership import Membership
-from failover.core.types import HISTORY_MAX, HOLDING, ComponentSpec, Config, Decision, OnLoss, Record, Rules, State, WhenAlone
+from failover.core.types import (
+    HISTORY_MAX,
+    HOLDING,
+    ComponentSpec,
+    Config,
+    Decision,
+    OnLoss,
+    Record,
+    Rules,
+    State,
+    Waiting,
+    WhenAlone,
+)
 
 JOURNAL_MAX = 512
 """Decisions that are remembered for ``failover why``."""
@@ -113,6 +125,9 @@ class Component:
         resumed_ns: when the state was captured that this primacy began with, -1 for a fresh start; ``resumed_age_ns``: how old
             it was then.
         undelivered: why the last snapshot did not become a checkpoint; ``unstored``: on a standby, why it was not stored.
+        keeps_state: on a standby: to go on from the newest snapshot is to start the program again.
+        waiting: on a standby: the program that was ordered to wait, under ``waiting_epoch``; it is ready (``warm``) or, after
+            something went wrong, ``cold`` says what.
     """
 
     name: str
@@ -147,6 +162,11 @@ class Component:
     degraded: str = ""
     undelivered: str = ""
     unstored: str = ""
+    keeps_state: bool = False
+    waiting: Waiting | None = None
+    waiting_epoch: int = 0
+    warm: bool = False
+    cold: str = ""
     resumed_ns: int = -1
     resumed_age_ns: int = -1
     unprotected: bool = False

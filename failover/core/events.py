@@ -84,13 +84,18 @@ class ShipEnded:
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """On the standby: a snapshot that was admitted is verified, fits the chain, and is durable in this robot's store."""
+    """On the standby: a snapshot that was admitted is verified, fits the chain, and is durable in this robot's store.
+
+    Attributes:
+        keeps_state: to go on from it is to start the program again, which keeps its state itself.
+    """
 
     component: str
     epoch: int
     position: Position
     sender: str
     spec: ComponentSpec
+    keeps_state: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +138,16 @@ class Stopped:
 
     component: str
     epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class Warmed:
+    """How it stands with the act Warm, each time that this changes: it waits and is ready, or ``message`` says why not."""
+
+    component: str
+    epoch: int
+    ready: bool
+    message: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,6 +224,7 @@ Event = (
     | Restored
     | ActFailed
     | Stopped
+    | Warmed
     | Exited
     | Command
 )

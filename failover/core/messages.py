@@ -33,7 +33,8 @@ class Entry(msgspec.Struct, frozen=True, array_like=True):
         generation, sequence, digest: newest position it can restore from; for a standby, its acknowledgement. Sequence 0: none.
         standby: (primary) the robot it has entrusted, "" if none.
         yields_to: (primary, handing over) the robot that may claim now.
-        flags: ``NEEDS_BASE`` (standby), ``UNPROTECTED`` (primary has stopped protecting), ``HOLDS`` (on_loss is hold).
+        flags: ``NEEDS_BASE`` (standby), ``UNPROTECTED`` (primary has stopped protecting), ``HOLDS`` (on_loss is hold),
+            ``WARM`` (standby: its program waits there, started already).
         status: of a finished component, waitpid's.
     """
 
@@ -58,6 +59,7 @@ class Entry(msgspec.Struct, frozen=True, array_like=True):
 NEEDS_BASE = 1
 UNPROTECTED = 2
 HOLDS = 4
+WARM = 8
 
 
 class Beat(msgspec.Struct, frozen=True, array_like=True):

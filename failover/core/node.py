@@ -6,7 +6,7 @@ The agent feeds it one event at a time with the instant of its own clock and obe
 
 from __future__ import annotations
 
-from failover.core import acts, commands, election, endings, handover, lease, replication, view
+from failover.core import acts, commands, election, endings, handover, lease, replication, view, warmth
 from failover.core.acts import Ready
 from failover.core.component import Cause, Component, Journal, Turn
 from failover.core.events import (
@@ -30,6 +30,7 @@ from failover.core.events import (
     Stored,
     StoreFailed,
     Tick,
+    Warmed,
 )
 from failover.core.membership import Membership
 from failover.core.messages import HOLDS, Beat, Echo, Entry
@@ -255,6 +256,8 @@ def _tell(component: Component, turn: Turn, event: Event) -> None:
             endings.failed(component, turn, event)
         case Exited():
             endings.exited(component, turn, event)
+        case Warmed():
+            warmth.warmed(component, turn, event)
         case Stopped():
             if component.state is State.STOPPING:
                 component.move(Cause.CLEARED)
@@ -291,6 +294,7 @@ def _review(component: Component, turn: Turn) -> None:
         _review_held(component, turn)
     if component.state in ENDED:
         endings.report(component, turn)
+    warmth.review(component, turn)
 
 
 def _review_idle(component: Component, turn: Turn) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from failover.core.component import Component
 from failover.core.consent import STATES
-from failover.core.messages import HOLDS, NEEDS_BASE, UNPROTECTED, Beat, Echo, Entry
+from failover.core.messages import HOLDS, NEEDS_BASE, UNPROTECTED, WARM, Beat, Echo, Entry
 from failover.core.types import HOLDING, State
 from failover.core.wire import BODY_SIZE_MAX, beat_size, entry_size
 
@@ -19,7 +19,8 @@ def entry_of(component: Component, me: str) -> Entry:
     """One component as this robot holds it."""
     newest = component.newest
     handing = component.handing
-    flags = NEEDS_BASE * component.needs_base | UNPROTECTED * component.unprotected | HOLDS * component.waits
+    flags = NEEDS_BASE * component.needs_base | UNPROTECTED * component.unprotected
+    flags |= HOLDS * component.waits | WARM * component.warm
     return Entry(
         component.name,
         STATES.index(component.state),

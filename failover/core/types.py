@@ -158,6 +158,14 @@ class ComponentSpec:
 
 
 @dataclass(frozen=True, slots=True)
+class Waiting:
+    """What was started in advance: another command line, or another owner, is another program."""
+
+    launch: Launch
+    owner: int
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """What one robot's node is told at birth.
 
@@ -325,6 +333,7 @@ class ComponentView:
         notes: sentences: why it is degraded, waiting or failed.
         lease_until_ns: of this robot's clock; 0 acts without a lease.
         owner: uid; None where this robot has heard no more of it than its name.
+        warm: its program waits at its standby, started already: only one that keeps its state itself can.
     """
 
     name: str
@@ -344,6 +353,7 @@ class ComponentView:
     home: str = ""
     prefer: str = ""
     owner: int | None = None
+    warm: bool = False
 
 
 @dataclass(frozen=True, slots=True)

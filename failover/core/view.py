@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from failover.core.component import Component, Turn
 from failover.core.types import ENDED, MS, ComponentView, Protection, State, StatusView
+from failover.core.warmth import is_warm
 
 NS_PER_S = 10**9
 
@@ -18,6 +19,7 @@ def status(components: dict[str, Component], turn: Turn, boot: int) -> StatusVie
     )
     peers = turn.team.views(turn.now_ns)
     bad = any(view.protection is Protection.DEGRADED or view.state is State.FAILED for view in views)
+    bad = bad or any(component.cold for component in components.values())
     lost = any(peer.state == "dead" for peer in peers)
     return StatusView(turn.me, boot, "pair", _team_promise(turn), not bad and not lost, peers, views)
 
@@ -56,6 +58,7 @@ def _component(component: Component, turn: Turn) -> ComponentView:
         component.spec.home if component.spec else "",
         component.rules.prefer,
         component.spec.owner if component.spec else None,
+        is_warm(component, turn),
     )
 
 
@@ -123,6 +126,8 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
         notes.append(f"a snapshot was not stored at {turn.me}: {component.unstored}")
     if component.unprotected:
         notes.append("protected no longer, as on_unsupported = stop_protecting says; failover release, then protect, begins anew")
+    if component.cold:
+        notes.append(f"its program does not wait at {turn.me}, so a takeover would take longer, or fail: {component.cold}")
     if component.unable:
         notes.append(f"{turn.me} cannot run it: {component.unable}")
     if component.state is State.FROZEN:

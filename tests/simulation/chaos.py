@@ -10,7 +10,7 @@ from failover.core import speaker
 from failover.core.events import Handover
 from failover.core.types import MS, ComponentSpec, Launch, OnLoss, Rules, WhenAlone
 from tests.simulation.invariants import Broken, Invariants
-from tests.simulation.world import World, pair
+from tests.simulation.world import KEEPS_STATE, World, pair
 
 TROUBLE_NS = 3_000 * MS
 HEALING_NS = 4_000 * MS
@@ -27,10 +27,13 @@ NARROW = 5
 NARROW_BODY_SIZE = 130
 
 
-def life(seed: int) -> World:
+ENGINES = ("ptrace", KEEPS_STATE)
+
+
+def life(seed: int, engines: tuple[str, ...] = ENGINES) -> World:
     """Play one seed to its end; raises ``Broken`` when an invariant does not hold."""
-    random = Random(seed ^ 0x5EED)
-    specs = tuple(_spec(random, index) for index in range(random.choice((1, 1, 2, 3))))
+    random, engine = Random(seed ^ 0x5EED), Random(seed)
+    specs = tuple(_spec(random, index, engine.choice(engines)) for index in range(random.choice((1, 1, 2, 3))))
     with patch.object(speaker, "BODY_SIZE_MAX", speaker.BODY_SIZE_MAX if seed % NARROW else NARROW_BODY_SIZE):
         return _live(seed, random, specs)
 
@@ -55,11 +58,11 @@ def _live(seed: int, random: Random, specs: tuple[ComponentSpec, ...]) -> World:
                 raise
 
 
-def _spec(random: Random, index: int) -> ComponentSpec:
+def _spec(random: Random, index: int, engine: str) -> ComponentSpec:
     alone = random.choice((WhenAlone.RUN, WhenAlone.FREEZE))
     loss = random.choice((OnLoss.TAKEOVER, OnLoss.TAKEOVER, OnLoss.HOLD))
     return ComponentSpec(
-        f"/team/part{index}", launch=Launch(("part",)), rules=Rules(when_alone=alone, on_loss=loss, crash_limit=20)
+        f"/team/part{index}", launch=Launch(("part",), engine=engine), rules=Rules(when_alone=alone, on_loss=loss, crash_limit=20)
     )
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from checkpoint.model import Position
 from failover.core import acts
 from failover.core.messages import Beat
-from failover.core.types import Ballot, ComponentView, State, WhenAlone
-from tests.simulation.world import World, ballot_of
+from failover.core.types import Ballot, ComponentView, OnLoss, State, WhenAlone
+from tests.simulation.world import KEEPS_STATE, World, ballot_of
 
 
 class Broken(AssertionError):
@@ -56,6 +56,9 @@ class Invariants:
             case acts.Restore():
                 self._one_primary(world, robot, what)
                 self._not_older(world, robot, what)
+            case acts.Warm():
+                if what.component in world.robots[robot].programs:
+                    raise _broken(world, f"{robot}: {what.component} is to wait where it runs")
             case acts.ReportExit():
                 if what.acknowledged:
                     self.last.add(what.component)
@@ -68,6 +71,11 @@ class Invariants:
                 self.split.add(component)
                 if component in self.safe:
                     raise _broken(world, f"{component} acts at {' and '.join(where)} at once")
+
+    def _nothing_waits_in_vain(self, world: World, component: str, standby: str) -> None:
+        waiting = [name for name, robot in world.robots.items() if component in robot.warm]
+        if waiting != ([standby] if standby else []):
+            raise _broken(world, f"{component} should wait at {standby or 'no robot'}: it waits at {waiting}")
 
     def _one_primary(self, world: World, robot: str, act: acts.Start | acts.Restore) -> None:
         owner = self.owners.setdefault((act.component, act.epoch), robot)
@@ -119,6 +127,7 @@ class Invariants:
             if any(state in (State.FINISHED, State.FAILED, State.RELEASED) for state in states.values()):
                 if len(set(states.values())) > 1:
                     raise _broken(world, f"{component} has ended for some only: {states}")
+                self._nothing_waits_in_vain(world, component, "")
                 continue
             self._lives_well(world, component, states)
 
@@ -131,6 +140,10 @@ class Invariants:
             raise _broken(
                 world, f"{component} at {primaries[0]} is {seen.protection}, its checkpoint {seen.lag_ns / 1e6:.0f} ms old"
             )
+        waits = _waits_at_a_standby(world, component)
+        self._nothing_waits_in_vain(world, component, seen.standby if waits else "")
+        if waits != seen.warm:
+            raise _broken(world, f"{primaries[0]} says of the standby of {component}: warm {seen.warm}")
 
 
 def state_at(world: World, robot: str, component: str) -> State:
@@ -141,6 +154,11 @@ def state_at(world: World, robot: str, component: str) -> State:
 def seen_at(world: World, robot: str, component: str) -> ComponentView:
     """All that a robot says of a component that it knows."""
     return next(one for one in _views(world, robot) if one.name == component)
+
+
+def _waits_at_a_standby(world: World, component: str) -> bool:
+    specs = (record.spec for robot in world.robots.values() for record in ballot_of(robot).records if record.name == component)
+    return any(spec is not None and spec.launch.engine == KEEPS_STATE and spec.rules.on_loss is OnLoss.TAKEOVER for spec in specs)
 
 
 def _views(world: World, robot: str) -> tuple[ComponentView, ...]:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 from unittest.mock import patch
 
-from failover.core import acts, election, endings, lease, node, replication
+from failover.core import acts, election, endings, lease, node, replication, warmth
 from failover.core.component import Component, Turn
 from failover.core.membership import Membership
 from failover.core.messages import Entry
@@ -151,6 +151,22 @@ def tireless_giver() -> Any:
     return patch.object(replication, "ship_ended", hasty)
 
 
+def waits_for_ever() -> Any:
+    """What waits at a robot is not ended when the component has ended, or has another standby."""
+
+    def stubborn(component: Component, turn: Turn) -> None:
+        if component.waiting is None:
+            honest(component, turn)
+
+    honest = warmth.review
+    return patch.object(warmth, "review", stubborn)
+
+
+def waits_where_it_may_not_run() -> Any:
+    """A program waits also where it was told to be held only, or where somebody else is entrusted."""
+    return patch.object(warmth, "_wanted", lambda component: component.spec if component.keeps_state else None)
+
+
 SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (blind_to_the_better, "the_newest_checkpoint_wins_over_the_lesser_name"),
     (loyal_to_the_lost, "three_robots_stand_in_for_one_another"),
@@ -175,6 +191,8 @@ MUTANTS: tuple[Mutant, ...] = (
     runs_the_finished,
     crash_is_the_end,
     no_grace,
+    waits_for_ever,
+    waits_where_it_may_not_run,
 )
 
 

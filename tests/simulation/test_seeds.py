@@ -12,7 +12,7 @@ SEEDS = 500
 BLOCK = 50
 """Seeds a test, so that a failure names a narrow range and the story names the seed."""
 
-SEEDS_TO_CATCH = 150
+SEEDS_TO_CATCH = 300
 
 ONCE_BROKEN = (72, 79, 1554, 1572, 1753, 2737, 4440)
 """Each found a mistake: numbers used twice, a lease lost on the way, an epoch without consent, no lease taken for a free one."""
@@ -29,7 +29,7 @@ def test_every_promise_holds_whatever_goes_wrong(first: int) -> None:
 
 @pytest.mark.parametrize("seed", ONCE_BROKEN)
 def test_a_seed_that_once_broke_a_promise_keeps_it(seed: int) -> None:
-    life(seed)
+    life(seed, engines=("ptrace",))  # as it was
 
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.__name__)

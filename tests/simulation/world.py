@@ -30,9 +30,10 @@ from failover.core.events import (
     Stored,
     StoreFailed,
     Tick,
+    Warmed,
 )
 from failover.core.node import Node
-from failover.core.types import MS, Ballot, ComponentSpec, Config, Found, Held
+from failover.core.types import MS, Ballot, ComponentSpec, Config, Found, Held, Launch
 
 TEAM = "simulated"
 KEY = bytes(range(32))
@@ -40,6 +41,12 @@ QUEUE_MAX = 4_096
 """Events that may wait for one robot; more means that somebody floods."""
 
 RESTARTS_AT_LEAST_NS = 30 * MS
+
+KEEPS_STATE = "cooperative"
+"""The engine of programs that keep their state, and so wait at a standby."""
+
+WARM_FAILS = 0.2
+"""Of the programs that are started in advance."""
 
 
 @dataclass(slots=True)
@@ -90,6 +97,7 @@ class Robot:
     serial: dict[str, int] = field(default_factory=dict)
     leases: dict[str, int] = field(default_factory=dict)
     capturing: set[str] = field(default_factory=set)
+    warm: dict[str, Launch] = field(default_factory=dict)
     inbox: list[Event] = field(default_factory=list)
     receiver: wire.Receiver = field(default_factory=lambda: wire.Receiver(TEAM))
     life: int = 0
@@ -192,6 +200,7 @@ class World:
         robot = self.robots[name]
         robot.node = None
         robot.life += 1
+        robot.warm.clear()
         for component in robot.serial:
             robot.serial[component] += 1
         self.note(f"{name}: its agent dies")
@@ -341,6 +350,8 @@ class World:
                 robot.store.pop(act.component, None)
             case acts.Freeze() | acts.Thaw() | acts.SetLease() | acts.End() | acts.LetGo():
                 self._guard(robot, act)
+            case acts.Warm() | acts.Cool():
+                self._warm(robot, act)
             case acts.Answer():
                 self.note(f"{robot.name} answers: {act.sentence}")
 
@@ -364,6 +375,24 @@ class World:
             case acts.LetGo():
                 del robot.programs[act.component]
 
+    def _warm(self, robot: Robot, act: acts.Warm | acts.Cool) -> None:
+        """A program that waits takes a while to get there, and sometimes fails and is tried again."""
+        name, life = act.component, robot.life
+        robot.warm.pop(name, None)
+        if isinstance(act, acts.Cool):
+            return
+        launch = robot.warm[name] = replace(act.spec.launch)  # one of its own, to be told from the next
+
+        def done(ready: bool) -> None:
+            if robot.life != life or robot.warm.get(name) is not launch:
+                return
+            self._feed(robot, Warmed(name, act.epoch, ready, "" if ready else "it ended at once"))
+            if not ready:
+                self.after(self._soon(50, 100), lambda: done(True))
+
+        fails = self.random.random() < WARM_FAILS
+        self.after(self._soon(20, 200) * robot.slow, lambda: done(not fails))
+
     def _settle(self, robot: Robot, program: Program) -> None:
         """Add up what the program has computed, and let a lease that has run out freeze it for good."""
         ran_until_ns = self.now_ns
@@ -379,6 +408,7 @@ class World:
         name, life = act.component, robot.life
         robot.serial[name] = serial = robot.serial.get(name, 0) + 1
         robot.capturing.discard(name)
+        robot.warm.pop(name, None)
         if not isinstance(act, acts.Stop):
             robot.leases[name] = act.lease_until_ns
         if not isinstance(act, acts.Start):
@@ -461,7 +491,8 @@ class World:
                 self._feed(robot, StoreFailed(act.component, act.epoch, sender, "its parent is not here", True))
             else:
                 robot.store[act.component] = [*kept, act.position]
-                self._feed(robot, Stored(act.component, act.epoch, act.position, sender, act.spec))
+                keeps = act.spec.launch.engine == KEEPS_STATE
+                self._feed(robot, Stored(act.component, act.epoch, act.position, sender, act.spec, keeps))
 
         self.after(self._soon(1, 10) * robot.slow, done)
 
