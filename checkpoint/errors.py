@@ -77,3 +77,7 @@ class SegmentError(CheckpointError):
 
 class SegmentBusyError(SegmentError):
     """The newest bank could not be held just now; ask again later."""
+
+
+class TaskPacketError(CheckpointError):
+    """What came over a task socket is no packet as TASK.md says; nothing of it was used."""

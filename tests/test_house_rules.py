@@ -14,8 +14,10 @@ import pytest
 ROOT = Path(__file__).parent.parent
 FLOORS = ("checkpoint", "failover", "agent")
 
+PURE_CHECKPOINT = ("errors", "model", "pages", "layout", "state", "validity", "chain", "gathering", "task_packets")
+
 PURE_FILES = (
-    *(f"checkpoint/{name}.py" for name in ("errors", "model", "pages", "layout", "state", "validity", "chain", "gathering")),
+    *(f"checkpoint/{name}.py" for name in PURE_CHECKPOINT),
     "failover/core/",
     "failover/state/",
 )
