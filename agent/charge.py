@@ -156,7 +156,7 @@ class Charge:
                 await self._capture(act)
             case acts.Acknowledge():
                 if self.component is not None:
-                    await self.component.acknowledge(act.position)
+                    await self.component.acknowledge(act.position, is_safe=act.is_safe)
             case acts.Thaw():
                 await self._thaw(act)
             case acts.End():

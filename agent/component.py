@@ -209,14 +209,18 @@ class Component:
             captured.notes,
         )
 
-    async def acknowledge(self, position: Position) -> None:
-        """A standby holds the snapshot of ``position``: deltas start there, and the output up to there is committed."""
+    async def acknowledge(self, position: Position, *, is_safe: bool = True) -> None:
+        """The snapshot of ``position`` is a checkpoint: deltas start there, and the output up to there is committed.
+
+        Args:
+            is_safe: a standby holds it; a program that waits for its commit is told.
+        """
         totals = self._totals.pop(position, None)
         if totals is not None:
             self.logs.commit(totals)
         if self._keeper is not None and self._keeper.dialogue.open:
             self._keeper.dialogue.tell(channel.Acknowledge(position))
-        if commit := self._commits.pop(position, 0):
+        if (commit := self._commits.pop(position, 0)) and is_safe:
             self._guard.dialogue.tell(guard_messages.CommitSafe(commit))
 
     @contextlib.asynccontextmanager

@@ -91,11 +91,17 @@ class CancelShip:
 
 @dataclass(frozen=True, slots=True)
 class Acknowledge:
-    """Tell the keeper that ``position`` is a checkpoint: the next delta counts from here. No answer."""
+    """Tell the keeper that ``position`` is a checkpoint: the next delta counts from here. No answer.
+
+    Attributes:
+        is_safe: a standby holds it, or this robot is the whole team: a program that waits for it may go on. False where nobody
+            else is there just now.
+    """
 
     component: str
     epoch: int
     position: Position
+    is_safe: bool
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,7 +61,7 @@ def captured(component: Component, turn: Turn, event: Captured) -> None:
     _tell_prune(component, turn)
     to = component.standby if turn.alive(component.standby) else ""
     if not to:
-        _safe(component, turn, event.position)
+        _checkpoint(component, turn, event.position, is_safe=not turn.config.peers)
         return
     entry = _standby_entry(component, turn)
     fits = event.parent is None or (entry is not None and entry.position == event.parent)
@@ -104,7 +104,7 @@ def acknowledged(component: Component, turn: Turn, sender: str, entry: Entry) ->
     if flight is None or flight.position is None or flight.to != sender or not _follows_us(component, turn, entry):
         return
     if entry.position == flight.position:
-        _safe(component, turn, flight.position)
+        _checkpoint(component, turn, flight.position, is_safe=True)
     elif entry.flags & NEEDS_BASE and flight.parent is not None:
         turn.order(acts.CancelShip(component.name, component.epoch, flight.position, sender))
         _give_up(component, turn, f"{sender} needs a base")
@@ -123,12 +123,12 @@ def overdue(component: Component, turn: Turn) -> None:
         _give_up(component, turn, f"{flight.to or turn.me} did not take it")
 
 
-def _safe(component: Component, turn: Turn, position: Position) -> None:
-    """The position is a checkpoint: the next delta counts from it."""
+def _checkpoint(component: Component, turn: Turn, position: Position, *, is_safe: bool) -> None:
+    """The position is a checkpoint: the next delta counts from it. It is safe unless this robot alone holds it."""
     flight = component.flight
     assert flight is not None
     alone = not flight.to or not turn.alive(component.standby)
-    turn.order(acts.Acknowledge(component.name, component.epoch, position))
+    turn.order(acts.Acknowledge(component.name, component.epoch, position, is_safe))
     component.undelivered = ""
     component.parent = component.acked = position
     component.acked_ns = flight.started_ns

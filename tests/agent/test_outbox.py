@@ -19,7 +19,7 @@ def beat(counter: int, settled: int = 0) -> Beat:
 
 
 def act(sequence: int) -> Act:
-    return Acknowledge("/a", 1, Position(1, sequence, b""))
+    return Acknowledge("/a", 1, Position(1, sequence, b""), True)
 
 
 def outbox() -> Outbox:

@@ -73,7 +73,7 @@ def early_acknowledgement() -> Any:
     def hasty(component: Component, turn: Turn, event: Any) -> None:
         honest(component, turn, event)
         if component.flight is not None and component.flight.position == event.position:
-            turn.order(acts.Acknowledge(component.name, component.epoch, event.position))
+            turn.order(acts.Acknowledge(component.name, component.epoch, event.position, True))
 
     return patch.object(replication, "captured", hasty)
 

@@ -60,9 +60,22 @@ def test_alone_a_capture_counts_from_this_robots_own_store() -> None:
     (capture,) = only(running(node), acts.Capture)
     assert isinstance(capture, acts.Capture) and capture.base
     position = Position(capture.generation, capture.sequence, b"d")
-    assert only(node.step(Captured("/lab/x", 1, position, None), 5 * MS), acts.Acknowledge)
+    (acknowledged,) = only(node.step(Captured("/lab/x", 1, position, None), 5 * MS), acts.Acknowledge)
+    assert isinstance(acknowledged, acts.Acknowledge) and acknowledged.is_safe, "it is the whole team"
     (later,) = only(node.step(Tick(), 2_000 * MS), acts.Capture)
     assert isinstance(later, acts.Capture) and not later.base
+
+
+def test_what_this_robot_alone_holds_is_not_called_safe_while_there_could_be_a_standby() -> None:
+    node = Node(PAIR, 1, Ballot(), 0)
+    node.step(Run(1, SPEC), 0)
+    starts = [at for at in range(0, 5_000, 20) if only(node.step(Tick(), at * MS), acts.Start)]
+    assert starts, "nobody else was heard: it starts alone"
+    (capture,) = only(node.step(Started("/lab/x", 1), 5_000 * MS), acts.Capture)
+    assert isinstance(capture, acts.Capture)
+    taken = Captured("/lab/x", 1, Position(capture.generation, capture.sequence, b"d"), None)
+    (acknowledged,) = only(node.step(taken, 5_005 * MS), acts.Acknowledge)
+    assert isinstance(acknowledged, acts.Acknowledge) and not acknowledged.is_safe
 
 
 def test_what_cannot_be_captured_degrades_and_names_the_reason() -> None:
