@@ -20,11 +20,13 @@ import msgspec
 from agent import births, clock, lost
 from agent.births import Program
 from agent.component import Component
+from agent.config import ComponentConfig
 from agent.errors import AgentError, GuardError, KeeperLostError
 from agent.figures import Figures, shortened
 from agent.mistake import end_lanes_on_mistake
 from agent.places import Places
 from agent.records import Records
+from agent.rules import started_here
 from checkpoint.channel import close_all, content_of
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CheckpointError, UnsupportedError
@@ -52,6 +54,7 @@ class Surroundings:
     Attributes:
         tell: passes an event to the core.
         silence_ns: how long the robot that the component is taken over from has been silent, as far as known; for the outage.
+        here: what this robot's operator wants for a component.
     """
 
     places: Places
@@ -59,6 +62,7 @@ class Surroundings:
     records: Records
     tell: Callable[[Event], None]
     silence_ns: Callable[[str], Coroutine[Any, Any, int]]
+    here: Callable[[str], ComponentConfig]
 
 
 @dataclass(slots=True)
@@ -285,7 +289,7 @@ class Charge:
         if act.spec is None or act.spec.launch.engine != COOPERATIVE:
             owner = act.spec.owner if act.spec is not None else None
             return await births.restore(self.name, chain, places, outage_ns=outage_ns, owner=owner, laps=laps)
-        program = program_of(act.spec.launch)
+        program = program_of(started_here(act.spec.launch, self.around.here(self.name)))
         return await births.begin_again(
             self.name, program, chain, places, outage_ns=outage_ns, owner=act.spec.owner, epoch=act.epoch
         )

@@ -30,6 +30,9 @@ class ComponentConfig:
         standby: the robot that keeps its snapshots; "" lets the team choose.
         prefer: the robot that should run it; "" for wherever it is.
         snapshot_period_ms: 0 for the agent's own.
+        command: a program that keeps its state itself is started here again by this; () for the command line of `failover run`.
+        directory: and in this one, an absolute path; "" for that of `failover run`.
+        environment: and with these variables besides, or instead.
     """
 
     on_loss: Literal["takeover", "hold"] = "takeover"
@@ -38,6 +41,9 @@ class ComponentConfig:
     standby: str = ""
     prefer: str = ""
     snapshot_period_ms: int = 0
+    command: tuple[str, ...] = field(default_factory=tuple)
+    directory: str = ""
+    environment: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,3 +173,17 @@ def _check_components(path: Path, config: Config, members: Team) -> None:
             raise ConfigError(
                 f"{where}: snapshot_period_ms is {component.snapshot_period_ms}; at most {PERIOD_MS_MAX}; 0 means the agent's own"
             )
+        _check_command(where, component)
+
+
+def _check_command(where: str, component: ComponentConfig) -> None:
+    """What execve(2) would not take is found now, and not when a robot is lost."""
+    if component.command and not component.command[0]:
+        raise ConfigError(f"{where}: command begins with an empty word; the first one names the program")
+    if component.directory and not component.directory.startswith("/"):
+        raise ConfigError(f"{where}: directory = {component.directory!r} is not absolute; an agent has no directory of its own")
+    for name in component.environment:
+        if not name or "=" in name:
+            raise ConfigError(f"{where}: environment has a variable {name!r}; a name is not empty and has no '=' in it")
+    if any("\0" in word for word in (*component.command, component.directory, *component.environment.values())):
+        raise ConfigError(f"{where}: command, directory or environment holds a zero byte; no program can be given one")

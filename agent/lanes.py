@@ -124,7 +124,8 @@ class Lanes:
         speaking = asyncio.create_task(self._speak_to_heart())
         self._life = await self._begun
         store = await self._open_store()
-        around = Surroundings(self.places, store, Records(self._runtime / "running"), self.tell, self._silence_ns)
+        records = Records(self._runtime / "running")
+        around = Surroundings(self.places, store, records, self.tell, self._silence_ns, self.settings.component)
         self._around = around
         self._deposit = Deposit(store, self.places, self.tell, self._stored)
         self._dispatch = Dispatch(store, self._shipper, self.tell)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from agent.config import ComponentConfig, Config, Settings
 from failover.core import types
-from failover.core.types import OnCrash, OnLoss, OnUnsupported, Rules, WhenAlone
+from failover.core.types import Launch, OnCrash, OnLoss, OnUnsupported, Rules, WhenAlone
 
 
 def node_config(settings: Settings) -> types.Config:
@@ -32,4 +34,14 @@ def rules_for(config: Config, component: ComponentConfig) -> Rules:
         on_unsupported=OnUnsupported(component.on_unsupported),
         prefer=component.prefer,
         standby=component.standby,
+    )
+
+
+def started_here(launch: Launch, component: ComponentConfig) -> Launch:
+    """How this robot starts a program again that was first started on another: its own command line, if it has one."""
+    return replace(
+        launch,
+        argv=component.command or launch.argv,
+        directory=component.directory or launch.directory,
+        environment=tuple({**dict(launch.environment), **component.environment}.items()),
     )

@@ -44,7 +44,9 @@ def carried_out(orders: Callable[[Charge, Told], Any], directory: Path) -> Told:
     guard = Told()
 
     async def run() -> None:
-        around = Surroundings(cast(Any, None), cast(Any, None), Records(directory), lambda _: None, cast(Any, None))
+        around = Surroundings(
+            cast(Any, None), cast(Any, None), Records(directory), lambda _: None, cast(Any, None), cast(Any, None)
+        )
         charge = Charge(NAME, around, cast(Component, guard), epoch=3)
         orders(charge, guard)
         charge.begin()

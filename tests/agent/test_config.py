@@ -7,14 +7,17 @@ import re
 import tomllib
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from agent import config as configuration
 from agent.config import ComponentConfig, Config
 from agent.errors import ConfigError
+from agent.rules import started_here
 from agent.transport import new_keys
 from failover.client import team
 from failover.client.team import Robot, Team
+from failover.core.types import Launch
 
 DOCUMENTED = Path(__file__).parents[2] / "systemd" / "agent.toml"
 ROBOT = Robot(("127.0.0.1:7420",), "127.0.0.1:7421")
@@ -41,7 +44,8 @@ def test_every_key_and_its_default_stand_in_the_documented_file() -> None:
     defaults = dataclasses.asdict(Config("robot1"))
     del defaults["robot"], defaults["components"]
     assert documented == defaults
-    assert component == dataclasses.asdict(ComponentConfig())
+    assert set(component) == {one.name for one in dataclasses.fields(ComponentConfig)}
+    assert msgspec.convert(component, ComponentConfig) == ComponentConfig()
 
 
 def test_a_whole_configuration_is_read(directory: Path) -> None:
@@ -51,6 +55,16 @@ def test_a_whole_configuration_is_read(directory: Path) -> None:
     assert settings.component("/lab/robot1/mapper").on_loss == "hold"
     assert settings.component("/lab/robot1/other") == ComponentConfig()
     assert list(settings.peers) == ["robot2"]
+
+
+def test_a_program_is_started_again_by_this_robots_own_command(directory: Path) -> None:
+    lines = ('[components."/lab/robot1/mapper"]', 'command = ["/opt/mapper", "--small"]', 'environment = { MAPS = "/srv/maps" }')
+    settings = configuration.load(written(directory, *lines))
+    launch = Launch(("/home/ann/mapper",), (("LANG", "C"), ("MAPS", "/home/ann/maps")), "/home/ann", umask=0o077)
+    told = started_here(launch, settings.component("/lab/robot1/mapper"))
+    environment = (("LANG", "C"), ("MAPS", "/srv/maps"))
+    assert told == Launch(("/opt/mapper", "--small"), environment, "/home/ann", umask=0o077)
+    assert started_here(launch, settings.component("/lab/robot1/other")) == launch
 
 
 @pytest.mark.parametrize(
@@ -70,6 +84,12 @@ def test_a_whole_configuration_is_read(directory: Path) -> None:
         (('[components."/lab/a"]', 'prefer = "robot7"'), 4, "the team knows robot1, robot2"),
         (('[components."/lab/a"]', 'on_lost = "hold"'), 5, "did you mean 'on_loss'"),
         (('[components."/lab/a"]', 'on_loss = "give up"'), 5, "Invalid enum value 'give up'"),
+        (('[components."/lab/a"]', 'command = "/opt/a"'), 5, "Expected `array`"),
+        (('[components."/lab/a"]', 'command = [""]'), 4, "the first one names the program"),
+        (('[components."/lab/a"]', 'command = ["/opt/a", "b\\u0000c"]'), 4, "a zero byte"),
+        (('[components."/lab/a"]', 'directory = "opt"'), 4, "is not absolute"),
+        (('[components."/lab/a"]', 'environment = { "A=B" = "c" }'), 4, "has a variable 'A=B'"),
+        (('[components."/lab/a"]', "environment = { A = 1 }"), 5, "Expected `str`"),
     ],
 )
 def test_a_mistake_is_named_with_file_line_and_cure(directory: Path, lines: tuple[str, ...], line: int, said: str) -> None:
