@@ -280,6 +280,9 @@ static inline int failover_sync_(int file)
     return 0;
 }
 
+/* ioctl(2) itself: libcs do not agree on the type of the request. */
+static inline int failover_ioctl_(int file, unsigned long request, void *order) { return (int)syscall(SYS_ioctl, file, request, order); }
+
 /* Lock one byte, for the opening that `file` is of (fcntl(2), F_OFD_SETLK); never waits. 0 or -errno. */
 static inline int failover_lock_(int file, int kind, off_t byte)
 {
@@ -324,6 +327,23 @@ static inline void failover_sleep_(uint32_t *word, uint32_t seen, uint64_t timeo
 
 /* --- Regions ------------------------------------------------------------------------------------------------------------------------ */
 
+/* Whether a text is UTF-8 as RFC 3629 has it: nothing too long, no surrogates, nothing beyond U+10FFFF. */
+static inline bool failover_is_utf8_(const char *text)
+{
+    const unsigned char *next = (const unsigned char *)text;
+    while (*next != 0) {
+        const unsigned char lead = *next++;
+        unsigned char low = lead == 0xE0 ? 0xA0 : lead == 0xF0 ? 0x90 : 0x80, high = lead == 0xED ? 0x9F : lead == 0xF4 ? 0x8F : 0xBF;
+        int rest = lead < 0x80 ? 0 : lead < 0xE0 ? 1 : lead < 0xF0 ? 2 : 3;
+        if (lead > 0xF4 || (lead >= 0x80 && lead < 0xC2))
+            return false;
+        for (; rest > 0; rest--, low = 0x80, high = 0xBF)
+            if (*next < low || *next++ > high)
+                return false;
+    }
+    return true;
+}
+
 static inline int failover_refuse_region_(failover_task_ *task, void *memory, size_t size, const char *name)
 {
     if (task->is_open)
@@ -332,6 +352,8 @@ static inline int failover_refuse_region_(failover_task_ *task, void *memory, si
         return failover_fail_(EINVAL, "cannot keep region '%.224s': %zu bytes at %p; 1 byte to 64 GiB are possible", name, size, memory);
     if (name[0] == '\0' || strlen(name) > FAILOVER_MAX_NAME_)
         return failover_fail_(ENAMETOOLONG, "cannot keep region '%.80s': a name has 1 to %d bytes", name, FAILOVER_MAX_NAME_);
+    if (!failover_is_utf8_(name))
+        return failover_fail_(EILSEQ, "cannot keep region %u, of %zu bytes: its name is no UTF-8", task->count + 1, size);
     if (task->count == FAILOVER_MAX_REGIONS_)
         return failover_fail_(E2BIG, "cannot keep region '%.224s': there are %d, which is all; put several variables into one struct", name,
                               FAILOVER_MAX_REGIONS_);
@@ -419,7 +441,7 @@ static inline int failover_written_(const failover_task_ *task, uint64_t start, 
     scan.spans = (uint64_t)(uintptr_t)spans;
     scan.span_count = FAILOVER_SPANS_;
     scan.mask = scan.answered = 2; /* PAGE_IS_WRITTEN, and just that: the kernel's fast path */
-    int count = ioctl(task->pagemap, FAILOVER_PAGEMAP_SCAN_, &scan);
+    int count = failover_ioctl_(task->pagemap, FAILOVER_PAGEMAP_SCAN_, &scan);
     *next = scan.walk_end;
     return count < 0 ? -errno : count;
 }
@@ -452,7 +474,7 @@ static inline void failover_follow_(failover_task_ *task)
     api.api = 0xAA;
     api.features = (1u << 13) | (1u << 15); /* UFFD_FEATURE_WP_UNPOPULATED, UFFD_FEATURE_WP_ASYNC */
     task->pagemap = open("/proc/self/pagemap", O_RDONLY | O_CLOEXEC);
-    if (task->pagemap < 0 || ioctl(task->faults, FAILOVER_UFFDIO_API_, &api) != 0) {
+    if (task->pagemap < 0 || failover_ioctl_(task->faults, FAILOVER_UFFDIO_API_, &api) != 0) {
         failover_stop_following_(task);
         return;
     }
@@ -467,7 +489,7 @@ static inline void failover_follow_(failover_task_ *task)
         order.start = low;
         order.size = high - low;
         order.mode = 2; /* UFFDIO_REGISTER_MODE_WP */
-        if (ioctl(task->faults, FAILOVER_UFFDIO_REGISTER_, &order) != 0)
+        if (failover_ioctl_(task->faults, FAILOVER_UFFDIO_REGISTER_, &order) != 0)
             continue;
         kept->low = low;
         kept->high = high;
@@ -1025,6 +1047,8 @@ static inline int failover_name_file_(failover_task_ *task, const char *name)
         size--;
     if (size == 0 || size > 200)
         return failover_fail_(EINVAL, "cannot keep a state named '%.220s': a name has 1 to 200 bytes", name);
+    if (!failover_is_utf8_(name))
+        return failover_fail_(EILSEQ, "cannot keep a state: its name, of %zu bytes, is no UTF-8", size);
     snprintf(task->file_name, sizeof task->file_name, "%.*s.segment", (int)size, name);
     for (char *next = task->file_name; *next != '\0'; next++)
         if (*next == '/')
@@ -1113,21 +1137,30 @@ static inline int failover_choose_(failover_task_ *task, const failover_layout_ 
     }
     if (best < 0)
         return failover_fail_(EBADMSG, "cannot resume from %s: it is damaged, and holds no whole commit; to begin anew, move it away", task->file_name);
-    failover_note_(task, "the newest commit was damaged; commit %llu took its place\n", (unsigned long long)record->number);
+    if (record->number != newest >> FAILOVER_BANK_BITS_) /* else the disk gave at the second asking what it had not at the first */
+        failover_note_(task, "the newest commit was damaged; commit %llu took its place\n", (unsigned long long)record->number);
     *bank = (uint32_t)best;
     return 0;
 }
 
-static inline int failover_fill_regions_(failover_task_ *task, const failover_layout_ *stored, uint32_t bank)
+/* Fill regions from a bank that is whole; after an error they are as they were. What is read first goes to a bank of our own segment: the
+ * first commit writes all of that anyway. */
+static inline int failover_fill_regions_(failover_task_ *task, int file, const failover_layout_ *stored, uint32_t bank)
 {
+    unsigned char *aside = task->map + failover_bank_at_(&task->layout.head, 0);
     for (uint32_t index = 0; index < task->count; index++) {
-        const failover_entry_ *entry = failover_entry_named_(stored, task->kept[index].name);
-        if (entry == NULL)
-            continue;
-        int failed = failover_read_(task->file, task->kept[index].memory, entry->size,
-                                    failover_bank_at_(&stored->head, bank) + entry->first * FAILOVER_PAGE_);
+        const failover_kept_ *kept = &task->kept[index];
+        const failover_entry_ *entry = failover_entry_named_(stored, kept->name);
+        int failed = entry == NULL ? 0
+                                   : failover_read_(file, aside + kept->first * FAILOVER_PAGE_, entry->size,
+                                                    failover_bank_at_(&stored->head, bank) + entry->first * FAILOVER_PAGE_);
         if (failed != 0)
             return failover_fail_(-failed, "cannot resume from %s: %s", task->file_name, strerror(-failed));
+    }
+    for (uint32_t index = 0; index < task->count; index++) {
+        const failover_kept_ *kept = &task->kept[index];
+        if (failover_entry_named_(stored, kept->name) != NULL)
+            memcpy(kept->memory, aside + kept->first * FAILOVER_PAGE_, kept->size);
     }
     return 0;
 }
@@ -1145,7 +1178,7 @@ static inline int failover_load_(failover_task_ *task)
     if (failed == 0)
         failed = failover_choose_(task, &stored, &bank, &record);
     if (failed == 0)
-        failed = failover_fill_regions_(task, &stored, bank);
+        failed = failover_fill_regions_(task, task->file, &stored, bank);
     free(stored.entries);
     if (failed != 0)
         return failed;

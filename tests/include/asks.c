@@ -34,6 +34,12 @@ int main(int count, char **words)
         failover_region((char *)&value + 1, 1, "inside");
     if (is(what, "twice"))
         failover_region(bytes, sizeof bytes, "value");
+    if (is(what, "latin"))
+        failover_region(bytes, sizeof bytes, "gr\xfc" "n");
+    if (is(what, "surrogate"))
+        failover_region(bytes, sizeof bytes, "\xed\xa0\x80");
+    if (is(what, "umlaut"))
+        failover_region(bytes, sizeof bytes, "gr\xc3\xbcn \xf0\x9f\xa4\x96");
     if (is(what, "more"))
         failover_region(other, sizeof other, "other");
     if (is(what, "size"))

@@ -1,5 +1,6 @@
 /* In place of the calls that reach the disk (ld --wrap): each is noted in the file that descriptor DISK_LOG is of, as
- * kind (1 byte), descriptor (4), offset (8), size (8), bytes. DISK_FAIL=N lets the Nth of them fail, once, with EIO. */
+ * kind (1 byte), descriptor (4), offset (8), size (8), bytes. DISK_FAIL=N lets the Nth of them fail, once, with EIO; READ_FAIL=N the
+ * Nth pread. */
 #define _GNU_SOURCE
 #include <errno.h>
 #include <stdint.h>
@@ -8,10 +9,12 @@
 #include <sys/types.h>
 #include <unistd.h>
 
+ssize_t __real_pread(int, void *, size_t, off_t);
 ssize_t __real_pwrite(int, const void *, size_t, off_t);
 int __real_ftruncate(int, off_t);
 int __real_renameat(int, const char *, int, const char *);
 void disk_log_safe(uint64_t commit);
+ssize_t __wrap_pread(int, void *, size_t, off_t);
 ssize_t __wrap_pwrite(int, const void *, size_t, off_t);
 int __wrap_fdatasync(int);
 int __wrap_fsync(int);
@@ -42,6 +45,17 @@ static void note(char kind, int file, uint64_t offset, const void *bytes, uint64
 }
 
 void disk_log_safe(uint64_t commit) { note('!', 0, commit, NULL, 0); }
+
+ssize_t __wrap_pread(int file, void *bytes, size_t size, off_t offset)
+{
+    static int calls;
+    const char *which = getenv("READ_FAIL");
+    if (which != NULL && ++calls == atoi(which)) {
+        errno = EIO;
+        return -1;
+    }
+    return __real_pread(file, bytes, size, offset);
+}
 
 ssize_t __wrap_pwrite(int file, const void *bytes, size_t size, off_t offset)
 {

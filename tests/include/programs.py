@@ -16,7 +16,7 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 STRICT = ("-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 STRICT_CC = ("-std=c++17", *STRICT[1:])
-DISK_CALLS = ("pwrite", "fdatasync", "fsync", "ftruncate", "renameat")
+DISK_CALLS = ("pread", "pwrite", "fdatasync", "fsync", "ftruncate", "renameat")
 PAGES, LARGE = 24, 40
 """Of the arrays of telling.c."""
 

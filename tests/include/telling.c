@@ -54,7 +54,10 @@ int main(int count, char **words)
     large += 24;
     failover_on_resume(tell_resumed, &number);
     if (failover_open("telling") < 0) {
-        printf("%s\n", failover_error());
+        bool is_touched = number != 0;
+        for (size_t index = 0; index < LARGE * 4096; index++)
+            is_touched |= large[index] != 0 || few.bytes[index % sizeof few.bytes] != 0;
+        printf("%s\n%s", failover_error(), is_touched ? "touched\n" : "");
         return 1;
     }
     printf("began %llu\n", (unsigned long long)number);

@@ -72,17 +72,28 @@ def segment_of(pid: int) -> SegmentReader:
 # --- Compiling -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize("level", ["-O0", "-O2", "-O3"])
-def test_it_compiles_without_a_warning_as_c11_and_as_cxx17(compiler: str, level: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("compiler", "strict"),
+    [
+        ("gcc", STRICT),
+        ("clang", STRICT),
+        ("musl-gcc", STRICT),
+        ("aarch64-linux-gnu-gcc", STRICT),
+        ("g++", STRICT_CC),
+        ("clang++", STRICT_CC),
+    ],
+)
+def test_it_compiles_without_a_warning_as_c11_and_as_cxx17(
+    compiler: str, strict: tuple[str, ...], level: str, tmp_path: Path
+) -> None:
     if not has(compiler):
         pytest.skip(f"needs {compiler}, which is not installed here")
-    source = tmp_path / "only.c"
+    source = tmp_path / ("only.cc" if strict is STRICT_CC else "only.c")
     source.write_text('#include "failover.h"\nint main(void) { return failover_commit() < 0; }\n')
-    for language, strict in (("c", STRICT), ("c++", STRICT_CC)):
-        command = [compiler, "-x", language, *strict, level, "-Iinclude", "-c", "-o", tmp_path / "only.o", source]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
-        assert done.returncode == 0, done.stderr
+    command = [compiler, *strict, level, "-Iinclude", "-c", "-o", tmp_path / "only.o", source]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
+    assert done.returncode == 0, done.stderr
 
 
 def test_included_too_late_in_strict_c_it_says_what_to_do(tmp_path: Path) -> None:
@@ -231,12 +242,20 @@ def test_two_programs_do_not_share_a_state(tmp_path: Path) -> None:
         ("overlap", "region 'inside': it overlaps with 'value'"),
         ("twice", "region 'value': another one has that name"),
         ("nameless", "a name has 1 to 200 bytes"),
+        ("latin", "region 2, of 8192 bytes: its name is no UTF-8"),
+        ("surrogate", "region 2, of 8192 bytes: its name is no UTF-8"),
     ],
 )
 def test_what_cannot_be_kept_is_refused_by_its_name(word: str, sentence: str, tmp_path: Path) -> None:
     first, second = asks(tmp_path, word)[:2]
     assert first.startswith("open -") and sentence in first
     assert second == "commit -22 cannot commit: no state is open; call failover_open() first"
+
+
+def test_a_name_in_any_script_is_read_by_others(tmp_path: Path) -> None:
+    asks(tmp_path, "umlaut")
+    found = committed_in(tmp_path / "asks.segment")
+    assert found is not None and [region.name for region in found.layout.regions] == ["value", "grün 🤖"]
 
 
 def test_a_commit_too_early_and_a_region_too_late_are_refused(tmp_path: Path) -> None:

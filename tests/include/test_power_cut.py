@@ -162,6 +162,19 @@ def test_a_call_that_fails_is_told_and_made_up_for(which: int, tmp_path: Path) -
     assert not (tmp_path / "telling.segment.new").exists()
 
 
+def test_an_error_while_the_state_is_read_leaves_no_region_partly_filled(tmp_path: Path) -> None:
+    output(telling_with_log(), tmp_path, "6", "wait")
+    refusals = 0
+    for which in range(1, 250):  # three reads a page, and some
+        told = output(telling_with_log(), tmp_path, READ_FAIL=str(which)).splitlines()
+        if told[-1].startswith("cannot resume"):
+            assert len(told) == 1, "its regions are as they were"
+            refusals += 1
+        else:
+            assert told[-1] in ("began 6", "began 5"), told
+    assert refusals > 3, "the calls that fail are those that read the state"
+
+
 def test_a_folder_that_does_not_take_anything_costs_age_and_is_told(tmp_path: Path) -> None:
     (tmp_path / "telling.segment.new").mkdir()
     done = output(telling_with_log(), tmp_path, "3")
