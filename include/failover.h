@@ -11,7 +11,7 @@
  *     }
  *
  * Compile with -pthread. In C, include this header before all others or define _GNU_SOURCE. docs/c.md is the manual, SEGMENT.md
- * (in checkpoint/) says what the bytes are. All functions that return int or int64_t answer a negative errno when they fail, and
+ * and TASK.md (in checkpoint/) say what the bytes are. All functions that return int or int64_t answer a negative errno when they fail, and
  * failover_error() says in a sentence what was tried, on what, why not. Nothing here prints, aborts or raises a signal.
  *
  * A process keeps one state. Regions are registered and the state is opened by one thread; commits come from any, one at a time, and
@@ -28,6 +28,7 @@
 
 #include <errno.h>
 #include <fcntl.h>
+#include <poll.h>
 #include <pthread.h>
 #include <signal.h>
 #include <stdarg.h>
@@ -35,6 +36,7 @@
 #include <stddef.h>
 #include <stdint.h>
 #include <stdio.h>
+#include <stdio_ext.h>
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
@@ -43,8 +45,10 @@
 #include <sys/ioctl.h>
 #include <sys/mman.h>
 #include <sys/random.h>
+#include <sys/socket.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
+#include <sys/un.h>
 
 #ifndef F_OFD_SETLK
 #error "failover.h: include it before all other headers, or compile with -D_GNU_SOURCE"
@@ -68,10 +72,11 @@ extern "C" {
 /* Where the state came from that a program goes on with. */
 typedef struct failover_resumption {
     uint64_t commit;     /* number of that commit, in the run that made it */
-    uint64_t generation; /* of this run; every resume opens a new one */
-    uint64_t epoch;      /* number of the primacy under which this program runs: the fencing token. 0 without an agent */
+    uint64_t generation; /* of this run; every resume opens a new one. Under an agent: of the checkpoint that it goes on from */
+    uint64_t epoch;      /* as failover_epoch() */
     double age_s;        /* seconds since that commit */
-    const char *why;     /* "restarted": the same machine, from the file beside the program */
+    const char *why;     /* "restarted" on the same robot; "taken over" from one that was lost; "handed over" as was ordered */
+    const char *robot;   /* where that commit was made; "" without an agent */
     const char *notes;   /* what does not come back as it was, one sentence a line; "" if all does */
 } failover_resumption;
 
@@ -85,9 +90,15 @@ static inline int failover_region(void *memory, size_t size, const char *name);
 /* Have a function called by failover_open() when the state was resumed: regions are filled by then. */
 static inline void failover_on_resume(failover_callback *called, void *context);
 
-/* Begin, or go on from the newest commit: 0 or 1. The state is kept in NAME.segment ("/" as ".") in the folder that FAILOVER_STATE
- * names, else in the working directory; FAILOVER_COMPONENT takes the place of `name`. After an error regions are as they were. */
+/* Begin, or go on from the newest commit: 0 or 1. After an error regions are as they were.
+ * Started by an agent (failover run), a program gets its state from there, and its commits travel to a standby; on a robot that stands by
+ * this call waits, perhaps for days, until the program is needed. Otherwise the state is kept in NAME.segment ("/" as ".") in the folder that
+ * FAILOVER_STATE names, else in the working directory; FAILOVER_COMPONENT takes the place of `name`. */
 static inline int failover_open(const char *name);
+
+/* Number of the primacy under which this program runs, which only grows: the fencing token, for whoever must tell an old primary from a
+ * new one. 0 without an agent. */
+static inline uint64_t failover_epoch(void);
 
 /* What failover_open() resumed; NULL where the state began here. Valid until failover_close(). */
 static inline const failover_resumption *failover_resumed(void);
@@ -96,10 +107,12 @@ static inline const failover_resumption *failover_resumed(void);
  * commit makes up for it; -EBUSY: another thread is committing. */
 static inline int64_t failover_commit(void);
 
-/* Return 0 when the newest commit survives a power cut; -ETIMEDOUT if it does not after so many milliseconds. Negative: no limit. */
+/* Return 0 when the newest commit survives a power cut (under an agent: the loss of this robot); -ETIMEDOUT if it does not after so many
+ * milliseconds. Negative: no limit. */
 static inline int failover_wait(int timeout_ms);
 
-/* Write the newest commit and let everything go; regions are forgotten, their memory stays. At exit() this happens by itself. */
+/* Write the newest commit (under an agent: whoever wants it to be safe waits before) and let everything go; regions are forgotten, their
+ * memory stays. At exit() this happens by itself. */
 static inline int failover_close(void);
 
 /* Why the last call of this thread that failed did so: a sentence. */
@@ -145,9 +158,51 @@ typedef struct failover_entry_ {
 } failover_entry_;
 
 typedef struct failover_record_ {
-    uint64_t number, realtime, monotonic, boottime, others[3];
-    uint64_t sum; /* in a file beside a program */
+    uint64_t number, realtime, monotonic, boottime;
+    uint64_t told, outputs[2]; /* whether somebody counts the program's output, and how much there was */
+    uint64_t sum;              /* in a file beside a program */
 } failover_record_;
+
+/* --- Bytes (TASK.md) --------------------------------------------------------------------------------------------------------------- */
+
+enum {
+    FAILOVER_TASK_VERSION_ = 1,
+    FAILOVER_HELLO_ = 1,
+    FAILOVER_BEGIN_ = 2,
+    FAILOVER_REFUSED_ = 3,
+    FAILOVER_KEEPS_ = 4,
+    FAILOVER_SAFE_ = 5,
+    FAILOVER_PACKET_SIZE_ = 512,
+    FAILOVER_TOLD_ = 1,
+    FAILOVER_PENDING_ = 2
+};
+
+typedef struct failover_begin_ {
+    uint32_t kind, version;
+    uint64_t epoch, pipes[2];
+    uint32_t why, unused;
+    uint64_t generation, age_ns;
+    char component[256], robot[64];
+    uint64_t rest;
+} failover_begin_;
+
+typedef char failover_begin_has_384_bytes_[sizeof(failover_begin_) == 384 ? 1 : -1];
+
+typedef union failover_packet_ {
+    struct {
+        uint32_t kind, version;
+    } head;
+    failover_begin_ begin;
+    struct {
+        uint32_t kind, version;
+        uint64_t commit;
+    } safe;
+    struct {
+        uint32_t kind, version;
+        char why[504];
+    } refused;
+    unsigned char bytes[FAILOVER_PACKET_SIZE_];
+} failover_packet_;
 
 /* --- What this process keeps ------------------------------------------------------------------------------------------------------ */
 
@@ -170,6 +225,7 @@ typedef struct failover_task_ {
     int refusal; /* the first failover_region() that failed */
     char refused[512];
     bool is_open, is_forked, is_registered;
+    bool has_descriptors; /* those below are numbers, or -1 */
     failover_callback *on_resume;
     void *context;
     bool is_resumed;
@@ -200,6 +256,13 @@ typedef struct failover_task_ {
     uint32_t closing, trouble;     /* atomic; trouble: errno of the last write that failed */
     uint64_t committed, durable;   /* atomic: numbers */
     const char *step;              /* atomic: what failed */
+
+    /* the guard, where there is one: then there is no recorder and no file */
+    int guard;                  /* its socket, or -1 */
+    const uint64_t *counters;   /* of our output; NULL where nobody counts it */
+    uint64_t stuck[4], epoch;   /* the counters when they were last given up */
+    bool is_kept, is_pending;   /* the guard was told of a commit; the last commit does not know its output */
+    char robot[64];
 } failover_task_;
 
 /* One of each in a program, however many of its files include this one. */
@@ -400,6 +463,8 @@ static inline void failover_on_resume(failover_callback *called, void *context)
     failover_the_task_.context = context;
 }
 
+static inline uint64_t failover_epoch(void) { return failover_the_task_.epoch; }
+
 static inline const failover_resumption *failover_resumed(void)
 {
     return failover_the_task_.is_resumed ? &failover_the_task_.resumption : NULL;
@@ -496,6 +561,238 @@ static inline void failover_follow_(failover_task_ *task)
     }
 }
 
+/* --- Under an agent: how much this program has printed (SEGMENT.md, records) -------------------------------------------------------- */
+
+/* A commit that finds a pipe full, or the guard in the middle of counting, waits so long; for a guard that stands still, once. */
+#define FAILOVER_PATIENCE_NS_ ((uint64_t)300000)
+
+static inline int failover_unread_(int stream)
+{
+    int unread = 0;
+    return failover_ioctl_(stream, 0x541B /* FIONREAD */, &unread) == 0 ? unread : 0;
+}
+
+/* Whether a flush fits into the pipe, however its slots, each a page, are filled: two neighbours hold more than one page together, and
+ * the first may be read in part. An empty pipe is taken as it is. Source: pipe(7), pipe_write() in the kernel's fs/pipe.c. */
+static inline bool failover_has_room_(FILE *file, int stream)
+{
+    const uint64_t page = (uint64_t)sysconf(_SC_PAGESIZE), held = __fpending(file), unread = (uint64_t)failover_unread_(stream);
+    const int size = held != 0 && unread != 0 ? fcntl(stream, F_GETPIPE_SZ) : -1;
+    return size < 0 || 2 * ((unread + page - 1) / page) + 2 + (held + page - 1) / page + 1 <= (uint64_t)size / page;
+}
+
+/* Flush a stream if that waits for nobody: neither for room in its pipe nor for a thread that is in the middle of printing. */
+static inline bool failover_flush_(FILE *file, int stream)
+{
+    if (ftrylockfile(file) != 0)
+        return false;
+    const bool has_room = failover_has_room_(file, stream);
+    if (has_room)
+        fflush(file);
+    funlockfile(file);
+    return has_room;
+}
+
+/* Bytes that were written to a stream: those that the guard took, and those that it has not. False while it is taking some. */
+static inline bool failover_total_(const failover_task_ *task, int stream, uint64_t *total)
+{
+    const uint64_t *busy = task->counters + 2 * (stream - 1), *taken = busy + 1;
+    const uint64_t before = __atomic_load_n(taken, __ATOMIC_SEQ_CST);
+    if (__atomic_load_n(busy, __ATOMIC_SEQ_CST) != 0)
+        return false;
+    *total = before + (uint64_t)failover_unread_(stream);
+    return __atomic_load_n(busy, __ATOMIC_SEQ_CST) == 0 && __atomic_load_n(taken, __ATOMIC_SEQ_CST) == before;
+}
+
+static inline bool failover_totals_(const failover_task_ *task, uint64_t *totals)
+{
+    return failover_flush_(stdout, 1) && failover_flush_(stderr, 2) && failover_total_(task, 1, totals) &&
+           failover_total_(task, 2, totals + 1);
+}
+
+/* What a commit's record says of its output. */
+static inline uint64_t failover_outputs_(failover_task_ *task, uint64_t *totals)
+{
+    totals[0] = totals[1] = 0;
+    task->is_pending = false;
+    if (task->counters == NULL)
+        return 0;
+    const bool is_stuck = memcmp(task->stuck, task->counters, sizeof task->stuck) == 0;
+    const uint64_t limit = failover_clock_(CLOCK_MONOTONIC) + FAILOVER_PATIENCE_NS_;
+    while (!failover_totals_(task, totals)) {
+        const struct timespec moment = {0, 50000};
+        if (is_stuck || failover_clock_(CLOCK_MONOTONIC) > limit) {
+            memcpy(task->stuck, task->counters, sizeof task->stuck);
+            totals[0] = totals[1] = 0;
+            task->is_pending = true;
+            return FAILOVER_PENDING_;
+        }
+        nanosleep(&moment, NULL);
+    }
+    memset(task->stuck, 0xff, sizeof task->stuck);
+    return FAILOVER_TOLD_;
+}
+
+/* --- Under an agent: the guard's socket (TASK.md) -------------------------------------------------------------------------------------- */
+
+/* Send a packet that is nothing but its head. Never waits; 0 or -errno. */
+static inline int failover_say_(int guard, uint32_t kind)
+{
+    const uint32_t head[2] = {kind, FAILOVER_TASK_VERSION_};
+    return send(guard, head, sizeof head, MSG_NOSIGNAL | MSG_DONTWAIT) == (ssize_t)sizeof head ? 0 : -errno;
+}
+
+/* Take one packet, and up to two descriptors (the others stay -1): its size, 0 when the guard hung up, -errno. Others are closed unseen. */
+static inline ssize_t failover_take_(int guard, int flags, failover_packet_ *packet, int *descriptors)
+{
+    union {
+        struct cmsghdr head;
+        char room[CMSG_SPACE(8 * sizeof(int))];
+    } control;
+    struct iovec place;
+    struct msghdr message;
+    memset(&message, 0, sizeof message);
+    memset(&control, 0, sizeof control);
+    place.iov_base = packet;
+    place.iov_len = sizeof *packet;
+    message.msg_iov = &place;
+    message.msg_iovlen = 1;
+    message.msg_control = &control;
+    message.msg_controllen = sizeof control;
+    ssize_t size = recvmsg(guard, &message, flags | MSG_CMSG_CLOEXEC);
+    if (size < 0)
+        return -errno;
+    size_t count = 0;
+    if (message.msg_controllen >= CMSG_LEN(0) && control.head.cmsg_level == SOL_SOCKET && control.head.cmsg_type == SCM_RIGHTS)
+        count = (control.head.cmsg_len - CMSG_LEN(0)) / sizeof(int);
+    for (size_t index = 0; index < count; index++) {
+        int descriptor;
+        memcpy(&descriptor, CMSG_DATA(&control.head) + index * sizeof(int), sizeof(int));
+        if (descriptors != NULL && index < 2)
+            descriptors[index] = descriptor;
+        else
+            close(descriptor);
+    }
+    if (size != 0 && ((message.msg_flags & MSG_TRUNC) != 0 || size < (ssize_t)sizeof packet->head || packet->head.version != FAILOVER_TASK_VERSION_))
+        return -EPROTO;
+    return size;
+}
+
+/* The abstract address that the environment names, which is taken out of it; 0 where it names none. */
+static inline socklen_t failover_address_(struct sockaddr_un *address)
+{
+    const char *told = getenv("FAILOVER_TASK");
+    if (told == NULL || strncmp(told, "@failover.", 10) != 0 || strlen(told) != 26 || strspn(told + 10, "0123456789abcdef") != 16)
+        return 0;
+    memset(address, 0, sizeof *address);
+    address->sun_family = AF_UNIX;
+    memcpy(address->sun_path + 1, told + 1, 25);
+    unsetenv("FAILOVER_TASK");
+    return (socklen_t)(offsetof(struct sockaddr_un, sun_path) + 26);
+}
+
+/* Connect to the guard: 1, or 0 where this program has none, or -errno with a sentence. */
+static inline int failover_connect_(failover_task_ *task)
+{
+    struct sockaddr_un address;
+    struct ucred listener;
+    socklen_t size = failover_address_(&address), room = sizeof listener;
+    if (size == 0)
+        return 0;
+    task->guard = socket(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC, 0);
+    if (task->guard < 0)
+        return failover_fail_(errno, "cannot keep a state under the agent: no socket: %s", strerror(errno));
+    while (connect(task->guard, (const struct sockaddr *)&address, size) != 0) {
+        if (errno == EINTR)
+            continue;
+        const int code = errno;
+        close(task->guard);
+        task->guard = -1;
+        return code == ECONNREFUSED ? 0 : failover_fail_(code, "cannot keep a state under the agent: no way to its guard: %s", strerror(code));
+    }
+    if (getsockopt(task->guard, SOL_SOCKET, SO_PEERCRED, &listener, &room) != 0 || (listener.uid != 0 && listener.uid != geteuid()))
+        return failover_fail_(EPERM, "cannot keep a state under the agent: who listens at FAILOVER_TASK is neither this user nor root");
+    return 1;
+}
+
+/* Say Hello and wait for Begin, as long as it takes. 0, or -errno with a sentence. */
+static inline int failover_hear_begin_(failover_task_ *task, failover_packet_ *packet, int *descriptors)
+{
+    int failed = failover_say_(task->guard, FAILOVER_HELLO_);
+    if (failed != 0)
+        return failover_fail_(-failed, "cannot keep a state under the agent: its guard does not hear: %s", strerror(-failed));
+    ssize_t size;
+    do
+        size = failover_take_(task->guard, 0, packet, descriptors);
+    while (size == -EINTR);
+    if (size <= 0)
+        return failover_fail_(size < 0 ? (int)-size : ECONNRESET, "cannot keep a state under the agent: its guard does not say how to begin: %s",
+                              size < 0 ? strerror((int)-size) : "it has hung up");
+    if (packet->head.kind == FAILOVER_REFUSED_ && size == (ssize_t)sizeof packet->refused)
+        return failover_fail_(EACCES, "cannot keep a state under the agent: %.503s", packet->refused.why);
+    const failover_begin_ *begin = &packet->begin;
+    if (begin->kind != FAILOVER_BEGIN_ || size != (ssize_t)sizeof *begin || begin->why > 3 || descriptors[0] < 0 ||
+        (descriptors[1] < 0) != (begin->why == 0) || memchr(begin->robot, 0, sizeof begin->robot) == NULL)
+        return failover_fail_(EPROTO, "cannot keep a state under the agent: its guard says something else than how to begin");
+    return 0;
+}
+
+/* Count our output if it still goes into the pipes that we were born with. */
+static inline int failover_count_output_(failover_task_ *task, const failover_begin_ *begin, int counters)
+{
+    struct stat found;
+    for (int stream = 1; stream <= 2; stream++)
+        if (fstat(stream, &found) != 0 || !S_ISFIFO(found.st_mode) || found.st_ino != begin->pipes[stream - 1])
+            return 0;
+    void *map = fstat(counters, &found) == 0 && found.st_size >= (off_t)FAILOVER_PAGE_
+                    ? mmap(NULL, FAILOVER_PAGE_, PROT_READ, MAP_SHARED, counters, 0)
+                    : MAP_FAILED;
+    if (map == MAP_FAILED)
+        return failover_fail_(EPROTO, "cannot keep a state under the agent: its guard's counters cannot be read");
+    task->counters = (const uint64_t *)map;
+    memset(task->stuck, 0xff, sizeof task->stuck);
+    return 0;
+}
+
+/* Take in what the guard has said until now. False when it has gone. */
+static inline bool failover_hear_(failover_task_ *task)
+{
+    failover_packet_ packet;
+    for (;;) {
+        ssize_t size = failover_take_(task->guard, MSG_DONTWAIT, &packet, NULL);
+        if (size == -EAGAIN || size == -EINTR)
+            return true;
+        if (size != (ssize_t)sizeof packet.safe || packet.head.kind != FAILOVER_SAFE_)
+            return false;
+        uint64_t known = __atomic_load_n(&task->durable, __ATOMIC_RELAXED);
+        while (known < packet.safe.commit &&
+               !__atomic_compare_exchange_n(&task->durable, &known, packet.safe.commit, true, __ATOMIC_RELEASE, __ATOMIC_RELAXED))
+            continue;
+    }
+}
+
+static inline int failover_wait_for_standby_(failover_task_ *task, uint64_t number, uint64_t limit)
+{
+    for (;;) {
+        const bool is_there = failover_hear_(task);
+        const uint64_t durable = __atomic_load_n(&task->durable, __ATOMIC_ACQUIRE), now = failover_clock_(CLOCK_MONOTONIC);
+        if (durable >= number)
+            return 0;
+        if (!is_there)
+            return failover_fail_(EPIPE, "commit %llu is not safe: the guard of this program has gone, nothing that it commits is safe any more",
+                                  (unsigned long long)number);
+        if (now >= limit && task->is_pending)
+            return failover_fail_(ETIMEDOUT, "commit %llu is not safe yet: its output pipe is full, the guard takes nothing from it; a later commit "
+                                  "will do", (unsigned long long)number);
+        if (now >= limit)
+            return failover_fail_(ETIMEDOUT, "commit %llu is not safe yet: the standby holds commit %llu; failover status says how it stands",
+                                  (unsigned long long)number, (unsigned long long)durable);
+        struct pollfd wanted = {task->guard, POLLIN, 0};
+        const uint64_t left = (limit - now) / 1000000u + 1;
+        poll(&wanted, 1, left < 100 ? (int)left : 100); /* another thread that waits may take the packet that we wait for */
+    }
+}
+
 /* --- Commit ---------------------------------------------------------------------------------------------------------------------------- */
 
 static inline uint64_t *failover_words_(const failover_task_ *task, uint64_t offset)
@@ -581,7 +878,7 @@ static inline int failover_free_bank_(int file, const uint64_t *held, int newest
 }
 
 /* Bring a locked bank up to date; SEGMENT.md, "Commit", steps 2 to 6. */
-static inline void failover_fill_(failover_task_ *task, uint32_t bank)
+static inline void failover_fill_(failover_task_ *task, uint32_t bank, uint64_t told, const uint64_t *outputs)
 {
     uint64_t *record = failover_words_(task, failover_record_at_(bank));
     __atomic_store_n(record, 0, __ATOMIC_RELEASE);
@@ -591,6 +888,9 @@ static inline void failover_fill_(failover_task_ *task, uint32_t bank)
     record[1] = failover_clock_(CLOCK_REALTIME);
     record[2] = failover_clock_(CLOCK_MONOTONIC);
     record[3] = failover_clock_(CLOCK_BOOTTIME);
+    record[4] = told;
+    record[5] = outputs[0];
+    record[6] = outputs[1];
     task->number++;
     __atomic_store_n(record, task->number, __ATOMIC_RELEASE);
     task->held[bank] = task->number;
@@ -608,12 +908,16 @@ static inline int64_t failover_commit(void)
         return failover_fail_(EINVAL, "cannot commit: no state is open; call failover_open() first");
     if (__atomic_exchange_n(&task->committing, 1, __ATOMIC_ACQUIRE) != 0)
         return failover_fail_(EBUSY, "cannot commit: another thread is committing");
+    uint64_t outputs[2];
+    const uint64_t told = failover_outputs_(task, outputs);
     for (uint32_t index = 0; index < task->count; index++)
         failover_mark_(task, &task->kept[index]);
     int bank = failover_free_bank_(task->segment, task->held, task->newest);
     task->is_missing = bank < 0;
     if (bank >= 0)
-        failover_fill_(task, (uint32_t)bank);
+        failover_fill_(task, (uint32_t)bank, told, outputs);
+    if (bank >= 0 && task->guard >= 0 && !task->is_kept)
+        task->is_kept = failover_say_(task->guard, FAILOVER_KEEPS_) != -EAGAIN;
     int64_t number = (int64_t)task->number;
     __atomic_store_n(&task->committed, task->number, __ATOMIC_RELEASE);
     __atomic_store_n(&task->committing, 0, __ATOMIC_RELEASE);
@@ -1023,6 +1327,8 @@ static inline int failover_wait(int timeout_ms)
         return failover_fail_(EAGAIN, "the last commit was not made: readers held all banks of the segment; commit again");
     const uint64_t number = __atomic_load_n(&task->committed, __ATOMIC_ACQUIRE), second = 1000000000u;
     const uint64_t limit = timeout_ms < 0 ? UINT64_MAX : failover_clock_(CLOCK_MONOTONIC) + (uint64_t)timeout_ms * 1000000u;
+    if (task->guard >= 0)
+        return failover_wait_for_standby_(task, number, limit);
     for (;;) {
         uint32_t safe = __atomic_load_n(&task->safe, __ATOMIC_ACQUIRE);
         if (__atomic_load_n(&task->durable, __ATOMIC_ACQUIRE) >= number)
@@ -1035,7 +1341,7 @@ static inline int failover_wait(int timeout_ms)
     }
 }
 
-/* --- Going on from the file ------------------------------------------------------------------------------------------------------------ */
+/* --- Going on from what is stored ----------------------------------------------------------------------------------------------------- */
 
 /* lab.r1.mapper.segment for /lab/r1/mapper. */
 static inline int failover_name_file_(failover_task_ *task, const char *name)
@@ -1165,6 +1471,19 @@ static inline int failover_fill_regions_(failover_task_ *task, int file, const f
     return 0;
 }
 
+/* Note what was resumed, for whoever asks. */
+static inline void failover_tell_(failover_task_ *task, uint64_t commit, uint64_t generation, uint64_t age_ns, const char *why)
+{
+    task->is_resumed = true;
+    task->resumption.commit = commit;
+    task->resumption.generation = generation;
+    task->resumption.epoch = task->epoch;
+    task->resumption.age_s = (double)age_ns / 1e9;
+    task->resumption.why = why;
+    task->resumption.robot = task->robot;
+    task->resumption.notes = task->notes;
+}
+
 static inline int failover_load_(failover_task_ *task)
 {
     failover_layout_ stored;
@@ -1184,20 +1503,66 @@ static inline int failover_load_(failover_task_ *task)
         return failed;
     const uint64_t now = failover_clock_(CLOCK_REALTIME);
     task->generation++;
-    task->is_resumed = true;
-    task->resumption.commit = record.number;
-    task->resumption.generation = task->generation;
-    task->resumption.age_s = now > record.realtime ? (double)(now - record.realtime) / 1e9 : 0.0;
-    task->resumption.why = "restarted";
-    task->resumption.notes = task->notes;
+    failover_tell_(task, record.number, task->generation, now > record.realtime ? now - record.realtime : 0, "restarted");
     return 0;
+}
+
+/* Take the state that the guard handed over: a segment of which the newest commit is it. */
+static inline int failover_load_handed_(failover_task_ *task, const failover_begin_ *begin, int handed)
+{
+    static const char *const reasons[] = {"", "restarted", "taken over", "handed over"};
+    failover_layout_ stored;
+    failover_record_ record;
+    uint32_t bank = 0;
+    memset(&stored, 0, sizeof stored);
+    memset(&record, 0, sizeof record);
+    int file = failover_again_(handed, O_RDONLY); /* the lock must be ours */
+    int failed = file < 0 ? failover_fail_(errno, "cannot resume from %s: %s", task->file_name, strerror(errno)) : 0;
+    if (failed == 0)
+        failed = failover_read_layout_(file, task->file_name, &stored);
+    if (failed == 0)
+        failed = failover_match_(task, &stored);
+    if (failed == 0) {
+        failed = failover_hold_newest_(file, stored.head.banks, &bank, &record);
+        if (failed != 0)
+            failover_fail_(-failed, "cannot resume from %s: no commit is to be had from it: %s", task->file_name, strerror(-failed));
+    }
+    if (failed == 0)
+        failed = failover_fill_regions_(task, file, &stored, bank);
+    if (file >= 0)
+        close(file);
+    free(stored.entries);
+    if (failed != 0)
+        return failed;
+    memcpy(task->robot, begin->robot, sizeof task->robot);
+    failover_tell_(task, record.number, begin->generation, begin->age_ns, reasons[begin->why]);
+    return 0;
+}
+
+/* Begin as the guard says, when it says so. */
+static inline int failover_begin_guarded_(failover_task_ *task)
+{
+    failover_packet_ packet;
+    int descriptors[2] = {-1, -1};
+    memset(&packet, 0, sizeof packet);
+    snprintf(task->file_name, sizeof task->file_name, "the agent's checkpoint");
+    int failed = failover_hear_begin_(task, &packet, descriptors);
+    task->epoch = packet.begin.epoch;
+    if (failed == 0)
+        failed = failover_count_output_(task, &packet.begin, descriptors[0]);
+    if (failed == 0 && packet.begin.why != 0)
+        failed = failover_load_handed_(task, &packet.begin, descriptors[1]);
+    for (int index = 0; index < 2; index++)
+        if (descriptors[index] >= 0)
+            close(descriptors[index]);
+    return failed;
 }
 
 /* --- Open and close ---------------------------------------------------------------------------------------------------------------------- */
 
 static inline void failover_release_(failover_task_ *task)
 {
-    const int files[] = {task->segment, task->source, task->folder, task->file, task->fresh};
+    const int files[] = {task->segment, task->source, task->folder, task->file, task->fresh, task->guard};
     const bool is_registered = task->is_registered;
     failover_stop_following_(task);
     for (size_t index = 0; index < sizeof files / sizeof *files; index++)
@@ -1205,6 +1570,8 @@ static inline void failover_release_(failover_task_ *task)
             close(files[index]);
     if (task->map != NULL)
         munmap(task->map, task->layout.head.size);
+    if (task->counters != NULL)
+        munmap((void *)(uintptr_t)task->counters, FAILOVER_PAGE_);
     free(task->kept);
     free(task->layout.entries);
     free(task->versions);
@@ -1224,9 +1591,9 @@ static inline void failover_forked_(void)
 {
     failover_task_ *task = &failover_the_task_;
     pthread_mutex_unlock(&failover_files_);
-    if (!task->is_open || task->is_forked)
+    if (!task->has_descriptors || task->is_forked)
         return;
-    const int files[] = {task->segment, task->source, task->folder, task->file, task->fresh, task->faults, task->pagemap};
+    const int files[] = {task->segment, task->source, task->folder, task->file, task->fresh, task->faults, task->pagemap, task->guard};
     task->is_forked = true;
     for (size_t index = 0; index < sizeof files / sizeof *files; index++)
         if (files[index] >= 0)
@@ -1244,7 +1611,7 @@ static inline int failover_close(void)
     failover_wake_(&task->hurry);
     if (task->has_recorder)
         pthread_join(task->recorder, NULL);
-    if (task->durable < task->number)
+    if (task->guard < 0 && task->durable < task->number)
         outcome = failover_not_safe_(task, task->trouble != 0 ? (int)task->trouble : EIO, task->number);
     failover_release_(task);
     return outcome;
@@ -1264,9 +1631,11 @@ static inline int failover_start_recorder_(failover_task_ *task)
     return failed == 0 ? 0 : failover_fail_(failed, "cannot start the thread that writes %s: %s", task->file_name, strerror(failed));
 }
 
-static inline int failover_set_out_(failover_task_ *task, const char *name)
+/* A state in a file beside the program: read what is there, and start the recorder. */
+static inline int failover_begin_beside_(failover_task_ *task, const char *name)
 {
     const char *folder = getenv("FAILOVER_STATE"), *chosen = getenv("FAILOVER_COMPONENT");
+    const uint64_t pages = task->layout.head.pages;
     int failed = failover_name_file_(task, chosen != NULL && *chosen != '\0' ? chosen : name);
     if (failed != 0)
         return failed;
@@ -1274,12 +1643,6 @@ static inline int failover_set_out_(failover_task_ *task, const char *name)
     task->folder = open(folder, O_RDONLY | O_DIRECTORY | O_CLOEXEC);
     if (task->folder < 0)
         return failover_fail_(errno, "cannot keep a state in folder %.200s: %s", folder, strerror(errno));
-    failed = failover_lay_out_(task);
-    if (failed == 0)
-        failed = failover_make_segment_(task);
-    if (failed != 0)
-        return failed;
-    const uint64_t pages = task->layout.head.pages;
     task->table_sum = failover_table_sum_(&task->layout);
     task->sums = (uint64_t *)calloc(pages, sizeof(uint64_t));
     task->stamps = (uint64_t *)calloc(pages, sizeof(uint64_t));
@@ -1293,12 +1656,30 @@ static inline int failover_set_out_(failover_task_ *task, const char *name)
     return failed != 0 ? failed : failover_start_recorder_(task);
 }
 
+static inline int failover_set_out_(failover_task_ *task, const char *name)
+{
+    int failed = failover_lay_out_(task);
+    if (failed == 0)
+        failed = failover_make_segment_(task);
+    if (failed == 0)
+        failed = failover_connect_(task);
+    if (failed != 0)
+        return failed < 0 ? failed : failover_begin_guarded_(task);
+    return failover_begin_beside_(task, name);
+}
+
 static inline int failover_open(const char *name)
 {
     failover_task_ *task = &failover_the_task_;
     if (task->is_open)
         return failover_fail_(EBUSY, "cannot open state '%.200s': one is open, and a process keeps one", name == NULL ? "" : name);
-    task->segment = task->source = task->folder = task->file = task->fresh = task->faults = task->pagemap = -1;
+    task->segment = task->source = task->folder = task->file = task->fresh = task->faults = task->pagemap = task->guard = -1;
+    task->has_descriptors = true;
+    if (!task->is_registered) {
+        task->is_registered = true;
+        pthread_atfork(failover_forking_, failover_fork_made_, failover_forked_);
+        atexit(failover_at_exit_);
+    }
     int failed = task->refusal != 0 ? failover_fail_(-task->refusal, "%s", task->refused) : 0;
     if (failed == 0 && task->count == 0)
         failed = failover_fail_(EINVAL, "cannot open state '%.200s': no region is registered", name == NULL ? "" : name);
@@ -1310,11 +1691,6 @@ static inline int failover_open(const char *name)
     }
     failover_follow_(task);
     task->is_open = true;
-    if (!task->is_registered) {
-        task->is_registered = true;
-        pthread_atfork(failover_forking_, failover_fork_made_, failover_forked_);
-        atexit(failover_at_exit_);
-    }
     if (task->is_resumed && task->on_resume != NULL)
         task->on_resume(&task->resumption, task->context);
     return task->is_resumed;
@@ -1384,6 +1760,7 @@ class task {
     const failover_resumption *resumed() const { return outcome_ > 0 ? failover_resumed() : nullptr; }
     int64_t commit() { return failover_commit(); }
     int wait(int timeout_ms = -1) { return failover_wait(timeout_ms); }
+    uint64_t epoch() const { return failover_epoch(); }
 
   private:
     int outcome_;
