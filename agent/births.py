@@ -24,6 +24,7 @@ from agent.places import Places, complete_logs, log_directory
 from agent.streams import discard, total_of
 from checkpoint import channel, format
 from checkpoint.engine import COOPERATIVE, PTRACE
+from checkpoint.engines.cooperative import age_ns as commit_age_ns
 from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Credentials
@@ -177,10 +178,11 @@ async def begin_again(
         await component.undo()
         raise
     why = RESTARTED if outline.machine.robot == places.robot else TAKEN_OVER
-    origin = Origin(outline.machine.robot, filled.position.generation, why, outage_ns)
+    age_ns = outage_ns + commit_age_ns(outline)
+    origin = Origin(outline.machine.robot, filled.position.generation, why, age_ns)
     task = guard_messages.Task(epoch, origin)
     start = _starting(name, program, places, task, total_of(outline.output))
-    component.prepared = Prepared(start, segment)
+    component.prepared = Prepared(start, segment, age_ns)
     return component
 
 

@@ -19,7 +19,7 @@ import msgspec
 
 from agent import births, clock, lost
 from agent.births import Program
-from agent.component import Component
+from agent.component import Captured, Component
 from agent.config import ComponentConfig
 from agent.errors import AgentError, GuardError, KeeperLostError
 from agent.figures import Figures, shortened
@@ -27,7 +27,7 @@ from agent.mistake import end_lanes_on_mistake
 from agent.places import Places
 from agent.records import Records
 from agent.rules import started_here
-from checkpoint.channel import close_all, content_of
+from checkpoint.channel import Unchanged, close_all, content_of
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CheckpointError, UnsupportedError
 from checkpoint.linux.inheritance import Inheritance
@@ -250,6 +250,7 @@ class Charge:
         try:
             outage_ns, read_ns = clock.age_ns(descriptors[-1]), clock.now_ns()
             component = await self._brought_back(act, descriptors, outage_ns, laps)
+            age_ns = component.prepared.age_ns if component.prepared is not None else outage_ns
         finally:
             close_all(tuple(descriptors))
         self.around.records.note(self.name, act.epoch)
@@ -267,7 +268,7 @@ class Charge:
             laps,
         )
         self.started.set()
-        self.around.tell(events.Restored(self.name, act.epoch, act.position, outage_ns + clock.now_ns() - read_ns))
+        self.around.tell(events.Restored(self.name, act.epoch, act.position, age_ns + clock.now_ns() - read_ns))
         self._watch_the_end()
 
     async def _let_it_run(self, component: Component) -> None:
@@ -299,12 +300,17 @@ class Charge:
         captured = await component.capture(
             base=act.base, generation=act.generation, sequence=act.sequence, epoch=act.epoch, hold=act.hold
         )
+        self.figures.reasons = ()
+        if captured.commit:
+            self.figures.commits.note(captured.commit, clock.now_ns() - captured.age_ns)
+        if isinstance(captured, Unchanged):
+            self.around.tell(events.Unchanged(self.name, act.epoch, act.sequence, captured.position))
+            return
         try:
             await asyncio.to_thread(self.around.store.put, captured.snapshot, prove=False)
         finally:
             os.close(captured.snapshot)
         self.figures.captured(captured)
-        self.figures.reasons = ()
         self.around.tell(
             events.Captured(
                 self.name,
@@ -314,6 +320,7 @@ class Charge:
                 captured.size,
                 captured.freeze_us,
                 captured.dirty_bytes,
+                captured.age_ns,
             )
         )
 
@@ -365,6 +372,7 @@ class Charge:
         captured = await component.capture(
             base=True, generation=newest.generation, sequence=newest.sequence + 1, epoch=act.epoch, hold=True
         )
+        assert isinstance(captured, Captured), "a base is always made"
         try:
             content = content_of(captured.snapshot)
         finally:

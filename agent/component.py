@@ -50,6 +50,7 @@ class Captured:
         parent: None for a base: also when a delta was asked of a keeper that has nothing to start from.
         snapshot: a sealed memfd with the encoded snapshot; the receiver closes it.
         size: bytes of it.
+        commit, age_ns: of a program that keeps its state: number of the commit that it holds, and how old that was.
     """
 
     position: Position
@@ -59,6 +60,8 @@ class Captured:
     freeze_us: int
     dirty_bytes: int
     notes: tuple[str, ...]
+    commit: int = 0
+    age_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,10 +70,12 @@ class Prepared:
 
     Attributes:
         segment: descriptor of its state; ours to close.
+        age_ns: how old that state is, since its commit.
     """
 
     start: guard_messages.Start
     segment: int
+    age_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,11 +184,16 @@ class Component:
             raise
         return tuple(protected.notes)
 
-    async def capture(self, *, base: bool, generation: int, sequence: int, epoch: int, hold: bool = False) -> Captured:
+    async def capture(
+        self, *, base: bool, generation: int, sequence: int, epoch: int, hold: bool = False
+    ) -> Captured | channel.Unchanged:
         """Take a snapshot; a base if the keeper has no acknowledged position to start from.
 
         Args:
             hold: leave the program standing still afterwards, until `thaw` or `stop`.
+
+        Returns:
+            `Unchanged` only where a delta of a program that keeps its state, and is not to be held, would say nothing new.
 
         Raises:
             checkpoint.errors.CaptureError, UnsupportedError, ProcessGoneError, ProbeError; KeeperLostError. The program runs on.
@@ -191,7 +201,10 @@ class Component:
         await self.protect()
         order = channel.Capture(base, generation, sequence, epoch, hold)
         async with self._standing_still(hold and self.engine == COOPERATIVE):
-            captured, (snapshot,) = await self.ask_keeper(order)
+            captured, descriptors = await self.ask_keeper(order)
+        if isinstance(captured, channel.Unchanged):
+            return captured
+        (snapshot,) = descriptors
         self._held = hold and self.engine != COOPERATIVE
         self._commits[captured.position] = captured.commit
         self._totals[captured.position] = captured.totals
@@ -207,6 +220,8 @@ class Component:
             captured.freeze_us,
             captured.dirty_bytes,
             captured.notes,
+            captured.commit,
+            captured.age_ns,
         )
 
     async def acknowledge(self, position: Position, *, is_safe: bool = True) -> None:

@@ -46,6 +46,7 @@ EVENTS: Final[dict[str, Any]] = {
     for kind in (
         events.Started,
         events.Captured,
+        events.Unchanged,
         events.CaptureFailed,
         events.ShipEnded,
         events.Stored,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
 from typing import Final
 
 from agent.component import Captured
@@ -11,6 +12,54 @@ from checkpoint.model import Position
 
 REASONS_TOLD: Final = 3
 """Of the reasons why it cannot be captured, in one sentence of the core; ``status --json`` has them all."""
+
+
+GAPS_KEPT: Final = 64
+"""Of the commits that were captured last; the longest of them is what a program is used to."""
+SILENT_TIMES: Final = 10
+"""A program whose newest commit is so many times older than it is used to has stopped committing, it seems…"""
+SILENT_NS_MIN: Final = 2 * 10**9
+"""…but not sooner than this;"""
+SILENT_NS_AT_FIRST: Final = 10 * 10**9
+"""nor sooner than this, where it has made one commit only."""
+
+
+@dataclass(slots=True)
+class Commits:
+    """When a program that keeps its state commits, as far as captures show it.
+
+    Attributes:
+        number: of the newest one, 0 before the first; at ``newest_ns``, on this robot's clock.
+    """
+
+    number: int = 0
+    newest_ns: int = 0
+    _gaps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=GAPS_KEPT))
+
+    def note(self, number: int, at_ns: int) -> None:
+        """A capture has found this commit."""
+        if 0 < self.number < number:  # one that was started again begins with 1
+            self._gaps_ns.append((at_ns - self.newest_ns) // (number - self.number))
+        self.number, self.newest_ns = number, at_ns
+
+    @property
+    def usual_ns(self) -> int | None:
+        """The longest time that lay between two of the last commits; None where there were not two."""
+        return max(self._gaps_ns) if self._gaps_ns else None
+
+    def is_overdue(self, now_ns: int) -> bool:
+        """Whether the newest is much older than it used to become."""
+        usual_ns = self.usual_ns
+        limit_ns = SILENT_NS_AT_FIRST if usual_ns is None else max(SILENT_TIMES * usual_ns, SILENT_NS_MIN)
+        return self.number > 0 and now_ns - self.newest_ns > limit_ns
+
+    def remark(self, now_ns: int) -> str:
+        """What to say of a program that is overdue, for somebody who looks at ``failover status`` for the first time."""
+        used = "its only one" if self.usual_ns is None else f"before that there was one every {seconds(self.usual_ns)}"
+        return (
+            f"last commit {seconds(now_ns - self.newest_ns)} ago, {used}: it does not commit any more, or it hangs; "
+            "if its robot is lost now, it goes on from that commit"
+        )
 
 
 @dataclass(slots=True)
@@ -30,6 +79,7 @@ class Figures:
     reasons: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     engine: str = PTRACE
+    commits: Commits = field(default_factory=Commits)
 
     def captured(self, captured: Captured) -> None:
         """Count one snapshot that was taken here."""
@@ -44,6 +94,12 @@ class Figures:
         """Count one snapshot that came from the primary."""
         self.snapshots += 1
         self.newest, self.snapshot_size, self.engine = position, size, engine
+
+
+def seconds(duration_ns: int) -> str:
+    """A duration as people say it: 0.012 s, 1.5 s, 14 s."""
+    value = duration_ns / 1e9
+    return f"{value:.0f} s" if value >= 10 else f"{value:.1f} s" if value >= 0.1 else f"{value:.3f} s"
 
 
 def shortened(reasons: tuple[str, ...]) -> str:

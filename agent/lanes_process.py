@@ -182,6 +182,7 @@ ANSWERS: Final[dict[type[Event], tuple[str, ...]]] = {
     events.Restored: ("Restore",),
     events.ActFailed: ("Start", "Restore"),
     events.Captured: ("Capture",),
+    events.Unchanged: ("Capture",),
     events.CaptureFailed: ("Capture",),
     events.ShipEnded: ("Ship",),
     events.Stopped: ("Stop", "Start", "Restore", "Capture", "End"),

@@ -7,9 +7,11 @@ from collections.abc import Mapping
 from importlib import metadata
 from typing import Any, Final
 
+from agent import clock
 from agent.charge import Charge
 from agent.config import Settings
 from agent.door import Life, Told
+from agent.figures import Commits, Figures
 from agent.transport import Link, LinkState
 from checkpoint.engine import PTRACE
 from failover.core.types import ComponentView, PeerView, Protection, State
@@ -118,6 +120,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings) -
         "standby_sequence": newest.sequence if newest and view.standby else None,
         "lag_ms": view.lag_ns / NANOSECONDS_A_MILLISECOND if view.lag_ns >= 0 else None,
         "period_ms": view.period_ms,
+        **_commits(view, figures),
         "freeze_us": figures.freeze_us if figures else view.freeze_us or None,
         "freeze_us_max": figures.freeze_us_max if figures else None,
         "snapshot_size": figures.snapshot_size if figures else None,
@@ -132,5 +135,28 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings) -
         "prefer": view.prefer,
         "owner": view.owner,
         "reasons": list(figures.reasons) if figures else [],
-        "notes": [*view.notes, *(figures.notes if figures else ())],
+        "notes": [*view.notes, *(figures.notes if figures else ()), *_overdue(view, figures)],
     }
+
+
+def _commits(view: ComponentView, figures: Figures | None) -> dict[str, Any]:
+    """Of a program that keeps its state and runs here: how old its newest commit is, and how often it used to commit."""
+    commits = _running_commits(view, figures)
+    if commits is None:
+        return {"commit_age_ms": None, "commit_usual_ms": None, "commit_overdue": False}
+    now_ns, usual_ns = clock.now_ns(), commits.usual_ns
+    return {
+        "commit_age_ms": (now_ns - commits.newest_ns) / NANOSECONDS_A_MILLISECOND,
+        "commit_usual_ms": usual_ns / NANOSECONDS_A_MILLISECOND if usual_ns is not None else None,
+        "commit_overdue": commits.is_overdue(now_ns),
+    }
+
+
+def _overdue(view: ComponentView, figures: Figures | None) -> list[str]:
+    commits, now_ns = _running_commits(view, figures), clock.now_ns()
+    return [commits.remark(now_ns)] if commits is not None and commits.is_overdue(now_ns) else []
+
+
+def _running_commits(view: ComponentView, figures: Figures | None) -> Commits | None:
+    runs = view.state in (State.PRIMARY, State.HANDING_OVER)
+    return figures.commits if runs and figures is not None and figures.commits.number else None

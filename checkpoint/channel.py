@@ -281,7 +281,7 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
         size: bytes of the encoded snapshot.
         dirty_bytes: of the pages that it carries, before compression.
         totals: bytes that the component had written to standard output and standard error at the freeze, or the commit.
-        commit: its number, of a cooperative snapshot.
+        commit: its number, of a cooperative snapshot; ``age_ns``: how old it was by then.
     """
 
     position: Position
@@ -292,6 +292,19 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
     notes: tuple[str, ...] = ()
     totals: tuple[int, int] = (0, 0)
     commit: int = 0
+    age_ns: int = 0
+
+
+class Unchanged(msgspec.Struct, frozen=True, tag=True):
+    """A program that commits has committed nothing since the newest acknowledged position: no snapshot was made.
+
+    Attributes:
+        age_ns: how old that commit is.
+    """
+
+    position: Position
+    commit: int
+    age_ns: int
 
 
 class Filled(msgspec.Struct, frozen=True, tag=True):
@@ -336,4 +349,4 @@ class Failed(msgspec.Struct, frozen=True, tag=True):
 
 
 Request = Probe | Protect | Capture | Acknowledge | Restore | Fill | Resume | Release
-Reply = Probed | Protected | Captured | Restored | Filled | Resumed | Released | Failed
+Reply = Probed | Protected | Captured | Unchanged | Restored | Filled | Resumed | Released | Failed

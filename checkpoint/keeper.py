@@ -96,9 +96,12 @@ class Keeper:
 
     def _capture(self, request: channel.Capture, _: Descriptors) -> Answer:
         session = self._following("capture")
+        if unchanged := _unchanged(session, request):
+            return unchanged, ()
         order = CaptureOrder(request.base, request.generation, request.sequence, request.epoch, self._robot, request.hold)
         snapshot = session.capture(order)
         encoded, size = encoded_in_memory(snapshot)
+        commit, age_ns = _commit_at(session, snapshot.position)
         answer = channel.Captured(
             position=snapshot.position,
             parent=snapshot.parent,
@@ -107,7 +110,8 @@ class Keeper:
             dirty_bytes=len(snapshot.contents),
             notes=snapshot.notes,
             totals=session.totals,
-            commit=_commit_at(session, snapshot.position),
+            commit=commit,
+            age_ns=age_ns,
         )
         return answer, (encoded,)
 
@@ -175,11 +179,21 @@ class Keeper:
             session.close()
 
 
-def _commit_at(session: Session, position: Position) -> int:
-    """The number of the commit that a cooperative capture holds."""
+def _commit_at(session: Session, position: Position) -> tuple[int, int]:
+    """The number of the commit that a cooperative capture holds, and its age, in nanoseconds."""
     from checkpoint.engines.guarded_task import GuardedTask
 
-    return session.commit_at(position) if isinstance(session, GuardedTask) else 0
+    return (session.commit_at(position), session.age_ns(position)) if isinstance(session, GuardedTask) else (0, 0)
+
+
+def _unchanged(session: Session, request: channel.Capture) -> channel.Unchanged | None:
+    """What is said in place of a delta with nothing in it; a base, and the last delta of a handover, are always made."""
+    from checkpoint.engines.guarded_task import GuardedTask
+
+    if request.base or request.hold or not isinstance(session, GuardedTask):
+        return None
+    position = session.unchanged()
+    return channel.Unchanged(position, *_commit_at(session, position)) if position else None
 
 
 def streams_of(descriptors: Descriptors) -> Streams:

@@ -6,6 +6,7 @@ the pages mean:
 
     arguments   of the program, as it was started
     directory   its working directory
+    age         nanoseconds between the commit and the snapshot
     commit      number of the commit, in its lineage
     regions     [kind, size] of each region, in the order of the mappings
 
@@ -70,12 +71,14 @@ class _Mark:
     Attributes:
         commit: its number.
         lineage: in which that number counts.
+        clocks: the machine's, at that commit.
         totals: bytes of output at that commit.
     """
 
     position: Position
     commit: int
     lineage: bytes
+    clocks: Clocks
     table: PageTable
     totals: Totals
 
@@ -124,7 +127,7 @@ class CooperativeSession:
             committed = _nothing_since(parent, layout)
         totals = self._totals_of(committed, until_now) if self._outputs else (0, 0)
         snapshot, table = self._snapshot(committed, parent, order, totals)
-        self._waiting.append(_Mark(snapshot.position, committed.number, layout.lineage, table, totals))
+        self._waiting.append(_Mark(snapshot.position, committed.number, layout.lineage, committed.clocks, table, totals))
         self.totals = totals
         return snapshot
 
@@ -157,9 +160,26 @@ class CooperativeSession:
             if mark.position == position:
                 self._acknowledged = mark
 
+    def unchanged(self) -> Position | None:
+        """The newest acknowledged position, if nothing was committed since; then a capture would say nothing new."""
+        known = self._acknowledged
+        if known is None or (known.commit, known.lineage) != (self._reader.newest(), self._reader.layout.lineage):
+            return None
+        return known.position
+
     def commit_at(self, position: Position) -> int:
         """The number of the commit that a capture of this session holds; 0 if it is none of the last ones."""
-        return next((mark.commit for mark in self._waiting if mark.position == position), 0)
+        mark = self._mark_at(position)
+        return mark.commit if mark else 0
+
+    def committed_ns(self, position: Position) -> int:
+        """CLOCK_BOOTTIME at that commit, as its program says; now, if it is none of the last ones."""
+        mark = self._mark_at(position)
+        return mark.clocks.boottime_ns if mark else now().boottime_ns
+
+    def _mark_at(self, position: Position) -> _Mark | None:
+        known = [*self._waiting, self._acknowledged] if self._acknowledged else self._waiting
+        return next((mark for mark in known if mark.position == position), None)
 
     def close(self) -> None:
         """See `checkpoint.engine.Session.close`."""
@@ -192,6 +212,7 @@ class CooperativeSession:
 
     def _facts(self, committed: Committed) -> dict[str, Fact]:
         return {
+            "age": max(now().boottime_ns - committed.clocks.boottime_ns, 0),
             "arguments": list(self._process.arguments),
             "commit": committed.number,
             "directory": self._directory,
@@ -202,7 +223,7 @@ class CooperativeSession:
 def _nothing_since(parent: _Mark | None, layout: Layout) -> Committed:
     """The commit that was acknowledged, once more."""
     assert parent is not None, "a whole state is something"
-    return Committed(layout, parent.commit, now(), np.empty(0, dtype=np.uint64), memoryview(b""), parent.totals)
+    return Committed(layout, parent.commit, parent.clocks, np.empty(0, dtype=np.uint64), memoryview(b""), parent.totals)
 
 
 def now() -> Clocks:
@@ -299,6 +320,12 @@ def regions_of(state: Snapshot) -> tuple[tuple[Region, NDArray[np.uint8]], ...]:
     contents = np.frombuffer(state.contents, dtype=np.uint8)
     addresses = pages.addresses_of(pages.extents(state.runs), PAGE)
     return tuple((region, _filled(region, addresses, contents)) for region in regions)
+
+
+def age_ns(state: Snapshot) -> int:
+    """How old the commit in a snapshot was when it was taken; 0 of a snapshot of another engine, or of one that does not say."""
+    age = next((held.facts.get("age") for held in state.resources if held.kind == KIND), 0)
+    return max(age, 0) if isinstance(age, int) else 0
 
 
 def _sizes(state: Snapshot) -> list[tuple[int, int]]:

@@ -7,7 +7,7 @@ nothing, and each capture looks where its commits go now.
 from __future__ import annotations
 
 from checkpoint.engine import COOPERATIVE, NOTED, CaptureOrder, Finding, Report, Restored, RestoreOptions, Session, Streams
-from checkpoint.engines.cooperative import CooperativeSession, open_segment
+from checkpoint.engines.cooperative import CooperativeSession, now, open_segment
 from checkpoint.engines.outputs import Outputs
 from checkpoint.errors import ProcessGoneError, RestoreError
 from checkpoint.linux import procfs
@@ -36,9 +36,19 @@ class GuardedTask:
             raise ProcessGoneError(f"{self.component} (pid {self.pid}) has ended")
         return self._following().capture(order)
 
+    def unchanged(self) -> Position | None:
+        """The newest acknowledged position, if a capture would say nothing new; None: capture."""
+        if self._session is None or self._session.reader.is_superseded or procfs.status(self.pid).state in "ZX":
+            return None
+        return self._session.unchanged()
+
     def commit_at(self, position: Position) -> int:
         """The number of the commit that a capture holds; 0 if it is none of the last ones."""
         return self._session.commit_at(position) if self._session else 0
+
+    def age_ns(self, position: Position) -> int:
+        """How old the commit is that a capture holds."""
+        return max(now().boottime_ns - self._session.committed_ns(position), 0) if self._session else 0
 
     def acknowledge(self, position: Position) -> None:
         """See `checkpoint.engine.Session.acknowledge`."""

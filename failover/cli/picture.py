@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 
 Mood = Literal["good", "warning", "bad", "quiet"]
 
-COLUMNS: Final = ("", "role", "state", "epoch", "lag", "freeze", "standby", "links")
+COLUMNS: Final = ("", "role", "state", "engine", "epoch", "lag", "freeze", "standby", "links")
 
 BAD_STATES: Final = frozenset({"degraded", "failed"})
 OVER_STATES: Final = frozenset({"ended", "released"})
@@ -34,6 +34,11 @@ def milliseconds(value: float | None) -> str:
     if value < 1000:
         return f"{value:.0f} ms"
     return f"{value / 1000:.1f} s" if value < 120_000 else f"{value / 60_000:.0f} min"
+
+
+def ago(value: float | None) -> str:
+    """14 s ago."""
+    return f"{milliseconds(round(value, -3) if value and value >= 10_000 else value).replace('.0 s', ' s')} ago"
 
 
 def microseconds(value: float | None) -> str:
@@ -63,7 +68,7 @@ def rows(status: Mapping[str, Any]) -> tuple[Row, ...]:
         found += _branch(own, "")
     orphans = [component for component in components if component.get("primary") not in {name for name, _ in robots}]
     if orphans:
-        found.append(Row(("nobody", *[""] * 7), "bad"))
+        found.append(Row(("nobody", *[""] * (len(COLUMNS) - 1)), "bad"))
         found += _branch(orphans, "")
     return tuple(found)
 
@@ -82,12 +87,12 @@ def is_unprotected(component: Mapping[str, Any]) -> bool:
 
 def _robot_row(status: Mapping[str, Any], name: str, peer: Mapping[str, Any] | None) -> Row:
     if peer is None:
-        return Row((f"{name} (here)", str(status.get("role") or ""), "live", "", "", "", "", _lanes(status)), "good")
+        return Row((f"{name} (here)", str(status.get("role") or ""), "live", "", "", "", "", "", _lanes(status)), "good")
     state = peer["state"]
     lost = peer.get("beats_lost")
     links = ", ".join(part for part in (peer.get("lane") or "", f"{lost} beat{'s' * (lost > 1)} lost" if lost else "") if part)
     mood: Mood = "good" if state == "live" else "bad" if state == "dead" else "warning"
-    return Row((name, "", state, "", "", "", "", links), mood)
+    return Row((name, "", state, "", "", "", "", "", links), mood)
 
 
 def _lanes(status: Mapping[str, Any]) -> str:
@@ -104,14 +109,16 @@ def _branch(components: Sequence[Mapping[str, Any]], indent: str) -> list[Row]:
 
 
 def _component_row(component: Mapping[str, Any], branch: str) -> Row:
-    freeze = microseconds(component.get("freeze_us"))
+    is_frozen = component.get("engine") != "cooperative"
+    freeze = microseconds(component.get("freeze_us")) if is_frozen else "never"
     worst = component.get("freeze_us_max")
-    if worst:
+    if worst and is_frozen:
         freeze += f" (max {worst / 1000:.2f})"
     cells = (
         branch + str(component["name"]),
         str(component.get("role") or ""),
         _state(component),
+        str(component.get("engine") or ""),
         str(component.get("epoch") or ""),
         milliseconds(component.get("lag_ms")),
         freeze,
@@ -127,6 +134,8 @@ def _state(component: Mapping[str, Any]) -> str:
         return f"ended ({ending(status)})"
     if component.get("state") == "running" and is_unprotected(component):
         return "running, unprotected"
+    if component.get("state") == "running" and component.get("commit_overdue"):
+        return f"running, last commit {ago(component.get('commit_age_ms'))}"
     return str(component.get("state") or "")
 
 
@@ -143,7 +152,8 @@ def mood_of(component: Mapping[str, Any]) -> Mood:
         return "bad"
     if state in OVER_STATES:
         return "quiet"
-    return "warning" if state in UNSETTLED_STATES or not component.get("standby") or is_unprotected(component) else "good"
+    doubtful = not component.get("standby") or is_unprotected(component) or component.get("commit_overdue")
+    return "warning" if state in UNSETTLED_STATES or doubtful else "good"
 
 
 def remarks(status: Mapping[str, Any]) -> tuple[str, ...]:

@@ -52,11 +52,15 @@ beats: {sent, heard, unsent, refused, late_us_max, gap_us_max, gaps}: of this li
 peers: [{name, state, last_heard_ms, hears_us, load, beats_lost, lane, notes}]
     state: unknown | live | suspect | dead; lane: connected | connecting | refused | down
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
-    isolated, standby, standby_sequence, lag_ms, period_ms, freeze_us, freeze_us_max, snapshot_size, dirty_bytes, snapshots,
-    restores, crashes, outage_ms, exit_status, promise, owner, reasons, notes, elsewhere}]
+    isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
+    freeze_us_max, snapshot_size, dirty_bytes, snapshots, restores, crashes, outage_ms, exit_status, promise, owner, reasons,
+    notes, elsewhere}]
     owner: uid of the user who may give orders about it and read its output, besides root
     role: primary | standby | none; protection: none | protected | degraded | stopped
     state: starting | running | frozen | held | restoring | ended | degraded | failed | released
+    lag_ms: age of what the standby holds: since its capture began, or, where a program keeps its state, since its commit
+    commit_…: of a program that keeps its state, at its primary: age of its newest commit, the longest time that lay between two
+        of the last ones, whether the newest is much older than that
     elsewhere: with ``team``: {robot: the same fields, as that robot sees the component}
 """
 """What ``status`` answers, field by field. A value that is not known is None."""

@@ -46,11 +46,11 @@ class Restore:
 
 @dataclass(frozen=True, slots=True)
 class Capture:
-    """Take a snapshot and keep it durably in this robot's store. → Captured, CaptureFailed. One at a time per component.
+    """Take a snapshot and keep it durably in this robot's store. → Captured, Unchanged, CaptureFailed. One at a time.
 
     Attributes:
-        base: whole; otherwise a delta since the last position that was acknowledged to the keeper.
-        hold: leave the program frozen afterwards (the last delta of a handover); the act Thaw or Stop follows.
+        base: whole; otherwise a delta since the last position that was acknowledged to the keeper, or `Unchanged`.
+        hold: leave the program frozen afterwards (the last delta of a handover); the act Thaw or Stop follows. Never `Unchanged`.
     """
 
     component: str

@@ -87,6 +87,7 @@ class Flight:
 
     Attributes:
         position: None while it is being taken.
+        state_ns: how old its state is counted from: the order, or, where the program commits, its commit.
         to: standby that it goes to; "" for this robot's own store only.
         final: the last delta of a handover.
     """
@@ -98,6 +99,7 @@ class Flight:
     position: Position | None = None
     parent: Position | None = None
     final: bool = False
+    state_ns: int = 0
 
 
 @dataclass(slots=True)

@@ -40,6 +40,7 @@ class Captured:
 
     Attributes:
         dirty_size: bytes of pages carried; ``size``: bytes of the encoded snapshot.
+        age_ns: how old the state in it was by then: of a program that commits, since its commit.
     """
 
     component: str
@@ -49,6 +50,21 @@ class Captured:
     size: int = 0
     freeze_us: int = 0
     dirty_size: int = 0
+    age_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Unchanged:
+    """The act Capture found what was acknowledged at ``position``: a program that commits has committed nothing since.
+
+    Attributes:
+        sequence: as ordered; no snapshot was made under this number.
+    """
+
+    component: str
+    epoch: int
+    sequence: int
+    position: Position
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,6 +233,7 @@ Event = (
     | Received
     | Started
     | Captured
+    | Unchanged
     | CaptureFailed
     | ShipEnded
     | Stored

@@ -30,6 +30,7 @@ from failover.core.events import (
     Stored,
     StoreFailed,
     Tick,
+    Unchanged,
     Warmed,
 )
 from failover.core.membership import Membership
@@ -244,6 +245,8 @@ def _tell(component: Component, turn: Turn, event: Event) -> None:
             _runs(component, turn, event)
         case Captured():
             replication.captured(component, turn, event)
+        case Unchanged():
+            replication.unchanged(component, turn, event)
         case CaptureFailed():
             replication.capture_failed(component, turn, event)
         case ShipEnded():

@@ -11,7 +11,7 @@ from failover.core import acts, lease
 from failover.core.component import Component, Flight, Turn
 from failover.core.consent import grants
 from failover.core.election import supersede
-from failover.core.events import Captured, CaptureFailed, ShipEnded, Stored, StoreFailed
+from failover.core.events import Captured, CaptureFailed, ShipEnded, Stored, StoreFailed, Unchanged
 from failover.core.messages import NEEDS_BASE, Entry
 from failover.core.names import weight
 from failover.core.types import HISTORY_MAX, MS, OnUnsupported, State
@@ -58,6 +58,7 @@ def captured(component: Component, turn: Turn, event: Captured) -> None:
     component.freeze_us, component.degraded = event.freeze_us, ""
     component.base_wanted = False
     flight.position, flight.parent = event.position, event.parent
+    flight.state_ns = max(flight.started_ns - event.age_ns, 0)
     _tell_prune(component, turn)
     to = component.standby if turn.alive(component.standby) else ""
     if not to:
@@ -70,6 +71,21 @@ def captured(component: Component, turn: Turn, event: Captured) -> None:
         return
     flight.to = to
     turn.order(acts.Ship(component.name, component.epoch, event.position, event.parent, to, component.spec))
+
+
+def unchanged(component: Component, turn: Turn, event: Unchanged) -> None:
+    """The newest checkpoint is all there is to know: nothing travels, and it goes on growing older."""
+    flight = component.flight
+    if flight is None or flight.position is not None or (event.epoch, event.sequence) != (component.epoch, component.sequence):
+        return
+    component.sequence -= 1  # no snapshot bears this number, and so every number that is due for pruning is met
+    component.degraded, component.flight = "", None
+    is_theirs = not flight.to or flight.to in component.entrusted
+    if event.position != component.acked or not is_theirs:
+        component.base_wanted, component.due_ns = True, turn.now_ns
+        return
+    component.undelivered = ""
+    component.due_ns = max(flight.started_ns + _period_ns(component, turn, flight), turn.now_ns)
 
 
 def capture_failed(component: Component, turn: Turn, event: CaptureFailed) -> None:
@@ -127,17 +143,21 @@ def _checkpoint(component: Component, turn: Turn, position: Position, *, is_safe
     """The position is a checkpoint: the next delta counts from it. It is safe unless this robot alone holds it."""
     flight = component.flight
     assert flight is not None
-    alone = not flight.to or not turn.alive(component.standby)
     turn.order(acts.Acknowledge(component.name, component.epoch, position, is_safe))
     component.undelivered = ""
     component.parent = component.acked = position
-    component.acked_ns = flight.started_ns
-    period_ms = turn.config.alone_period_ms if alone else component.rules.period_ms
-    component.due_ns = max(flight.started_ns + period_ms * MS, turn.now_ns)
+    component.acked_ns = flight.state_ns
+    component.due_ns = max(flight.started_ns + _period_ns(component, turn, flight), turn.now_ns)
     component.flight = None
     if flight.final and component.handing is not None and flight.to == component.handing.to:
         component.handing.yielded = True
         turn.say(component, f"{turn.me} lets {flight.to} claim it")
+
+
+def _period_ns(component: Component, turn: Turn, flight: Flight) -> int:
+    """Between two captures: what the operator wants, or, while no standby takes them, seldom."""
+    is_alone = not flight.to or not turn.alive(component.standby)
+    return (turn.config.alone_period_ms if is_alone else component.rules.period_ms) * MS
 
 
 def _give_up(component: Component, turn: Turn, why: str = "") -> None:

@@ -33,6 +33,20 @@ while True:
     failover.commit()
     time.sleep(0.01)
 """
+FORGETS = """
+import time
+import failover
+
+state = failover.resume("count", default={"step": 0})
+origin = failover.resumed()
+if origin is not None:
+    print("resumed", origin.age_s > 2, flush=True)
+while True:
+    state["step"] += 1
+    if origin is not None or state["step"] <= 200:
+        failover.commit()
+    time.sleep(0.01)
+"""
 SNAPSHOTS = 5
 
 
@@ -42,9 +56,9 @@ def pair(tmp_path: Path) -> Iterator[tuple[RobotMachine, RobotMachine]]:
         yield both
 
 
-def start_counting(robot: RobotMachine, folder: Path) -> None:
+def start_counting(robot: RobotMachine, folder: Path, script: str = COUNTER) -> None:
     program = folder / "counter.py"
-    program.write_text(COUNTER)
+    program.write_text(script)
     robots.run(robot, "count", sys.executable, str(program), cwd=str(folder), engine="cooperative")
 
 
@@ -114,3 +128,23 @@ def test_a_program_that_keeps_its_state_is_handed_over(pair: tuple[RobotMachine,
     assert done.returncode == 0, done.stdout + done.stderr
     robots.until(lambda: shown(second).get("role") == "primary", "robot2 to run it")
     went_on(second, before, "taken-over")
+
+
+def test_a_program_that_stops_committing_is_seen_in_status_and_sends_nothing(
+    pair: tuple[RobotMachine, RobotMachine], tmp_path: Path
+) -> None:
+    first, second = pair
+    start_counting(first, tmp_path, FORGETS)
+    robots.until(lambda: robots.checkpoints(second, "count") >= SNAPSHOTS, "checkpoints at robot2")
+    assert not shown(first)["commit_overdue"]
+    robots.until(lambda: shown(first)["commit_overdue"], "robot1 to find that it stopped")
+    sent = shown(first)["snapshots"]
+    robots.until(lambda: shown(first)["lag_ms"] > 5_000, "its newest commit to grow old")
+    told = shown(first)
+    assert told["lag_ms"] >= told["commit_age_ms"] > told["commit_usual_ms"]
+    assert (told["snapshots"], told["protection"]) == (sent, "protected")
+    assert robots.checkpoints(second, "count") <= sent
+    drawn = robots.failover(first, "status").stdout
+    assert "running, last commit" in drawn and "it does not commit any more" in drawn
+    first.cut_power()
+    robots.until(lambda: b"resumed True" in robots.output(second, "count"), "it to learn how old its state is")

@@ -30,6 +30,7 @@ from failover.core.events import (
     Stored,
     StoreFailed,
     Tick,
+    Unchanged,
     Warmed,
 )
 from failover.core.node import Node
@@ -128,6 +129,8 @@ class World:
     def __init__(self, seed: int, configs: list[Config], watchers: tuple[Watcher, ...] = ()) -> None:
         self.random = Random(seed)
         self.now_ns = 0
+        self.unchanged = 0.0
+        """Share of captures that find nothing new: of programs that commit seldom."""
         self.network = Network()
         self.values: dict[Position, int] = {}
         self.log: list[str] = []
@@ -452,6 +455,11 @@ class World:
             program = robot.programs.get(name)
             if program is None or program.exit_status is not None:
                 self._feed(robot, CaptureFailed(name, act.epoch, "the program is gone"))
+                return
+            known = robot.keeper.get(name)
+            may_be_unchanged = self.unchanged and known is not None and not act.base and not act.hold
+            if known is not None and may_be_unchanged and self.random.random() < self.unchanged:
+                self._feed(robot, Unchanged(name, act.epoch, act.sequence, known))
                 return
             self._settle(robot, program)
             program.frozen = program.frozen or act.hold

@@ -71,9 +71,9 @@ def test_status_shows_the_team_as_a_tree_and_is_healthy(agent: Start) -> None:
     ran = failover("status", socket=agent(answering(STATUS)).path)
     assert ran.returncode == 0, ran.stderr
     lines = ran.stdout.splitlines()
-    assert lines[0].split() == ["role", "state", "epoch", "lag", "freeze", "standby", "links"]
+    assert lines[0].split() == ["role", "state", "engine", "epoch", "lag", "freeze", "standby", "links"]
     assert lines[1].startswith("robot1 (here)")
-    assert " ".join(lines[2].split()) == "└─ /lab/robot1/mapper primary running 3 98 ms 0.91 ms (max 1.40) robot2"
+    assert " ".join(lines[2].split()) == "└─ /lab/robot1/mapper primary running ptrace 3 98 ms 0.91 ms (max 1.40) robot2"
     assert lines[3].split()[:2] == ["robot2", "live"]
     assert "promise: If robot1 dies now, robot2 goes on." in lines
 
@@ -93,6 +93,14 @@ def test_status_says_by_its_exit_status_that_something_is_degraded(agent: Start,
     for component in change.get("components", []):
         for reason in component["reasons"]:
             assert reason in ran.stdout
+
+
+def test_a_program_that_has_stopped_committing_is_told_apart_in_words(agent: Start) -> None:
+    told = {"engine": "cooperative", "freeze_us": 0, "lag_ms": 14_300.0, "commit_age_ms": 14_210.0, "commit_overdue": True}
+    ran = failover("status", socket=agent(answering(STATUS | {"components": [COMPONENT | told]})).path)
+    assert ran.returncode == 0, "it runs, and its standby has what it committed"
+    row = " ".join(ran.stdout.splitlines()[2].split())
+    assert row == "└─ /lab/robot1/mapper primary running, last commit 14 s ago cooperative 3 14.3 s never robot2"
 
 
 def test_an_ended_component_needs_no_standby(agent: Start) -> None:

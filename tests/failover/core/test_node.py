@@ -7,7 +7,7 @@ import pytest
 from checkpoint.model import Position
 from failover.core import acts, ballot
 from failover.core.component import TABLE, Cause
-from failover.core.events import Captured, CaptureFailed, Received, Release, Run, Started, Tick
+from failover.core.events import Captured, CaptureFailed, Received, Release, Run, Started, Tick, Unchanged
 from failover.core.membership import Peer
 from failover.core.messages import Beat, Echo, Entry
 from failover.core.node import Node
@@ -76,6 +76,33 @@ def test_what_this_robot_alone_holds_is_not_called_safe_while_there_could_be_a_s
     taken = Captured("/lab/x", 1, Position(capture.generation, capture.sequence, b"d"), None)
     (acknowledged,) = only(node.step(taken, 5_005 * MS), acts.Acknowledge)
     assert isinstance(acknowledged, acts.Acknowledge) and not acknowledged.is_safe
+
+
+def test_a_program_that_commits_nothing_makes_no_snapshots_and_its_lag_grows() -> None:
+    node = Node(ALONE, 1, Ballot(), 0)
+    (capture,) = only(running(node), acts.Capture)
+    assert isinstance(capture, acts.Capture)
+    held = Position(capture.generation, capture.sequence, b"d")
+    node.step(Captured("/lab/x", 1, held, None, age_ns=1 * MS), 5 * MS)
+    first = node.status(100 * MS).components[0].lag_ns
+    (later,) = only(node.step(Tick(), 2_000 * MS), acts.Capture)
+    assert isinstance(later, acts.Capture)
+    assert not node.step(Unchanged("/lab/x", 1, later.sequence, held), 2_001 * MS).act
+    seen = node.status(2_100 * MS).components[0]
+    assert (seen.lag_ns - first, seen.positions) == (2_000 * MS, (held,))
+    (again,) = only(node.step(Tick(), 4_000 * MS), acts.Capture)
+    assert isinstance(again, acts.Capture)
+    assert (again.sequence, again.base) == (later.sequence, False), "no number is left out"
+    node.step(Unchanged("/lab/x", 1, later.sequence - 1, held), 4_001 * MS)
+    assert not only(node.step(Tick(), 4_002 * MS), acts.Capture), "a late answer to an older order is none to this one"
+
+
+def test_an_unchanged_state_that_is_not_the_newest_checkpoint_is_sent_whole() -> None:
+    node = Node(ALONE, 1, Ballot(), 0)
+    (capture,) = only(running(node), acts.Capture)
+    assert isinstance(capture, acts.Capture)
+    (again,) = only(node.step(Unchanged("/lab/x", 1, capture.sequence, Position(1, 1, b"old")), 5 * MS), acts.Capture)
+    assert isinstance(again, acts.Capture) and again.base
 
 
 def test_what_cannot_be_captured_degrades_and_names_the_reason() -> None:
