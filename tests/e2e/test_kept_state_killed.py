@@ -35,7 +35,7 @@ PROGRAM: Final = Path(__file__).parent / "voyage.py"
 SPREAD_S: Final = 0.25
 """Instants of death lie in here: a commit takes a millisecond or two, a capture begins every 0.1 s."""
 HASTE: Final = 0.2
-"""How often nobody waits for anything to be safe before the next kill."""
+"""How often the program is killed again before anything more is safe."""
 
 CYCLE: Final = ("program", "program", "robot", "other", "robot")
 """An agent resumes from the newest checkpoint after three crashes in a minute at most; one that comes back has forgotten them."""
@@ -169,13 +169,12 @@ def resumed(going: Voyage, what: str) -> None:
 
 def kill_somebody(going: Voyage, kind: str) -> None:
     robot = robots.until(going.primary, "one robot to run it")
-    if going.dice.random() > HASTE:
+    if kind != "program" or going.dice.random() > HASTE:  # whoever takes over must have something
         going.until_safe()
     time.sleep(going.dice.uniform(0, SPREAD_S))  # not a wait for anything: the instant of the kill
     if kind == "program":
         kill_program(going, robot)
     elif kind == "robot":
-        going.until_safe()
         cut_robot(going, robot)
     else:
         kind = going.dice.choice(sorted(OTHERS))
