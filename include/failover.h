@@ -183,10 +183,9 @@ typedef struct failover_begin_ {
     uint32_t why, unused;
     uint64_t generation, age_ns;
     char component[256], robot[64];
-    uint64_t rest;
 } failover_begin_;
 
-typedef char failover_begin_has_384_bytes_[sizeof(failover_begin_) == 384 ? 1 : -1];
+typedef char failover_begin_has_376_bytes_[sizeof(failover_begin_) == 376 ? 1 : -1];
 
 typedef union failover_packet_ {
     struct {

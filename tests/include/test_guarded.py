@@ -32,7 +32,7 @@ LIMIT_S = 20
 
 def begin(pipes: tuple[int, int], why: int = 0, robot: str = "", generation: int = 0, age_ns: int = 0) -> bytes:
     return struct.pack(
-        "<IIQQQIIQQ256s64sQ", 2, 1, 3, *pipes, why, 0, generation, age_ns, b"/lab/guarded", robot.encode(), 0
+        "<IIQQQIIQQ256s64s", 2, 1, 3, *pipes, why, 0, generation, age_ns, b"/lab/guarded", robot.encode()
     )  # fmt: skip
 
 
