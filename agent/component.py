@@ -28,7 +28,7 @@ from typing import Any, Final
 
 from agent import guard_messages
 from agent.errors import GuardError, GuardLostError, KeeperLostError
-from agent.guard_messages import Described, Exited, Refused, Started, VesselReady
+from agent.guard_messages import Described, Exited, Refused, Started, TaskConnected, TaskKeeps, VesselReady
 from agent.nursery import GuardLink, KeeperLink
 from agent.places import Places, log_directory
 from agent.streams import OutputLogs
@@ -101,6 +101,7 @@ class Component:
         name, pid, inner_pid, isolated: as the guard said.
         logs: its output; `OutputLogs.read` serves ``failover logs``.
         engine: by which it is captured: `PTRACE` or `COOPERATIVE`.
+        task_pid: of the process that keeps its state, 0 before it has said so; keeps: it has made a commit.
         prepared: a program that is to be started with a state, by `resume`.
         streams: what its guard gave of them: counters, two read ends, two logs; none of somebody else's child.
         ended: the wait status once the program has ended (None: it was not our child); GuardLostError if the guard died first.
@@ -120,6 +121,8 @@ class Component:
         self._totals: dict[Position, tuple[int, int]] = {}
         self._commits: dict[Position, int] = {}
         self.engine = PTRACE
+        self.task_pid = 0
+        self.keeps = False
         self.prepared: Prepared | None = None
         self._lease_until_ns = 0
         self._held = False
@@ -335,7 +338,7 @@ class Component:
         self.pid, self.inner_pid, self.isolated, self.notes = born.pid, born.inner_pid, born.isolated, born.notes
         self.streams = streams
         if isinstance(born, Described):
-            self.engine = COOPERATIVE if born.keeps_state else PTRACE
+            self.engine, self.task_pid, self.keeps = born.engine, born.task_pid, born.keeps
 
     async def ask_guard(self, request: Any, descriptors: tuple[int, ...] = ()) -> Any:
         """The guard's reply, and descriptors that are ours now.
@@ -390,6 +393,9 @@ class Component:
         if isinstance(message, Exited):
             if not self.ended.done():
                 self.ended.set_result(message.status)
+            return True
+        if isinstance(message, TaskConnected | TaskKeeps):
+            self.task_pid, self.keeps = message.pid, isinstance(message, TaskKeeps)
             return True
         return isinstance(message, guard_messages.FrozenByLease)
 

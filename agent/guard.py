@@ -53,6 +53,7 @@ from agent.guard_messages import (
     Watch,
     Watching,
 )
+from agent.task_end import TaskEnd
 from agent.ward import Ward, WardError
 from checkpoint.channel import Channel, ChannelError, close_all
 from checkpoint.errors import CheckpointError
@@ -125,6 +126,8 @@ class Guard:
             watched[self._keeper] = self._lose_keeper
         if self._ward is not None and self._ward.pidfd is not None and self._ward.exited is None:
             watched[self._ward.pidfd] = self._watched_end
+        if self._ward is not None and self._ward.task is not None and self._ward.exited is None:
+            watched[self._ward.task.fileno()] = functools.partial(self._heed_task, self._ward.task)
         poll = select.poll()
         for descriptor in watched:
             poll.register(descriptor, select.POLLIN)
@@ -234,7 +237,7 @@ class Guard:
         self._reply(Done())
 
     def _commit_safe(self, request: CommitSafe, _: tuple[int, ...]) -> None:
-        if self._ward is not None and self._ward.task is not None:
+        if self._ward is not None and self._ward.task is not None and self._ward.exited is None:
             self._ward.task.tell_safe(request.commit)
 
     def _lease(self, request: Lease, _: tuple[int, ...]) -> None:
@@ -295,6 +298,13 @@ class Guard:
         assert self._ward is not None
         self._ward.watched_end()
         self._announce_end()
+
+    def _heed_task(self, task: TaskEnd) -> None:
+        """The program says something about the state that it keeps."""
+        if self._ward is None or self._ward.exited is not None:  # it has ended in this same turn
+            return
+        for event in task.heed():
+            self._tell(event)
 
     def _announce_end(self) -> None:
         assert self._ward is not None and self._ward.exited is not None

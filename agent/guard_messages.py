@@ -9,6 +9,7 @@ from typing import Literal
 
 import msgspec
 
+from checkpoint.engine import COOPERATIVE, PTRACE
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Clocks
 from checkpoint.task_channel import Origin
@@ -19,10 +20,15 @@ class Message(msgspec.Struct, frozen=True, tag=True):
 
 
 class Task(msgspec.Struct, frozen=True):
-    """What a program that keeps its state is told (`checkpoint.task_channel`)."""
+    """What a program is told as soon as it says that it keeps its state (`checkpoint.task_channel`).
+
+    Attributes:
+        engine: as it was asked for; for `Described`.
+    """
 
     epoch: int
     origin: Origin | None = None
+    engine: str = COOPERATIVE
 
 
 class Start(Message, frozen=True):
@@ -35,7 +41,7 @@ class Start(Message, frozen=True):
         log_directory: where `agent.streams.OutputLogs` are.
         cgroup: a cgroup v2 directory to make the component's own cgroup in; "" for the guard's.
         inheritance: whose rights, limits and priorities it gets; None: the guard's.
-        task: for a program that keeps its state; with a descriptor, if it has an origin: the state as a segment.
+        task: for a program that may keep its state; with a descriptor, if it has an origin: the state as a segment.
         totals: bytes that it had written to its two streams by then.
     """
 
@@ -166,7 +172,8 @@ class Described(Message, frozen=True):
         totals: bytes written to the two streams so far.
         freezes_by: "cgroup" (invisible to the program) or "SIGSTOP".
         blocked: why output is held back, "" if it is not.
-        keeps_state: it was started as a program that keeps its state: the cooperative engine's.
+        engine: as it was asked for.
+        task_pid: of the process that keeps the state, 0 while there is none; keeps: it has made a commit.
     """
 
     component: str
@@ -183,7 +190,9 @@ class Described(Message, frozen=True):
     freezes_by: Literal["", "cgroup", "SIGSTOP"]
     blocked: str
     notes: tuple[str, ...]
-    keeps_state: bool = False
+    engine: str = PTRACE
+    task_pid: int = 0
+    keeps: bool = False
 
 
 class Refused(Message, frozen=True):
@@ -209,6 +218,18 @@ class FrozenByLease(Message, frozen=True):
     """The lease ran out and the guard froze the component; an event."""
 
 
+class TaskConnected(Message, frozen=True):
+    """A process has said that it keeps the state, and goes on when it is told how; an event. 0: it has gone, and kept nothing."""
+
+    pid: int
+
+
+class TaskKeeps(Message, frozen=True):
+    """It has made its first commit to a segment: a capture finds something there from now on; an event."""
+
+    pid: int
+
+
 Request = Start | MakeVessel | Watch | Commit | Lease | Freeze | Thaw | CommitSafe | Kill | Describe | LetGo | Forget
 Reply = Started | VesselReady | Watching | Done | Described | Refused
-Event = Exited | FrozenByLease
+Event = Exited | FrozenByLease | TaskConnected | TaskKeeps

@@ -29,7 +29,9 @@ from agent.guard_messages import Described, Exited, MakeVessel, Start, Watch
 from agent.pump import Pump
 from agent.streams import STREAMS, OutputLogs
 from agent.task_end import TaskEnd
+from checkpoint.engine import PTRACE
 from checkpoint.linux.vessel import Birth, Born, spawn_program, spawn_vessel
+from checkpoint.task_channel import VARIABLE
 
 DRAIN_S: Final = 2.0
 """How long the end of a program waits for its last output to be written; a full disk must not hide the end."""
@@ -59,6 +61,8 @@ class Ward:
     exited: Exited | None = None
     notes: list[str] = field(default_factory=list)
     task: TaskEnd | None = None
+    engine: str = PTRACE
+    """As it was asked for."""
 
     # --- birth ---
 
@@ -76,14 +80,18 @@ class Ward:
         environment = dict(os.fsdecode(item).split("=", 1) for item in order.environment if b"=" in item)
         directory = os.fsdecode(order.working_directory)
 
+        environment.pop(VARIABLE, None)  # of whoever gave the order: he may be a component himself
+        task = _task_end(order, segment) if order.task is not None else None
+
         def give_birth(birth: Birth) -> Born:
             named = environment if task is None else environment | task.environment
             return spawn_program(argv, named, directory, order.umask, birth)
 
-        task = TaskEnd(order.component, order.task, segment) if order.task is not None else None
         kept = order.inheritance
         user = (kept.uid, kept.gid) if kept is not None else None
-        return cls._bear(order, order.totals, Birth(isolate=order.isolate, inheritance=kept), give_birth, user, task)
+        ward = cls._bear(order, order.totals, Birth(isolate=order.isolate, inheritance=kept), give_birth, user, task)
+        ward.engine = order.task.engine if order.task is not None else PTRACE
+        return ward
 
     @classmethod
     def make_vessel(cls, order: MakeVessel) -> Ward:
@@ -133,18 +141,16 @@ class Ward:
                 os.fchown(pump.write_ends[stream], *user)
         hold, notes = freezing.choose(order.cgroup, f"{freezing.CGROUP_PREFIX}{secrets.token_hex(8)}")
         try:
+            ends = pump.write_ends
+            if task is not None:
+                task.flows_into(pump.counters.descriptor, (ends[1], ends[2]))
             with open(os.devnull, "rb") as nothing, hold.birthplace():
-                ends = pump.write_ends
-                if task is not None:
-                    birth = replace(birth, passed=task.begin(pump.counters.descriptor, (ends[1], ends[2])))
                 born = act(replace(birth, stdio=(nothing.fileno(), ends[1], ends[2])))
         except BaseException:
             hold.close()
             if task is not None:
                 task.close()
             raise
-        if task is not None:
-            task.born()
         hold.add(born.pid)
         pump.start()
         said = [*notes, *born.notes, *([] if logs.trims else [NO_TRIM])]
@@ -261,6 +267,8 @@ class Ward:
             self.freezer.kill()
         if self.pump is not None and not self.pump.drain(DRAIN_S):
             self.notes.append("its last output may be incomplete: " + (self.pump.blocked or "something else still writes to it"))
+        if self.task is not None:
+            self.task.close()
         self.frozen_by = ""
         self.exited = Exited(status, self.totals(), tuple(self.notes))
 
@@ -299,12 +307,22 @@ class Ward:
             freezes_by=self.freezer.kind,
             blocked=self.pump.blocked if self.pump is not None else "",
             notes=(*self.notes, *more_notes),
-            keeps_state=self.task is not None,
+            engine=self.engine,
+            task_pid=self.task.pid if self.task is not None else 0,
+            keeps=self.task is not None and self.task.keeps,
         )
 
     def _check_alive(self, what: str) -> None:
         if self.exited is not None:
             raise WardError(f"cannot {what}: the program has ended; ask for its status, then forget it")
+
+
+def _task_end(order: Start, segment: tuple[int, ...]) -> TaskEnd:
+    """The socket of a program that may keep its state, which begins as soon as it says that it does."""
+    assert order.task is not None
+    task = TaskEnd(order.component, order.inheritance.uid if order.inheritance is not None else os.geteuid())
+    task.begin(order.task.epoch, order.task.origin, *segment[:1])
+    return task
 
 
 def _reap_one() -> tuple[int, int] | None:

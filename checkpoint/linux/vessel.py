@@ -58,7 +58,6 @@ class Birth:
         clocks: the reading its monotonic and boot time are to go on from; None: this machine's clocks are right for it.
         elapsed_ns: time since that reading.
         stdio: our descriptors that become its 0, 1 and 2; all others are closed.
-        passed: one of ours that it has too, under the same number; -1: none.
         own_session: make it the leader of a session, with standard input as its terminal if that is one.
         die_with_parent: SIGKILL it when the calling thread ends.
         inheritance: whose rights, limits and priorities it gets; None: ours.
@@ -69,7 +68,6 @@ class Birth:
     clocks: Clocks | None = None
     elapsed_ns: int = 0
     stdio: tuple[int, int, int] = (0, 1, 2)
-    passed: int = -1
     own_session: bool = True
     die_with_parent: bool = True
     inheritance: Inheritance | None = None
@@ -285,8 +283,6 @@ def _grow_up(lines: _Lines, birth: Birth, watch_write: int, become: Callable[[],
         fcntl.ioctl(0, termios.TIOCSCTTY, 0)
     _forget_signals()
     namespaces.close_others_on_exec(3)
-    if birth.passed >= 0:
-        os.set_inheritable(birth.passed, True)
     if birth.inheritance is not None:
         take_on(birth.inheritance)
     if birth.die_with_parent:

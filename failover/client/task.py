@@ -100,7 +100,7 @@ class Task:
 
     def _commit(self) -> int:
         self._is_missing = not self.state.commit(self.value)
-        self._keeping.notice()
+        self._keeping.notice(self.state.segments)
         return self.state.number
 
     @contextmanager
@@ -154,12 +154,12 @@ def open_task(
         FitError: it does not fit the declaration any more; names the field. It is still stored.
         TaskError: the folder cannot be used.
     """
-    name = os.environ.get(NAME_VARIABLE) or name
+    guard = guarded()
+    name = guard.handed.begin.component if guard is not None else os.environ.get(NAME_VARIABLE) or name
     if not name.strip("/.") or "\0" in name:
         raise TaskError(f"cannot keep a state under the name {name!r}: choose a word, or a path such as /lab/robot1/mapper")
     schema = schema_of(name)
     state = KeptState(schema)
-    guard = guarded()
     if guard is not None:
         return _open_guarded(name, state, guard, lambda: begin(state, schema))
     file = StateFile(folder_of(name, folder or Path(os.environ.get(FOLDER_VARIABLE) or Path.cwd())), name)

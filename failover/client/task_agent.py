@@ -1,25 +1,55 @@
 """The state of a program that runs under an agent: what it begins with, and which commits are safe at another robot.
 
-`failover run --engine cooperative` starts a program with one end of a socket, on which its guard says both
-(`checkpoint.task_channel`). There is no file beside such a program.
+The guard of such a program listens at a name that it leaves in the environment (`checkpoint/TASK.md`). There is no file
+beside the program then.
 """
 
 from __future__ import annotations
 
+import array
+import contextlib
+import logging
 import os
+import re
 import select
 import socket
 import stat
+import struct
 import threading
 import time
+import weakref
 from dataclasses import dataclass
+from typing import Final
 
-from checkpoint.channel import Channel, ChannelClosedError, ChannelError, close_all
+from checkpoint.channel import close_all
+from checkpoint.errors import TaskPacketError
 from checkpoint.segment import PENDING, Committed, Outputs
 from checkpoint.segment_reader import SegmentReader
-from checkpoint.task_channel import VARIABLE, Begin, Message, Safe
+from checkpoint.task_channel import (
+    NAME_PREFIX,
+    PACKET_SIZE_MAX,
+    VARIABLE,
+    Begin,
+    FromGuard,
+    Hello,
+    Keeps,
+    Refused,
+    Safe,
+    encode,
+    from_guard,
+)
 from failover.client.task_output import OwnOutput
 from failover.errors import NotCommittedError, TaskError
+
+_NAME: Final = re.compile(re.escape(NAME_PREFIX) + r"[0-9a-f]{16}")
+_CREDENTIALS: Final = struct.Struct("3i")
+_INT_SIZE: Final = array.array("i").itemsize
+DESCRIPTORS_MAX: Final = 2
+"""Counters, and a segment."""
+
+UNTOLD: Final = "cannot keep a state under the agent: its guard does not say how to begin"
+
+log = logging.getLogger("failover")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,30 +65,74 @@ class Handed:
 
 
 class Guarded:
-    """This program's end of the socket. Belongs to this process alone: no child, and nothing it executes, gets it."""
+    """This program's end of the socket. Belongs to this process alone: no child, and nothing it executes, gets it.
+
+    Args:
+        end: connected to the guard; ours from now on.
+
+    Raises:
+        TaskError: the guard will not have it, or says what makes no sense.
+    """
 
     def __init__(self, end: socket.socket) -> None:
-        self._channel: Channel[Message] = Channel(end, Message)
+        self._end = end
         self._lock = threading.Lock()
         self._output: OwnOutput | None = None
         self._is_pending = False
+        self._told_segment = 0
         self.durable = 0
         """Number of the newest commit that a standby holds."""
-        self.handed = self._receive_begin()
+        try:
+            with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # it has hung up; it may have said why
+                end.send(encode(Hello()), socket.MSG_NOSIGNAL)
+            self.handed = self._receive_begin()
+        except OSError as error:
+            end.close()
+            raise TaskError(f"{UNTOLD}: {error.strerror or error}") from error
+        except BaseException:
+            end.close()
+            raise
+        _close_in_children(self)
 
     def _receive_begin(self) -> Handed:
+        """Wait to be told how to begin: a warm program waits here until its robot takes over."""
+        begin, descriptors = self._receive()
         try:
-            begin, descriptors = self._channel.receive()
-        except (ChannelError, OSError) as error:
-            raise TaskError(f"cannot keep a state under the agent: its guard does not say how to begin: {error}") from error
-        try:
+            if isinstance(begin, Refused):
+                raise TaskError(f"cannot keep a state under the agent: {begin.text}")
             if not isinstance(begin, Begin) or len(descriptors) != 1 + (begin.origin is not None):
-                raise TaskError("cannot keep a state under the agent: its guard says something else than how to begin")
+                raise TaskError(f"{UNTOLD}, but says something else")
             if _has_pipes(begin.pipes):
                 self._output = OwnOutput(descriptors[0])
             return Handed(begin, _state_in(descriptors[1]) if begin.origin is not None else None)
         finally:
             close_all(descriptors)
+
+    def _receive(self) -> tuple[FromGuard, tuple[int, ...]]:
+        """One packet, and its descriptors, ours to close.
+
+        Raises:
+            TaskError: the guard has gone, or what came is no packet.
+        """
+        room = socket.CMSG_SPACE(DESCRIPTORS_MAX * _INT_SIZE)
+        try:
+            content, ancillary, _, _ = self._end.recvmsg(PACKET_SIZE_MAX + 1, room, socket.MSG_CMSG_CLOEXEC)
+        except ConnectionResetError:  # said once, before what it said when it hung up
+            content, ancillary, _, _ = self._end.recvmsg(PACKET_SIZE_MAX + 1, room, socket.MSG_CMSG_CLOEXEC)
+        carried = array.array("i")
+        for level, kind, packed in ancillary:
+            if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
+                carried.frombytes(packed[: len(packed) - len(packed) % _INT_SIZE])
+        try:
+            if not content:
+                raise TaskError("the guard of this program has gone: nothing that it commits is safe any more")
+            return from_guard(content), tuple(carried)
+        except TaskPacketError as error:
+            close_all(tuple(carried))
+            raise TaskError(f"cannot understand the guard of this program: {error}") from error
+        except TaskError:
+            close_all(tuple(carried))
+            raise
 
     def outputs(self) -> Outputs:
         """What this program has written until now, for its commit."""
@@ -71,8 +145,19 @@ class Guarded:
         """Why the newest commit does not travel; "" while all is well."""
         return "its output pipe is full, the guard takes nothing from it; a later commit will do" if self._is_pending else ""
 
-    def notice(self) -> None:
-        """There is a new commit: whoever takes it looks by himself."""
+    def notice(self, segment: int) -> None:
+        """There is a new commit. Whoever takes it looks by himself, and is told of the first in each segment.
+
+        Args:
+            segment: how many segments there were, with the one that it went to.
+        """
+        if segment == self._told_segment:
+            return
+        try:
+            self._end.send(encode(Keeps()), socket.MSG_NOSIGNAL | socket.MSG_DONTWAIT)
+        except OSError:  # full: at the next commit; gone: nobody listens
+            return
+        self._told_segment = segment
 
     def wait(self, number: int, timeout: float | None) -> None:
         """Return when a standby holds commit ``number``.
@@ -90,34 +175,57 @@ class Guarded:
                 self._hear(left)
 
     def _hear(self, left: float | None) -> None:
-        readable, _, _ = select.select([self._channel.fileno()], [], [], left)
-        if not readable:
+        waiting = select.poll()
+        waiting.register(self._end, select.POLLIN)
+        if not waiting.poll(None if left is None else left * 1000):
             return
         try:
-            message, descriptors = self._channel.receive()
-        except ChannelClosedError as error:
-            raise NotCommittedError("the guard of this program has gone: nothing that it commits is safe any more") from error
+            message, descriptors = self._receive()
+        except (TaskError, OSError) as error:
+            raise NotCommittedError(str(error)) from error
         close_all(descriptors)
         if isinstance(message, Safe):
             self.durable = max(self.durable, message.commit)
 
     def close(self) -> None:
         """Let go of the socket."""
-        self._channel.close()
+        self._end.close()
 
 
 def guarded() -> Guarded | None:
-    """Our end of the guard's socket; None where this program was not started as one that keeps its state."""
+    """Our end of the guard's socket; None where this program was started by nobody who keeps its state.
+
+    Raises:
+        TaskError: its guard will not have it.
+    """
     told = os.environ.pop(VARIABLE, "")
-    if not told.isdigit():
+    if not _NAME.fullmatch(told):
         return None
+    end = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
     try:
-        if not stat.S_ISSOCK(os.fstat(int(told)).st_mode):
-            return None
-    except OSError:  # we are a child of the program that it was given to
+        end.connect("\0" + told[1:])
+        _, uid, _ = _CREDENTIALS.unpack(end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
+    except OSError as error:
+        end.close()
+        log.warning("no agent keeps this state, a file does: nobody listens at %s=%s: %s", VARIABLE, told, error.strerror)
         return None
-    os.set_inheritable(int(told), False)
-    return Guarded(socket.socket(fileno=int(told)))
+    if uid not in (0, os.geteuid()):
+        end.close()
+        log.warning("no agent keeps this state, a file does: who listens at %s=%s is uid %d, not we or root", VARIABLE, told, uid)
+        return None
+    return Guarded(end)
+
+
+def _close_in_children(guarded: Guarded) -> None:
+    """A forked child would keep the guard from learning of our end."""
+    remembered = weakref.ref(guarded)
+
+    def forked() -> None:
+        known = remembered()
+        if known is not None:
+            known.close()
+
+    os.register_at_fork(after_in_child=forked)
 
 
 def _has_pipes(told: tuple[int, int]) -> bool:

@@ -145,7 +145,7 @@ class Recorder:
         self._thread = threading.Thread(target=self._record, name="failover-recorder", daemon=True)
         self._pid = os.getpid()
 
-    def notice(self) -> None:
+    def notice(self, _: int) -> None:
         """There is a new commit."""
         if not self._fresh.is_set():
             self._fresh.set()

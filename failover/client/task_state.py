@@ -59,6 +59,8 @@ class KeptState:
         """Where the content of each region lay at the last commit, and its size."""
         self.outputs: Callable[[], Outputs] = _nobody_counts
         """What was written until now, where somebody counts it."""
+        self.segments = 0
+        """How many there were until now."""
         self._is_forked = False
         _close_in_children(self)
 
@@ -147,6 +149,7 @@ class KeptState:
         ]
         layout = Layout(tuple(regions), self._lineage)
         old, self._writer = self._writer, self._grown(layout)
+        self.segments += 1
         self._rooms = rooms
         if old is not None:
             old.supersede()

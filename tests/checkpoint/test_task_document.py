@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from checkpoint import task_packets
+from checkpoint import task_channel
 from checkpoint.errors import TaskPacketError
-from checkpoint.task_packets import REASONS, Begin, FromGuard, Hello, Keeps, Origin, Packet, Refused, Safe
+from checkpoint.task_channel import REASONS, Begin, FromGuard, Hello, Keeps, Origin, Packet, Refused, Safe
 
-DOCUMENT = (Path(task_packets.__file__).parent / "TASK.md").read_text()
+DOCUMENT = (Path(task_channel.__file__).parent / "TASK.md").read_text()
 BEGIN = Begin("/lab/heater", 3, (100, 101))
 RESUMED = Begin("/lab/heater", 4, (102, 103), Origin("robot1", 129, "taken over", 250_000_000))
 FROM_GUARD: tuple[FromGuard, ...] = (BEGIN, RESUMED, Refused("another process keeps it"), Safe(42))
@@ -40,14 +40,14 @@ def fields(packet: str) -> list[tuple[int, int]]:
 
 def in_fields(packet: Packet) -> list[int | bytes]:
     """What the document says that a packet's bytes mean: numbers, and fields of text."""
-    content = task_packets.encode(packet)
+    content = task_channel.encode(packet)
     parts = [content[offset : offset + size] for offset, size in fields(type(packet).__name__)]
     return [int.from_bytes(part, "little") if len(part) <= 8 else part for part in parts]
 
 
 @pytest.mark.parametrize("packet", [*FROM_GUARD, *FROM_PROGRAM], ids=lambda packet: type(packet).__name__)
 def test_kind_version_and_size_are_those_of_the_document(packet: Packet) -> None:
-    content = task_packets.encode(packet)
+    content = task_channel.encode(packet)
     kind, size = kinds()[type(packet).__name__]
     assert (int.from_bytes(content[:4], "little"), int.from_bytes(content[4:8], "little"), len(content)) == (kind, 1, size)
     assert [offset for offset, _ in fields(type(packet).__name__)][1:] + [size] == [
@@ -72,31 +72,31 @@ def test_the_example_in_the_document_is_what_we_send() -> None:
     packets = {"Hello": Hello(), "Begin": BEGIN, "Keeps": Keeps(), "Safe": Safe(42)}
     assert {name for name, _ in shown} == set(packets)
     for name, text in shown:
-        assert task_packets.encode(packets[name]).rstrip(b"\0") == bytes.fromhex(text).rstrip(b"\0")
+        assert task_channel.encode(packets[name]).rstrip(b"\0") == bytes.fromhex(text).rstrip(b"\0")
 
 
 def test_the_limits_of_the_document_are_those_of_the_code() -> None:
-    assert f"at most {task_packets.PACKET_SIZE_MAX} bytes" in DOCUMENT
-    assert max(size for _, size in kinds().values()) == task_packets.PACKET_SIZE_MAX
-    assert f"{task_packets.VARIABLE}={task_packets.NAME_PREFIX}0123456789abcdef" in DOCUMENT
+    assert f"at most {task_channel.PACKET_SIZE_MAX} bytes" in DOCUMENT
+    assert max(size for _, size in kinds().values()) == task_channel.PACKET_SIZE_MAX
+    assert f"{task_channel.VARIABLE}={task_channel.NAME_PREFIX}0123456789abcdef" in DOCUMENT
 
 
 @pytest.mark.parametrize("packet", FROM_GUARD, ids=lambda packet: type(packet).__name__)
 def test_a_program_understands_what_a_guard_says(packet: FromGuard) -> None:
-    assert task_packets.from_guard(task_packets.encode(packet)) == packet
+    assert task_channel.from_guard(task_channel.encode(packet)) == packet
 
 
 def test_a_guard_understands_what_a_program_says() -> None:
-    assert [task_packets.from_program(task_packets.encode(packet)) for packet in FROM_PROGRAM] == list(FROM_PROGRAM)
+    assert [task_channel.from_program(task_channel.encode(packet)) for packet in FROM_PROGRAM] == list(FROM_PROGRAM)
 
 
 def test_each_side_takes_only_what_the_other_may_say() -> None:
     for packet in FROM_GUARD:
         with pytest.raises(TaskPacketError, match="none that programs send"):
-            task_packets.from_program(task_packets.encode(packet))
+            task_channel.from_program(task_channel.encode(packet))
     for answer in FROM_PROGRAM:
         with pytest.raises(TaskPacketError, match="none that guards send"):
-            task_packets.from_guard(task_packets.encode(answer))
+            task_channel.from_guard(task_channel.encode(answer))
 
 
 @pytest.mark.parametrize(
@@ -113,16 +113,16 @@ def test_each_side_takes_only_what_the_other_may_say() -> None:
     ],
 )
 def test_a_beginning_that_contradicts_the_document_is_refused_with_its_reason(offset: int, put: bytes, sentence: str) -> None:
-    content = bytearray(task_packets.encode(RESUMED))
+    content = bytearray(task_channel.encode(RESUMED))
     content[offset : offset + len(put)] = put
     with pytest.raises(TaskPacketError, match=sentence):
-        task_packets.from_guard(bytes(content))
+        task_channel.from_guard(bytes(content))
 
 
 @pytest.mark.parametrize("packet", [*FROM_GUARD, *FROM_PROGRAM], ids=lambda packet: type(packet).__name__)
 def test_a_packet_that_is_cut_or_longer_is_refused(packet: Packet) -> None:
-    content = task_packets.encode(packet)
-    read = task_packets.from_program if isinstance(packet, Hello | Keeps) else task_packets.from_guard
+    content = task_channel.encode(packet)
+    read = task_channel.from_program if isinstance(packet, Hello | Keeps) else task_channel.from_guard
     for wrong in (*(content[:size] for size in range(len(content))), content + b"\0"):
         with pytest.raises(TaskPacketError):
             read(wrong)
@@ -131,12 +131,12 @@ def test_a_packet_that_is_cut_or_longer_is_refused(packet: Packet) -> None:
 @settings(max_examples=300, deadline=None)
 @given(st.binary(max_size=600) | st.tuples(st.integers(0, 6), st.binary(max_size=520)).map(lambda drawn: named(*drawn)))
 def test_whatever_comes_is_a_packet_or_refused(content: bytes) -> None:
-    for read in (task_packets.from_program, task_packets.from_guard):
+    for read in (task_channel.from_program, task_channel.from_guard):
         try:
             packet = read(content)
         except TaskPacketError:
             continue
-        assert task_packets.encode(packet) == content, "what is taken says nothing that was not understood"
+        assert task_channel.encode(packet) == content, "what is taken says nothing that was not understood"
 
 
 def named(kind: int, body: bytes) -> bytes:
@@ -146,5 +146,5 @@ def named(kind: int, body: bytes) -> bytes:
 
 
 def test_a_reason_that_is_too_long_is_cut_and_still_text() -> None:
-    said = task_packets.from_guard(task_packets.encode(Refused("ö" * 600)))
+    said = task_channel.from_guard(task_channel.encode(Refused("ö" * 600)))
     assert said == Refused("ö" * 251)
