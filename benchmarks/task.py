@@ -118,10 +118,7 @@ def _others(directory: Path, value: Callable[[], Any]) -> Iterator[Case]:
     with closing(sqlite3.connect(directory / "rows")) as rows:
         rows.execute("CREATE TABLE states (name TEXT PRIMARY KEY, state BLOB)")
         yield "sqlite3 of a pickle", lambda: _replace_row(rows, pickle.dumps(value(), protocol=5))
-    try:
-        joblib = importlib.import_module("joblib")
-    except ImportError:
-        return
+    joblib = importlib.import_module("joblib")  # untyped
     yield "joblib, fsync, rename", lambda: _dump_aside(joblib, directory / "jobs", value())
 
 
