@@ -29,7 +29,7 @@ from agent.records import Records
 from agent.rules import started_here
 from checkpoint.channel import Unchanged, close_all, content_of
 from checkpoint.engine import COOPERATIVE
-from checkpoint.errors import CheckpointError, UnsupportedError
+from checkpoint.errors import CheckpointError, NothingCommittedError, UnsupportedError
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Position
 from checkpoint.store import Store
@@ -120,7 +120,7 @@ class Charge:
         """A guard was found alive after a restart."""
         self.component, self.epoch = component, epoch
         self.started.set()
-        self._task(self._see_the_end(component))
+        self._watch_the_end()
 
     async def close(self) -> None:
         """Let everything go; the program runs on."""
@@ -182,6 +182,10 @@ class Charge:
         """Say what went wrong, to the log and to the core where it waits for it."""
         message = str(trouble) or type(trouble).__name__
         reasons = tuple(getattr(trouble, "reasons", ())) or (message,)
+        if isinstance(trouble, NothingCommittedError) and isinstance(act, acts.Capture):
+            self.figures.reasons = ()
+            self.around.tell(events.NothingToCapture(self.name, act.epoch, message))
+            return
         if not isinstance(act, acts.Capture) or reasons != self.figures.reasons:  # a capture is tried again every second
             log.warning("%s: %s: %s", self.name, type(act).__name__, message)
         match act:
@@ -419,8 +423,12 @@ class Charge:
         return self.component
 
     def _watch_the_end(self) -> None:
-        """From now on, and not before the core knows that it runs, tell when it has ended."""
+        """From now on, and not before the core knows that it runs, tell when it has ended, and when it commits first."""
+        self._present().committed = self._see_the_commit
         self._task(self._see_the_end(self._present()))
+
+    def _see_the_commit(self) -> None:
+        self.around.tell(events.Committed(self.name, self.epoch))
 
     async def _see_the_end(self, component: Component) -> None:
         try:

@@ -22,7 +22,7 @@ import asyncio
 import contextlib
 import os
 import signal
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -35,7 +35,7 @@ from agent.streams import OutputLogs
 from checkpoint import channel, errors
 from checkpoint.channel import Failed, close_all
 from checkpoint.engine import COOPERATIVE, PTRACE
-from checkpoint.errors import CheckpointError, RestoreError
+from checkpoint.errors import CheckpointError, NothingCommittedError, RestoreError
 from checkpoint.model import Position
 
 TOTALS_LIMIT: Final = 64
@@ -102,6 +102,7 @@ class Component:
         logs: its output; `OutputLogs.read` serves ``failover logs``.
         engine: by which it is captured: `PTRACE` or `COOPERATIVE`.
         task_pid: of the process that keeps its state, 0 before it has said so; keeps: it has made a commit.
+        committed: called at its first commit to each segment.
         prepared: a program that is to be started with a state, by `resume`.
         streams: what its guard gave of them: counters, two read ends, two logs; none of somebody else's child.
         ended: the wait status once the program has ended (None: it was not our child); GuardLostError if the guard died first.
@@ -123,6 +124,8 @@ class Component:
         self.engine = PTRACE
         self.task_pid = 0
         self.keeps = False
+        self.committed: Callable[[], None] = lambda: None
+        self._followed: tuple[str, int] | None = None
         self.prepared: Prepared | None = None
         self._lease_until_ns = 0
         self._held = False
@@ -155,8 +158,6 @@ class Component:
             born, streams = await self.ask_guard(prepared.start, (prepared.segment,))
             self.take(born, streams)
             await self.lease(self._lease_until_ns)
-            with contextlib.suppress(CheckpointError, KeeperLostError):  # the next capture tries with a new one
-                await self._follow()
         except GuardError:
             await self.undo()
             raise
@@ -166,25 +167,37 @@ class Component:
     # --- protection ---
 
     async def protect(self) -> tuple[str, ...]:
-        """Give it a keeper, if it has none; returns the keeper's notes.
+        """Have a keeper follow it, or the process that keeps its state; returns the keeper's notes.
 
         Raises:
             checkpoint.errors.UnsupportedError: with the reasons; the program was not touched.
             ProbeError, KeeperLostError.
         """
-        if self._keeper is not None and self._keeper.dialogue.open:
+        followed = self.engine, (self.task_pid or self.pid) if self.engine == COOPERATIVE else self.pid
+        has_one = self._keeper is not None and self._keeper.dialogue.open
+        if has_one and self._followed not in (None, followed):
+            await self._release_keeper()
+            has_one = False
+        if not has_one:
+            await self.give_keeper()
+        if self._followed == followed or self._awaits_commit:
             return ()
-        await self.give_keeper()
-        return await self._follow()
+        return await self._follow(*followed)
 
-    async def _follow(self) -> tuple[str, ...]:
-        """Have a keeper that follows nothing yet follow the program; it ends if it cannot."""
-        order = channel.Protect(self.pid, self.name, bool(self.streams), self._places.robot, self.engine)
+    @property
+    def _awaits_commit(self) -> bool:
+        """Whether there is nothing to follow yet."""
+        return self.engine == COOPERATIVE and not self.keeps
+
+    async def _follow(self, engine: str, pid: int) -> tuple[str, ...]:
+        """Have a keeper that follows nothing yet follow a process; it ends if it cannot."""
+        order = channel.Protect(pid, self.name, bool(self.streams), self._places.robot, engine)
         try:
             protected, _ = await self.ask_keeper(order, self.streams)
         except (CheckpointError, KeeperLostError):
             self._drop_keeper()
             raise
+        self._followed = engine, pid
         return tuple(protected.notes)
 
     async def capture(
@@ -199,16 +212,21 @@ class Component:
             `Unchanged` only where a delta of a program that keeps its state, and is not to be held, would say nothing new.
 
         Raises:
-            checkpoint.errors.CaptureError, UnsupportedError, ProcessGoneError, ProbeError; KeeperLostError. The program runs on.
+            checkpoint.errors.NothingCommittedError: there is nothing to capture yet; `committed` is called when there is.
+            CaptureError, UnsupportedError, ProcessGoneError, ProbeError; KeeperLostError. The program runs on.
         """
+        is_held_by_guard = hold and self.engine == COOPERATIVE
+        if self._awaits_commit:
+            what = "it has committed nothing yet" if self.task_pid else "it has not said yet that it keeps a state"
+            raise NothingCommittedError(f"cannot capture {self.name}: {what}")
         await self.protect()
         order = channel.Capture(base, generation, sequence, epoch, hold)
-        async with self._standing_still(hold and self.engine == COOPERATIVE):
+        async with self._standing_still(is_held_by_guard):
             captured, descriptors = await self.ask_keeper(order)
         if isinstance(captured, channel.Unchanged):
             return captured
         (snapshot,) = descriptors
-        self._held = hold and self.engine != COOPERATIVE
+        self._held = hold and not is_held_by_guard
         self._commits[captured.position] = captured.commit
         self._totals[captured.position] = captured.totals
         while len(self._totals) > TOTALS_LIMIT:
@@ -308,9 +326,7 @@ class Component:
 
     async def release(self) -> None:
         """End protection; the program runs on, its guard keeps its streams until it ends."""
-        if self._keeper is not None and self._keeper.dialogue.open:
-            with contextlib.suppress(CheckpointError, KeeperLostError):
-                await self.ask_keeper(channel.Release())
+        await self._release_keeper()
         await self.ask_guard(guard_messages.LetGo())
         self.close()
 
@@ -384,9 +400,16 @@ class Component:
 
     def _drop_keeper(self) -> None:
         keeper, self._keeper = self._keeper, None
-        self._held = False
+        self._held, self._followed = False, None
         if keeper is not None:
             keeper.end()
+
+    async def _release_keeper(self) -> None:
+        """Have the keeper let go of what it follows, if it is there, and end."""
+        if self._keeper is not None and self._keeper.dialogue.open:
+            with contextlib.suppress(CheckpointError, KeeperLostError):
+                await self.ask_keeper(channel.Release())
+        self._drop_keeper()
 
     def _heard(self, message: Any) -> bool:
         """Events of the guard."""
@@ -396,6 +419,8 @@ class Component:
             return True
         if isinstance(message, TaskConnected | TaskKeeps):
             self.task_pid, self.keeps = message.pid, isinstance(message, TaskKeeps)
+            if self.keeps:
+                self.committed()
             return True
         return isinstance(message, guard_messages.FrozenByLease)
 

@@ -48,6 +48,8 @@ EVENTS: Final[dict[str, Any]] = {
         events.Captured,
         events.Unchanged,
         events.CaptureFailed,
+        events.NothingToCapture,
+        events.Committed,
         events.ShipEnded,
         events.Stored,
         events.StoreFailed,

@@ -39,6 +39,10 @@ class ProcessGoneError(CaptureError):
     """The process ended while it was being looked at."""
 
 
+class NothingCommittedError(CaptureError):
+    """The program keeps its state itself, and has committed nothing yet: nothing is wrong, there is nothing to capture."""
+
+
 class RestoreError(CheckpointError):
     """A restore was begun and not finished; nothing of it is left behind."""
 

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from checkpoint import pages
 from checkpoint.chain import position_of
 from checkpoint.engine import COOPERATIVE, CaptureOrder
-from checkpoint.errors import CaptureError, RestoreError, SegmentError
+from checkpoint.errors import CaptureError, NothingCommittedError, RestoreError, SegmentError
 from checkpoint.linux import abi, procfs
 from checkpoint.model import (
     Clocks,
@@ -112,7 +112,7 @@ class CooperativeSession:
         """Make a snapshot of the newest commit.
 
         Raises:
-            CaptureError: nothing was committed yet.
+            NothingCommittedError: there is none.
             SegmentError: the program does not keep the rules of its segment, or the bank was busy.
         """
         layout = self._reader.layout
@@ -122,7 +122,7 @@ class CooperativeSession:
         until_now = self._outputs.totals() if self._outputs else (0, 0)
         committed = self._reader.read(parent.commit if parent else 0)
         if committed is None and parent is None:
-            raise CaptureError(f"cannot capture {self._component}: it has committed nothing yet")
+            raise NothingCommittedError(f"cannot capture {self._component}: it has committed nothing yet")
         if committed is None or (parent is not None and self._outputs and committed.outputs is PENDING):
             committed = _nothing_since(parent, layout)
         totals = self._totals_of(committed, until_now) if self._outputs else (0, 0)

@@ -90,6 +90,7 @@ class Flight:
         state_ns: how old its state is counted from: the order, or, where the program commits, its commit.
         to: standby that it goes to; "" for this robot's own store only.
         final: the last delta of a handover.
+        is_outdated: the program's first commit came while the snapshot was being taken.
     """
 
     started_ns: int
@@ -99,6 +100,7 @@ class Flight:
     position: Position | None = None
     parent: Position | None = None
     final: bool = False
+    is_outdated: bool = False
     state_ns: int = 0
 
 
@@ -126,6 +128,7 @@ class Component:
         due_ns: next capture; ``until_ns``: when the present claim, start or restore is overdue.
         resumed_ns: when the state was captured that this primacy began with, -1 for a fresh start; ``resumed_age_ns``: how old
             it was then.
+        awaited: why there is nothing to capture, where that is as it should be.
         undelivered: why the last snapshot did not become a checkpoint; ``unstored``: on a standby, why it was not stored.
         keeps_state: on a standby: to go on from the newest snapshot is to start the program again.
         waiting: on a standby: the program that was ordered to wait, under ``waiting_epoch``; it is ready (``warm``) or, after
@@ -162,6 +165,7 @@ class Component:
     acked_ns: int = -1
     freeze_us: int = 0
     degraded: str = ""
+    awaited: str = ""
     undelivered: str = ""
     unstored: str = ""
     keeps_state: bool = False

@@ -73,7 +73,8 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str) -> 
     component.plan = plan
     component.claim_counter = turn.next_counter
     component.until_ns = turn.now_ns + turn.config.loyalty_ns
-    component.unprotected, component.degraded, component.needs_base = False, "", False
+    component.unprotected, component.needs_base = False, False
+    component.degraded = component.awaited = ""
     component.undelivered = component.unstored = ""
     component.resumed_ns = component.resumed_age_ns = -1
     component.handing, component.ending, component.reported = None, False, False

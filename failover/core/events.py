@@ -84,6 +84,23 @@ class CaptureFailed:
 
 
 @dataclass(frozen=True, slots=True)
+class NothingToCapture:
+    """The act Capture came too early: the program keeps its state itself and has committed nothing yet. `Committed` follows."""
+
+    component: str
+    epoch: int
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class Committed:
+    """A program that keeps its state has made its first commit, or the first to another segment: a capture finds it now."""
+
+    component: str
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True)
 class ShipEnded:
     """The transfer ordered by the act Ship has ended: ``ok`` when the last byte was taken by the other side.
 
@@ -235,6 +252,8 @@ Event = (
     | Captured
     | Unchanged
     | CaptureFailed
+    | NothingToCapture
+    | Committed
     | ShipEnded
     | Stored
     | StoreFailed

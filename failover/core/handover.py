@@ -56,7 +56,7 @@ def _call_off(component: Component, turn: Turn, handing: Handing) -> None:
     component.move(Cause.CALL_OFF)
     component.handing = component.flight = None
     turn.order(acts.Freeze(component.name, component.epoch))
-    why = component.degraded or component.undelivered
+    why = component.degraded or component.awaited or component.undelivered
     sentence = f"{handing.to} did not take {component.name} in time; it stays at {turn.me}" + (f": {why}" if why else "")
     _answer(turn, handing.request, False, sentence)
     turn.say(component, f"the handover to {handing.to} is called off")

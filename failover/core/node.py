@@ -14,10 +14,12 @@ from failover.core.events import (
     Captured,
     CaptureFailed,
     Command,
+    Committed,
     Event,
     Exited,
     Failback,
     Handover,
+    NothingToCapture,
     Prefer,
     Received,
     Release,
@@ -249,6 +251,10 @@ def _tell(component: Component, turn: Turn, event: Event) -> None:
             replication.unchanged(component, turn, event)
         case CaptureFailed():
             replication.capture_failed(component, turn, event)
+        case NothingToCapture():
+            replication.nothing_to_capture(component, turn, event)
+        case Committed():
+            replication.committed(component, turn, event)
         case ShipEnded():
             replication.ship_ended(component, turn, event)
         case Stored():

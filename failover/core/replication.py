@@ -11,7 +11,7 @@ from failover.core import acts, lease
 from failover.core.component import Component, Flight, Turn
 from failover.core.consent import grants
 from failover.core.election import supersede
-from failover.core.events import Captured, CaptureFailed, ShipEnded, Stored, StoreFailed, Unchanged
+from failover.core.events import Captured, CaptureFailed, Committed, NothingToCapture, ShipEnded, Stored, StoreFailed, Unchanged
 from failover.core.messages import NEEDS_BASE, Entry
 from failover.core.names import weight
 from failover.core.types import HISTORY_MAX, MS, OnUnsupported, State
@@ -55,7 +55,7 @@ def captured(component: Component, turn: Turn, event: Captured) -> None:
     if flight is None or flight.position is not None or not _current(component, event.epoch, event.position):
         return
     component.hold(event.position)
-    component.freeze_us, component.degraded = event.freeze_us, ""
+    component.freeze_us, component.degraded, component.awaited = event.freeze_us, "", ""
     component.base_wanted = False
     flight.position, flight.parent = event.position, event.parent
     flight.state_ns = max(flight.started_ns - event.age_ns, 0)
@@ -101,6 +101,28 @@ def capture_failed(component: Component, turn: Turn, event: CaptureFailed) -> No
     if event.unsupported and component.rules.on_unsupported is OnUnsupported.STOP_PROTECTING:
         component.unprotected = True
         turn.say(component, "it is protected no longer: on_unsupported = stop_protecting")
+
+
+def nothing_to_capture(component: Component, turn: Turn, event: NothingToCapture) -> None:
+    """Nothing is wrong: we look again after a while, or as soon as it has committed, perhaps in this moment."""
+    flight = component.flight
+    if flight is None or flight.position is not None or event.epoch != component.epoch:
+        return
+    _give_up(component, turn)
+    component.degraded, component.awaited = "", event.message
+    if flight.is_outdated:
+        component.due_ns = turn.now_ns
+
+
+def committed(component: Component, turn: Turn, event: Committed) -> None:
+    """There is something to capture: at once, also after a capture that is under way and may have looked too early."""
+    if event.epoch != component.epoch or component.handing is not None:
+        return
+    component.awaited = ""
+    if component.flight is not None:
+        component.flight.is_outdated = True
+    else:
+        component.due_ns = turn.now_ns
 
 
 def ship_ended(component: Component, turn: Turn, event: ShipEnded) -> None:

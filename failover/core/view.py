@@ -118,6 +118,8 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
     notes = []
     if component.degraded and component.holding:
         notes.append(f"not captured: {component.degraded}; {_age(component, turn)}")
+    elif component.awaited and component.holding:
+        notes.append(f"nothing to protect yet: {component.awaited}; {_age(component, turn)}")
     elif component.holding and _overdue(component, turn):
         notes.append(f"snapshots do not arrive: {component.undelivered}; {_age(component, turn)}")
     if component.holding and component.resumed_age_ns >= STALE_NS:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
+import shlex
 import signal
 import sys
 from collections.abc import AsyncIterator
@@ -20,7 +22,7 @@ from agent.component import Captured, Component
 from agent.errors import GuardError
 from agent.places import Places, guard_sockets
 from checkpoint.engine import COOPERATIVE
-from checkpoint.errors import CaptureError, MismatchError
+from checkpoint.errors import CaptureError, MismatchError, NothingCommittedError
 from checkpoint.linux import procfs
 from tests.agent.guards import PATIENCE_S
 from tests.agent.test_component import Captures, live, output, piece_of, until
@@ -122,8 +124,50 @@ def test_a_program_that_has_committed_nothing_is_told_so(tmp_path: Path) -> None
     async def story(places: Places) -> None:
         async with gone_afterwards(await started(places, SILENT)) as component:
             await until(lambda: output(component) == b"here\n", "its output")
-            with pytest.raises(CaptureError, match="has not committed yet"):
+            with pytest.raises(NothingCommittedError, match="has not said yet that it keeps a state"):
                 await Captures(component).take()
+
+    live(tmp_path, story)
+
+
+def test_the_first_commit_is_told_at_once_and_captured(tmp_path: Path) -> None:
+    async def story(places: Places) -> None:
+        script = BEGIN + "print('begun', flush=True)\nwhile not pathlib.Path('FLAG').exists(): time.sleep(0.002)\n"
+        script = "import pathlib\n" + script.replace("FLAG", str(tmp_path / "go")) + "failover.commit()\ntime.sleep(1000)\n"
+        async with gone_afterwards(await started(places, script)) as component:
+            told = asyncio.Event()
+            component.committed = told.set
+            await until(lambda: output(component) == b"begun\n", "it to begin")
+            captures = Captures(component)
+            with pytest.raises(NothingCommittedError, match="has committed nothing yet"):
+                await captures.take()
+            assert not told.is_set()
+            (tmp_path / "go").touch()
+            await asyncio.wait_for(told.wait(), PATIENCE_S)
+            assert (await captures.take()).parent is None
+            captures.close()
+
+    live(tmp_path, story)
+
+
+def test_a_child_of_what_was_started_may_keep_the_state(tmp_path: Path) -> None:
+    """A shell that does not exec, as launchers do: also its end is that of the component."""
+
+    async def story(places: Places) -> None:
+        command = shlex.join([sys.executable, "-c", STEPS]) + "; true"
+        wrapped = replace(program(STEPS), argv=(b"sh", b"-c", os.fsencode(command)))
+        async with gone_afterwards(await births.start(NAME, wrapped, places, 3)) as component:
+            await until(lambda: output(component).count(b"\n") > 10, "some steps")
+            assert component.task_pid not in (0, component.pid)
+            await captures_go_on(component)
+            os.close((await held(component)).snapshot)
+            assert procfs.status(component.task_pid).state in "ST"
+            before = len(output(component))
+            assert len(output(component)) == before
+            await component.thaw()
+            await until(lambda: len(output(component)) > before, "it to go on")
+            os.kill(component.task_pid, signal.SIGTERM)
+            assert await component.ended == 0
 
     live(tmp_path, story)
 
@@ -179,7 +223,7 @@ def test_a_program_goes_on_exactly_after_what_its_last_snapshot_carries(tmp_path
             await until(lambda: output(first).count(b"\n") > 10, "some steps")
             captures = Captures(first)
             for _ in range(5):
-                captured = await captures.take()
+                captured = await next_of(first, captures)
         end = piece_of(captured).offset + len(piece_of(captured).content)
         second = await again(replace(places, robot="robot2"), captures, STEPS)
         await second.resume()
@@ -195,11 +239,18 @@ def test_a_program_goes_on_exactly_after_what_its_last_snapshot_carries(tmp_path
     live(tmp_path, story)
 
 
+async def next_of(component: Component, captures: Captures) -> Captured:
+    """A snapshot after another commit of a program that takes steps."""
+    before = output(component).count(b"\n")
+    await until(lambda: output(component).count(b"\n") > before + 2, "another commit")
+    return await captures.take()
+
+
 async def captures_go_on(component: Component) -> None:
     """The program that was started again is protected as it was before."""
     captures = Captures(component)
     assert (await captures.take()).parent is None
-    assert (await captures.take()).parent is not None
+    assert (await next_of(component, captures)).parent is not None
     captures.close()
 
 

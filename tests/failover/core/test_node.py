@@ -7,7 +7,18 @@ import pytest
 from checkpoint.model import Position
 from failover.core import acts, ballot
 from failover.core.component import TABLE, Cause
-from failover.core.events import Captured, CaptureFailed, Received, Release, Run, Started, Tick, Unchanged
+from failover.core.events import (
+    Captured,
+    CaptureFailed,
+    Committed,
+    NothingToCapture,
+    Received,
+    Release,
+    Run,
+    Started,
+    Tick,
+    Unchanged,
+)
 from failover.core.membership import Peer
 from failover.core.messages import Beat, Echo, Entry
 from failover.core.node import Node
@@ -112,6 +123,27 @@ def test_what_cannot_be_captured_degrades_and_names_the_reason() -> None:
     (seen,) = node.status(6 * MS).components
     assert seen.protection == "degraded" and "fd 7 is a socket" in seen.notes[0]
     assert only(node.step(Tick(), 2_000 * MS), acts.Capture)
+
+
+def test_a_program_that_has_committed_nothing_yet_is_captured_as_soon_as_it_has() -> None:
+    node = Node(ALONE, 1, Ballot(), 0)
+    running(node)
+    assert not node.step(NothingToCapture("/lab/x", 1, "it has committed nothing yet"), 5 * MS).act
+    seen = node.status(6 * MS).components[0]
+    assert (seen.protection, node.status(6 * MS).healthy) == ("none", True), "nothing is wrong"
+    assert seen.notes == ("nothing to protect yet: it has committed nothing yet; there is no checkpoint yet",)
+    assert not any("not captured" in decision.sentence for decision in node.why("/lab/x"))
+    (capture,) = only(node.step(Committed("/lab/x", 1), 7 * MS), acts.Capture)
+    assert isinstance(capture, acts.Capture)
+    node.step(Captured("/lab/x", 1, Position(capture.generation, capture.sequence, b"d"), None), 8 * MS)
+    assert node.status(9 * MS).components[0].notes == ()
+
+
+def test_a_first_commit_in_the_middle_of_a_capture_is_not_passed_over() -> None:
+    node = Node(ALONE, 1, Ballot(), 0)
+    running(node)
+    assert not only(node.step(Committed("/lab/x", 1), 3 * MS), acts.Capture), "one is in flight"
+    assert only(node.step(NothingToCapture("/lab/x", 1, "nothing yet"), 5 * MS), acts.Capture)
 
 
 def test_stop_protecting_means_no_more_captures() -> None:
