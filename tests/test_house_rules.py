@@ -30,7 +30,9 @@ PURE_IMPORTS = frozenset(
     """.split()  # noqa: SIM905
 )
 
-VALUE_IMPORTS = frozenset({"copy", "datetime", "decimal", "fractions", "pathlib", "pickle", "sys", "uuid", "zoneinfo"})
+VALUE_IMPORTS = frozenset(
+    "array copy datetime decimal fractions ipaddress pathlib pickle random sys uuid zoneinfo".split()  # noqa: SIM905
+)
 """Where a program's values are stored, also the modules whose values are kept; pickle has a door of its own."""
 
 IMPURE_CALLS = frozenset({"open", "print", "input", "exec", "eval"})

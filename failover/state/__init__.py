@@ -11,9 +11,11 @@ nothing (but ``__post_init__`` of a msgspec.Struct). No pickle, but where a decl
 |---|---|---|
 | None, bool, int, float, complex, str, bytes | the same, to the bit | int of up to a million bits, NaN payloads, odd text |
 | a number's place | whatever number it held | an int in a float's place, numpy's scalars |
-| bytearray | one object | |
+| bytearray, array.array | one object | numbers only |
 | datetime, date, time, timedelta, timezone, ZoneInfo | the same, fold too | zones of datetime and zoneinfo |
-| Decimal, Fraction, UUID, range, Path, PurePath | the same | |
+| Decimal, Fraction, UUID, range, slice, Path, PurePath | the same | |
+| ipaddress, msgspec.UNSET | the same | |
+| random.Random, numpy.random.Generator | draws next what it would have drawn | Random is 2.5 KB |
 | Enum, Flag, Literal | the member of that name | values may be numbered anew |
 | list, deque, tuple, set, frozenset | the same, bounds too | of what is declared, or of Any |
 | dict, OrderedDict, Counter, defaultdict | the same, order too | immutable keys; the factory is the declaration's |
@@ -24,7 +26,7 @@ nothing (but ``__post_init__`` of a msgspec.Struct). No pickle, but where a decl
 | Any, object, bare list, dict … | any kind above | not a program's own classes: declare these |
 | ``Annotated[X, Pickled()]``, ``Field(pickled=True)`` | what pickle makes | *who can write the stored state can run code here* |
 
-Refused by name, at declaration or at the commit: locks, files, sockets, functions, instances of subclasses of what was declared,
+Refused by name and with what to keep instead (`advice`), at declaration or at the commit: locks, files, sockets, functions, instances of subclasses of what was declared,
 attributes that are no fields, views that share memory, nesting deeper than 100, more than 64 MiB besides arrays.
 
 An object that is reached by two paths is one object again, and cycles are cycles: a second way to a mutable object is stored as

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import array
 import collections
 import collections.abc
 import copy
 import enum
+import random
 import types
 import typing
 from collections.abc import Callable, Mapping
@@ -15,6 +17,7 @@ import numpy as np
 
 from failover.errors import SchemaError
 from failover.state import arrays, numbers, plain
+from failover.state.advice import NO_FIELDS, advice_for, advice_for_annotation
 from failover.state.choices import AnyKind, EnumKind, FlagKind, LiteralKind, UnionKind
 from failover.state.containers import DequeKind, ListKind, MappingKind, SetKind, TupleKind
 from failover.state.declare import MISSING, Field, Formerly, Pickled
@@ -22,8 +25,10 @@ from failover.state.dtypes import DtypeError, lower_dtype
 from failover.state.kinds import Kind
 from failover.state.opened import LabelledKind, PlainRecordKind
 from failover.state.pickled import PickledKind, UnreadKind
+from failover.state.random_numbers import GeneratorKind, RandomKind
 from failover.state.records import RecordField, RecordKind
 from failover.state.styles import Components, Member, record_of
+from failover.state.typed import NumbersKind
 
 _ATOMS: dict[Any, Kind] = {
     None: numbers.NONE,
@@ -37,6 +42,8 @@ _ATOMS: dict[Any, Kind] = {
     bytearray: arrays.BYTEARRAY_KIND,
     np.ndarray: arrays.ANY_ARRAY,
     np.generic: arrays.ANY_SCALAR,
+    array.array: NumbersKind(),
+    random.Random: RandomKind(),
     **plain.PLAIN_KINDS,
 }
 
@@ -56,14 +63,13 @@ _WRAPPERS = tuple(
     found for name in ("Final", "Required", "NotRequired", "ReadOnly") if (found := getattr(typing, name, None)) is not None
 )
 
-NOT_DATA = "it is no data that a state can hold; keep what it was made from and make it anew in on_resume"
-
 
 class Compiler:
     """Makes the kinds of one schema; equal declarations share one kind, so that objects can be shared between their places."""
 
     def __init__(self) -> None:
         self._made: dict[Any, Kind] = {}
+        self._generator = GeneratorKind()
         self.any = self._open(AnyKind())
 
     def open(self) -> AnyKind:
@@ -81,7 +87,7 @@ class Compiler:
             self._of_kind(DequeKind, kind),
             self._mapping_of(dict, kind, kind),
         )
-        kind.complete((arrays.ANY_SCALAR, *_ATOMS.values(), *containers, *also))
+        kind.complete((arrays.ANY_SCALAR, *_ATOMS.values(), self._generator, *containers, *also))
         return kind
 
     # Interning
@@ -172,7 +178,7 @@ class Compiler:
             return self._generic(annotation, origin, arguments, where, default)
         if isinstance(annotation, type):
             return self._class(annotation, (), where, default)
-        raise SchemaError(f"cannot keep {where}: {annotation!r} is not a type that we know; {NOT_DATA}", where)
+        raise _unknown(annotation, origin, where)
 
     def _inferred(self, default: Any, where: str) -> Kind:
         """What a default says without an annotation."""
@@ -203,7 +209,7 @@ class Compiler:
             return self.kind(origin.__value__[arguments], where, default)
         if isinstance(origin, type) and origin is not collections.abc.Callable:
             return self._class(origin, arguments, where, default)
-        raise SchemaError(f"cannot keep {where}: {annotation!r} is not a type that we know; {NOT_DATA}", where)
+        raise _unknown(annotation, origin, where)
 
     def _union(self, arms: tuple[Any, ...], where: str) -> Kind:
         kinds = tuple(dict.fromkeys(self.kind(arm, where) for arm in arms))
@@ -241,6 +247,8 @@ class Compiler:
             return self._once(cls, lambda: FlagKind(cls) if issubclass(cls, enum.Flag) else EnumKind(cls))
         if cls in _ATOMS:
             return _ATOMS[cls]
+        if cls in self._generator.types:
+            return self._generator
         return self._record(cls, arguments, where)
 
     def _abstract(self, cls: Any, arguments: tuple[Any, ...], where: str) -> Kind:
@@ -281,7 +289,8 @@ class Compiler:
             message = f"cannot keep {where}: an annotation of {cls.__qualname__} cannot be resolved: {error}"
             raise SchemaError(f"{message}; define what it names where the class's module can see it", where) from error
         if record is None:
-            raise SchemaError(f"cannot keep {where}: a {cls.__module__}.{cls.__qualname__} cannot be kept: {NOT_DATA}", where)
+            cure = advice_for(cls) or NO_FIELDS
+            raise SchemaError(f"cannot keep {where}: a {cls.__module__}.{cls.__qualname__} cannot be kept: {cure}", where)
         name = f"{cls.__name__}[{', '.join(map(_spelled, arguments))}]" if arguments else cls.__name__
         kind = RecordKind(name, dict if typing.is_typeddict(cls) else cls, record.style)
         self._made[key] = kind
@@ -295,6 +304,11 @@ class Compiler:
         default = member.default() if annotation is MISSING and member.default is not None else MISSING
         kind = self.any if annotation is MISSING and default is MISSING else self.kind(annotation, where, default)
         return RecordField(member.name, kind, member.default, _formerly(annotation), member.optional)
+
+
+def _unknown(annotation: Any, origin: Any, where: str) -> SchemaError:
+    cure = advice_for_annotation(annotation, origin)
+    return SchemaError(f"cannot keep {where}: {annotation!r} is not a type that we know; {cure}", where)
 
 
 def _spelled(annotation: Any) -> str:

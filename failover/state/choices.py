@@ -6,8 +6,9 @@ import enum
 from typing import Any
 
 from failover.errors import FitError, KeepError
+from failover.state.advice import advice_for
 from failover.state.containers import TUPLE
-from failover.state.kinds import Build, Kind, Walk
+from failover.state.kinds import Build, Kind, Walk, with_article
 from failover.state.wire import INT_MAX, INT_MIN, SAME, Place, Wire, mark_of, text_of
 
 AS = "$as"
@@ -177,6 +178,15 @@ def _contradict(left: Kind, right: Kind, shapes: frozenset[str]) -> bool:
     return left is not right and not shapes.isdisjoint(right.shapes) and not (left.evident and right.evident)
 
 
+def _nameless(value: object, where: str) -> KeepError:
+    """The refusal of a value of which a stored state would not say what it is."""
+    cure = advice_for(type(value))
+    if cure:
+        return KeepError(f"cannot keep {where}: it holds {with_article(type(value).__name__)}: {cure}", where)
+    message = f"cannot keep {where}: nothing but its own type ({type(value).__name__}) would say what it is"
+    return KeepError(f"{message}; declare the type at its place, or take it out of what is kept", where)
+
+
 def shape_of(wire: Wire) -> str:
     """What a wire value looks like, in the words of ``Kind.shapes``."""
     if type(wire) is dict:
@@ -205,9 +215,7 @@ class AnyKind(Kind):
     def lower(self, value: Any, walk: Walk, place: Place) -> Wire:
         kind = self._by_type.get(type(value)) or self._by_base(value)
         if kind is None:
-            where = text_of(place)
-            message = f"cannot keep {where}: nothing but its own type ({type(value).__name__}) would say what it is"
-            raise KeepError(f"{message}; declare the type at its place, or take it out of what is kept", where)
+            raise _nameless(value, text_of(place))
         return kind.lower(value, walk, place)
 
     def _by_base(self, value: object) -> Kind | None:

@@ -10,6 +10,7 @@ been two, silently. Immutable values may be split, for nobody can tell.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from array import array
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -87,7 +88,9 @@ class Kind(ABC):
         """The refusal of a value that is not of the declared type."""
         where = text_of(place)
         cure = cure or "assign what is declared, or change the declaration"
-        return KeepError(f"cannot keep {where}: it holds {_article(type(value).__name__)}, declared {self.name}; {cure}", where)
+        return KeepError(
+            f"cannot keep {where}: it holds {with_article(type(value).__name__)}, declared {self.name}; {cure}", where
+        )
 
     def misfit(self, wire: Wire, place: Place, why: str = "") -> FitError:
         """The refusal of a stored value that is not of the declared type."""
@@ -98,7 +101,8 @@ class Kind(ABC):
 FIT_CURE = "give the schema a higher version and a migration, or declare it as it was stored"
 
 
-def _article(name: str) -> str:
+def with_article(name: str) -> str:
+    """A name of a class as it is said."""
     return f"{'an' if name[:1] in 'aeiouAEIOU' else 'a'} {name}"
 
 
@@ -197,7 +201,7 @@ class Walk:
         neighbours.append(len(self._arrays))
         self._arrays.append((array, place))
 
-    def meet_buffer(self, value: bytearray, place: Place) -> None:
+    def meet_buffer(self, value: bytearray | array[Any], place: Place) -> None:
         """Note bytes that an array may lie over.
 
         Raises:

@@ -1,4 +1,4 @@
-"""Kinds of the standard library's immutable values: dates and times, Decimal, Fraction, UUID, paths, ranges.
+"""Kinds of immutable values: dates and times, Decimal, Fraction, UUID, addresses, paths, ranges, slices; msgspec.UNSET.
 
 Each is a mark and two functions: value → payload, payload → value. The second refuses, by ValueError or TypeError, whatever
     the first would not have written; the kind turns that into a sentence with the place.
@@ -7,6 +7,7 @@ Each is a mark and two functions: value → payload, payload → value. The seco
 from __future__ import annotations
 
 import datetime as dt
+import ipaddress
 import pathlib
 import uuid
 import zoneinfo
@@ -15,6 +16,7 @@ from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from failover.errors import FitError, KeepError
@@ -170,6 +172,18 @@ def _lift_fraction(wire: Wire) -> Fraction:
     return Fraction(numerator, denominator)
 
 
+def _lower_slice(value: slice) -> Wire:
+    """Of whole numbers; others are anything that an index may be."""
+    parts = (value.start, value.stop, value.step)
+    if not all(part is None or type(part) is int for part in parts):
+        raise ValueError("its bounds are neither integers nor None")
+    return [None if part is None else _whole(part)[0] for part in parts]
+
+
+def _lift_slice(wire: Wire) -> slice:
+    return slice(*(None if part is None else _integers([part], 1)[0] for part in _parts(wire, object, object, object)))
+
+
 # Names
 
 
@@ -183,6 +197,17 @@ def _lift_uuid(wire: Wire) -> uuid.UUID:
     if type(wire) is not bytes:
         raise TypeError("not 16 bytes")
     return uuid.UUID(bytes=wire)
+
+
+def _address_kind(cls: type) -> MarkedKind:
+    """Addresses, networks and interfaces, by their text."""
+    return MarkedKind(f"${cls.__name__.lower()}", cls, str, lambda wire: cls(_text(wire)))
+
+
+def _lift_unset(wire: Wire) -> msgspec.UnsetType:
+    if wire is not None:
+        raise ValueError("it has no content")
+    return msgspec.UNSET
 
 
 def _lift_text(wire: Wire) -> str:
@@ -215,6 +240,19 @@ PLAIN_KINDS: dict[type, MarkedKind] = {
     range: MarkedKind(
         "$range", range, lambda value: _whole(value.start, value.stop, value.step), lambda wire: range(*_integers(wire, 3))
     ),
+    slice: MarkedKind("$slice", slice, _lower_slice, _lift_slice),
+    msgspec.UnsetType: MarkedKind("$unset", msgspec.UnsetType, lambda value: None, _lift_unset),
+    **{
+        cls: _address_kind(cls)
+        for cls in (
+            ipaddress.IPv4Address,
+            ipaddress.IPv6Address,
+            ipaddress.IPv4Network,
+            ipaddress.IPv6Network,
+            ipaddress.IPv4Interface,
+            ipaddress.IPv6Interface,
+        )
+    },
     pathlib.Path: PATH,
     pathlib.PurePosixPath: _path_kind("$posixpath", pathlib.PurePosixPath),
     pathlib.PureWindowsPath: _path_kind("$windowspath", pathlib.PureWindowsPath),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import array
 import collections
 import datetime as dt
+import ipaddress
 import math
 import pathlib
 import struct
@@ -14,6 +16,7 @@ from decimal import Decimal
 from fractions import Fraction
 from typing import Annotated, Any, Final, Literal, NewType, Optional
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -94,6 +97,15 @@ KEPT: list[tuple[Any, Any]] = [
     (Decimal, Decimal("sNaN123")),
     (Decimal, Decimal("1E+999999")),
     (Fraction, Fraction(-(10**30), 7)),
+    (slice, slice(1, None, -(1 << 70))),
+    (msgspec.UnsetType, msgspec.UNSET),
+    (int | msgspec.UnsetType, msgspec.UNSET),
+    (ipaddress.IPv4Address, ipaddress.ip_address("192.168.7.11")),
+    (ipaddress.IPv6Interface, ipaddress.ip_interface("fe80::1%eth0/64")),
+    (ipaddress.IPv4Network, ipaddress.ip_network("10.0.0.0/8")),
+    (array.array, array.array("d", [0.1, -0.0])),
+    (array.array, array.array("H", range(5000))),
+    (list[array.array], [array.array("b")]),
     (uuid.UUID, uuid.UUID(int=7)),
     (pathlib.Path, pathlib.Path("/a/b\udcff/ü")),
     (pathlib.PurePath, pathlib.PurePath(".")),
@@ -286,5 +298,5 @@ def test_arrays_can_be_read_into_memory_of_the_callers_choice() -> None:
 
 
 def test_what_is_read_can_be_written_to() -> None:
-    for array in (np.zeros(3), np.zeros(3000), np.asfortranarray(np.ones((30, 40)))):
-        resumed(np.ndarray, array)[...] = 1
+    for value in (np.zeros(3), np.zeros(3000), np.asfortranarray(np.ones((30, 40)))):
+        resumed(np.ndarray, value)[...] = 1

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import collections
 import datetime as dt
+import io
+import os
+import queue
+import re
 import socket
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import msgspec
@@ -57,7 +62,7 @@ class Kilometres(float):
     [
         (
             Busy,
-            r"cannot keep kept\.lock: .*lock.* it is no data that a state can hold; keep what it was made from",
+            r"cannot keep kept\.lock: .*lock.* a lock belongs to the threads of one process; make it anew at each start",
         ),
         (Deep, r"cannot keep kept\.inner\[\]\.lock: "),
         (dict[str, socket.socket], r"cannot keep kept\[\]: a socket\.socket cannot be kept"),
@@ -75,6 +80,32 @@ class Kilometres(float):
 def test_what_cannot_be_kept_is_refused_when_it_is_declared(declared: Any, sentence: str) -> None:
     with pytest.raises(SchemaError, match=f"^{sentence}"):
         Schema.of(declared, name="kept")
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (threading.Lock, "it holds a lock: a lock belongs to the threads of one process; make it anew at each start"),
+        (threading.Event, "it holds an Event: a lock belongs to the threads"),
+        (threading.Thread, "it holds a Thread: what runs does not go on in another process; keep what it works on, and start"),
+        (lambda: Path(os.devnull).open(), "it holds a TextIOWrapper: an open file .*; keep its path and position, and open it"),  # noqa: SIM115 - it is closed below
+        (io.BytesIO, r"it holds a BytesIO: keep its bytes, getvalue\(\)"),
+        (socket.socket, "it holds a socket: a connection belongs to one process; keep the address, and connect anew"),
+        (lambda: (number for number in range(3)), "it holds a generator: nobody can tell where it stands; keep the numbers"),
+        (lambda: lambda: 3, "it holds a function: code is no data; keep a name or a member of an Enum, and look the function up"),
+        (lambda: int, "it holds a type: code is no data; .* look the class up by it"),
+        (lambda: memoryview(b"x"), r"it holds a memoryview: keep the array or bytearray that it looks into, or bytes\(it\)"),
+        (queue.Queue, "it holds a Queue: it has locks inside; keep a collections.deque"),
+        (lambda: re.compile("x"), "it holds a Pattern: keep its text"),
+        (lambda: np.random.RandomState(1), r"it holds a RandomState: keep the numpy.random.Generator over it"),
+    ],
+)
+def test_what_is_found_in_a_dict_is_refused_with_what_to_do(make: Callable[[], Any], sentence: str) -> None:
+    value = make()
+    with pytest.raises(KeepError, match=rf"^cannot keep kept\['parts'\]\[1\]: {sentence}"):
+        Schema.of(dict, name="kept").encode({"parts": [0, value]})
+    if hasattr(value, "close"):
+        value.close()
 
 
 def test_a_type_that_is_made_of_itself_is_refused() -> None:
