@@ -26,8 +26,9 @@ nothing (but ``__post_init__`` of a msgspec.Struct). No pickle, but where a decl
 | Any, object, bare list, dict … | any kind above | not a program's own classes: declare these |
 | ``Annotated[X, Pickled()]``, ``Field(pickled=True)`` | what pickle makes | *who can write the stored state can run code here* |
 
-Refused by name and with what to keep instead (`advice`), at declaration or at the commit: locks, files, sockets, functions, instances of subclasses of what was declared,
-attributes that are no fields, views that share memory, nesting deeper than 100, more than 64 MiB besides arrays.
+Refused by name and with what to keep instead (`advice`), at declaration or at the commit: locks, files, sockets, functions,
+instances of subclasses of what was declared, attributes that are no fields, views that share memory, nesting deeper than 100,
+more than 64 MiB besides arrays.
 
 An object that is reached by two paths is one object again, and cycles are cycles: a second way to a mutable object is stored as
 the path of the first. That costs one look into a dictionary for each mutable object; refusing it would forbid
