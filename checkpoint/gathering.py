@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from checkpoint import pages
 from checkpoint.pages import Buffer, Flags, PageMap, Words
+
+LONG_COPY: Final = 1 << 18
+"""Bytes that are copied by numpy, which lets other threads run meanwhile: this is also done inside programs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,11 +53,15 @@ def are_zero(copies: Sequence[Copy], sources: PageMap, page_size: int) -> Flags:
 def gathered(contents: Sequence[Buffer], sources: PageMap, page_size: int) -> memoryview:
     """The content of every page, in address order: neighbours from one copy are copied at once."""
     carried = [memoryview(content).cast("B") for content in contents]
+    arrays = [np.frombuffer(content, dtype=np.uint8) for content in contents]
     buffer = np.empty(len(sources.addresses) * page_size, dtype=np.uint8)
     target = buffer.data
     for first, (index, page), count in _stretches(sources.words):
         begin, start, size = first * page_size, page * page_size, count * page_size
-        target[begin : begin + size] = carried[index][start : start + size]
+        if size < LONG_COPY:
+            target[begin : begin + size] = carried[index][start : start + size]
+        else:
+            buffer[begin : begin + size] = arrays[index][start : start + size]
     return target.toreadonly()
 
 

@@ -34,6 +34,9 @@ EMPTY_SUM = bytes(DIGEST_SIZE)
 
 _LANE = np.dtype("<u8")
 
+DIGESTED = 1024
+"""Pages digested at a time: less than a millisecond, after which another thread of a program may run."""
+
 
 # Sets of pages
 
@@ -141,7 +144,11 @@ def digest_pages(contents: Buffer, addresses: Words, page_size: int) -> Words:
     """
     rows = _rows(contents, page_size)
     assert len(rows) == len(addresses), "one address for every page"
-    packed = b"".join(map(xxhash.xxh3_128_digest, rows, addresses.tolist()))
+    seeds = addresses.tolist()
+    packed = b"".join(
+        b"".join(map(xxhash.xxh3_128_digest, rows[first : first + DIGESTED], seeds[first : first + DIGESTED]))
+        for first in range(0, len(seeds), DIGESTED)
+    )
     return np.frombuffer(packed, dtype=_LANE).astype(np.uint64, copy=False).reshape(-1, 2)
 
 

@@ -35,6 +35,8 @@ REST_PART: Final = 9
 """After a write the thread rests this many times as long as it took: it takes a tenth of a processor, and of Python, at most…"""
 REST_S_MAX: Final = 0.1
 """…but not longer than this, which is what a crash loses of a program that commits without pause."""
+TIDY_S: Final = 5.0
+"""Between two looks whether the deltas of a large state have become too many; the chain grows by what is written meanwhile."""
 RETRY_S: Final = 0.5
 """After a write that failed."""
 LOOK_S: Final = 1.0
@@ -74,6 +76,8 @@ class StateFile:
         newest = self._store.newest(component)
         self.generation = newest.generation + 1 if newest else 1
         self._sequence = 0
+        self._is_small = True
+        self._tidied = time.monotonic()
         self._is_closed = False
 
     @property
@@ -114,8 +118,19 @@ class StateFile:
             os.close(descriptor)
         self._sequence += 1
         session.acknowledge(snapshot.position)
-        self._store.keep_newest(self.component, 1)
+        self._is_small = is_small
         return session.commit_at(snapshot.position)
+
+    def tidy(self) -> None:
+        """Forget what is older than the newest. Of a large state seldom: its deltas become a new base then, which is all of it.
+
+        Raises:
+            CheckpointError: the disk does not take that base; nothing was forgotten.
+        """
+        now = time.monotonic()
+        if self._is_small or now >= self._tidied + TIDY_S:
+            self._tidied = now
+            self._store.keep_newest(self.component, 1)
 
     def close(self) -> None:
         """Let another process have it; nothing else may be called afterwards."""
@@ -189,7 +204,7 @@ class Recorder:
             self._fresh.clear()
             began = time.monotonic()
             rest = RETRY_S
-            if self._write_newest():
+            if self._write_newest() and self._tidy():
                 rest = min(REST_PART * (time.monotonic() - began), REST_S_MAX)
             elif self._is_closing:
                 return
@@ -209,11 +224,21 @@ class Recorder:
         except SegmentBusyError:
             return False
         except (CheckpointError, OSError) as error:
-            if str(error) != self.trouble:
-                log.warning("a commit was not written, the program goes on: %s", error)
-            self.trouble = str(error)
-            return False
+            return self._failed(error)
         with self._written:
             self.durable, self.trouble = durable, ""
             self._written.notify_all()
         return True
+
+    def _tidy(self) -> bool:
+        try:
+            self._file.tidy()
+        except (CheckpointError, OSError) as error:
+            return self._failed(error)
+        return True
+
+    def _failed(self, error: Exception) -> bool:
+        if str(error) != self.trouble:
+            log.warning("a commit was not written, the program goes on: %s", error)
+        self.trouble = str(error)
+        return False

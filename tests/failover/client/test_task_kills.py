@@ -138,6 +138,7 @@ def a_life_cut_short(root: Path, cut_at: int) -> tuple[CuttingDisk, int] | None:
             session = session or CooperativeSession(state.open_reader(), os.getpid(), "voyage")
             file.write(session)
             safe = voyage.number
+            file.tidy()
         file.close()
     except PowerCutError:
         return disk, safe
@@ -147,6 +148,7 @@ def a_life_cut_short(root: Path, cut_at: int) -> tuple[CuttingDisk, int] | None:
 @pytest.mark.timeout(240)
 def test_power_may_be_cut_at_any_write_of_the_state_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("failover.client.task_file.SMALL_PAGES", 1)  # deltas, so that folding is cut, too
+    monkeypatch.setattr("failover.client.task_file.TIDY_S", 0.0)
     monkeypatch.setattr("checkpoint.store.CHEAP_DELTA_COUNT", 2)
     for cut_at in itertools.count():
         old = tmp_path / f"old{cut_at}"
