@@ -19,12 +19,9 @@ import failover
 
 LAST = int(sys.argv[1]) if len(sys.argv) > 1 else None
 PERIOD_S = 0.01
-WRAP = 1 << 16
-"""The device counts with 16 bits, and begins again at 0."""
-METRES = 1e-5
-"""Of one tick."""
-TOGETHER = 5
-"""Frames between two commits: the points at which the speeds fit the way."""
+WRAP = 1 << 16  # the device counts with 16 bits, and begins again at 0
+METRES = 1e-5  # of one tick
+TOGETHER = 5  # frames between two commits: the points at which the speeds fit the way
 
 
 @dataclass
