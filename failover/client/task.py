@@ -70,6 +70,7 @@ class Task:
 
     Attributes:
         name: of the component.
+        epoch: under which it runs; 0 without an agent.
         value: what is committed.
         resumed: where it came from; None where it began here.
         activations: its steps, where it has any.
@@ -77,6 +78,7 @@ class Task:
 
     def __init__(self, name: str, state: KeptState, keeping: Recorder | Guarded, value: Any, resumed: Resumed | None) -> None:
         self.name = name
+        self.epoch = keeping.handed.begin.epoch if isinstance(keeping, Guarded) else 0
         self.state = state
         self.value = value
         self.resumed = resumed
@@ -341,6 +343,15 @@ def wait_committed(timeout: float | None = None) -> None:
 def resumed() -> Resumed | None:
     """Where the state came from; None where it began in this run."""
     return PROCESS.the_task("tell where the state came from").resumed
+
+
+def epoch() -> int:
+    """Number of the primacy under which this program runs: the fencing token, which only grows. 0 without an agent.
+
+    Give it along with every order to something outside (a motor controller, a gripper) that remembers the highest one it has
+    seen and refuses lower ones: then a program that was replaced and does not know it yet moves nothing any more.
+    """
+    return PROCESS.the_task("tell the epoch").epoch
 
 
 def activations() -> Activations:

@@ -26,7 +26,7 @@ class Count:
 count = failover.resume("count", default=Count())
 origin = failover.resumed()
 if origin is not None:
-    print("#", origin.robot, origin.epoch, origin.why.replace(" ", "-"))
+    print("#", origin.robot, failover.epoch(), origin.why.replace(" ", "-"))
 while True:
     print(count.value)
     count.value += 1

@@ -71,7 +71,7 @@ def test_a_state_is_there_again_as_it_was_committed() -> None:
     assert mission == Mission(3, ["a well"])
     resumed = failover.resumed()
     assert resumed is not None
-    assert (resumed.why, resumed.generation, resumed.epoch) == ("restarted", 2, 0)
+    assert (resumed.why, resumed.generation, resumed.epoch, failover.epoch()) == ("restarted", 2, 0, 0)
     assert 0 <= resumed.age_s < 60
     assert resumed.robot == os.uname().nodename
 
@@ -184,7 +184,9 @@ def test_a_transaction_commits_at_its_end_and_not_in_the_middle() -> None:
     assert failover.resume("mission", default=Mission()).leg == 2
 
 
-@pytest.mark.parametrize("call", [failover.commit, failover.wait_committed, failover.resumed, failover.activations])
+@pytest.mark.parametrize(
+    "call", [failover.commit, failover.wait_committed, failover.resumed, failover.activations, failover.epoch]
+)
 def test_without_a_state_every_call_says_how_to_begin(call: object) -> None:
     with pytest.raises(failover.TaskError, match=r"failover.resume\("):
         call()  # type: ignore[operator]
