@@ -43,6 +43,9 @@ Bytes = NDArray[np.uint8]
 NAME: Final = "failover-segment"
 """What /proc/PID/fd and /proc/PID/maps call it."""
 
+HANDED_NAME: Final = "failover-handed"
+"""…and one that is handed to a program to go on from: it must not be taken for the one that its commits go to."""
+
 COMPARE_SIZE: Final = 1 << 18
 """Bytes compared at a time where nobody tells which pages were written."""
 
@@ -86,13 +89,13 @@ class SegmentWriter:
         number: of the newest commit.
     """
 
-    def __init__(self, layout: Layout, *, number: int = 0) -> None:
+    def __init__(self, layout: Layout, *, number: int = 0, name: str = NAME) -> None:
         if sys.byteorder != "little":
             raise SegmentError("segment: this machine stores the high byte first, which segments do not")
         layout.check()
         self.layout = layout
         self.number = number
-        self.descriptor = os.memfd_create(NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        self.descriptor = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         os.ftruncate(self.descriptor, layout.file_size)
         fcntl.fcntl(self.descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
         self._memory = _mapped(self.descriptor, layout.file_size)

@@ -52,8 +52,8 @@ from checkpoint.model import (
 from checkpoint.pages import PageTable, Words
 from checkpoint.segment import PAGE, PENDING, Committed, Layout, Pending, Region
 from checkpoint.segment_reader import SegmentReader
+from checkpoint.segment_writer import HANDED_NAME, SegmentWriter, Source
 from checkpoint.segment_writer import NAME as SEGMENT_NAME
-from checkpoint.segment_writer import SegmentWriter, Source
 from checkpoint.stream_counts import Totals
 
 if TYPE_CHECKING:
@@ -360,6 +360,6 @@ def fill_segment(state: Snapshot) -> SegmentWriter:
         RestoreError: it is no snapshot of this engine, or contradicts itself.
     """
     regions = regions_of(state)
-    writer = SegmentWriter(Layout(tuple(region for region, _ in regions), secrets.token_bytes(16)))
+    writer = SegmentWriter(Layout(tuple(region for region, _ in regions), secrets.token_bytes(16)), name=HANDED_NAME)
     assert writer.commit([Source(content[: region.size]) for region, content in regions]), "nobody reads it yet"
     return writer

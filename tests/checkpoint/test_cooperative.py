@@ -113,6 +113,14 @@ def test_the_segment_of_a_process_is_found_and_read_after_its_death() -> None:
         reader.close()
 
 
+def test_a_state_that_a_program_was_handed_is_not_taken_for_what_it_commits() -> None:
+    """It may be read for long, and be the only one until there is a first commit."""
+    handed = fill_segment(base_of(7))
+    with pytest.raises(CaptureError, match="no segment"):
+        open_segment(os.getpid())
+    handed.close()
+
+
 def test_a_process_without_a_segment_is_said_to_have_none() -> None:
     with subprocess.Popen(["/bin/sleep", "60"]) as other:
         try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -109,7 +108,6 @@ class ShipsLog:
             assert line == want, f"line {number} is {line!r} and not {want!r}"
         return len(lines)
 
-    @property
-    def size(self) -> int:
-        """Bytes that it has by now."""
-        return os.stat(self.path).st_size
+    def newest(self) -> int:
+        """Number of the last step that the newest life has begun."""
+        return self._numbers[self._last_of[self.resumptions[-1].life]]

@@ -93,8 +93,12 @@ class Voyage:
 
 
 @contextmanager
-def voyage(directory: Path, dice: random.Random) -> Iterator[Voyage]:
-    """Two robots that share the loopback, so that one that was switched off can come back; the program runs at robot1."""
+def voyage(directory: Path, dice: random.Random, *arguments: str) -> Iterator[Voyage]:
+    """Two robots that share the loopback, so that one that was switched off can come back; the program runs at robot1.
+
+    Args:
+        arguments: of the program, besides its log.
+    """
     directory.mkdir()
 
     with Stage(directory / "stage", replace(means(), own_network=False)) as stage:
@@ -106,9 +110,8 @@ def voyage(directory: Path, dice: random.Random) -> Iterator[Voyage]:
             first, second = stage.robots
             robots.until(lambda: robots.connected(first) and robots.connected(second), "the robots to hear each other")
             going = Voyage(stage, ShipsLog(directory / "log"), dice)
-            robots.run(
-                first, "voyage", sys.executable, str(PROGRAM), str(going.log.path), cwd=str(directory), engine="cooperative"
-            )
+            command = (sys.executable, str(PROGRAM), str(going.log.path), *arguments)
+            robots.run(first, "voyage", *command, cwd=str(directory), engine="cooperative")
             robots.until(lambda: going.lives() and going.acknowledged(), "a commit to be safe")
             yield going
             for robot in stage.robots:
@@ -203,3 +206,27 @@ def test_whatever_is_killed_the_state_is_the_last_one_that_was_safe_or_later(tmp
             check_output(going)
             killed, in_commit = killed + going.killed, in_commit + going.in_commit
             print(f"killed {killed.total()}: {dict(killed)}, {in_commit} in the middle of a commit; {going.lives()} lives")
+
+
+RUNGS: Final = 49 if "FAILOVER_KILLS" in os.environ else 40
+"""A state that grows to 53 MB, and to 7 where only a short test was asked for."""
+
+
+@pytest.mark.timeout(max(120, KILLS * 60))
+def test_a_state_that_outgrows_its_memory_again_and_again_is_as_safe(tmp_path: Path) -> None:
+    """It begins in a few kilobytes; each time it needs more room its commits go on in another, larger segment."""
+    print(f"FAILOVER_SEED={SEED}")
+    dice = random.Random(f"growing {SEED}")
+    with voyage(tmp_path / "0", dice, str(RUNGS)) as going:
+        for number in range(max(KILLS // 10, 2)):
+            life, rung = going.now().number, dice.randrange(RUNGS)
+            robots.until(lambda life=life, rung=rung: newest(going) >= life + rung, f"{rung} steps more")  # type: ignore[misc]
+            kill_somebody(going, ("program", "robot")[number % 2])
+        check_output(going)
+        print(f"killed {going.killed.total()}: {dict(going.killed)}, {going.in_commit} in the middle of a commit")
+
+
+def newest(going: Voyage) -> int:
+    """Number of the last step of the newest life."""
+    going.log.read()
+    return going.log.newest()

@@ -1,4 +1,4 @@
-"""A program that keeps its state and tells an independent log what became of it: ``python voyage.py LOG``.
+"""A program that keeps its state and tells an independent log what became of it: ``python voyage.py LOG [RUNGS]``.
 
 It commits without pause. Everything in its state follows from the steps that led to it, so that a state which was put together
 out of two commits, or which belongs to a life that was abandoned, gives itself away. Lines of the log, each one write(2):
@@ -35,6 +35,10 @@ TRAIL: Final = 20
 CLOUD_EVERY: Final = 8
 """Steps between two that change a whole MB."""
 WAIT_S: Final = 1.0
+CRATE: Final = 1000
+"""Bytes of one item of the cargo."""
+GROWTH: Final = 1.25
+"""From one rung to the next: the cargo has 1 kB at the first, 11 MB at the forty-second, 53 MB at the forty-ninth."""
 
 
 @dataclass
@@ -47,9 +51,14 @@ class Voyage:
     note: str = ""
     grid: NDArray[np.uint64] = field(default_factory=lambda: np.zeros((ROWS, 512), np.uint64))
     cloud: NDArray[np.uint64] = field(default_factory=lambda: np.zeros(1 << 17, np.uint64))
+    cargo: list[bytes] = field(default_factory=list)
 
-    def sail(self, life: str) -> None:
-        """Become the state of the next step."""
+    def sail(self, life: str, rungs: int) -> None:
+        """Become the state of the next step.
+
+        Args:
+            rungs: after so many steps the cargo, which grows from step to step, begins small again; 0: there is none.
+        """
         self.number += 1
         self.seal = seal_after(self.seal, self.number, life)
         self.trail[self.number % TRAIL] = self.seal
@@ -57,12 +66,19 @@ class Voyage:
         self.grid[self.number * STRIDE % ROWS] = self.seal
         if self.number % CLOUD_EVERY == 0:
             self.cloud[:] = self.seal
+        if rungs:
+            count = round(GROWTH ** (self.number % rungs))
+            del self.cargo[max(count - 1, 0) :]
+            self.cargo += [crate(self.number, place) for place in range(len(self.cargo), count - 1)]
+            self.cargo.append(crate(self.seal, count))
 
     def portrait(self) -> str:
         """A digest of all of it; "torn" where its parts do not even agree among themselves."""
         rows, cloud = self.grid[:, 0], self.cloud[0]
         agrees = (self.grid == rows[:, None]).all() and (self.cloud == cloud).all()
         agrees = agrees and self.trail[self.number % TRAIL] == self.seal and self.note == note_of(self.number, self.seal)
+        agrees = agrees and (not self.cargo or self.cargo[-1] == crate(self.seal, len(self.cargo)))
+        agrees = agrees and all(len(held) == CRATE for held in self.cargo)
         return portrait_of(rows.tolist(), int(cloud), self.trail) if agrees else "torn"
 
 
@@ -74,6 +90,11 @@ def seal_after(seal: int, number: int, life: str) -> int:
 def note_of(number: int, seal: int) -> str:
     """A text that grows and shrinks."""
     return f"{seal:x}" * (number % 300) if number else ""
+
+
+def crate(seal: int, place: int) -> bytes:
+    """One item of the cargo."""
+    return (b"%d %d " % (seal, place)).ljust(CRATE, b".")
 
 
 def portrait_of(rows: Sequence[int], cloud: int, trail: Sequence[int]) -> str:
@@ -125,14 +146,14 @@ class Waiting:
 def main() -> None:
     """Resume, and sail until killed."""
     life = secrets.token_hex(4)
-    log = Log(sys.argv[1], life)
+    log, rungs = Log(sys.argv[1], life), int(sys.argv[2]) if sys.argv[2:] else 0
     voyage = failover.resume("voyage", default=Voyage())
     resumed = failover.resumed()
     origin = (resumed.epoch, resumed.why.replace(" ", "-")) if resumed else (0, "begun")
     log.write("r", voyage.number, voyage.seal, *origin, voyage.portrait())
     waiting = Waiting(log)
     while True:
-        voyage.sail(life)
+        voyage.sail(life, rungs)
         print(voyage.number, voyage.seal)
         log.write("b", voyage.number, voyage.seal)
         failover.commit()
