@@ -73,14 +73,16 @@ def table(figures: Sequence[Figure]) -> str:
     """A Markdown table; the columns of alternatives and ratios only where there are any."""
     compared = any(figure.who != OURS for figure in figures)
     lines = [_line(figure, ratio(figure, figures), compared) for figure in figures]
-    head = ["measured", "case", *(["by"] if compared else []), "unit", "min", "median", "p95", "max", "n"]
+    head = ["measured", "case", *(["by"] if compared else []), "unit", "min", "median", "p95", "p99", "max", "n"]
     head += [f"÷ {OURS}"] if compared else []
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, ["---"] * len(head), *lines))
 
 
 def _line(figure: Figure, beside: float | None, compared: bool) -> list[str]:
     values = figure.values
-    numbers = [number(value) for value in (min(values), figure.median, percentile(values, 0.95), max(values))]
+    numbers = [
+        number(value) for value in (min(values), figure.median, percentile(values, 0.95), percentile(values, 0.99), max(values))
+    ]
     closing = ["" if beside is None else f"{number(beside)} ×"] if compared else []
     return [figure.benchmark, figure.case, *([figure.who] if compared else []), figure.unit, *numbers, str(len(values)), *closing]
 

@@ -39,8 +39,8 @@ def test_nothing_is_divided_by_nought() -> None:
 
 def test_a_table_of_ours_alone_has_no_column_for_others() -> None:
     head, _, line = table([OURS]).splitlines()
-    assert cells(head) == ["measured", "case", "unit", "min", "median", "p95", "max", "n"]
-    assert cells(line) == ["stop", "10 MB", "ms", "1.00", "2.00", "3.00", "3.00", "3"]
+    assert cells(head) == ["measured", "case", "unit", "min", "median", "p95", "p99", "max", "n"]
+    assert cells(line) == ["stop", "10 MB", "ms", "1.00", "2.00", "3.00", "3.00", "3.00", "3"]
 
 
 def test_a_table_with_others_says_who_and_how_much_more() -> None:
@@ -48,7 +48,7 @@ def test_a_table_with_others_says_who_and_how_much_more() -> None:
     assert lines[0][2] == "by" and lines[0][-1] == "÷ failover"
     assert (lines[2][2], lines[2][-1]) == ("failover", "")
     assert (lines[3][2], lines[3][-1]) == ("other", "10.0 ×")
-    assert {len(line) for line in lines} == {10}
+    assert {len(line) for line in lines} == {11}
 
 
 @pytest.mark.parametrize(("value", "text"), [(0.123, "0.12"), (12.34, "12.3"), (1234.5, "1,234"), (0.0, "0.00")])
