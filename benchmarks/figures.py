@@ -80,9 +80,8 @@ def table(figures: Sequence[Figure]) -> str:
 
 def _line(figure: Figure, beside: float | None, compared: bool) -> list[str]:
     values = figure.values
-    numbers = [
-        number(value) for value in (min(values), figure.median, percentile(values, 0.95), percentile(values, 0.99), max(values))
-    ]
+    late = percentile(values, 0.95), percentile(values, 0.99)
+    numbers = [number(value) for value in (min(values), figure.median, *late, max(values))]
     closing = ["" if beside is None else f"{number(beside)} ×"] if compared else []
     return [figure.benchmark, figure.case, *([figure.who] if compared else []), figure.unit, *numbers, str(len(values)), *closing]
 

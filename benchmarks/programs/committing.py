@@ -1,9 +1,10 @@
-"""A control loop that keeps its state: each step computes for about a millisecond, then commits.
+"""A control loop that keeps its state: each step computes for about half a millisecond, then commits.
 
 ``python3 committing.py CASE HOW STEPS PAUSE_US OUTPUT`` writes STEPS lines of two numbers to OUTPUT: nanoseconds that the
-computing took, and the commit; then it sleeps for ever. CASE: ``small``, a dataclass; ``big``, 1 MB changed
-inside an array of 100 MB; ``ordinary``, the same in an array that the program had made itself. HOW: ``kept`` as ever, beside a file or under an agent;
-``memory``, no further than shared memory: nobody takes the commits.
+computing took, and the commit; then it sleeps for ever.
+
+CASE: ``small``, a dataclass; ``big``, 1 MB changed inside an array of 100 MB; ``ordinary``, the same, the array handed over in
+the default. HOW: ``kept`` as ever, beside a file or under an agent; ``memory``, no further than shared memory: nobody takes it.
 """
 
 import sys
@@ -22,7 +23,7 @@ from failover.state import Field, Schema
 BIG = 100 << 20
 CHANGED = 1 << 20
 WORK = 12_000
-"""Rounds of a loop in Python: about a millisecond."""
+"""Rounds of a loop in Python: some half a millisecond."""
 WARM_STEPS = 20
 """Not counted: each bank is filled once."""
 
