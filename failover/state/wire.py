@@ -23,8 +23,8 @@ INLINE_SIZE_MAX = 4096
 DATA_SIZE_MAX = 64 << 20
 """Bytes of a state besides its regions; reading it takes up to about 64 times as much memory (an empty list is one byte)."""
 
-REGION_COUNT_MAX = 4096
-"""Regions of one state."""
+REGION_COUNT_MAX = 1023
+"""Regions of one state: as many as a segment has room for beside the state itself."""
 
 DEPTH_MAX = 100
 """How deep a state may be nested; far from the recursion limit of Python, also inside a program's own calls."""

@@ -266,6 +266,7 @@ def test_a_state_that_is_too_large_besides_its_arrays_is_refused() -> None:
 
 
 def test_too_many_arrays_are_refused() -> None:
+    assert REGION_COUNT_MAX == segment.MAX_REGIONS - 1
     with pytest.raises(KeepError, match=rf"kept\[{REGION_COUNT_MAX}\]: more than {REGION_COUNT_MAX} arrays of 4096 bytes"):
         Schema.of(list[bytes], name="kept").encode([bytes(4096)] * (REGION_COUNT_MAX + 1))
 
