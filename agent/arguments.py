@@ -49,7 +49,7 @@ class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
     isolate: bool = True
     wait: bool = True
     user: str = ""
-    engine: Literal["ptrace", "cooperative"] = "ptrace"
+    engine: Literal["auto", "ptrace", "cooperative"] = "auto"
 
 
 class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):

@@ -28,7 +28,7 @@ from checkpoint.engines.cooperative import age_ns as commit_age_ns
 from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Credentials
-from checkpoint.task_channel import RESTARTED, TAKEN_OVER, Origin
+from checkpoint.task_channel import HANDED_OVER, RESTARTED, TAKEN_OVER, Origin
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +57,8 @@ async def start(name: str, program: Program, places: Places, epoch: int = 0) -> 
         guard.dialogue.close()
         raise GuardError(f"{name}: cannot begin its output anew in {error.filename}: {error.strerror}") from error
     component = Component(name, guard, places)
-    component.engine = program.engine
-    task = guard_messages.Task(epoch) if program.engine == COOPERATIVE else None
+    component.engine_wanted = program.engine
+    task = guard_messages.Task(epoch, engine=program.engine) if program.engine != PTRACE else None
     return await _born(component, _starting(name, program, places, task))
 
 
@@ -99,6 +99,7 @@ async def restore(
     outage_ns: int,
     owner: int | None = None,
     laps: Laps | None = None,
+    task: guard_messages.Task | None = None,
 ) -> Component:
     """Rebuild a component from a chain (descriptors of encoded snapshots, oldest first), stopped, committed to nothing.
 
@@ -107,6 +108,7 @@ async def restore(
     Args:
         laps: told how long each stage took.
         outage_ns: added to the program's monotonic and boot time: how long ago the newest snapshot was taken.
+        task: for a program that may still say that it keeps its state.
         owner: uid; None: whoever it ran as. What is not root's opens its files with its owner's rights, and gets no others.
 
     Raises:
@@ -130,7 +132,9 @@ async def restore(
         log_directory=str(log_directory(name, places)),
         cgroup=places.cgroup,
         user=(theirs.uids[1], theirs.gids[1]),
+        task=task,
     )
+    component.engine_wanted = task.engine if task is not None else PTRACE
     try:
         keeper = await component.give_keeper()
         laps.lap("guard and keeper")
@@ -155,10 +159,14 @@ async def begin_again(
     outage_ns: int,
     owner: int,
     epoch: int,
+    is_planned: bool = False,
 ) -> Component:
     """Prepare a program that keeps its state to go on from a chain of the cooperative engine; `resume` starts it.
 
     Whatever fails, and whoever dies before `resume`: nothing of it is left.
+
+    Args:
+        is_planned: nothing was lost: somebody ordered it here.
 
     Raises:
         checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
@@ -170,14 +178,14 @@ async def begin_again(
         raise MismatchError(f"cannot restore {name}: {reason}", (reason,))
     await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
     component = Component(name, await places.nursery.guard(), places)
-    component.engine = COOPERATIVE
+    component.engine_wanted = COOPERATIVE  # what another engine took before it says Hello would be older than its state
     try:
         await component.give_keeper()
         filled, (segment,) = await component.ask_keeper(channel.Fill(name), tuple(chain))
     except (CheckpointError, GuardError, KeeperLostError):
         await component.undo()
         raise
-    why = RESTARTED if outline.machine.robot == places.robot else TAKEN_OVER
+    why = RESTARTED if outline.machine.robot == places.robot else HANDED_OVER if is_planned else TAKEN_OVER
     age_ns = outage_ns + commit_age_ns(outline)
     origin = Origin(outline.machine.robot, filled.position.generation, why, age_ns)
     task = guard_messages.Task(epoch, origin)

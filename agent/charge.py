@@ -23,13 +23,15 @@ from agent.component import Captured, Component
 from agent.config import ComponentConfig
 from agent.errors import AgentError, GuardError, KeeperLostError
 from agent.figures import Figures, shortened
+from agent.guard_messages import Task
 from agent.mistake import end_lanes_on_mistake
 from agent.places import Places
 from agent.records import Records
 from agent.rules import started_here
+from checkpoint import format
 from checkpoint.channel import Unchanged, close_all, content_of
-from checkpoint.engine import COOPERATIVE
-from checkpoint.errors import CheckpointError, NothingCommittedError, UnsupportedError
+from checkpoint.engine import AUTO, COOPERATIVE
+from checkpoint.errors import CheckpointError, NothingCommittedError, RestoreError, UnsupportedError
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Position
 from checkpoint.store import Store
@@ -236,8 +238,10 @@ class Charge:
         """Give it a keeper. A program that was started here runs on unprotected where it cannot have one; a guest is refused."""
         assert self.component is not None
         try:
-            self.figures.notes = await self.component.protect()
             self.figures.reasons = ()
+            self.figures.notes = await self.component.protect()
+        except NothingCommittedError as early:
+            log.info("%s: %s", self.name, early)
         except (CheckpointError, KeeperLostError) as trouble:
             self.figures.reasons = trouble.reasons if isinstance(trouble, UnsupportedError) else (str(trouble),)
             if refuse:
@@ -289,14 +293,25 @@ class Charge:
             self._coming = None
 
     async def _brought_back(self, act: acts.Restore, chain: list[int], outage_ns: int, laps: clock.Laps) -> Component:
-        """The component by the engine that its program was started for."""
-        places = self.around.places
-        if act.spec is None or act.spec.launch.engine != COOPERATIVE:
-            owner = act.spec.owner if act.spec is not None else None
-            return await births.restore(self.name, chain, places, outage_ns=outage_ns, owner=owner, laps=laps)
-        program = program_of(started_here(act.spec.launch, self.around.here(self.name)))
+        """The component by the engine that took the newest snapshot."""
+        places, spec = self.around.places, act.spec
+        newest = await asyncio.to_thread(format.read_outline, chain[-1])
+        if newest.engine != COOPERATIVE:
+            owner = spec.owner if spec is not None else None
+            task = Task(act.epoch, engine=AUTO) if spec is not None and spec.launch.engine == AUTO else None
+            return await births.restore(self.name, chain, places, outage_ns=outage_ns, owner=owner, laps=laps, task=task)
+        if spec is None:
+            raise RestoreError(f"cannot start {self.name} again: this robot was never told its command; start it by failover run")
+        program = program_of(started_here(spec.launch, self.around.here(self.name)))
         return await births.begin_again(
-            self.name, program, chain, places, outage_ns=outage_ns, owner=act.spec.owner, epoch=act.epoch
+            self.name,
+            program,
+            chain,
+            places,
+            outage_ns=outage_ns,
+            owner=spec.owner,
+            epoch=act.epoch,
+            is_planned=act.is_planned,
         )
 
     async def _capture(self, act: acts.Capture) -> None:

@@ -22,7 +22,7 @@ import asyncio
 import contextlib
 import os
 import signal
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -34,9 +34,12 @@ from agent.places import Places, log_directory
 from agent.streams import OutputLogs
 from checkpoint import channel, errors
 from checkpoint.channel import Failed, close_all
-from checkpoint.engine import COOPERATIVE, PTRACE
-from checkpoint.errors import CheckpointError, NothingCommittedError, RestoreError
+from checkpoint.engine import AUTO, COOPERATIVE, PTRACE
+from checkpoint.errors import CheckpointError, NothingCommittedError, RestoreError, UnsupportedError
 from checkpoint.model import Position
+
+HELLO_PATIENCE_S: Final = 10.0
+"""How long a program may take to say that it keeps its state, before it is an alarm that it cannot be captured from outside."""
 
 TOTALS_LIMIT: Final = 64
 """Captures whose acknowledgement may still come; the core has one under way."""
@@ -100,7 +103,7 @@ class Component:
     Attributes:
         name, pid, inner_pid, isolated: as the guard said.
         logs: its output; `OutputLogs.read` serves ``failover logs``.
-        engine: by which it is captured: `PTRACE` or `COOPERATIVE`.
+        engine_wanted: as it was asked for: `AUTO`, `PTRACE` or `COOPERATIVE`.
         task_pid: of the process that keeps its state, 0 before it has said so; keeps: it has made a commit.
         committed: called at its first commit to each segment.
         prepared: a program that is to be started with a state, by `resume`.
@@ -121,7 +124,8 @@ class Component:
         self.streams: tuple[int, ...] = ()
         self._totals: dict[Position, tuple[int, int]] = {}
         self._commits: dict[Position, int] = {}
-        self.engine = PTRACE
+        self.engine_wanted = PTRACE
+        self._impatient_at = asyncio.get_running_loop().time() + HELLO_PATIENCE_S
         self.task_pid = 0
         self.keeps = False
         self.committed: Callable[[], None] = lambda: None
@@ -131,6 +135,13 @@ class Component:
         self._held = False
         guard.dialogue.heard = self._heard
         guard.dialogue.ended = self._guard_lost
+
+    @property
+    def engine(self) -> str:
+        """By which it is captured now: `PTRACE` or `COOPERATIVE`."""
+        if self.engine_wanted != AUTO:
+            return self.engine_wanted
+        return COOPERATIVE if self.task_pid else PTRACE
 
     async def resume(self) -> None:
         """After `births.restore`: commit to it and let it go on.
@@ -150,6 +161,8 @@ class Component:
         self.notes = (*self.notes, *resumed.notes)
         if any(note.startswith(channel.UNPROTECTED) for note in resumed.notes):
             self._drop_keeper()  # the next capture tries with a new one
+        else:
+            self._followed = PTRACE, self.pid
 
     async def _begin_again(self, prepared: Prepared) -> None:
         """Start the program with the state that waits for it."""
@@ -182,7 +195,23 @@ class Component:
             await self.give_keeper()
         if self._followed == followed or self._awaits_commit:
             return ()
-        return await self._follow(*followed)
+        with self._patience():
+            return await self._follow(*followed)
+
+    @contextlib.contextmanager
+    def _patience(self) -> Iterator[None]:
+        """What cannot be captured from outside may yet say that it keeps its state: numpy's threads are there before that.
+
+        Raises:
+            NothingCommittedError: instead of UnsupportedError, for a while.
+        """
+        try:
+            yield
+        except UnsupportedError as refusal:
+            is_young = asyncio.get_running_loop().time() < self._impatient_at
+            if self.engine_wanted != AUTO or not is_young:
+                raise
+            raise NothingCommittedError(f"{refusal}; it may yet say that it keeps its state") from refusal
 
     @property
     def _awaits_commit(self) -> bool:
@@ -215,14 +244,15 @@ class Component:
             checkpoint.errors.NothingCommittedError: there is nothing to capture yet; `committed` is called when there is.
             CaptureError, UnsupportedError, ProcessGoneError, ProbeError; KeeperLostError. The program runs on.
         """
+        await self.protect()
         is_held_by_guard = hold and self.engine == COOPERATIVE
         if self._awaits_commit:
             what = "it has committed nothing yet" if self.task_pid else "it has not said yet that it keeps a state"
             raise NothingCommittedError(f"cannot capture {self.name}: {what}")
-        await self.protect()
         order = channel.Capture(base, generation, sequence, epoch, hold)
         async with self._standing_still(is_held_by_guard):
-            captured, descriptors = await self.ask_keeper(order)
+            with self._patience():
+                captured, descriptors = await self.ask_keeper(order)
         if isinstance(captured, channel.Unchanged):
             return captured
         (snapshot,) = descriptors
@@ -354,7 +384,7 @@ class Component:
         self.pid, self.inner_pid, self.isolated, self.notes = born.pid, born.inner_pid, born.isolated, born.notes
         self.streams = streams
         if isinstance(born, Described):
-            self.engine, self.task_pid, self.keeps = born.engine, born.task_pid, born.keeps
+            self.engine_wanted, self.task_pid, self.keeps = born.engine, born.task_pid, born.keeps
 
     async def ask_guard(self, request: Any, descriptors: tuple[int, ...] = ()) -> Any:
         """The guard's reply, and descriptors that are ours now.
@@ -373,7 +403,7 @@ class Component:
         Raises:
             KeeperLostError: none can be had.
         """
-        self._keeper = await self._places.nursery.keeper()
+        self._keeper, self._followed = await self._places.nursery.keeper(), None
         return self._keeper
 
     async def ask_keeper(self, request: Any, descriptors: tuple[int, ...] = ()) -> Any:

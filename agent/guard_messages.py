@@ -66,6 +66,7 @@ class MakeVessel(Message, frozen=True):
         clocks: as the program read them when its snapshot was taken, ``elapsed_ns`` ago.
         totals: bytes that the program had written to its two streams.
         user: uid and gid that the program ran as.
+        task: for a program that may still say that it keeps its state: its new guard listens where it was told to look.
     """
 
     component: str
@@ -77,6 +78,7 @@ class MakeVessel(Message, frozen=True):
     log_directory: str
     cgroup: str = ""
     user: tuple[int, int] | None = None
+    task: Task | None = None
 
 
 class Watch(Message, frozen=True):

@@ -22,11 +22,13 @@ import secrets
 import select
 import socket
 import struct
+from pathlib import Path
 from typing import Final
 
 from agent.guard_messages import TaskConnected, TaskKeeps
 from checkpoint.errors import TaskPacketError
 from checkpoint.task_channel import (
+    NAME,
     NAME_PREFIX,
     PACKET_SIZE_MAX,
     VARIABLE,
@@ -48,6 +50,17 @@ _CREDENTIALS: Final = struct.Struct("3i")
 Told = TaskConnected | TaskKeeps
 
 
+def name_told_to(pid: int) -> str:
+    """Where a program that was started by another guard looks for its own; "" where it was told none, or hides it."""
+    try:
+        environment = Path(f"/proc/{pid}/environ").read_bytes()
+    except OSError:
+        return ""
+    prefix = f"{VARIABLE}=".encode()
+    told = [item.removeprefix(prefix).decode(errors="replace") for item in environment.split(b"\0") if item.startswith(prefix)]
+    return told[0] if told and NAME.fullmatch(told[0]) else ""
+
+
 class TaskEnd:
     """The socket that one program is born with the name of.
 
@@ -57,20 +70,28 @@ class TaskEnd:
         keeps: it has made a commit.
     """
 
-    def __init__(self, component: str, user: int) -> None:
+    def __init__(self, component: str, user: int, name: str = "") -> None:
         """Listen.
 
         Args:
             user: uid whose processes may keep the state; root's may, too.
+            name: where a program that was restored looks; "" for a new one.
+
+        Raises:
+            OSError: somebody else listens there.
         """
-        name = NAME_PREFIX + secrets.token_hex(8)
+        name = name or NAME_PREFIX + secrets.token_hex(8)
         self.environment = {VARIABLE: name}
         self.pid = 0
         self.keeps = False
         self._component = component
         self._users = (0, user)
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
-        self._listener.bind("\0" + name[1:])
+        try:
+            self._listener.bind("\0" + name[1:])
+        except OSError:
+            self._listener.close()
+            raise
         self._listener.listen(BACKLOG)
         self._poll = select.epoll()
         self._poll.register(self._listener, select.EPOLLIN)
@@ -93,7 +114,7 @@ class TaskEnd:
 
         Args:
             counters: of its streams; stays the caller's.
-            outputs: write ends of its pipes.
+            outputs: of each of its pipes, one end.
         """
         first, second = (os.fstat(end).st_ino for end in outputs)
         self._pipes = (first, second)

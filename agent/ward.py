@@ -28,7 +28,7 @@ from agent.freezer import Freezer
 from agent.guard_messages import Described, Exited, MakeVessel, Start, Watch
 from agent.pump import Pump
 from agent.streams import STREAMS, OutputLogs
-from agent.task_end import TaskEnd
+from agent.task_end import TaskEnd, name_told_to
 from checkpoint.engine import PTRACE
 from checkpoint.linux.vessel import Birth, Born, spawn_program, spawn_vessel
 from checkpoint.task_channel import VARIABLE
@@ -63,6 +63,8 @@ class Ward:
     task: TaskEnd | None = None
     engine: str = PTRACE
     """As it was asked for."""
+    offered: MakeVessel | None = None
+    """What a restored program is told when it says that it keeps its state."""
 
     # --- birth ---
 
@@ -103,6 +105,7 @@ class Ward:
         birth = Birth(order.inner_pid, order.isolate, order.clocks, order.elapsed_ns)
         ward = cls._bear(order, order.totals, birth, spawn_vessel, order.user)
         ward.committed = False
+        ward.offered, ward.engine = order, order.task.engine if order.task is not None else PTRACE
         return ward
 
     @classmethod
@@ -174,7 +177,22 @@ class Ward:
         """
         self._check_alive("commit to it")
         self.committed = True
+        self._listen_again()
         self.lapse(time.monotonic_ns())
+
+    def _listen_again(self) -> None:
+        """A program that was restored before it said that it keeps its state looks for its guard where the last one listened."""
+        if self.offered is None or self.offered.task is None or self.pump is None or not (name := name_told_to(self.born.pid)):
+            return
+        try:
+            task = TaskEnd(self.component, self.offered.user[0] if self.offered.user is not None else os.geteuid(), name)
+        except OSError as error:
+            self.notes.append(f"nobody would hear it say that it keeps its state: cannot listen at {name}: {error.strerror}")
+            return
+        first, second = (self.pump.read_ends[stream] for stream in STREAMS)
+        task.flows_into(self.pump.counters.descriptor, (first, second))
+        task.begin(self.offered.task.epoch, self.offered.task.origin)
+        self.task = task
 
     def freeze(self, by: Literal["order", "lease"] = "order", *, exposed: bool = False) -> None:
         """Hold it; a thread that is deep in the kernel stands as soon as it leaves it.

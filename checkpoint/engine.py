@@ -15,6 +15,8 @@ from checkpoint.model import Position, Snapshot
 PTRACE: Final = "ptrace"
 COOPERATIVE: Final = "cooperative"
 """Names of the engines, see `engine_named`."""
+AUTO: Final = "auto"
+"""The cooperative engine for a program that says that it keeps its state, before that and for all others ptrace."""
 
 KEPT: Final = "kept"
 REFUSED: Final = "refused"

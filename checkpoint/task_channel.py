@@ -8,6 +8,7 @@ Both ends may be hostile to each other: a packet is decoded strictly, or refused
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from checkpoint.errors import TaskPacketError
 VARIABLE: Final = "FAILOVER_TASK"
 """Names the guard's socket: `NAME_PREFIX` and 16 hexadecimal digits; the first character stands for a zero byte."""
 NAME_PREFIX: Final = "@failover."
+NAME: Final = re.compile(re.escape(NAME_PREFIX) + "[0-9a-f]{16}")
 
 VERSION: Final = 1
 PACKET_SIZE_MAX: Final = 512

@@ -33,7 +33,7 @@ class GuardedTask:
     def capture(self, order: CaptureOrder) -> Snapshot:
         """See `checkpoint.engine.Session.capture`."""
         if procfs.status(self.pid).state in "ZX":
-            raise ProcessGoneError(f"{self.component} (pid {self.pid}) has ended")
+            raise ProcessGoneError(f"the process of {self.component} that keeps its state (pid {self.pid}) has ended")
         return self._following().capture(order)
 
     def unchanged(self) -> Position | None:

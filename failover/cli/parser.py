@@ -134,10 +134,10 @@ def _run(room: argparse.ArgumentParser) -> None:
     )
     room.add_argument(
         "--engine",
-        choices=("ptrace", "cooperative"),
-        default="ptrace",
-        help="cooperative: the program says by itself what must survive (failover.resume, failover.component), and is started "
-        "again from that (default: ptrace, for a program that nobody prepared)",
+        choices=("auto", "ptrace", "cooperative"),
+        default="auto",
+        help="ptrace: captured from outside, for a program that nobody prepared; cooperative: the program says by itself what "
+        "must survive (failover.resume, failover.component), and is started again from that (default: auto, as it turns out)",
     )
     room.add_argument("--user", metavar="USER", help="run it as this user, by name or number (only root may; default: as you)")
     room.add_argument("command", metavar="CMD", nargs="+", help="the program and its arguments, after --")
@@ -342,7 +342,10 @@ VERBS: Final = (
 
           failover run -- python3 mapper.py --map hall.yaml
           failover run --name /lab/robot1/mapper --detach -- ./mapper
-          failover run --engine cooperative -- python3 counter.py
+          failover run -- sh -c 'python3 counter.py --from hall; true'
+
+        A program that says what must survive (docs/decorator.md) is recognised, also below a shell or a launcher; until it says
+        so it is captured from outside, like a program that never does.
         """,
         _run,
         "failover.cli.components:run",

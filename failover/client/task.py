@@ -52,7 +52,8 @@ class Resumed:
         robot: name of the robot, or of the host, where it was committed.
         epoch: number of the primacy under which this program runs now: the fencing token. 0 without an agent.
         generation: of this run; every resume opens a new one. Under an agent: of the checkpoint that it goes on from.
-        why: "restarted" on the same robot, from its agent's store or the folder beside the program; "taken over" from another.
+        why: "restarted" on the same robot, from its agent's store or the folder beside the program; "taken over" from another
+            that was lost; "handed over" by another, as somebody ordered: nothing was lost.
         age_s: seconds since that commit.
         notes: what does not come back as it was: fields that were added or dropped, a damaged file that was passed over.
     """

@@ -10,7 +10,6 @@ import array
 import contextlib
 import logging
 import os
-import re
 import select
 import socket
 import stat
@@ -26,7 +25,7 @@ from checkpoint.errors import TaskPacketError
 from checkpoint.segment import PENDING, Committed, Outputs
 from checkpoint.segment_reader import SegmentReader
 from checkpoint.task_channel import (
-    NAME_PREFIX,
+    NAME,
     PACKET_SIZE_MAX,
     VARIABLE,
     Begin,
@@ -41,7 +40,6 @@ from checkpoint.task_channel import (
 from failover.client.task_output import OwnOutput
 from failover.errors import NotCommittedError, TaskError
 
-_NAME: Final = re.compile(re.escape(NAME_PREFIX) + r"[0-9a-f]{16}")
 _CREDENTIALS: Final = struct.Struct("3i")
 _INT_SIZE: Final = array.array("i").itemsize
 DESCRIPTORS_MAX: Final = 2
@@ -199,7 +197,7 @@ def guarded() -> Guarded | None:
         TaskError: its guard will not have it.
     """
     told = os.environ.pop(VARIABLE, "")
-    if not _NAME.fullmatch(told):
+    if not NAME.fullmatch(told):
         return None
     end = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
     try:

@@ -35,6 +35,7 @@ class Restore:
 
     Attributes:
         lease_until_ns: given to the guard before the program runs; 0 = no lease.
+        is_planned: another robot has handed it over; nothing was lost.
     """
 
     component: str
@@ -42,6 +43,7 @@ class Restore:
     position: Position
     spec: ComponentSpec | None
     lease_until_ns: int = 0
+    is_planned: bool = False
 
 
 @dataclass(frozen=True, slots=True)

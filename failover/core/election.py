@@ -63,14 +63,14 @@ def vacant(component: Component, turn: Turn) -> bool:
     return True
 
 
-def claim(component: Component, turn: Turn, plan: Position | None, why: str) -> None:
+def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, is_planned: bool = False) -> None:
     """Open a new epoch as its primary-to-be. The ballot holds it before anybody hears of it."""
     component.alone_right = not component.freezes or _right_to_act_alone(component, turn)
     component.move(Cause.CLAIM)
     component.epoch += 1
     component.primary = turn.me
     component.entrusted, component.trusted, component.standby = (), False, ""
-    component.plan = plan
+    component.plan, component.is_planned = plan, is_planned
     component.claim_counter = turn.next_counter
     component.until_ns = turn.now_ns + turn.config.loyalty_ns
     component.unprotected, component.needs_base = False, False
@@ -99,7 +99,7 @@ def advance(component: Component, turn: Turn) -> None:
         turn.order(acts.Start(component.name, component.epoch, component.spec, lease_ns))
     else:
         component.move(Cause.RESTORE)
-        turn.order(acts.Restore(component.name, component.epoch, component.plan, component.spec, lease_ns))
+        turn.order(acts.Restore(component.name, component.epoch, component.plan, component.spec, lease_ns, component.is_planned))
     component.lease_ns = component.told_ns = lease_ns
 
 
@@ -212,7 +212,7 @@ def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry, t
     if entry.flags & UNPROTECTED:
         drop(component, turn, f"{sender} protects it no longer")
     if entry.yields_to == turn.me and component.state is State.STANDBY and component.newest == entry.position:
-        claim(component, turn, component.newest, f"{sender} hands it over")
+        claim(component, turn, component.newest, f"{sender} hands it over", is_planned=True)
 
 
 def _stronger(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> bool:

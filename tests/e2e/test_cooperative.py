@@ -127,7 +127,7 @@ def test_a_program_that_keeps_its_state_is_handed_over(pair: tuple[RobotMachine,
     done = robots.failover(first, "handover", "count")
     assert done.returncode == 0, done.stdout + done.stderr
     robots.until(lambda: shown(second).get("role") == "primary", "robot2 to run it")
-    went_on(second, before, "taken-over")
+    went_on(second, before, "handed-over")
 
 
 def test_a_program_that_stops_committing_is_seen_in_status_and_sends_nothing(
