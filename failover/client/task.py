@@ -239,9 +239,11 @@ class _Process:
 
     def __init__(self) -> None:
         self.task: Task | None = None
+        self._pid = 0
+        """Of the process that keeps it: a forked child does not."""
 
     def keep(self, task: Task) -> None:
-        self.task = task
+        self.task, self._pid = task, os.getpid()
         atexit.register(self.release)
 
     def release(self) -> None:
@@ -257,7 +259,7 @@ class _Process:
         return self.task
 
     def refuse_second(self, name: str) -> None:
-        if self.task is not None:
+        if self.task is not None and self._pid == os.getpid():
             raise TaskError(
                 f"cannot keep {name}: this process keeps {self.task.name} already, and only what is in one state is "
                 "committed as one; put both into one dataclass"

@@ -649,6 +649,30 @@ def test_a_child_that_outlives_its_parent_does_not_keep_the_state_from_the_next_
         assert failover.resume("counter", default={"n": 0}) == {"n": 5}
 
 
+def test_a_child_may_keep_a_state_of_its_own(folder: Path) -> None:
+    path = program(
+        folder,
+        """
+        import failover, os, sys
+        state = failover.resume("parent", default={"n": 0})
+        failover.commit()
+        if os.fork() == 0:
+            state = failover.resume("child", default={"n": 0})
+            state["n"] = 7
+            failover.commit()
+            sys.exit()
+        os.wait()
+        state["n"] = 5
+        failover.commit()
+        """,
+    )
+    with started(path) as process:
+        assert process.communicate(timeout=60) == ("", "")
+    assert failover.resume("parent", default={}) == {"n": 5}
+    again()
+    assert failover.resume("child", default={}) == {"n": 7}
+
+
 @pytest.mark.parametrize("way", ["def", "async def"])
 def test_the_end_of_a_program_writes_its_last_commit_and_sigterm_ends_it_between_steps(folder: Path, way: str) -> None:
     path = program(
