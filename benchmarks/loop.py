@@ -18,7 +18,7 @@ from failover.cli.demo.robots import Stage, means
 CASES: Final = {
     "small": "a small dataclass",
     "big": "1 MB changed of 100 MB",
-    "ordinary": "1 MB changed of 100 MB, of numpy's own array",
+    "ordinary": "1 MB changed of 100 MB, an array in the default",
 }
 STEPS: Final = 1000
 QUICK_STEPS: Final = 200

@@ -25,6 +25,7 @@ from typing import Any, Final, TypeVar
 from checkpoint.engines.cooperative import regions_of, this_machine
 from checkpoint.errors import CheckpointError
 from checkpoint.model import Snapshot
+from failover.client.task_adopt import adopt
 from failover.client.task_agent import Guarded, guarded
 from failover.client.task_file import Recorder, StateFile, folder_of
 from failover.client.task_rhythm import Activations
@@ -163,13 +164,19 @@ def open_task(
         raise TaskError(f"cannot keep a state under the name {name!r}: choose a word, or a path such as /lab/robot1/mapper")
     schema = schema_of(name)
     state = KeptState(schema)
+
+    def first() -> Any:
+        value = begin(state, schema)
+        adopt(value, state.array)
+        return value
+
     if guard is not None:
-        return _open_guarded(name, state, guard, lambda: begin(state, schema))
+        return _open_guarded(name, state, guard, first)
     file = StateFile(folder_of(name, folder or Path(os.environ.get(FOLDER_VARIABLE) or Path.cwd())), name)
     try:
         snapshot = file.load()
         if snapshot is None:
-            return _beside(name, state, file, begin(state, schema), None)
+            return _beside(name, state, file, first(), None)
         decoded = state.decode(_contents(snapshot, file))
     except BaseException:
         file.close()
@@ -320,7 +327,9 @@ def commit() -> int:
 def transaction(state: S) -> Iterator[S]:
     """Change the state in the body; one commit at its end, none if it raises.
 
-    What the body has changed in memory by then stays changed; a program that catches the exception puts it right or resumes.
+    What the body has changed in memory by then stays changed, for parts of the state may be known to the program by other names,
+    and a rollback that reached some of them only would leave a state that never was. Whoever catches the exception puts it
+    right, or ends the program, which resumes from its last commit.
     """
     task = PROCESS.the_task("begin a transaction")
     if state is not task.value:
