@@ -160,24 +160,23 @@ async def begin_again(
     owner: int,
     epoch: int,
     is_planned: bool = False,
+    waiting: Component | None = None,
 ) -> Component:
-    """Prepare a program that keeps its state to go on from a chain of the cooperative engine; `resume` starts it.
+    """Prepare a program that keeps its state to go on from a chain of the cooperative engine; `resume` lets it.
 
     Whatever fails, and whoever dies before `resume`: nothing of it is left.
 
     Args:
         is_planned: nothing was lost: somebody ordered it here.
+        waiting: the program, started to wait (`start_to_wait`); None: `resume` starts it.
 
     Raises:
         checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
     """
     outline = await asyncio.to_thread(format.read_outline, chain[-1])
-    inherited = program.inheritance.uid if program.inheritance is not None else os.geteuid()
-    if owner not in (ROOT, inherited):
-        reason = f"it is to run as uid {inherited}, which is not its owner, uid {owner}; start it as that user"
-        raise MismatchError(f"cannot restore {name}: {reason}", (reason,))
+    _check_owner(name, program, owner)
     await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
-    component = Component(name, await places.nursery.guard(), places)
+    component = waiting or Component(name, await places.nursery.guard(), places)
     component.engine_wanted = COOPERATIVE  # what another engine took before it says Hello would be older than its state
     try:
         await component.give_keeper()
@@ -188,10 +187,34 @@ async def begin_again(
     why = RESTARTED if outline.machine.robot == places.robot else HANDED_OVER if is_planned else TAKEN_OVER
     age_ns = outage_ns + commit_age_ns(outline)
     origin = Origin(outline.machine.robot, filled.position.generation, why, age_ns)
-    task = guard_messages.Task(epoch, origin)
-    start = _starting(name, program, places, task, total_of(outline.output))
-    component.prepared = Prepared(start, segment, age_ns)
+    totals = total_of(outline.output)
+    if waiting is not None:
+        component.prepared = Prepared(guard_messages.BeginTask(epoch, origin, totals), segment, age_ns)
+    else:
+        start = _starting(name, program, places, guard_messages.Task(epoch, origin), totals)
+        component.prepared = Prepared(start, segment, age_ns)
     return component
+
+
+async def start_to_wait(name: str, program: Program, places: Places, owner: int) -> Component:
+    """Start a program that keeps its state in advance: it waits for `begin_again`, and ends with this agent until then.
+
+    Raises:
+        checkpoint.errors.MismatchError: it would run as somebody else than its owner.
+        GuardError: it could not be started; nothing is left of it.
+    """
+    _check_owner(name, program, owner)
+    component = Component(name, await places.nursery.guard(), places)
+    component.engine_wanted = COOPERATIVE
+    return await _born(component, _starting(name, program, places, guard_messages.Task(warm=True)))
+
+
+def _check_owner(name: str, program: Program, owner: int) -> None:
+    """Raises MismatchError: a program of this owner's would run as somebody else."""
+    inherited = program.inheritance.uid if program.inheritance is not None else os.geteuid()
+    if owner not in (ROOT, inherited):
+        reason = f"it is to run as uid {inherited}, which is not its owner, uid {owner}; start it as that user"
+        raise MismatchError(f"cannot restore {name}: {reason}", (reason,))
 
 
 async def reconnect(socket_path: Path, places: Places) -> Component:

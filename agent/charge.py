@@ -28,6 +28,7 @@ from agent.mistake import end_lanes_on_mistake
 from agent.places import Places
 from agent.records import Records
 from agent.rules import started_here
+from agent.standby import Standby
 from checkpoint import format
 from checkpoint.channel import Unchanged, close_all, content_of
 from checkpoint.engine import AUTO, COOPERATIVE
@@ -73,6 +74,7 @@ class Charge:
 
     Attributes:
         component: None while nothing of it runs here.
+        standby: what waits here to take it over.
         epoch: of the newest act; an older one is dropped.
         ended: set by the core's word that the component's end is a record.
     """
@@ -84,6 +86,7 @@ class Charge:
     figures: Figures = field(default_factory=Figures)
     started: asyncio.Event = field(default_factory=asyncio.Event)
     ended: asyncio.Future[acts.ReportExit] | None = None
+    standby: Standby = field(init=False)
     _queue: asyncio.Queue[Act] = field(default_factory=asyncio.Queue)
     _tasks: set[asyncio.Task[None]] = field(default_factory=set)
     _stopping: bool = False
@@ -96,6 +99,9 @@ class Charge:
     _is_thaw_owed: bool = False
     """A thaw was refused, for its lease was over by then; the next lease brings it."""
 
+    def __post_init__(self) -> None:
+        self.standby = Standby(self.name, self.around.places)
+
     def begin(self) -> None:
         """Start to carry acts out."""
         self._task(self._work())
@@ -105,6 +111,10 @@ class Charge:
         self._note_lease(act)
         if isinstance(act, acts.SetLease | acts.Freeze):
             self._task(self._at_once(act))
+        elif isinstance(act, acts.Warm):
+            self._warm(act)
+        elif isinstance(act, acts.Cool):
+            self.standby.cool()
         else:
             self._queue.put_nowait(act)
 
@@ -118,6 +128,17 @@ class Charge:
             case acts.Freeze():
                 self._is_held, self._is_thaw_owed = True, False
 
+    def _warm(self, act: acts.Warm) -> None:
+        """Have the program wait, unless this robot's operator does not want that."""
+        here = self.around.here(self.name)
+        if not here.warm:
+            return
+
+        def tell(ready: bool, why: str) -> None:
+            self.around.tell(events.Warmed(self.name, act.epoch, ready, why))
+
+        self.standby.warm(program_of(started_here(act.spec.launch, here)), act.spec.owner, tell)
+
     def adopt(self, component: Component, epoch: int) -> None:
         """A guard was found alive after a restart."""
         self.component, self.epoch = component, epoch
@@ -129,6 +150,7 @@ class Charge:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self.standby.close()
         if self.component is not None:
             self.component.close()
 
@@ -169,6 +191,7 @@ class Charge:
                 if self.component is not None:
                     self._task(self._end(self.component, act.signal))
             case acts.Stop():
+                self.standby.cool()
                 await self._stop()
                 self.around.tell(events.Stopped(self.name, act.epoch))
             case acts.LetGo():
@@ -218,6 +241,7 @@ class Charge:
             log.warning("%s: %s: %s", self.name, type(act).__name__, trouble)
 
     async def _start(self, act: acts.Start) -> None:
+        self.standby.cool()
         adopted = self.component is not None
         self.around.records.note(self.name, act.epoch)
         if self.component is None:
@@ -257,12 +281,9 @@ class Charge:
         laps.lap(f"opening {len(descriptors)} snapshots")
         try:
             outage_ns, read_ns = clock.age_ns(descriptors[-1]), clock.now_ns()
-            component = await self._brought_back(act, descriptors, outage_ns, laps)
-            age_ns = component.prepared.age_ns if component.prepared is not None else outage_ns
+            component, age_ns = await self._resumed(act, descriptors, outage_ns, laps)
         finally:
             close_all(tuple(descriptors))
-        self.around.records.note(self.name, act.epoch)
-        await self._let_it_run(component)
         laps.lap("letting it go")
         self.component = component
         self.figures.restores += 1
@@ -279,8 +300,22 @@ class Charge:
         self.around.tell(events.Restored(self.name, act.epoch, act.position, age_ns + clock.now_ns() - read_ns))
         self._watch_the_end()
 
-    async def _let_it_run(self, component: Component) -> None:
+    async def _resumed(self, act: acts.Restore, chain: list[int], outage_ns: int, laps: clock.Laps) -> tuple[Component, int]:
+        """The component, running, and the age of its state: what waits here for it, or, where that fails, from its beginning."""
+        waiting = self.standby.take()
+        if waiting is not None:
+            try:
+                component = await self._brought_back(act, chain, outage_ns, laps, waiting)
+                return await self._let_it_run(component, act.epoch, outage_ns)
+            except TROUBLE as trouble:
+                log.warning("%s: what waited here cannot go on with it, it is started anew: %s", self.name, trouble)
+        component = await self._brought_back(act, chain, outage_ns, laps)
+        return await self._let_it_run(component, act.epoch, outage_ns)
+
+    async def _let_it_run(self, component: Component, epoch: int, outage_ns: int) -> tuple[Component, int]:
         """Give it the newest lease, and those that come while it is resumed; then it runs, or nothing of it is left."""
+        age_ns = component.prepared.age_ns if component.prepared is not None else outage_ns
+        self.around.records.note(self.name, epoch)
         self._coming = component
         try:
             if self._lease_until_ns:
@@ -291,12 +326,17 @@ class Charge:
             raise
         finally:
             self._coming = None
+        return component, age_ns
 
-    async def _brought_back(self, act: acts.Restore, chain: list[int], outage_ns: int, laps: clock.Laps) -> Component:
+    async def _brought_back(
+        self, act: acts.Restore, chain: list[int], outage_ns: int, laps: clock.Laps, waiting: Component | None = None
+    ) -> Component:
         """The component by the engine that took the newest snapshot."""
         places, spec = self.around.places, act.spec
         newest = await asyncio.to_thread(format.read_outline, chain[-1])
         if newest.engine != COOPERATIVE:
+            if waiting is not None:
+                await waiting.undo()
             owner = spec.owner if spec is not None else None
             task = Task(act.epoch, engine=AUTO) if spec is not None and spec.launch.engine == AUTO else None
             return await births.restore(self.name, chain, places, outage_ns=outage_ns, owner=owner, laps=laps, task=task)
@@ -312,6 +352,7 @@ class Charge:
             owner=spec.owner,
             epoch=act.epoch,
             is_planned=act.is_planned,
+            waiting=waiting,
         )
 
     async def _capture(self, act: acts.Capture) -> None:
@@ -439,8 +480,11 @@ class Charge:
 
     def _watch_the_end(self) -> None:
         """From now on, and not before the core knows that it runs, tell when it has ended, and when it commits first."""
-        self._present().committed = self._see_the_commit
-        self._task(self._see_the_end(self._present()))
+        component = self._present()
+        component.committed = self._see_the_commit
+        if component.keeps:  # it was quicker
+            self._see_the_commit()
+        self._task(self._see_the_end(component))
 
     def _see_the_commit(self) -> None:
         self.around.tell(events.Committed(self.name, self.epoch))

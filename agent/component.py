@@ -69,14 +69,14 @@ class Captured:
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """A program that keeps its state, before it is started again.
+    """A program that keeps its state, before it goes on: it is started again, or waits already.
 
     Attributes:
         segment: descriptor of its state; ours to close.
         age_ns: how old that state is, since its commit.
     """
 
-    start: guard_messages.Start
+    order: guard_messages.Start | guard_messages.BeginTask
     segment: int
     age_ns: int
 
@@ -104,8 +104,9 @@ class Component:
         name, pid, inner_pid, isolated: as the guard said.
         logs: its output; `OutputLogs.read` serves ``failover logs``.
         engine_wanted: as it was asked for: `AUTO`, `PTRACE` or `COOPERATIVE`.
-        task_pid: of the process that keeps its state, 0 before it has said so; keeps: it has made a commit.
+        task_pid: of the process that keeps its state, 0 before it has said so (``connected``); keeps: it has made a commit.
         committed: called at its first commit to each segment.
+        last_words: what its guard noted at its end.
         prepared: a program that is to be started with a state, by `resume`.
         streams: what its guard gave of them: counters, two read ends, two logs; none of somebody else's child.
         ended: the wait status once the program has ended (None: it was not our child); GuardLostError if the guard died first.
@@ -130,6 +131,8 @@ class Component:
         self.keeps = False
         self.committed: Callable[[], None] = lambda: None
         self._followed: tuple[str, int] | None = None
+        self.connected = asyncio.Event()
+        self.last_words: tuple[str, ...] = ()
         self.prepared: Prepared | None = None
         self._lease_until_ns = 0
         self._held = False
@@ -165,10 +168,12 @@ class Component:
             self._followed = PTRACE, self.pid
 
     async def _begin_again(self, prepared: Prepared) -> None:
-        """Start the program with the state that waits for it."""
+        """Have the program go on with the state that waits for it. One that waits has its lease before it can take a step."""
         self.prepared = None
         try:
-            born, streams = await self.ask_guard(prepared.start, (prepared.segment,))
+            if isinstance(prepared.order, guard_messages.BeginTask):
+                await self.lease(self._lease_until_ns)
+            born, streams = await self.ask_guard(prepared.order, (prepared.segment,))
             self.take(born, streams)
             await self.lease(self._lease_until_ns)
         except GuardError:
@@ -444,6 +449,7 @@ class Component:
     def _heard(self, message: Any) -> bool:
         """Events of the guard."""
         if isinstance(message, Exited):
+            self.last_words = message.notes
             if not self.ended.done():
                 self.ended.set_result(message.status)
             return True
@@ -451,6 +457,8 @@ class Component:
             self.task_pid, self.keeps = message.pid, isinstance(message, TaskKeeps)
             if self.keeps:
                 self.committed()
+            if message.pid:
+                self.connected.set()
             return True
         return isinstance(message, guard_messages.FrozenByLease)
 

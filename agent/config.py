@@ -30,6 +30,7 @@ class ComponentConfig:
         standby: the robot that keeps its snapshots; "" lets the team choose.
         prefer: the robot that should run it; "" for wherever it is.
         snapshot_period_ms: 0 for the agent's own.
+        warm: a program that keeps its state itself is started here in advance, where this robot is its standby, and waits.
         command: a program that keeps its state itself is started here again by this; () for the command line of `failover run`.
         directory: and in this one, an absolute path; "" for that of `failover run`.
         environment: and with these variables besides, or instead.
@@ -41,6 +42,7 @@ class ComponentConfig:
     standby: str = ""
     prefer: str = ""
     snapshot_period_ms: int = 0
+    warm: bool = True
     command: tuple[str, ...] = field(default_factory=tuple)
     directory: str = ""
     environment: dict[str, str] = field(default_factory=dict)

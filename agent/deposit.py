@@ -11,6 +11,7 @@ from agent.shipping import Refusal
 from agent.streams import OutputLogs
 from checkpoint import format
 from checkpoint.channel import close_all
+from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import ChainError, CheckpointError, FormatError
 from checkpoint.model import Snapshot
 from checkpoint.store import Store
@@ -75,7 +76,8 @@ class Deposit:
                 self._tell(StoreFailed(offer.component, offer.epoch, peer, str(error), needs_base))
                 return
         self._kept(offer.component, snapshot, offer.size)
-        self._tell(Stored(offer.component, offer.epoch, snapshot.position, peer, offer.spec))
+        keeps_state = snapshot.engine == COOPERATIVE
+        self._tell(Stored(offer.component, offer.epoch, snapshot.position, peer, offer.spec, keeps_state))
 
     def mend_logs(self, running: Collection[str]) -> None:
         """Bring each stream as far as the newest checkpoint says: an earlier life, or a power cut, may have come in between.

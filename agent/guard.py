@@ -32,6 +32,7 @@ import msgspec
 
 from agent import kernel
 from agent.guard_messages import (
+    BeginTask,
     Commit,
     CommitSafe,
     Describe,
@@ -84,6 +85,7 @@ class Guard:
         self._signals = _wake_on_signals()
         self._answers: dict[type, Callable[[Any, tuple[int, ...]], None]] = {
             Start: self._start,
+            BeginTask: self._begin_task,
             MakeVessel: self._make_vessel,
             Watch: self._watch,
             Commit: self._commit,
@@ -219,6 +221,13 @@ class Guard:
         born = ward.born
         self._reply(Started(born.pid, born.inner_pid, born.isolated, self._all_notes()), ward.descriptors())
 
+    def _begin_task(self, request: BeginTask, descriptors: tuple[int, ...]) -> None:
+        self._reap()  # it may have ended just now
+        ward = self._guarded()
+        ward.begin_task(request, descriptors)
+        born = ward.born
+        self._reply(Started(born.pid, born.inner_pid, born.isolated, self._all_notes()), ward.descriptors())
+
     def _make_vessel(self, request: MakeVessel, descriptors: tuple[int, ...]) -> None:
         self._check_free()
         self._ward = ward = Ward.make_vessel(request)
@@ -291,6 +300,9 @@ class Guard:
     def _heed_signals(self) -> None:
         while numbers := _drain(self._signals):
             self._told_to_end |= signal.SIGTERM in numbers
+        self._reap()
+
+    def _reap(self) -> None:
         if self._ward is not None and self._ward.reap():
             self._announce_end()
 

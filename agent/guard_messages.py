@@ -24,11 +24,13 @@ class Task(msgspec.Struct, frozen=True):
 
     Attributes:
         engine: as it was asked for; for `Described`.
+        warm: it is told nothing before `BeginTask`, its output stays in its pipes until then, and without the agent it ends.
     """
 
-    epoch: int
+    epoch: int = 0
     origin: Origin | None = None
     engine: str = COOPERATIVE
+    warm: bool = False
 
 
 class Start(Message, frozen=True):
@@ -86,6 +88,18 @@ class Watch(Message, frozen=True):
 
     component: str
     pid: int
+
+
+class BeginTask(Message, frozen=True):
+    """Have a program begin that was started warm; under the lease given before. With its state as a segment, if it has an origin.
+
+    Attributes:
+        totals: bytes that the component had written to its two streams by then; what waits in its pipes follows them.
+    """
+
+    epoch: int
+    origin: Origin | None
+    totals: tuple[int, int]
 
 
 class Commit(Message, frozen=True):
@@ -168,7 +182,7 @@ class Described(Message, frozen=True):
     """How the component stands.
 
     Attributes:
-        state: none: nothing was started yet; vessel: not committed yet.
+        state: none: nothing was started yet; vessel: not committed yet; waiting: started warm, and not begun yet.
         frozen_by: who holds it: "" nobody, "order" the agent, "lease" the guard.
         exit_status: as wait(2) gives it; None before the end, and for a process that was not our child.
         totals: bytes written to the two streams so far.
@@ -179,7 +193,7 @@ class Described(Message, frozen=True):
     """
 
     component: str
-    state: Literal["none", "vessel", "running", "frozen", "ended"]
+    state: Literal["none", "vessel", "waiting", "running", "frozen", "ended"]
     pid: int
     inner_pid: int
     isolated: bool
@@ -232,6 +246,6 @@ class TaskKeeps(Message, frozen=True):
     pid: int
 
 
-Request = Start | MakeVessel | Watch | Commit | Lease | Freeze | Thaw | CommitSafe | Kill | Describe | LetGo | Forget
+Request = Start | BeginTask | MakeVessel | Watch | Commit | Lease | Freeze | Thaw | CommitSafe | Kill | Describe | LetGo | Forget
 Reply = Started | VesselReady | Watching | Done | Described | Refused
 Event = Exited | FrozenByLease | TaskConnected | TaskKeeps

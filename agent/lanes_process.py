@@ -43,6 +43,7 @@ class LanesProcess:
         self._waiting: deque[ToLanes] = deque()
         self._expected: dict[tuple[str, str], Act] = {}
         self._admitted: dict[str, acts.Admit] = {}
+        self._warm: dict[str, acts.Warm] = {}
         self._ready = False
         self._early: deque[Act] = deque(maxlen=WAITING_LIMIT)
 
@@ -94,18 +95,23 @@ class LanesProcess:
         expected = isinstance(act, EXPECTED)
         if isinstance(act, acts.Admit):
             self._admitted[act.component] = act
+        elif isinstance(act, acts.Warm):
+            self._warm[act.component] = act
+        elif isinstance(act, acts.Cool | acts.Start | acts.Restore | acts.Stop):
+            self._warm.pop(act.component, None)
         if expected:
             self._expected[type(act).__name__, act.component] = act  # type: ignore[union-attr]
         if self._ready:
             self.send(door.order(act))
-        elif not expected and not isinstance(act, acts.Admit):
+        elif not expected and not isinstance(act, acts.Admit | acts.Warm):
             self._early.append(act)
 
     def ready(self) -> None:
         """The inventory has come: whatever was ordered in the meantime leaves now."""
         self._ready = True
-        for admit in self._admitted.values():
-            self.send(door.order(admit))
+        lasting: tuple[Act, ...] = (*self._admitted.values(), *self._warm.values())
+        for act in lasting:
+            self.send(door.order(act))
         while self._early:
             self.send(door.order(self._early.popleft()))
 

@@ -28,6 +28,9 @@ PIPE_SIZE: Final = 256 << 10
 """Asked of the kernel for each pipe; bounds what a snapshot carries unread. A smaller pipe works too."""
 
 COUNTERS_SIZE: Final = mmap.PAGESIZE
+LINE_LIMIT: Final = 200
+"""Characters of a program's last words that are told."""
+
 RETRY_S: Final = 0.1
 """Between two attempts to write to a disk that is full."""
 
@@ -41,12 +44,15 @@ class Counters:
     The last two never change: the first byte of each stream that this robot's log had when its pump began.
     """
 
-    def __init__(self, totals: tuple[int, int], firsts: tuple[int, int] = (0, 0)) -> None:
+    def __init__(self) -> None:
         self.descriptor = os.memfd_create("failover-streams", os.MFD_CLOEXEC)
         os.fchmod(self.descriptor, 0o600)  # a program that keeps its state reads it, and must not open it for writing
         os.ftruncate(self.descriptor, COUNTERS_SIZE)
         self._mapping = mmap.mmap(self.descriptor, COUNTERS_SIZE)
         self._words = memoryview(self._mapping).cast("Q")  # an item is stored by one eight-byte move, never in parts
+
+    def begin_at(self, totals: tuple[int, int], firsts: tuple[int, int]) -> None:
+        """Before a byte is taken: what was written before this program, and where the logs begin."""
         self._words[1], self._words[3] = totals
         self._words[4], self._words[5] = firsts
 
@@ -75,11 +81,13 @@ class Counters:
 
 
 class Pump:
-    """Two pipes, two logs, one thread of its own: a disk that hangs must not keep the guard from its lease."""
+    """Two pipes, two logs, one thread of its own: a disk that hangs must not keep the guard from its lease.
 
-    def __init__(self, logs: OutputLogs, totals: tuple[int, int]) -> None:
-        self.logs = logs
-        self.counters = Counters(totals, (logs.bounds(1).start, logs.bounds(2).start))
+    Until `begin` what the program writes stays in its pipes, and when they are full, it waits.
+    """
+
+    def __init__(self) -> None:
+        self.counters = Counters()
         self.blocked = ""
         """Why output is not being written now; "" while it is."""
         self.read_ends: dict[int, int] = {}
@@ -89,14 +97,41 @@ class Pump:
         self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._drained = threading.Event()
         self._draining = False
-        self._thread = threading.Thread(target=self._run, name="pump", daemon=True)
+        self._logs: OutputLogs | None = None
 
-    def start(self) -> None:
-        """Begin to pump. Fork before this: afterwards the process has two threads."""
+    @property
+    def logs(self) -> OutputLogs:
+        """Where the output goes."""
+        assert self._logs is not None, "open comes first"
+        return self._logs
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it is known where the output goes."""
+        return self._logs is not None
+
+    def open(self, logs: OutputLogs, totals: tuple[int, int]) -> None:
+        """Say where the output goes, and what was written there before."""
+        self._logs = logs
+        self.counters.begin_at(totals, (logs.bounds(1).start, logs.bounds(2).start))
+
+    def born(self) -> None:
+        """The program has the write ends; ours go."""
         for descriptor in self.write_ends.values():
             os.close(descriptor)
         self.write_ends.clear()
-        self._thread.start()
+
+    def begin(self) -> None:
+        """Begin to pump. Fork before this: afterwards the process has two threads."""
+        threading.Thread(target=self._run, name="pump", daemon=True).start()
+
+    def last_line(self) -> str:
+        """Of a program that ended before it was begun: the last line that it wrote to its standard error; "" if it wrote none."""
+        try:
+            said = os.read(self.read_ends[2], PIPE_SIZE).decode(errors="replace").split("\n")
+        except BlockingIOError:
+            return ""
+        return next((line.strip()[:LINE_LIMIT] for line in reversed(said) if line.strip()), "")
 
     def drain(self, patience_s: float) -> bool:
         """The program has ended: wait until what it left in the pipes is in the logs; False if the disk took longer."""

@@ -13,7 +13,7 @@ from agent.config import Settings
 from agent.door import Life, Told
 from agent.figures import Commits, Figures
 from agent.transport import Link, LinkState
-from checkpoint.engine import PTRACE
+from checkpoint.engine import COOPERATIVE, PTRACE
 from failover.core.types import ComponentView, PeerView, Protection, State
 
 NANOSECONDS_A_MILLISECOND: Final = 1_000_000
@@ -102,6 +102,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings) -
     figures = charge.figures if charge is not None else None
     running = charge.component if charge is not None else None
     newest = view.positions[0] if view.positions else None
+    engine = running.engine if running is not None else figures.engine if figures is not None else PTRACE
     degraded = view.protection in (Protection.DEGRADED, Protection.STOPPED) and view.state is State.PRIMARY
     return {
         "name": view.name,
@@ -112,7 +113,8 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings) -
         "epoch": view.epoch,
         "generation": newest.generation if newest else None,
         "sequence": newest.sequence if newest else None,
-        "engine": (running.engine if running is not None else figures.engine) if figures else PTRACE,
+        "engine": engine,
+        "warm": view.warm if engine == COOPERATIVE else None,
         "pid": running.pid if running is not None else None,
         "inner_pid": running.inner_pid if running is not None else None,
         "isolated": running.isolated if running is not None else None,

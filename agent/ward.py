@@ -4,6 +4,7 @@
 state                 arrows out of it
 ====================  ==================================================================================================
 ``vessel``            `commit` → running; `abandon` (agent or keeper lost) → ended
+``waiting``           `begin_task` → running; `abandon` (agent lost) → ended; it ends → ended
 ``running``           `freeze` or a lease that runs out → frozen; it ends → ended
 ``frozen``            `thaw`, or a new lease after the old one froze it → running; SIGKILL → ended
 ``ended``             none: the status is kept until it is forgotten
@@ -25,7 +26,7 @@ from typing import Final, Literal
 
 from agent import freezer as freezing
 from agent.freezer import Freezer
-from agent.guard_messages import Described, Exited, MakeVessel, Start, Watch
+from agent.guard_messages import BeginTask, Described, Exited, MakeVessel, Start, Watch
 from agent.pump import Pump
 from agent.streams import STREAMS, OutputLogs
 from agent.task_end import TaskEnd, name_told_to
@@ -37,6 +38,8 @@ DRAIN_S: Final = 2.0
 """How long the end of a program waits for its last output to be written; a full disk must not hide the end."""
 
 NO_TRIM: Final = "its logs grow without bound: their filesystem cannot give the beginning of a file back"
+UNFINISHED: Final = "the restore was not finished: agent or keeper ended before it was committed"
+NOBODY_LEFT: Final = "it waited to begin, and the agent that would have told it has ended"
 WATCHED: Final = "it was started by somebody else: its exit status will not be known, its output is not kept"
 
 
@@ -55,6 +58,7 @@ class Ward:
     pump: Pump | None = None
     pidfd: int | None = None
     committed: bool = True
+    warm: bool = False
     let_go: bool = False
     frozen_by: Literal["", "order", "lease"] = ""
     lease_until_ns: int = 0
@@ -91,7 +95,10 @@ class Ward:
 
         kept = order.inheritance
         user = (kept.uid, kept.gid) if kept is not None else None
-        ward = cls._bear(order, order.totals, Birth(isolate=order.isolate, inheritance=kept), give_birth, user, task)
+        waits = order.task is not None and order.task.warm
+        totals = None if waits else order.totals
+        ward = cls._bear(order, totals, Birth(isolate=order.isolate, inheritance=kept), give_birth, user, task)
+        ward.warm, ward.committed = waits, not waits
         ward.engine = order.task.engine if order.task is not None else PTRACE
         return ward
 
@@ -125,7 +132,7 @@ class Ward:
     def _bear(
         cls,
         order: Start | MakeVessel,
-        totals: tuple[int, int],
+        totals: tuple[int, int] | None,
         birth: Birth,
         act: Callable[[Birth], Born],
         user: tuple[int, int] | None,
@@ -134,11 +141,12 @@ class Ward:
         """Logs, pipes and a freezer first; the process last, into all of them.
 
         Args:
+            totals: bytes that it had written by then; None: it waits, and what it writes now stays in its pipes.
             user: uid and gid that the pipes shall belong to, so that the program can open /dev/stdout; None: ours.
         """
-        logs = OutputLogs(Path(order.log_directory))
-        logs.truncate(totals)
-        pump = Pump(logs, totals)
+        pump = Pump()
+        if totals is not None:
+            _open(pump, order.log_directory, totals)
         if user is not None and os.geteuid() == 0:
             for stream in STREAMS:
                 os.fchown(pump.write_ends[stream], *user)
@@ -155,17 +163,42 @@ class Ward:
                 task.close()
             raise
         hold.add(born.pid)
-        pump.start()
-        said = [*notes, *born.notes, *([] if logs.trims else [NO_TRIM])]
-        return cls(order.component, born, hold, order.log_directory, pump, notes=said, task=task)
+        pump.born()
+        if pump.is_open:
+            pump.begin()
+        ward = cls(order.component, born, hold, order.log_directory, pump, notes=[*notes, *born.notes], task=task)
+        ward.note_logs()
+        return ward
 
     def descriptors(self) -> tuple[int, ...]:
         """What the keeper needs of the streams: counters, two read ends, two logs. They stay ours."""
-        if self.pump is None:
+        if self.pump is None or not self.pump.is_open:
             return ()
         reads = [self.pump.read_ends[stream] for stream in STREAMS]
         logs = [self.pump.logs.descriptor(stream) for stream in STREAMS]
         return (self.pump.counters.descriptor, *reads, *logs)
+
+    def note_logs(self) -> None:
+        """Say what the filesystem of the logs cannot do."""
+        if self.pump is not None and self.pump.is_open and not self.pump.logs.trims:
+            self.notes.append(NO_TRIM)
+
+    def begin_task(self, order: BeginTask, segment: tuple[int, ...]) -> None:
+        """Have a program begin that waits for it, under the lease that it was given before; from here on it outlives the agent.
+
+        Raises:
+            WardError: it does not wait, or has ended in the meantime.
+            OSError: its logs cannot be written; it waits as before.
+        """
+        self._check_alive("have it begin")
+        if self.committed or not self.warm:
+            raise WardError("it does not wait to begin: it was started to run, and runs")
+        assert self.task is not None and self.pump is not None, "what is warm was born so"
+        _open(self.pump, self.log_directory, order.totals)
+        self.note_logs()
+        self.commit()  # with its lease over it is frozen now, before it hears anything
+        self.pump.begin()
+        self.task.begin(order.epoch, order.origin, *segment[:1])
 
     # --- holding still ---
 
@@ -260,9 +293,9 @@ class Ward:
             pass
 
     def abandon(self) -> None:
-        """Agent or keeper are gone before the vessel became the component: nothing of it stays."""
+        """Agent or keeper are gone before it was the component: nothing of it stays."""
+        self.notes.append(NOBODY_LEFT if self.warm else UNFINISHED)
         self.committed = True
-        self.notes.append("the restore was not finished: agent or keeper ended before it was committed")
         self.kill(signal.SIGKILL)
 
     def reap(self) -> bool:
@@ -283,7 +316,9 @@ class Ward:
         """Its leftovers end with it, unless it was let go; then its last output is written, then the end is known."""
         if not self.let_go and self.pidfd is None:
             self.freezer.kill()
-        if self.pump is not None and not self.pump.drain(DRAIN_S):
+        if self.pump is not None and not self.pump.is_open:
+            self.notes.extend([said] if (said := self.pump.last_line()) else [])
+        elif self.pump is not None and not self.pump.drain(DRAIN_S):
             self.notes.append("its last output may be incomplete: " + (self.pump.blocked or "something else still writes to it"))
         if self.task is not None:
             self.task.close()
@@ -300,12 +335,12 @@ class Ward:
         """Bytes taken from the two streams so far."""
         return self.pump.counters.totals() if self.pump is not None else (0, 0)
 
-    def state(self) -> Literal["vessel", "running", "frozen", "ended"]:
+    def state(self) -> Literal["vessel", "waiting", "running", "frozen", "ended"]:
         """The state of the table above."""
         if self.exited is not None:
             return "ended"
         if not self.committed:
-            return "vessel"
+            return "waiting" if self.warm else "vessel"
         return "frozen" if self.frozen_by else "running"
 
     def describe(self, more_notes: tuple[str, ...]) -> Described:
@@ -339,8 +374,16 @@ def _task_end(order: Start, segment: tuple[int, ...]) -> TaskEnd:
     """The socket of a program that may keep its state, which begins as soon as it says that it does."""
     assert order.task is not None
     task = TaskEnd(order.component, order.inheritance.uid if order.inheritance is not None else os.geteuid())
-    task.begin(order.task.epoch, order.task.origin, *segment[:1])
+    if not order.task.warm:
+        task.begin(order.task.epoch, order.task.origin, *segment[:1])
     return task
+
+
+def _open(pump: Pump, log_directory: str, totals: tuple[int, int]) -> None:
+    """Have the output go on in the logs from ``totals`` on, whatever stood there beyond."""
+    logs = OutputLogs(Path(log_directory))
+    logs.truncate(totals)
+    pump.open(logs, totals)
 
 
 def _reap_one() -> tuple[int, int] | None:

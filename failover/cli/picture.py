@@ -122,10 +122,16 @@ def _component_row(component: Mapping[str, Any], branch: str) -> Row:
         str(component.get("epoch") or ""),
         milliseconds(component.get("lag_ms")),
         freeze,
-        str(component.get("standby") or "none"),
+        _standby(component),
         "",
     )
     return Row(cells, mood_of(component))
+
+
+def _standby(component: Mapping[str, Any]) -> str:
+    """Who goes on with it; whether its program waits there already, where one can."""
+    standby, warm = component.get("standby"), component.get("warm")
+    return "none" if not standby else str(standby) if warm is None else f"{standby}, {'warm' if warm else 'cold'}"
 
 
 def _state(component: Mapping[str, Any]) -> str:
