@@ -53,7 +53,8 @@ def _outage(quick: bool, directory: Path) -> Findings:
         "Outage",
         "Two robots on this machine, in namespaces of their own where root allows; beats each 20 ms, a lease of 120 ms. Every "
         "process of the primary is stopped and killed; from that instant to the next output of each program at the standby "
-        "(they write each 10 ms).",
+        "(they write each 10 ms). The first ones are captured from outside; those that keep their state themselves are started "
+        "again, where they are not *warm*: started in advance, and waiting.",
         tuple(outage.outage(quick, directory)),
     )
 

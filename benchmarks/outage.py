@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from benchmarks.figures import Figure
 from benchmarks.running import BenchmarkError
@@ -14,8 +17,33 @@ CUTS = {1: 5, 2: 4, 4: 3}
 
 QUICK_CUTS = {1: 2}
 
-COUNTING = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.01)\n"
+COUNTING: Final = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.01)\n"
 """Prints every 10 ms."""
+
+KEEPING: Final = """
+import time
+import failover
+count = failover.resume("count", default={"i": 0})
+while True:
+    print(count["i"], flush=True)
+    count["i"] += 1
+    failover.commit()
+    time.sleep(0.01)
+"""
+"""The same, and keeps its state itself."""
+
+SLOW_IMPORT: Final = """
+import time
+began = time.monotonic()
+import numpy
+while time.monotonic() - began < 0.5:
+    numpy.linalg.svd(numpy.ones((200, 200)))
+"""
+"""numpy, and as much work again as makes half a second of it, as a larger library does while it is imported."""
+
+KEPT_CUTS = 4
+QUICK_KEPT_CUTS = 1
+COLD: Final = '[components."/demo/robot1/count0"]\nwarm = false\n'
 
 SNAPSHOTS = 15
 PATIENCE_S = 60.0
@@ -25,26 +53,63 @@ IN_FLIGHT_S = 0.03
 
 def outage(quick: bool, directory: Path) -> list[Figure]:
     """Cut a robot's power again and again, with one, two and four programs running there."""
-    return [_outages(count, cuts, directory) for count, cuts in (QUICK_CUTS if quick else CUTS).items()]
+    return [_outages(story, directory) for story in (*_from_memory(quick), *_from_kept_states(quick))]
 
 
-def _outages(count: int, cuts: int, directory: Path) -> Figure:
+@dataclass(frozen=True, slots=True)
+class Story:
+    """One case: which program runs there, and how often.
+
+    Attributes:
+        count: of programs at once.
+        settings: lines added to both robots' configurations.
+        warm: their standby waits for them with their programs started.
+    """
+
+    case: str
+    argv: tuple[str, ...]
+    count: int
+    cuts: int
+    settings: str = ""
+    engine: str = "ptrace"
+    warm: bool = False
+
+
+def _from_memory(quick: bool) -> list[Story]:
+    """Programs that know nothing of it."""
+    argv = ("/usr/bin/python3", "-S", "-c", COUNTING)
+    return [Story(f"{count} at once", argv, count, cuts) for count, cuts in (QUICK_CUTS if quick else CUTS).items()]
+
+
+def _from_kept_states(quick: bool) -> list[Story]:
+    """Programs that keep their state themselves: as a takeover finds them, started in advance or not."""
+    cuts = QUICK_KEPT_CUTS if quick else KEPT_CUTS
+    stories = []
+    for what, script in (("a counter", KEEPING), ("an import of 0.5 s", SLOW_IMPORT + KEEPING)):
+        argv = (sys.executable, "-c", script)
+        stories.append(Story(f"keeps its state, {what}, warm", argv, 1, cuts, engine="cooperative", warm=True))
+        stories.append(Story(f"keeps its state, {what}, cold", argv, 1, cuts, COLD, engine="cooperative"))
+    return stories
+
+
+def _outages(story: Story, directory: Path) -> Figure:
     found: list[float] = []
-    for number in range(cuts):
-        with Stage(directory / f"outage-{count}-{number}", means()) as stage:
+    for number in range(story.cuts):
+        with Stage(directory / f"outage-{story.case.replace(' ', '-')}-{number}", means(), story.settings) as stage:
             stage.directory.mkdir()
             stage.start()
-            found += _one_cut(stage, count)
-    return Figure("power cut to next output", f"{count} at once", "ms", tuple(found))
+            found += _one_cut(stage, story)
+    return Figure("power cut to next output", story.case, "ms", tuple(found))
 
 
-def _one_cut(stage: Stage, count: int) -> list[float]:
+def _one_cut(stage: Stage, story: Story) -> list[float]:
     """Milliseconds from the cut to the first byte that each program writes at the standby."""
     primary, standby = stage.robots
+    count = story.count
     for number in range(count):
         with primary.control() as link:
-            link.ask("run", argv=["/usr/bin/python3", "-S", "-c", COUNTING], name=f"count{number}", cwd="/", wait=False)
-    _wait_for_snapshots(standby, count)
+            link.ask("run", argv=list(story.argv), name=f"count{number}", cwd="/", wait=False, engine=story.engine)
+    _wait_for_standby(standby, story)
     cut = time.monotonic()
     primary.cut_power()
     logs = sorted((standby.directory / "state" / "logs").glob("*/stdout.log"))
@@ -65,11 +130,14 @@ def _one_cut(stage: Stage, count: int) -> list[float]:
     return [(instant - cut) * 1e3 for instant in first.values()]
 
 
-def _wait_for_snapshots(standby: RobotMachine, count: int) -> None:
+def _wait_for_standby(standby: RobotMachine, story: Story) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
         components = standby.status()["components"]
-        if len(components) == count and all((one["snapshots"] or 0) >= SNAPSHOTS for one in components):
+        ready = [(one["snapshots"] or 0) >= SNAPSHOTS and bool(one["warm"]) == story.warm for one in components]
+        if len(ready) == story.count and all(ready):
             return
         time.sleep(0.02)
-    raise BenchmarkError(f"no {SNAPSHOTS} snapshots of each program came to {standby.name}: {standby.last_words()}")
+    raise BenchmarkError(
+        f"{story.case}: {standby.name} did not get {SNAPSHOTS} snapshots of each program: {standby.last_words()}"
+    )
