@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import enum
 import inspect
 import signal
@@ -86,16 +84,10 @@ class Turns:
                 _sleep_until(task.activations.next_ns(time.monotonic_ns()))
                 stopping.is_between_steps = False
 
-    async def __aiter__(self) -> AsyncIterator[int]:
-        task, stopped = self._task, asyncio.Event()
-        task.activations = Activations(self._period_ns, time.monotonic_ns())
-        with _asyncio_sigterm(stopped):
-            while not stopped.is_set():
-                yield task.activations.steps
-                task.commit()
-                left = task.activations.next_ns(time.monotonic_ns()) - time.monotonic_ns()
-                with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(stopped.wait(), max(left, 0) / 1e9)
+    def __aiter__(self) -> AsyncIterator[int]:
+        from failover.client.task_asyncio import turns  # which takes its time to load: only who has an asyncio loop pays for it
+
+        return turns(self._task, self._period_ns)
 
 
 def every(period: float) -> Turns:
@@ -119,23 +111,15 @@ def every(period: float) -> Turns:
 
 def run_steps(task: Task, step: Step, on_resume: Step | None, period_ns: int) -> None:
     """Call ``on_resume``, then the step again and again, committing each, until it returns `FINISHED` or SIGTERM comes."""
-    turns = Turns(task, period_ns)
     if inspect.iscoroutinefunction(step):
-        asyncio.run(_run_in_loop(turns, task, step, on_resume))
+        from failover.client.task_asyncio import run_steps_in_loop
+
+        run_steps_in_loop(task, step, on_resume, period_ns)
         return
-    for turn in turns:
+    for turn in Turns(task, period_ns):
         if turn == 0 and on_resume is not None:
             on_resume()
         if step() is FINISHED:
-            task.commit()
-            return
-
-
-async def _run_in_loop(turns: Turns, task: Task, step: Step, on_resume: Step | None) -> None:
-    async for turn in turns:
-        if turn == 0 and on_resume is not None:
-            await _finished(on_resume())
-        if await _finished(step()) is FINISHED:
             task.commit()
             return
 
@@ -144,20 +128,3 @@ def _sleep_until(deadline_ns: int) -> None:
     left = deadline_ns - time.monotonic_ns()
     if left > 0:
         time.sleep(left / 1e9)
-
-
-async def _finished(outcome: object) -> object:
-    return await outcome if inspect.isawaitable(outcome) else outcome
-
-
-@contextmanager
-def _asyncio_sigterm(stopped: asyncio.Event) -> Iterator[None]:
-    is_ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-    loop = asyncio.get_running_loop()
-    if is_ours:
-        loop.add_signal_handler(signal.SIGTERM, stopped.set)
-    try:
-        yield
-    finally:
-        if is_ours:
-            loop.remove_signal_handler(signal.SIGTERM)
