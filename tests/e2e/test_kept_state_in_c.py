@@ -63,8 +63,9 @@ def test_a_controller_in_c_outlives_its_robot_and_its_output_is_continuous(
     ran = subprocess.run(command, env={"FAILOVER_STATE": str(alone)}, capture_output=True, text=True, check=True, timeout=60)
     expected = ran.stdout.splitlines()
 
-    robots.run(first, "controller", str(controller()), "5", str(STEPS), cwd=str(tmp_path), engine="cooperative")
+    robots.run(first, "controller", str(controller()), "5", str(STEPS), cwd=str(tmp_path), engine="auto")
     robots.until_protected(first, "controller")
+    robots.until(lambda: robots.component(second, "controller").get("engine") == "cooperative", "a checkpoint of its own")
     os.kill(robots.host_pid(first, robots.component(first, "controller")["pid"]), signal.SIGKILL)
     robots.until(lambda: said(first), "robot1 to resume it")
     assert said(first)[0].endswith(", restarted")

@@ -45,7 +45,7 @@ def started(machine: Machine) -> int:
     with control(machine) as link:
         environment = {"PATH": "/usr/bin", "PYTHONPATH": str(CHECKOUT)}
         argv = [sys.executable, "-c", COUNTER]
-        answer = link.ask("run", argv=argv, name="kept", env=environment, cwd="/", wait=False, user=USER, engine="cooperative")
+        answer = link.ask("run", argv=argv, name="kept", env=environment, cwd="/", wait=False, user=USER, engine="auto")
         return int(answer["pid"])
 
 
