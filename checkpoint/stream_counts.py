@@ -34,7 +34,9 @@ class StreamCounts:
 
     def __init__(self, counters: int, pipes: tuple[int, int]) -> None:
         self._counters = mmap.mmap(counters, COUNTERS.size, prot=mmap.PROT_READ)
+        self._words = memoryview(self._counters)[: COUNTERS.size].cast("Q")
         self._pipes = pipes
+        self._found = array.array("i", [0])
         first, second = COUNTERS.unpack(self._counters[: COUNTERS.size])[FIRSTS:]
         self.firsts: Totals = (first, second)
 
@@ -44,21 +46,26 @@ class StreamCounts:
         Raises:
             OSError: an end is no pipe and no terminal.
         """
-        first, second = (self._total(index, patience_s) for index in range(STREAMS))
+        first = self._total(0, patience_s)
+        second = self._total(1, patience_s)
         return None if first is None or second is None else (first, second)
+
+    def unread(self, index: int) -> int:
+        """Bytes that wait in a stream's pipe or terminal. Source: ioctl_tty(2), FIONREAD; pipe(7)."""
+        fcntl.ioctl(self._pipes[index], termios.FIONREAD, self._found)
+        return self._found[0]
 
     def words(self) -> bytes:
         """The guard's counters as they are: while it does nothing, they stay the same."""
         return self._counters[: COUNTERS.size]
 
     def _total(self, index: int, patience_s: float) -> int | None:
-        deadline = 0.0
+        words, busy, counted, deadline = self._words, 2 * index, 2 * index + 1, 0.0
         while True:
-            before = COUNTERS.unpack(self._counters[: COUNTERS.size])[2 * index : 2 * index + 2]
-            unread = unread_in(self._pipes[index])
-            after = COUNTERS.unpack(self._counters[: COUNTERS.size])[2 * index : 2 * index + 2]
-            if before == after and not before[0]:
-                return int(before[1]) + unread
+            is_busy, count = words[busy], words[counted]
+            unread = self.unread(index)
+            if not is_busy and not words[busy] and words[counted] == count:
+                return count + unread
             now = time.perf_counter()
             deadline = deadline or now + patience_s
             if now > deadline:
@@ -67,11 +74,5 @@ class StreamCounts:
 
     def close(self) -> None:
         """Give the memory back."""
+        self._words.release()
         self._counters.close()
-
-
-def unread_in(descriptor: int) -> int:
-    """Bytes that wait in a pipe or terminal. Source: ioctl_tty(2), FIONREAD; pipe(7)."""
-    found = array.array("i", [0])
-    fcntl.ioctl(descriptor, termios.FIONREAD, found)
-    return found[0]

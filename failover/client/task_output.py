@@ -6,16 +6,15 @@ would wait: then the commit says `PENDING` instead, and a keeper passes it over.
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import io
 import mmap
 import sys
 import time
-from typing import Final
+from typing import Final, TextIO
 
 from checkpoint.segment import PENDING, Pending
-from checkpoint.stream_counts import StreamCounts, Totals, unread_in
+from checkpoint.stream_counts import StreamCounts, Totals
 
 PATIENCE_S: Final = 0.0003
 """How long a commit waits for a guard that is just emptying a pipe or counting what it took; for one that stands still, once."""
@@ -45,9 +44,8 @@ class OwnOutput:
         patience_s = 0.0 if self._stuck and self._counts.words() == self._stuck else PATIENCE_S
         if not self._has_room_within(patience_s):
             return self._give_up()
-        for stream in (sys.stdout, sys.stderr):
-            with contextlib.suppress(AttributeError, ValueError):  # there is none, or it is closed
-                stream.flush()
+        _flush(sys.stdout)
+        _flush(sys.stderr)
         totals = self._counts.totals(patience_s)
         if totals is None:
             return self._give_up()
@@ -60,20 +58,27 @@ class OwnOutput:
 
     def _has_room_within(self, patience_s: float) -> bool:
         deadline = 0.0
-        while not all(map(self._has_room, STREAMS, self._slots)):
+        while not (self._has_room(0) and self._has_room(1)):
             deadline = deadline or time.perf_counter() + patience_s
             if time.perf_counter() >= deadline:
                 return False
             time.sleep(LOOK_S)
         return True
 
-    @staticmethod
-    def _has_room(stream: int, slots: int) -> bool:
+    def _has_room(self, index: int) -> bool:
         """Whether a flush fits into the pipe, however its slots are filled.
 
         Two neighbours hold more than one page together, else the kernel had put them into one slot; the first may be read in
         part. What other threads and children write meanwhile is not foreseen. A pipe that is empty is taken as it is.
         Source: pipe(7), ``pipe_write`` in the kernel's fs/pipe.c.
         """
-        unread = unread_in(stream)
-        return not unread or 2 * -(-unread // mmap.PAGESIZE) + 2 + FLUSH_SLOTS <= slots
+        unread = self._counts.unread(index)
+        return not unread or 2 * -(-unread // mmap.PAGESIZE) + 2 + FLUSH_SLOTS <= self._slots[index]
+
+
+def _flush(stream: TextIO | None) -> None:
+    try:
+        if stream is not None:
+            stream.flush()
+    except (AttributeError, ValueError):  # it was replaced by something else, or closed
+        return
