@@ -87,6 +87,9 @@ class SegmentWriter:
     Attributes:
         descriptor: what a reader is handed; whoever inherits it by fork must close it, or it keeps this process's locks alive.
         number: of the newest commit.
+
+    Raises:
+        SegmentError: there is no memory for it, or a limit forbids it.
     """
 
     def __init__(self, layout: Layout, *, number: int = 0, name: str = NAME) -> None:
@@ -95,10 +98,16 @@ class SegmentWriter:
         layout.check()
         self.layout = layout
         self.number = number
-        self.descriptor = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-        os.ftruncate(self.descriptor, layout.file_size)
-        fcntl.fcntl(self.descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
-        self._memory = _mapped(self.descriptor, layout.file_size)
+        self.descriptor = -1
+        try:
+            self.descriptor = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+            os.ftruncate(self.descriptor, layout.file_size)
+            fcntl.fcntl(self.descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
+            self._memory = _mapped(self.descriptor, layout.file_size)
+        except OSError as error:
+            if self.descriptor >= 0:
+                os.close(self.descriptor)
+            raise SegmentError(f"segment: cannot get {layout.file_size >> 10} KiB of shared memory: {error.strerror}") from error
         self._memory[: len(layout.packed())] = layout.packed()
         self._words = memoryview(self._memory)[:TABLE_OFFSET].cast("Q")
         whole = np.frombuffer(self._memory, dtype=np.uint8)

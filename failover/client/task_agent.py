@@ -42,6 +42,8 @@ from failover.errors import NotCommittedError, TaskError
 
 _CREDENTIALS: Final = struct.Struct("3i")
 _INT_SIZE: Final = array.array("i").itemsize
+LOOK_S: Final = 1.0
+"""How long a thread holds the socket: another may wait with less patience."""
 DESCRIPTORS_MAX: Final = 2
 """Counters, and a segment."""
 
@@ -74,7 +76,8 @@ class Guarded:
 
     def __init__(self, end: socket.socket) -> None:
         self._end = end
-        self._lock = threading.Lock()
+        self._hearing = threading.RLock()
+        """Held by whoever waits for the next packet: a thread, and perhaps a signal handler that interrupts it."""
         self._output: OwnOutput | None = None
         self._is_pending = False
         self._told_segment = 0
@@ -106,7 +109,7 @@ class Guarded:
         finally:
             close_all(descriptors)
 
-    def _receive(self) -> tuple[FromGuard, tuple[int, ...]]:
+    def _receive(self, flags: int = 0) -> tuple[FromGuard, tuple[int, ...]]:
         """One packet, and its descriptors, ours to close.
 
         Raises:
@@ -114,9 +117,9 @@ class Guarded:
         """
         room = socket.CMSG_SPACE(DESCRIPTORS_MAX * _INT_SIZE)
         try:
-            content, ancillary, _, _ = self._end.recvmsg(PACKET_SIZE_MAX + 1, room, socket.MSG_CMSG_CLOEXEC)
+            content, ancillary, _, _ = self._end.recvmsg(PACKET_SIZE_MAX + 1, room, flags | socket.MSG_CMSG_CLOEXEC)
         except ConnectionResetError:  # said once, before what it said when it hung up
-            content, ancillary, _, _ = self._end.recvmsg(PACKET_SIZE_MAX + 1, room, socket.MSG_CMSG_CLOEXEC)
+            content, ancillary, _, _ = self._end.recvmsg(PACKET_SIZE_MAX + 1, room, flags | socket.MSG_CMSG_CLOEXEC)
         carried = array.array("i")
         for level, kind, packed in ancillary:
             if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
@@ -164,21 +167,27 @@ class Guarded:
             NotCommittedError: it does not, in time.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
-        with self._lock:
-            while self.durable < number:
-                left = None if deadline is None else deadline - time.monotonic()
-                if left is not None and left <= 0:
-                    why = self.trouble or f"the standby holds commit {self.durable}; failover status says how it stands"
-                    raise NotCommittedError(f"commit {number} is not safe after {timeout} s: {why}")
-                self._hear(left)
+        while self.durable < number:
+            left = None if deadline is None else deadline - time.monotonic()
+            if left is not None and left <= 0:
+                why = self.trouble or f"the standby holds commit {self.durable}; failover status says how it stands"
+                raise NotCommittedError(f"commit {number} is not safe after {timeout} s: {why}")
+            if self._hearing.acquire(timeout=LOOK_S if left is None else min(left, LOOK_S)):
+                try:
+                    if self.durable < number:
+                        self._hear(LOOK_S if left is None else min(left, LOOK_S))
+                finally:
+                    self._hearing.release()
 
-    def _hear(self, left: float | None) -> None:
+    def _hear(self, patience_s: float) -> None:
         waiting = select.poll()
         waiting.register(self._end, select.POLLIN)
-        if not waiting.poll(None if left is None else left * 1000):
+        if not waiting.poll(patience_s * 1000):
             return
         try:
-            message, descriptors = self._receive()
+            message, descriptors = self._receive(socket.MSG_DONTWAIT)
+        except BlockingIOError:  # a signal handler has taken it
+            return
         except (TaskError, OSError) as error:
             raise NotCommittedError(str(error)) from error
         close_all(descriptors)

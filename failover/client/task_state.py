@@ -48,7 +48,8 @@ class KeptState:
     def __init__(self, schema: Schema) -> None:
         self.live = LiveMemory()
         self._schema = schema
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
+        self._is_committing = False
         self._lineage = secrets.token_bytes(16)
         self._writer: SegmentWriter | None = None
         self._rooms: dict[str, int] = {}
@@ -77,7 +78,8 @@ class KeptState:
 
         Raises:
             KeepError: something in it cannot be kept; names it. The last commit stands.
-            TaskError: this process is a child of the one that keeps the state.
+            TaskError: this process is a child of the one that keeps the state, or a signal came in the middle of a commit, and
+                its handler commits.
         """
         with self._lock:
             if self._is_forked:
@@ -85,15 +87,22 @@ class KeptState:
                     f"cannot commit {self._schema.name} in pid {os.getpid()}, a child of the process that keeps this state: "
                     "commit there, or let the child keep one of its own"
                 )
-            encoded = self._schema.encode(value)
+            if self._is_committing:
+                raise TaskError(
+                    f"cannot commit {self._schema.name} in a signal handler that came in the middle of a commit: "
+                    "set a flag there, and commit in the loop that looks at it"
+                )
             try:
-                return self._commit(encoded)
+                self._is_committing = True
+                return self._commit(self._schema.encode(value))
             except SegmentError as error:
                 self.live.distrust()
                 raise KeepError(f"cannot keep {self._schema.name}: {error}", self._schema.name) from error
             except BaseException:
                 self.live.distrust()
                 raise
+            finally:
+                self._is_committing = False
 
     def _commit(self, encoded: Encoded) -> bool:
         contents = contents_of(encoded)
@@ -200,7 +209,7 @@ class KeptState:
     def forked(self) -> None:
         """In a child: give up the descriptor, whose locks are the parent's."""
         self._is_forked = True
-        self._lock = threading.Lock()  # the parent's may have been held by a thread that is not here
+        self._lock = threading.RLock()  # the parent's may have been held by a thread that is not here
         if self._writer is not None:
             self._writer.close()
 

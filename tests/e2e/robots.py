@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -35,15 +36,17 @@ T = TypeVar("T")
 
 @contextmanager
 def two_robots(
-    directory: Path, settings: str = "", prepare: Callable[[Path], None] = lambda _: None
+    directory: Path, settings: str = "", prepare: Callable[[Path], None] = lambda _: None, *, own_network: bool = True
 ) -> Iterator[tuple[RobotMachine, RobotMachine]]:
     """robot1 and robot2, beating and connected.
 
     Args:
         settings: lines added to their configurations.
         prepare: called with the directory in which each robot will have its own, before they start.
+        own_network: of each robot, where that can be had; else they share the loopback, and outlive each other's cable.
     """
-    with Stage(directory / "stage", means(), settings) as stage:
+    allowed = means()
+    with Stage(directory / "stage", replace(allowed, own_network=allowed.own_network and own_network), settings) as stage:
         stage.directory.mkdir()
         prepare(stage.directory)
         stage.start()
