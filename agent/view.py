@@ -115,6 +115,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings) -
         "sequence": newest.sequence if newest else None,
         "engine": engine,
         "warm": view.warm if engine == COOPERATIVE else None,
+        "cold": view.cold,
         "pid": running.pid if running is not None else None,
         "inner_pid": running.inner_pid if running is not None else None,
         "isolated": running.isolated if running is not None else None,

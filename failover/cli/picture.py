@@ -203,7 +203,9 @@ REASONS_SHOWN: Final = 8
 
 
 def is_healthy(status: Mapping[str, Any]) -> bool:
-    """Whether all that should be protected is: no component degraded, failed, unprotected or without standby, no peer dead."""
+    """Whether all that should be protected is: no component degraded, failed, unprotected or without a standby that can run it,
+    no peer dead."""
     living = [sight(component) for component in status["components"] if component.get("state") not in OVER_STATES]
     unwell = any(one.get("state") in BAD_STATES or not one.get("standby") or is_unprotected(one) for one in living)
+    unwell |= any(seen.get("cold") for one in status["components"] for seen in (one, *(one.get("elsewhere") or {}).values()))
     return not unwell and all(peer["state"] != "dead" for peer in status["peers"])

@@ -54,8 +54,10 @@ peers: [{name, state, last_heard_ms, hears_us, load, beats_lost, lane, notes}]
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
     freeze_us_max, snapshot_size, dirty_bytes, snapshots, restores, crashes, outage_ms, exit_status, promise, owner, reasons,
-    notes, elsewhere, warm}]
+    notes, elsewhere, warm,
+    cold}]
     warm: its program waits at its standby, started in advance; None where nothing could: it is restored from its memory
+    cold: why it does not wait at this robot, where it should and something went wrong; "" otherwise
     owner: uid of the user who may give orders about it and read its output, besides root
     role: primary | standby | none; protection: none | protected | degraded | stopped
     state: starting | running | frozen | held | restoring | ended | degraded | failed | released

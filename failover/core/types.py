@@ -334,6 +334,7 @@ class ComponentView:
         lease_until_ns: of this robot's clock; 0 acts without a lease.
         owner: uid; None where this robot has heard no more of it than its name.
         warm: its program waits at its standby, started already: only one that keeps its state itself can.
+        cold: why it does not wait here, where it should and something went wrong.
     """
 
     name: str
@@ -354,6 +355,7 @@ class ComponentView:
     prefer: str = ""
     owner: int | None = None
     warm: bool = False
+    cold: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ def status(components: dict[str, Component], turn: Turn, boot: int) -> StatusVie
     )
     peers = turn.team.views(turn.now_ns)
     bad = any(view.protection is Protection.DEGRADED or view.state is State.FAILED for view in views)
-    bad = bad or any(component.cold for component in components.values())
+    bad = bad or any(view.cold for view in views)
     lost = any(peer.state == "dead" for peer in peers)
     return StatusView(turn.me, boot, "pair", _team_promise(turn), not bad and not lost, peers, views)
 
@@ -59,6 +59,7 @@ def _component(component: Component, turn: Turn) -> ComponentView:
         component.rules.prefer,
         component.spec.owner if component.spec else None,
         is_warm(component, turn),
+        component.cold,
     )
 
 
