@@ -194,8 +194,7 @@ class Component:
         followed = self.engine, (self.task_pid or self.pid) if self.engine == COOPERATIVE else self.pid
         has_one = self._keeper is not None and self._keeper.dialogue.open
         if has_one and self._followed not in (None, followed):
-            await self._release_keeper()
-            has_one = False
+            await self._let_loose()
         if not has_one:
             await self.give_keeper()
         if self._followed == followed or self._awaits_commit:
@@ -224,10 +223,12 @@ class Component:
         return self.engine == COOPERATIVE and not self.keeps
 
     async def _follow(self, engine: str, pid: int) -> tuple[str, ...]:
-        """Have a keeper that follows nothing yet follow a process; it ends if it cannot."""
+        """Have a keeper that follows nothing follow a process. If it refuses it has touched nothing; if it fails it ends."""
         order = channel.Protect(pid, self.name, bool(self.streams), self._places.robot, engine)
         try:
             protected, _ = await self.ask_keeper(order, self.streams)
+        except UnsupportedError:
+            raise
         except (CheckpointError, KeeperLostError):
             self._drop_keeper()
             raise
@@ -361,7 +362,8 @@ class Component:
 
     async def release(self) -> None:
         """End protection; the program runs on, its guard keeps its streams until it ends."""
-        await self._release_keeper()
+        with contextlib.suppress(CheckpointError, KeeperLostError):
+            await self._let_loose()
         await self.ask_guard(guard_messages.LetGo())
         self.close()
 
@@ -439,12 +441,11 @@ class Component:
         if keeper is not None:
             keeper.end()
 
-    async def _release_keeper(self) -> None:
-        """Have the keeper let go of what it follows, if it is there, and end."""
+    async def _let_loose(self) -> None:
+        """Have the keeper let go of what it follows, if it is there; it may follow something else then."""
         if self._keeper is not None and self._keeper.dialogue.open:
-            with contextlib.suppress(CheckpointError, KeeperLostError):
-                await self.ask_keeper(channel.Release())
-        self._drop_keeper()
+            self._followed = None
+            await self.ask_keeper(channel.Release())
 
     def _heard(self, message: Any) -> bool:
         """Events of the guard."""

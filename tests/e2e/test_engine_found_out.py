@@ -91,9 +91,14 @@ def test_a_program_is_traced_until_it_says_that_it_keeps_its_state(
     pair: tuple[RobotMachine, RobotMachine], tmp_path: Path
 ) -> None:
     first, second = pair
-    start(first, tmp_path, WAITS + COUNTS)
+    start(first, tmp_path, WAITS + COUNTS.replace("while True:", WAITS.replace("go", "commit") + "while True:"))
     robots.until(lambda: captured_by(second, "ptrace"), "a checkpoint from outside")
     (tmp_path / "go").touch()
+    robots.until(
+        lambda: "it has committed nothing yet" in "".join(shown(first)["notes"]), "it to be said that there is no commit"
+    )
+    assert shown(first)["state"] == "running"
+    (tmp_path / "commit").touch()
     robots.until(lambda: captured_by(second, "cooperative"), "a checkpoint of its own")
     assert (shown(first)["engine"], shown(first)["reasons"], words_of_alarm(first)) == ("cooperative", [], [])
     taken_over(first, second)
