@@ -223,6 +223,15 @@ def test_a_program_that_returns_from_main_has_written_its_newest_commit(tmp_path
     assert output(telling(), tmp_path) == "resumed 1005 3\nbegan 1005\n"
 
 
+@pytest.mark.parametrize("compiler", ["clang", "musl-gcc"])
+def test_it_runs_by_other_compilers_and_another_libc(compiler: str, tmp_path: Path) -> None:
+    if not has(compiler):
+        pytest.skip(f"needs {compiler}, which is not installed here")
+    path = program(f"telling_{compiler}", "telling.c", flags=("-O2", *STRICT), compiler=compiler)
+    assert output(path, tmp_path, "100", "wait").splitlines()[-1] == "safe 100"
+    assert output(path, tmp_path) == "resumed 100 2\nbegan 100\n"
+
+
 def test_two_programs_do_not_share_a_state(tmp_path: Path) -> None:
     with running(program("asks"), tmp_path, "stay") as started:
         assert started.stdout is not None
