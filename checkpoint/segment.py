@@ -31,7 +31,7 @@ PAGE: Final = 4096
 """Bytes of a segment's page, whatever the machine's own are: so a state moves between machines."""
 
 BANKS: Final = 3
-"""One is newest, one may be held by a reader, one is free. The third takes no memory until a reader is met."""
+"""One is newest, one may be held by a reader, one is free."""
 MAX_BANKS: Final = 8
 MAX_REGIONS: Final = 1024
 MAX_PAGES: Final = (64 << 30) // PAGE

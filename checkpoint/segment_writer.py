@@ -253,8 +253,8 @@ class SegmentWriter:
                 self._memory[place : place + PAGE] = content[offset : offset + PAGE].ljust(PAGE, b"\0")
 
     def _free_bank(self) -> int | None:
-        """Lock a bank that is neither the newest nor held; the one that has missed least."""
-        for bank in sorted(range(len(self._held)), key=self._held.__getitem__, reverse=True):
+        """Lock a bank that is neither the newest nor held; in turn, so that none has ever missed much."""
+        for bank in sorted(range(len(self._held)), key=self._held.__getitem__):
             if bank != self._newest:
                 if _fcntl(self.descriptor, fcntl.F_OFD_SETLK, self._locks[bank]) == 0:
                     return bank

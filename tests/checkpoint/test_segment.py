@@ -17,7 +17,7 @@ import pytest
 
 from checkpoint import segment
 from checkpoint.errors import SegmentBusyError, SegmentError
-from checkpoint.segment import ARRAY, PAGE, PENDING, STATE, Layout, Region, lock_of, numbered
+from checkpoint.segment import ARRAY, BANKS, NEWEST_OFFSET, PAGE, PENDING, STATE, Layout, Region, lock_of, numbered
 from checkpoint.segment_reader import SegmentReader
 from checkpoint.segment_writer import SegmentWriter
 from tests.checkpoint.segments import LINEAGE, Telling, committing_child, layout, number_read, source
@@ -130,12 +130,23 @@ def test_a_reader_that_never_lets_go_stops_no_commit() -> None:
         assert found is not None and number_read(found) == 49
 
 
+def test_banks_are_written_in_turn_so_that_none_has_missed_much() -> None:
+    state = Telling()
+    with opened(layout()) as (writer, reader):
+        for number in range(1, 8):
+            assert writer.commit(state.sources(number))
+            assert reader._word(NEWEST_OFFSET) % 256 == (number - 1) % BANKS
+        with reader._held(4 % BANKS):
+            assert writer.commit(state.sources(8))
+            assert reader._word(NEWEST_OFFSET) % 256 == 5 % BANKS, "the next in turn is held: the one after it"
+
+
 def test_when_readers_hold_every_other_bank_a_commit_is_made_up_for_by_the_next() -> None:
     state = Telling()
     with opened(layout()) as (writer, reader):
         for number in (1, 2, 3):
             assert writer.commit(state.sources(number))
-        with reader._held(1), reader._held(2):
+        with reader._held(0), reader._held(1):
             assert not writer.commit(state.sources(4))
             found = reader.read()
             assert found is not None and number_read(found) == 3
