@@ -39,7 +39,9 @@ from agent.transport import BulkLane, Keys, LinkState, public_key_of
 from agent.units import starter
 from agent.verbs import Verbs
 from agent.view import team_view
-from checkpoint.channel import Channel, ChannelClosedError, ChannelError
+from checkpoint import format
+from checkpoint.channel import Channel, ChannelClosedError, ChannelError, close_all
+from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CheckpointError, StoreError
 from checkpoint.model import Snapshot
 from checkpoint.store import Store, open_store
@@ -386,7 +388,20 @@ def _resolve(waiting: dict[int, asyncio.Future[Any]], number: int, answer: Any) 
 
 
 def _held(store: Store) -> tuple[Held, ...]:
-    return tuple(Held(name, store.positions(name)[-HISTORY_MAX:]) for name in store.components())
+    return tuple(Held(name, store.positions(name)[-HISTORY_MAX:], _keeps_state(store, name)) for name in store.components())
+
+
+def _keeps_state(store: Store, name: str) -> bool:
+    """Whether the newest snapshot is of a program that keeps its state; False also where it cannot be read now."""
+    chain: list[int] = []
+    try:
+        chain = store.open_chain(name)
+        return format.read_outline(chain[-1]).engine == COOPERATIVE
+    except (CheckpointError, OSError) as error:
+        log.warning("%s: its newest checkpoint cannot be read: %s", name, error)
+        return False
+    finally:
+        close_all(tuple(chain))
 
 
 async def _live(settings: Settings, descriptor: int) -> None:

@@ -41,7 +41,7 @@ while time.monotonic() - began < 0.5:
 """
 """numpy, and as much work again as makes half a second of it, as a larger library does while it is imported."""
 
-KEPT_CUTS = 4
+KEPT_CUTS = 3
 QUICK_KEPT_CUTS = 1
 COLD: Final = '[components."/demo/robot1/count0"]\nwarm = false\n'
 

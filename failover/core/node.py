@@ -128,6 +128,7 @@ class Node:
         for one in held:
             if one.component in self._components:
                 component = self._components[one.component]
+                component.keeps_state = one.keeps_state
                 component.held = [position for position in one.positions if position.generation not in component.lost]
 
     def _begin(self, turn: Turn) -> None:

@@ -287,10 +287,15 @@ class Ballot:
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """Restorable positions that this robot's own store holds of one component, oldest first (at most ``HISTORY_MAX`` count)."""
+    """Restorable positions that this robot's own store holds of one component, oldest first (at most ``HISTORY_MAX`` count).
+
+    Attributes:
+        keeps_state: to go on from the newest one is to start the program again, which keeps its state itself.
+    """
 
     component: str
     positions: tuple[Position, ...]
+    keeps_state: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ def counting(first: RobotMachine, folder: Path) -> None:
     """Start it at the first robot."""
     program = folder / "counter.py"
     program.write_text(SCRIPT)
-    robots.run(first, "count", sys.executable, str(program), str(folder / "starts"), cwd=str(folder), engine="cooperative")
+    robots.run(first, "count", sys.executable, str(program), str(folder / "starts"), cwd=str(folder), engine="auto")
 
 
 def until_warm(*both: RobotMachine) -> None:

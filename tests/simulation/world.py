@@ -189,7 +189,12 @@ class World:
         for other in self.robots:
             if other != name:
                 robot.receiver.accept(other, KEY + other.encode())
-        held = tuple(Held(component, tuple(positions[-8:])) for component, positions in robot.store.items() if positions)
+        keep = {
+            record.name for record in decode(robot.ballot).records if record.spec and record.spec.launch.engine == KEEPS_STATE
+        }
+        held = tuple(
+            Held(component, tuple(positions[-8:]), component in keep) for component, positions in robot.store.items() if positions
+        )
         found = tuple(
             Found(component, program.epoch, program.exit_status is None, program.exit_status or 0)
             for component, program in robot.programs.items()

@@ -13,7 +13,7 @@ from failover.core.consent import STATES
 from failover.core.events import Event, Received, Stored, Tick, Warmed
 from failover.core.messages import WARM, Beat, Entry
 from failover.core.node import Node
-from failover.core.types import MS, Ballot, ComponentSpec, Config, Launch, OnLoss, Rules, State
+from failover.core.types import MS, Ballot, ComponentSpec, Config, Held, Launch, OnLoss, Record, Rules, State
 
 NAME = "/lab/x"
 SPEC = ComponentSpec(NAME, "robot2", Launch(("x",)))
@@ -98,6 +98,13 @@ def test_a_takeover_uses_what_waits(standby: Standby) -> None:
         ordered = standby.step(Tick())
     assert [type(act) for act in ordered] == [acts.Restore]
     assert not standby.node.status(standby.now_ns).components[0].warm
+
+
+def test_a_standby_that_was_restarted_has_it_wait_without_another_snapshot() -> None:
+    record = Record(NAME, 1, "robot2", State.STANDBY, trusted=True, spec=SPEC)
+    held = Held(NAME, (Position(65, 1, b"d"),), keeps_state=True)
+    node = Node(Config("robot1", ("robot2",), grace_ms=300), 2, Ballot((record,)), 0, (held,))
+    assert acts.Warm(NAME, 1, SPEC) in node.step(Tick(), 1 * MS).act
 
 
 def test_the_others_hear_whether_it_waits(standby: Standby) -> None:
