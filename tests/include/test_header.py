@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import shutil
 import signal
 import subprocess
 import time
@@ -230,6 +231,17 @@ def test_it_runs_by_other_compilers_and_another_libc(compiler: str, tmp_path: Pa
     path = program(f"telling_{compiler}", "telling.c", flags=("-O2", *STRICT), compiler=compiler)
     assert output(path, tmp_path, "100", "wait").splitlines()[-1] == "safe 100"
     assert output(path, tmp_path) == "resumed 100 2\nbegan 100\n"
+
+
+@pytest.mark.command("aarch64-linux-gnu-gcc")
+@pytest.mark.command("qemu-aarch64")
+def test_a_state_moves_between_two_processors(tmp_path: Path) -> None:
+    flags = ("-O2", "-static", *STRICT)
+    other = program("telling_aarch64", "telling.c", flags=flags, compiler="aarch64-linux-gnu-gcc")
+    emulator = Path(shutil.which("qemu-aarch64") or "")
+    assert output(emulator, tmp_path, str(other), "30", "wait").splitlines()[-1] == "safe 30"
+    assert output(telling(), tmp_path, "30") == "resumed 30 2\nbegan 30\n"
+    assert output(emulator, tmp_path, str(other)) == "resumed 60 3\nbegan 60\n"
 
 
 def test_two_programs_do_not_share_a_state(tmp_path: Path) -> None:
