@@ -8,6 +8,7 @@ import signal
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
@@ -15,8 +16,11 @@ from agent import births, clock, nursery, standby
 from agent.births import Program
 from agent.component import Component
 from agent.errors import GuardError
+from agent.guard_messages import BeginTask
 from agent.places import Places, guard_sockets
 from agent.standby import Standby
+from agent.ward import Ward
+from checkpoint.linux.vessel import Born
 from tests.agent.guards import PATIENCE_S, lives
 from tests.agent.test_component import Captures, live, output, piece_of, until
 from tests.agent.test_cooperative_component import BEGIN, NAME, STEPS, gone_afterwards, next_of, program, started
@@ -121,6 +125,47 @@ def test_a_program_whose_lease_is_over_takes_no_step(tmp_path: Path) -> None:
         captures.close()
 
     live(tmp_path, story)
+
+
+def test_a_guard_has_the_lease_before_it_is_told_to_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(places: Places) -> None:
+        captures, _ = await left_by(places, STEPS)
+        waiting = Waiting(places)
+        waiting.warm(program(STEPS))
+        component = await prepared(places, captures, await waiting.taken())
+        asked: list[str] = []
+        honest = component.ask_guard
+
+        async def noted(request: Any, descriptors: tuple[int, ...] = ()) -> Any:
+            asked.append(type(request).__name__)
+            return await honest(request, descriptors)
+
+        monkeypatch.setattr(component, "ask_guard", noted)
+        await component.lease(clock.now_ns() + 10**12)
+        await component.resume()
+        async with gone_afterwards(component):
+            assert asked[:2] == ["Lease", "BeginTask"]
+        captures.close()
+
+    live(tmp_path, story)
+
+
+def test_a_program_whose_lease_is_over_is_frozen_before_it_hears_anything(tmp_path: Path) -> None:
+    done: list[str] = []
+
+    class Noting:
+        """Stands for freezer, pump and task."""
+
+        is_open, logs = False, None
+
+        def __getattr__(self, name: str) -> Callable[..., None]:
+            return lambda *_: done.append(name)
+
+    nothing = cast(Any, Noting())
+    ward = Ward(NAME, Born(1, 1), nothing, str(tmp_path), nothing, committed=False, warm=True, task=nothing)
+    ward.set_lease(1)
+    ward.begin_task(BeginTask(4, None, (0, 0)), ())
+    assert done == ["open", "freeze", "begin", "begin"]
 
 
 def test_a_program_that_ends_before_it_is_ready_is_told_with_its_last_words_and_tried_again(
