@@ -1,4 +1,4 @@
-"""Leases and freezes overtake what waits in a component's queue: what waits must not bring an older word back."""
+"""Leases and freezes overtake what waits in a component's queue; a takeover that cannot go on with what waits here starts anew."""
 
 from __future__ import annotations
 
@@ -7,10 +7,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
+import pytest
+
 from agent.charge import Charge, Surroundings
+from agent.clock import Laps
 from agent.component import Component
 from agent.errors import GuardError
 from agent.records import Records
+from agent.standby import Standby
+from checkpoint.model import Position
 from failover.core import acts
 
 NAME = "/lab/robot1/mapper"
@@ -93,3 +98,33 @@ def test_a_thaw_that_waited_does_not_undo_a_later_freeze(tmp_path: Path) -> None
         charge.order(acts.Freeze(NAME, 3))
 
     assert not carried_out(orders, tmp_path).runs
+
+
+def test_a_takeover_that_what_waited_cannot_carry_out_starts_the_program_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nothing = cast(Any, None)
+    waiting, anew = cast(Component, object()), cast(Component, object())
+    tried: list[Component | None] = []
+
+    async def brought_back(
+        self: Charge, act: object, chain: object, outage_ns: int, laps: object, waits: Any = None
+    ) -> Component:
+        tried.append(waits)
+        return waits or anew
+
+    async def let_it_run(self: Charge, component: Component, epoch: int, outage_ns: int) -> tuple[Component, int]:
+        if component is waiting:
+            raise GuardError("the program has ended")
+        return component, outage_ns
+
+    monkeypatch.setattr(Charge, "_brought_back", brought_back)
+    monkeypatch.setattr(Charge, "_let_it_run", let_it_run)
+    monkeypatch.setattr(Standby, "take", lambda _: waiting)
+
+    async def run() -> None:
+        charge = Charge(NAME, Surroundings(nothing, nothing, Records(tmp_path), lambda _: None, nothing, nothing))
+        assert await charge._resumed(acts.Restore(NAME, 3, Position(1, 1, b"d"), None), [], 7, Laps()) == (anew, 7)
+        assert tried == [waiting, None]
+
+    asyncio.run(run())
