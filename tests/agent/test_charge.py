@@ -1,4 +1,4 @@
-"""Leases and freezes overtake what waits in a component's queue; a takeover that cannot go on with what waits here starts anew."""
+"""Leases and freezes overtake what waits in a component's queue; a takeover that what waits cannot carry out starts anew."""
 
 from __future__ import annotations
 
