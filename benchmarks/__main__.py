@@ -1,6 +1,6 @@
 """Measure, side by side with what a user would pick instead; print tables, and write them with the machine's facts.
 
-python -m benchmarks                     all of it, less than six minutes; writes benchmarks/RESULTS.md
+python -m benchmarks                     all of it, some seven minutes; writes benchmarks/RESULTS.md
 python -m benchmarks --quick             fewer cases and repetitions, less than 90 seconds; prints only
 python -m benchmarks --quick restore     one of them
 
