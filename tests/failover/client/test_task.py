@@ -356,7 +356,7 @@ def test_more_arrays_than_a_segment_has_regions_are_refused_and_the_last_commit_
     state = failover.resume("maps", default=Maps())
     assert state == Maps(number=1)
     state.images = {f"image {number}": np.ones(5000, dtype=np.uint8) for number in range(1100)}
-    with pytest.raises(KeepError, match="regions"):
+    with pytest.raises(KeepError, match="more than 1023 arrays"):
         failover.commit()
     state.images = {"image 7": np.full(5000, 7, dtype=np.uint8)}
     failover.commit()
