@@ -125,20 +125,18 @@ def voyage(directory: Path, dice: random.Random, *arguments: str) -> Iterator[Vo
 
 def kill_program(going: Voyage, robot: RobotMachine) -> None:
     """Nothing but the program; its robot resumes it."""
-    epoch = going.now().epoch
-    os.kill(robots.host_pid(robot, robots.component(robot, "voyage")["pid"]), signal.SIGKILL)
-    resumed(going, "the program to be resumed in place")
+    with another_life(going, "the program to be resumed in place") as before:
+        os.kill(robots.host_pid(robot, robots.component(robot, "voyage")["pid"]), signal.SIGKILL)
     assert going.now().why == "restarted"
-    assert going.now().epoch == (epoch or 1), "nobody took it over"
+    assert going.now().epoch == (before.epoch or 1), "nobody took it over"
 
 
 def cut_robot(going: Voyage, robot: RobotMachine) -> None:
     """All of the robot at one instant. It comes back when the other one has taken over."""
-    epoch = going.now().epoch
     assert not robots.mistake(robot), robots.mistake(robot)
-    robot.cut_power()
-    resumed(going, "the other robot to take over")
-    assert (going.now().why, going.now().epoch) == ("taken-over", max(epoch, 1) + 1)
+    with another_life(going, "the other robot to take over") as before:
+        robot.cut_power()
+    assert (going.now().why, going.now().epoch) == ("taken-over", max(before.epoch, 1) + 1)
     come_back(going.stage, robot)
 
 
@@ -163,9 +161,11 @@ def kill_other(going: Voyage, robot: RobotMachine, way: str) -> None:
         robots.until(lambda: going.lives() > lives, "the program to be resumed")
 
 
-def resumed(going: Voyage, what: str) -> None:
-    """Until there is another life; what was killed is counted."""
+@contextmanager
+def another_life(going: Voyage, what: str) -> Iterator[Resumption]:
+    """Do something to the newest life, which is given, and wait for the next; a commit that was broken off is counted."""
     before, lives = going.now(), going.lives()
+    yield before
     robots.until(lambda: going.lives() > lives, what)
     going.in_commit += going.log.last_kind.get(before.life) == "b"
 
