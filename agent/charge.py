@@ -22,7 +22,7 @@ from agent.births import Program
 from agent.component import Captured, Component
 from agent.config import ComponentConfig
 from agent.errors import AgentError, GuardError, KeeperLostError
-from agent.figures import Figures, shortened
+from agent.figures import Commits, Figures, shortened
 from agent.guard_messages import Task
 from agent.mistake import end_lanes_on_mistake
 from agent.places import Places
@@ -287,6 +287,7 @@ class Charge:
         laps.lap("letting it go")
         self.component = component
         self.figures.restores += 1
+        self.figures.commits = Commits()  # of another process: its numbers begin anew
         self.figures.reasons = ()
         self.figures.outage_ms = (silent_ns + clock.now_ns() - began_ns) / 1e6
         log.info(

@@ -1,0 +1,39 @@
+"""When a program that keeps its state is said to have stopped committing."""
+
+from __future__ import annotations
+
+from agent.figures import Commits
+
+MS = 10**6
+SECOND = 10**9
+
+
+def committing(every_ns: int, count: int) -> Commits:
+    commits = Commits()
+    for number in range(1, count + 1):
+        commits.note(10 * number, 10 * number * every_ns)  # a capture sees every tenth
+    return commits
+
+
+def test_a_program_is_measured_by_what_it_used_to_do() -> None:
+    often, seldom = committing(10 * MS, 20), committing(60 * SECOND, 20)
+    assert (often.usual_ns, seldom.usual_ns) == (10 * MS, 60 * SECOND)
+    assert not often.is_overdue(often.newest_ns + 1_900 * MS), "two seconds at least"
+    assert often.is_overdue(often.newest_ns + 2_100 * MS)
+    assert not seldom.is_overdue(seldom.newest_ns + 590 * SECOND)
+    assert "last commit 14 s ago, before that there was one every 0.010 s" in often.remark(often.newest_ns + 14 * SECOND)
+
+
+def test_a_program_that_committed_once_is_given_more_time() -> None:
+    once = committing(10 * MS, 1)
+    assert not Commits().is_overdue(100 * SECOND), "nothing was committed: that is told otherwise"
+    assert not once.is_overdue(once.newest_ns + 9 * SECOND)
+    assert once.is_overdue(once.newest_ns + 11 * SECOND)
+    assert "its only one" in once.remark(once.newest_ns + 11 * SECOND)
+
+
+def test_a_capture_that_finds_nothing_new_changes_nothing() -> None:
+    commits = committing(10 * MS, 20)
+    before = commits.newest_ns
+    commits.note(200, before)
+    assert (commits.usual_ns, commits.newest_ns) == (10 * MS, before)
