@@ -154,6 +154,7 @@ class LanesProcess:
                 self.order(act)
             else:
                 told.append(_failure(act))
+        told += [events.Warmed(act.component, act.epoch, False) for act in self._warm.values()]  # what waited ended with them
         told += [events.Exited(found.component, found.epoch, found.status) for found in inventory.found if not found.running]
         return told
 

@@ -13,6 +13,7 @@ import pytest
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_cooperative import COUNTER, lines, numbers, origins, shown
+from tests.e2e.test_deaths import kill, revived
 
 SCRIPT = (
     "import os, sys\nwith open(sys.argv[1], 'a') as starts:\n    starts.write('started\\n')\nprint('# imported - -')\n" + COUNTER
@@ -108,3 +109,19 @@ def test_what_waits_is_used_by_a_handover_and_ends_with_the_component(tmp_path: 
         assert starts(tmp_path) == 3, "the robot that it left has it waiting in turn"
         assert robots.failover(second, "stop", "count").returncode == 0
         robots.until(lambda: not programs(first) and not programs(second), "all of it to end")
+
+
+def test_what_waits_ends_with_the_lanes_and_another_takes_its_place(tmp_path: Path) -> None:
+    with robots.two_robots(tmp_path) as (first, second):
+        counting(first, tmp_path)
+        until_warm(first, second)
+        (lost,) = programs(second)
+        kill(second, ("lanes",))
+        revived(second, ("lanes",))
+        robots.until(lambda: starts(tmp_path) == 3, "another one to be started")
+        until_warm(first, second)
+        assert lost not in programs(second)
+        (waiting,), before = programs(second), len(numbers(second))
+        first.cut_power()
+        went_on(second, before)
+        assert programs(second) == [waiting]
