@@ -136,12 +136,12 @@ async def restore(
     )
     component.engine_wanted = task.engine if task is not None else PTRACE
     try:
-        keeper = await component.give_keeper()
+        keeper = await component.keeper.give()
         laps.lap("guard and keeper")
         await _vessel(component, request, keeper)
         laps.lap("vessel")
         order = channel.Restore(component.pid, name, outage_ns, streams=True, robot=places.robot, own_eyes=owner != ROOT)
-        restored, _ = await component.ask_keeper(order, (*chain, *component.streams))
+        restored, _ = await component.keeper.ask(order, (*chain, *component.streams))
         laps.lap("restore")
     except (CheckpointError, GuardError, KeeperLostError):
         await component.undo()
@@ -179,8 +179,8 @@ async def begin_again(
     component = waiting or Component(name, await places.nursery.guard(), places)
     component.engine_wanted = COOPERATIVE  # what another engine took before it says Hello would be older than its state
     try:
-        await component.give_keeper()
-        filled, (segment,) = await component.ask_keeper(channel.Fill(name), tuple(chain))
+        await component.keeper.give()
+        filled, (segment,) = await component.keeper.ask(channel.Fill(name), tuple(chain))
     except (CheckpointError, GuardError, KeeperLostError):
         await component.undo()
         raise

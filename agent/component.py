@@ -28,14 +28,15 @@ from typing import Any, Final
 
 from agent import guard_messages
 from agent.errors import GuardError, GuardLostError, KeeperLostError
+from agent.following import Following
 from agent.guard_messages import Described, Exited, Refused, Started, TaskConnected, TaskKeeps, VesselReady
-from agent.nursery import GuardLink, KeeperLink
+from agent.nursery import GuardLink
 from agent.places import Places, log_directory
 from agent.streams import OutputLogs
-from checkpoint import channel, errors
-from checkpoint.channel import Failed, close_all
+from checkpoint import channel
+from checkpoint.channel import close_all
 from checkpoint.engine import AUTO, COOPERATIVE, PTRACE
-from checkpoint.errors import CheckpointError, NothingCommittedError, RestoreError, UnsupportedError
+from checkpoint.errors import CheckpointError, NothingCommittedError, UnsupportedError
 from checkpoint.model import Position
 
 HELLO_PATIENCE_S: Final = 10.0
@@ -107,6 +108,7 @@ class Component:
         task_pid: of the process that keeps its state, 0 before it has said so (``connected``); keeps: it has made a commit.
         committed: called at its first commit to each segment.
         last_words: what its guard noted at its end.
+        keeper: what captures it.
         prepared: a program that is to be started with a state, by `resume`.
         streams: what its guard gave of them: counters, two read ends, two logs; none of somebody else's child.
         ended: the wait status once the program has ended (None: it was not our child); GuardLostError if the guard died first.
@@ -121,7 +123,7 @@ class Component:
         self.ended: asyncio.Future[int | None] = asyncio.get_running_loop().create_future()
         self._places = places
         self._guard = guard
-        self._keeper: KeeperLink | None = None
+        self.keeper = Following(name, places)
         self.streams: tuple[int, ...] = ()
         self._totals: dict[Position, tuple[int, int]] = {}
         self._commits: dict[Position, int] = {}
@@ -130,7 +132,6 @@ class Component:
         self.task_pid = 0
         self.keeps = False
         self.committed: Callable[[], None] = lambda: None
-        self._followed: tuple[str, int] | None = None
         self.connected = asyncio.Event()
         self.last_words: tuple[str, ...] = ()
         self.prepared: Prepared | None = None
@@ -157,7 +158,7 @@ class Component:
             return
         try:
             await self.ask_guard(guard_messages.Commit())
-            resumed, _ = await self.ask_keeper(channel.Resume())
+            resumed, _ = await self.keeper.ask(channel.Resume())
         except (CheckpointError, GuardError, KeeperLostError):
             await self.undo()
             raise
@@ -165,7 +166,7 @@ class Component:
         if any(note.startswith(channel.UNPROTECTED) for note in resumed.notes):
             self._drop_keeper()  # the next capture tries with a new one
         else:
-            self._followed = PTRACE, self.pid
+            self.keeper.followed = PTRACE, self.pid
 
     async def _begin_again(self, prepared: Prepared) -> None:
         """Have the program go on with the state that waits for it. One that waits has its lease before it can take a step."""
@@ -192,15 +193,14 @@ class Component:
             ProbeError, KeeperLostError.
         """
         followed = self.engine, (self.task_pid or self.pid) if self.engine == COOPERATIVE else self.pid
-        has_one = self._keeper is not None and self._keeper.dialogue.open
-        if has_one and self._followed not in (None, followed):
-            await self._let_loose()
-        if not has_one:
-            await self.give_keeper()
-        if self._followed == followed or self._awaits_commit:
+        if self.keeper.is_there and self.keeper.followed not in (None, followed):
+            await self.keeper.let_loose()
+        if not self.keeper.is_there:
+            await self.keeper.give()
+        if self.keeper.followed == followed or self._awaits_commit:
             return ()
         with self._patience():
-            return await self._follow(*followed)
+            return await self.keeper.follow(*followed, self.streams)
 
     @contextlib.contextmanager
     def _patience(self) -> Iterator[None]:
@@ -221,19 +221,6 @@ class Component:
     def _awaits_commit(self) -> bool:
         """Whether there is nothing to follow yet."""
         return self.engine == COOPERATIVE and not self.keeps
-
-    async def _follow(self, engine: str, pid: int) -> tuple[str, ...]:
-        """Have a keeper that follows nothing follow a process. If it refuses it has touched nothing; if it fails it ends."""
-        order = channel.Protect(pid, self.name, bool(self.streams), self._places.robot, engine)
-        try:
-            protected, _ = await self.ask_keeper(order, self.streams)
-        except UnsupportedError:
-            raise
-        except (CheckpointError, KeeperLostError):
-            self._drop_keeper()
-            raise
-        self._followed = engine, pid
-        return tuple(protected.notes)
 
     async def capture(
         self, *, base: bool, generation: int, sequence: int, epoch: int, hold: bool = False
@@ -258,7 +245,7 @@ class Component:
         order = channel.Capture(base, generation, sequence, epoch, hold)
         async with self._standing_still(is_held_by_guard):
             with self._patience():
-                captured, descriptors = await self.ask_keeper(order)
+                captured, descriptors = await self.keeper.ask(order)
         if isinstance(captured, channel.Unchanged):
             return captured
         (snapshot,) = descriptors
@@ -290,8 +277,7 @@ class Component:
         totals = self._totals.pop(position, None)
         if totals is not None:
             self.logs.commit(totals)
-        if self._keeper is not None and self._keeper.dialogue.open:
-            self._keeper.dialogue.tell(channel.Acknowledge(position))
+        self.keeper.tell(channel.Acknowledge(position))
         if (commit := self._commits.pop(position, 0)) and is_safe:
             self._guard.dialogue.tell(guard_messages.CommitSafe(commit))
 
@@ -363,7 +349,7 @@ class Component:
     async def release(self) -> None:
         """End protection; the program runs on, its guard keeps its streams until it ends."""
         with contextlib.suppress(CheckpointError, KeeperLostError):
-            await self._let_loose()
+            await self.keeper.let_loose()
         await self.ask_guard(guard_messages.LetGo())
         self.close()
 
@@ -404,28 +390,6 @@ class Component:
             raise GuardError(f"{self.name}: {reply.message}")
         return reply, streams
 
-    async def give_keeper(self) -> KeeperLink:
-        """Give it a keeper that follows nothing yet.
-
-        Raises:
-            KeeperLostError: none can be had.
-        """
-        self._keeper, self._followed = await self._places.nursery.keeper(), None
-        return self._keeper
-
-    async def ask_keeper(self, request: Any, descriptors: tuple[int, ...] = ()) -> Any:
-        """The keeper's reply, and descriptors that are ours now.
-
-        Raises:
-            CheckpointError: it failed, by its own error; KeeperLostError.
-        """
-        if self._keeper is None:
-            raise KeeperLostError(f"{self.name} has no keeper; protect it first")
-        reply, received = await self._keeper.dialogue.ask(request, descriptors)
-        if isinstance(reply, Failed):
-            raise _failure(reply)
-        return reply, received
-
     async def undo(self) -> None:
         """Before the commit: whatever was made of it is killed, and has ended when this returns."""
         self._drop_keeper()
@@ -436,16 +400,8 @@ class Component:
         self.close()
 
     def _drop_keeper(self) -> None:
-        keeper, self._keeper = self._keeper, None
-        self._held, self._followed = False, None
-        if keeper is not None:
-            keeper.end()
-
-    async def _let_loose(self) -> None:
-        """Have the keeper let go of what it follows, if it is there; it may follow something else then."""
-        if self._keeper is not None and self._keeper.dialogue.open:
-            self._followed = None
-            await self.ask_keeper(channel.Release())
+        self._held = False
+        self.keeper.drop()
 
     def _heard(self, message: Any) -> bool:
         """Events of the guard."""
@@ -467,11 +423,3 @@ class Component:
         if not self.ended.done():
             self.ended.set_exception(GuardLostError(f"the guard of {self.name} ended, and its program with it"))
             self.ended.exception()  # noted: after a release nobody waits for the end
-
-
-def _failure(failed: Failed) -> CheckpointError:
-    """The keeper's error as its own class."""
-    kind = getattr(errors, failed.error, RestoreError)
-    if issubclass(kind, errors.UnsupportedError | errors.MismatchError):
-        return kind(failed.message, failed.reasons)
-    return kind(failed.message) if issubclass(kind, CheckpointError) else RestoreError(failed.message)

@@ -209,7 +209,7 @@ def test_a_keeper_that_dies_costs_a_base_and_nothing_else(tmp_path: Path) -> Non
             captures = Captures(component)
             await captures.take()
             assert (await captures.take()).parent is not None
-            keeper = component._keeper
+            keeper = component.keeper._link
             assert keeper is not None
             os.kill(keeper.pid, signal.SIGKILL)
             with pytest.raises(KeeperLostError):

@@ -111,6 +111,7 @@ def test_a_snapshot_carries_the_output_as_it_stood_at_the_commit_and_freezes_nob
     async def story(places: Places) -> None:
         async with gone_afterwards(await started(places, PRINTS)) as component:
             await until(lambda: output(component) == b"before\nafter\n", "both lines")
+            await until(lambda: component.keeps, "the agent to hear of its commit")
             captures = Captures(component)
             captured = await captures.take()
             assert piece_of(captured).content == b"before\n", "flushed by the commit, and not a byte beyond"
@@ -158,6 +159,7 @@ def test_a_child_of_what_was_started_may_keep_the_state(tmp_path: Path) -> None:
         wrapped = replace(program(STEPS), argv=(b"sh", b"-c", os.fsencode(command)))
         async with gone_afterwards(await births.start(NAME, wrapped, places, 3)) as component:
             await until(lambda: output(component).count(b"\n") > 10, "some steps")
+            await until(lambda: component.keeps, "the agent to hear of its commit")
             assert component.task_pid not in (0, component.pid)
             await captures_go_on(component)
             os.close((await held(component)).snapshot)
@@ -176,6 +178,7 @@ def test_a_commit_is_safe_for_its_program_when_it_was_acknowledged_and_not_befor
     async def story(places: Places) -> None:
         async with gone_afterwards(await started(places, WAITS)) as component:
             await until(lambda: output(component) == b"committed\n", "the commit")
+            await until(lambda: component.keeps, "the agent to hear of its commit")
             captured = await component.capture(base=True, generation=1, sequence=1, epoch=3)
             os.close(captured.snapshot)
             assert output(component) == b"committed\n"
@@ -191,6 +194,7 @@ def test_a_guard_that_stands_still_holds_up_no_commit_and_costs_no_output(tmp_pa
         first = await births.start(NAME, replace(program(script), isolate=False), places, 3)
         async with gone_afterwards(first):
             await until(lambda: output(first) == b"begun\n", "its first commit")
+            await until(lambda: first.keeps, "the agent to hear of its commit")
             captures = Captures(first)
             base = await captures.take()
             guard = procfs.status(first.pid).ppid
@@ -221,6 +225,7 @@ def test_a_program_goes_on_exactly_after_what_its_last_snapshot_carries(tmp_path
     async def story(places: Places) -> None:
         async with gone_afterwards(await started(places, STEPS)) as first:
             await until(lambda: output(first).count(b"\n") > 10, "some steps")
+            await until(lambda: first.keeps, "the agent to hear of its commit")
             captures = Captures(first)
             for _ in range(5):
                 captured = await next_of(first, captures)
@@ -229,6 +234,7 @@ def test_a_program_goes_on_exactly_after_what_its_last_snapshot_carries(tmp_path
         await second.resume()
         async with gone_afterwards(second):
             await until(lambda: len(output(second)) > end + 200, "it to go on")
+            await until(lambda: second.keeps, "the agent to hear of its commit")
             told = output(second)[end:].splitlines()[0].decode()
             assert "robot='robot1', epoch=4, generation=1, why='taken over'" in told
             numbers = [int(line) for line in output(second).splitlines()[:-1] if line.isdigit()]
@@ -241,6 +247,7 @@ def test_a_program_goes_on_exactly_after_what_its_last_snapshot_carries(tmp_path
 
 async def next_of(component: Component, captures: Captures) -> Captured:
     """A snapshot after another commit of a program that takes steps."""
+    await until(lambda: component.keeps, "the agent to hear of its commit")
     before = output(component).count(b"\n")
     await until(lambda: output(component).count(b"\n") > before + 2, "another commit")
     return await captures.take()
@@ -249,6 +256,7 @@ async def next_of(component: Component, captures: Captures) -> Captured:
 async def captures_go_on(component: Component) -> None:
     """The program that was started again is protected as it was before."""
     captures = Captures(component)
+    await until(lambda: component.keeps, "the agent to hear of its commit")
     assert (await captures.take()).parent is None
     assert (await next_of(component, captures)).parent is not None
     captures.close()
@@ -258,6 +266,7 @@ def test_a_program_that_is_held_stands_still_until_it_is_thawed(tmp_path: Path) 
     async def story(places: Places) -> None:
         async with gone_afterwards(await started(places, STEPS)) as component:
             await until(lambda: output(component).count(b"\n") > 10, "some steps")
+            await until(lambda: component.keeps, "the agent to hear of its commit")
             os.close((await held(component)).snapshot)
             assert (await component.describe()).state == "frozen"
             await component.thaw()
@@ -282,6 +291,7 @@ def test_an_agent_that_comes_back_goes_on_with_the_same_engine(tmp_path: Path) -
     async def story(places: Places) -> None:
         first = await started(places, STEPS)
         await until(lambda: output(first).count(b"\n") > 10, "some steps")
+        await until(lambda: first.keeps, "the agent to hear of its commit")
         first.close()
         async with gone_afterwards(await births.reconnect(guard_sockets(places)[0], places)) as found:
             assert found.engine == COOPERATIVE
@@ -294,6 +304,7 @@ async def left_behind(places: Places) -> Captures:
     """One snapshot of a program that has made some steps, and is gone."""
     async with gone_afterwards(await started(places, STEPS)) as first:
         await until(lambda: output(first).count(b"\n") > 10, "some steps")
+        await until(lambda: first.keeps, "the agent to hear of its commit")
         captures = Captures(first)
         await captures.take()
     return captures
