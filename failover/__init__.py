@@ -93,8 +93,9 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Load a public name from its home on first use (PEP 562)."""
+    """Load a public name from its home on first use (PEP 562); from then on it stands here."""
     home = _HOMES.get(name)
     if home is None:
         raise AttributeError(f"module 'failover' has no attribute {name!r}")
-    return getattr(importlib.import_module(home), name)
+    found = globals()[name] = getattr(importlib.import_module(home), name)
+    return found

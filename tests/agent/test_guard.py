@@ -320,7 +320,8 @@ def test_what_was_frozen_by_order_is_not_thawed_by_a_lease(guard: GuardProcess) 
     guard.start(agent, *COUNTING)
     assert isinstance(agent.ask(Freeze()), Done)
     agent.ask(Lease(in_ns(FAR_NS)))
-    assert agent.describe().frozen_by == "order" and stands_still(guard)
+    assert agent.describe().frozen_by == "order"
+    until(lambda: stands_still(guard), "what lay in its pipe to be written")
     agent.ask(Thaw())
     assert grows(guard)
 
@@ -349,7 +350,8 @@ def test_what_is_held_for_a_tracer_stands_by_itself_until_it_is_thawed(guard: Gu
         agent.ask(Lease(1))
         agent.event(FrozenByLease)
     assert isinstance(agent.ask(Freeze(exposed=True)), Done)
-    assert state_of(pid) == "T" and stands_still(guard)
+    assert state_of(pid) == "T"
+    until(lambda: stands_still(guard), "what lay in its pipe to be written")
     agent.ask(Lease(0))
     assert stands_still(guard)
     agent.ask(Thaw())

@@ -5,6 +5,7 @@ On a booted machine with the service as it is shipped, and two real users who ar
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 import pytest
@@ -95,7 +96,7 @@ def test_a_program_inherits_what_it_would_in_the_shell_of_whoever_asked(machine:
     portrait = "nice -n 5 taskset 1 python3 /etc/portrait.py 'of me'"
     _, expected = as_user(machine, user, f"cd /var; {ODD}; {portrait}")
     _, seen = as_user(machine, user, f"cd /var; {ODD}; {portrait.replace('python3', 'failover run -- python3')}")
-    assert seen == expected
+    assert re.sub(r"\('FAILOVER_TASK', '@failover\.[0-9a-f]{16}'\), ", "", seen, count=1) == expected
     assert "345" in seen and "'COLOUR', 'green'" in seen  # the script did set things up
 
 
