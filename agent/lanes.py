@@ -178,12 +178,12 @@ class Lanes:
         """Pass an event to the core."""
         self._say(door.happened(event))
 
-    async def ask(self, what: Literal["status", "why"], component: str = "") -> Told:
-        """Ask the core for its view."""
+    async def ask(self, what: Literal["status", "why"]) -> Told:
+        """Ask the heart for the core's view, or for what it has not written down yet."""
         number = next(self._numbers)
         answer: asyncio.Future[Told] = asyncio.get_running_loop().create_future()
         self._questions[number] = answer
-        self._say(Ask(number, what, component))
+        self._say(Ask(number, what))
         try:
             return await asyncio.wait_for(answer, ANSWER_PATIENCE_S)
         except TimeoutError:

@@ -52,9 +52,7 @@ def team_view(
 ) -> dict[str, Any]:
     """The whole picture."""
     view = told.status
-    notes = [*life.notes, *notices]
-
-    notes += [told.ballot_trouble] if told.ballot_trouble else []
+    notes = [*life.notes, *notices, *told.troubles]
     beats = told.beats
     return {
         "robot": settings.config.robot,
