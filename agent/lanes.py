@@ -31,6 +31,7 @@ from agent.door import Ask, Farewell, HearKey, Inventory, Life, Order, SpeakKey,
 from agent.errands import Errands
 from agent.errors import AgentError, GuardLostError
 from agent.journal import set_up_log
+from agent.links import Facts, Links
 from agent.nursery import Nursery
 from agent.places import Places, guard_sockets
 from agent.records import Records
@@ -39,6 +40,7 @@ from agent.transport import BulkLane, Keys, LinkState, public_key_of
 from agent.units import starter
 from agent.verbs import Verbs
 from agent.view import team_view
+from agent.wires import Wires
 from checkpoint import format
 from checkpoint.channel import Channel, ChannelClosedError, ChannelError, close_all
 from checkpoint.engine import COOPERATIVE
@@ -109,7 +111,11 @@ class Lanes:
             if keys.public != settings.me.public_key:
                 self._own_troubles.append(UNFIT_KEY)
         bulks = {name: robot.bulk for name, robot in settings.peers.items()}
-        self._lane = BulkLane(config.robot, settings.me.bulk, bulks, keys, self._hear, self._link_changed)
+        facts = Facts(frozenset(config.wireless))
+        self._links = Links(settings.me, facts, anywhere=config.snapshots_over == "any")
+        self._wires = Wires(self._links, self._links_changed)
+        me = settings.me.bulk
+        self._lane = BulkLane(config.robot, me, bulks, keys, self._hear, self._link_changed, self._links)
         self._shipper = Shipper(self._lane, config.link_mbit_s * BYTES_A_MEGABIT)
         self._verbs = Verbs(self)
         self.errands = Errands(self._lane.say, self._hindrance, self._verbs.errands())
@@ -130,12 +136,13 @@ class Lanes:
         around = Surroundings(self.places, store, records, self.tell, self._silence_ns, self.settings.component)
         self._around = around
         self._deposit = Deposit(store, self.places, self.tell, self._stored)
-        self._dispatch = Dispatch(store, self._shipper, self.tell)
+        self._dispatch = Dispatch(store, self._shipper, self.tell, self._links.hindrance)
         self._receiver = Receiver(self._lane, self._store_path, self._deposit)
         found = await self._find_guards(around.records)
         await self._mend_logs(found)
         self._nursery.prepare()
         self._say(Inventory(_held(store), found))
+        self._wires.watch()
         self._lane.open()
         server = ControlServer(self._runtime / SOCKET_NAME, self.settings.config.group, self._verbs.table())
         await server.open()
@@ -144,6 +151,7 @@ class Lanes:
         finally:
             loop.remove_reader(self._heart.fileno())
             await server.close()
+            self._wires.close()
             await self.errands.close()
             await self._dispatch.close()
             await asyncio.gather(*(charge.close() for charge in self.charges.values()))
@@ -304,6 +312,12 @@ class Lanes:
             self._shipper.lost(peer)
             self.errands.lost(peer)
 
+    async def _links_changed(self, sentences: list[str]) -> None:
+        for sentence in sentences:
+            log.info("%s", sentence)
+            self.tell(events.Noticed("", sentence))
+        await self._lane.hold_to_devices()
+
     def _hindrance(self, peer: str) -> str:
         """Why nothing can be said to a peer on the bulk lane now; "" when it can."""
         link = self._lane.links.get(peer)
@@ -367,9 +381,10 @@ class Lanes:
             *self._own_troubles,
             *self._incompatible.values(),
             *self._lane.troubles(),
+            *self._links.notes(),
             *self._around.store.notices[-NOTICES_SHOWN:],
         ]
-        return team_view(self.settings, self._life, told, self.charges, self._lane.links, notices)
+        return team_view(self.settings, self._life, told, self.charges, self._lane.links, notices, self._links.shown())
 
 
 UNFIT_KEY: Final = (

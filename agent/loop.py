@@ -164,11 +164,11 @@ class Heart:
             self._scribe.note(ready.told)
 
     def _hear(self, descriptor: int) -> None:
-        for frame in self._beats.receive(descriptor):
+        for frame, link in self._beats.receive(descriptor):
             opened = self._hearing.open(frame)
             if isinstance(opened, Beat):
                 self._count(opened)
-                self._step(Received(opened))
+                self._step(Received(opened, link))
             else:
                 self._refused[str(opened.reason)] += 1
 

@@ -49,8 +49,12 @@ rule, promise: by which rule the team decides, and one sentence: what holds if t
 healthy: nothing is degraded, nothing has failed, nobody is silent, as far as this robot knows
 notes: [sentence, …]: what is missing or degraded on this robot
 beats: {sent, heard, unsent, refused, late_us_max, gap_us_max, gaps}: of this life; refused: {reason: count}
-peers: [{name, state, last_heard_ms, hears_us, load, beats_lost, lane, notes}]
-    state: unknown | live | suspect | dead; lane: connected | connecting | refused | down
+links: [{name, medium, because, carrier, addresses, snapshots, bytes_in, bytes_out}]: interfaces with an address of this robot
+    medium: wired | wireless | loopback; because: the fact that tells; carrier: its cable is in; snapshots: they may travel there
+    bytes_in, bytes_out: all that the kernel counted on it
+peers: [{name, state, last_heard_ms, hears_us, load, beats_lost, links, lane, notes}]
+    state: unknown | live | suspect | dead; links: ours, over which it was heard lately
+    lane: connected | connecting | refused | down
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
     freeze_us_max, snapshot_size, dirty_bytes, snapshots, restores, crashes, outage_ms, exit_status, promise, owner, reasons,
