@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.conftest import compiler
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_deaths import COUNT
@@ -66,24 +69,74 @@ def test_a_takeover_is_told_with_what_was_seen_and_what_it_cost_and_outlives_the
     assert lines(second, "begins, life 2", "--robot", "robot2")
 
 
-def test_a_frozen_primary_says_how_much_output_nobody_holds_and_both_stories_are_one(pair: Pair) -> None:
-    """robot1's agent is stopped (not its program): its guard freezes what it runs, robot2 takes over, then robot1 hears of it."""
+SKEW = r"""
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <stdlib.h>
+#include <time.h>
+int clock_gettime(clockid_t which, struct timespec *now) {
+    int (*real)(clockid_t, struct timespec *) = dlsym(RTLD_NEXT, "clock_gettime");
+    int status = real(which, now);
+    const char *skew = getenv("SKEW_S");
+    if (status == 0 && which == CLOCK_REALTIME && skew) now->tv_sec += atoi(skew);
+    return status;
+}
+"""
+"""The calendar of the processes that load it is wrong by so many seconds."""
+
+SKEW_S = 5
+
+
+def start_with_a_wrong_clock(robot: RobotMachine, directory: Path) -> None:
+    """The robot's agent ends, and starts again with its calendar `SKEW_S` ahead of everybody else's."""
+    source, library = directory / "skew.c", directory / "skew.so"
+    source.write_text(SKEW)
+    gcc = compiler()
+    assert gcc is not None
+    subprocess.run([gcc, "-shared", "-fPIC", "-o", library, source], check=True)
+    robots.keep_on(robot)
+    robots.stop_agent(robot)
+    robots.start_agent(robot, LD_PRELOAD=str(library), SKEW_S=str(SKEW_S))
+
+
+@pytest.mark.compiler
+def test_both_robots_tell_one_story_in_order_though_a_clock_is_wrong_by_five_seconds(pair: Pair, tmp_path: Path) -> None:
+    """robot1's agent is stopped, not its program: the guard holds it still, robot2 takes over, then robot1 hears of it."""
     first, second = pair
+    start_with_a_wrong_clock(second, tmp_path)
+    robots.until(lambda: robots.answers(second) and robots.connected(first) and robots.connected(second), "robot2 to be back")
+    robots.until_protected(first)
     agent = robots.host_pid(first, first.status()["pid"])
     os.kill(agent, signal.SIGSTOP)
     robots.until(lambda: robots.component(second, "count").get("role") == "primary", "robot2 to take over")
     os.kill(agent, signal.SIGCONT)
     robots.until(lambda: robots.component(first, "count").get("role") == "standby", "robot1 to follow")
     robots.until(lambda: bool(lines(first, "is told stale")), "the story to be told")
-    for robot in pair:
+    for robot, other, ahead_ms in ((first, "robot2", SKEW_S * 1_000), (second, "robot1", -SKEW_S * 1_000)):
         told = why(robot, "count")
-        assert all(one["answered"] for one in told["robots"])
-        did = [(line["robot"], line["did"]) for line in told["story"]]
-        claimed = next(at for at, (by, what) in enumerate(did) if by == "robot2" and "claims epoch" in what)
-        stale = next(at for at, (by, what) in enumerate(did) if by == "robot1" and "is told stale" in what)
-        assert claimed < stale, did
-        assert any(line["robot"] == "robot1" and "itself stood still" in line["did"] for line in told["story"])
+        clocks = {one["robot"]: one["clock_offset_ms"] for one in told["robots"] if one["answered"]}
+        assert set(clocks) == {"robot1", "robot2"}
+        assert clocks[other] == pytest.approx(ahead_ms, abs=1_000) and clocks[robot.name] == 0
+        expect_the_order(told["story"])
+        way = "ahead of" if ahead_ms > 0 else "behind"
+        shown = robots.failover(robot, "why", "count").stdout
+        assert re.search(rf"^{other}: its clock is [45]\.\d+ s {way} this robot's", shown, re.MULTILINE), shown
     robots.until(lambda: any(line["output_pending"] is not None for line in why(first)["story"]), "the output to be counted")
+
+
+def expect_the_order(story: list[dict[str, Any]]) -> None:
+    """robot2 noticed the silence, claimed, ran it; then robot1 woke, said so, and was told stale: whoever's clock was right."""
+    did = [(line["robot"], line["did"]) for line in story]
+    expected = (
+        ("robot2", "robot1 was silent for"),
+        ("robot2", "claims epoch"),
+        ("robot1", "itself stood still"),
+        ("robot1", "is told stale"),
+    )
+    places = [max(at for at, (by, what) in enumerate(did) if by == robot and words in what) for robot, words in expected]
+    assert places == sorted(places), did
+    instants = [story[place]["at"] for place in places]
+    assert instants == sorted(instants), "by the one clock that they are shown on"
 
 
 def test_only_what_is_young_enough_is_told(pair: Pair) -> None:
