@@ -29,7 +29,6 @@ from agent.places import Places
 from agent.records import Records
 from agent.rules import started_here
 from agent.standby import Standby
-from agent.streams import STREAMS
 from checkpoint import format
 from checkpoint.channel import Unchanged, close_all, content_of
 from checkpoint.engine import AUTO, COOPERATIVE
@@ -476,10 +475,7 @@ class Charge:
 
     def _notice(self, sentence: str, component: Component | None = None) -> None:
         """For ``failover why``; with how much a component has written that is in no checkpoint."""
-        pending = -1
-        if component is not None:
-            bounds = (component.logs.bounds(stream) for stream in STREAMS)
-            pending = sum(stream.size - stream.committed for stream in bounds)
+        pending = component.output_pending() if component is not None else -1
         self.around.tell(events.Noticed(self.name, sentence, pending))
 
     def _present(self) -> Component:
