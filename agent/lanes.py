@@ -12,7 +12,6 @@ import contextlib
 import itertools
 import logging
 import os
-import secrets
 import signal
 import socket
 import sys
@@ -36,10 +35,11 @@ from agent.nursery import Nursery
 from agent.places import Places, guard_sockets
 from agent.records import Records
 from agent.shipping import Receiver, Shipper
-from agent.transport import BulkLane, Keys, LinkState, public_key_of
+from agent.transport import Keys, LinkState, public_key_of
 from agent.units import starter
 from agent.verbs import Verbs
 from agent.view import team_view
+from agent.ways import BULK, Ways
 from agent.wires import Wires
 from checkpoint import format
 from checkpoint.channel import Channel, ChannelClosedError, ChannelError, close_all
@@ -67,7 +67,6 @@ from failover.core.messages import (
 from failover.core.types import HISTORY_MAX, Found, Held
 from failover.core.wire import KEY_SIZE_MIN
 
-BEAT_KEY_SIZE: Final = 32
 BYTES_A_MEGABIT: Final = 125_000
 ANSWER_PATIENCE_S: Final = 60.0
 """How long an operator's command may take; a handover's own limit in the core is shorter."""
@@ -110,15 +109,14 @@ class Lanes:
             keys = Keys(public_key_of(settings.secret_key), settings.secret_key, publics)
             if keys.public != settings.me.public_key:
                 self._own_troubles.append(UNFIT_KEY)
-        bulks = {name: robot.bulk for name, robot in settings.peers.items()}
         facts = Facts(frozenset(config.wireless))
         self._links = Links(settings.me, facts, anywhere=config.snapshots_over == "any")
         self._wires = Wires(self._links, self._links_changed)
-        me = settings.me.bulk
-        self._lane = BulkLane(config.robot, me, bulks, keys, self._hear, self._link_changed, self._links)
+        self._ways = Ways(settings, keys, self._hear, self._way_changed, self._links)
+        self._lane = self._ways.bulk
         self._shipper = Shipper(self._lane, config.link_mbit_s * BYTES_A_MEGABIT)
         self._verbs = Verbs(self)
-        self.errands = Errands(self._lane.say, self._hindrance, self._verbs.errands())
+        self.errands = Errands(self._ways.say, self.hindrance, self._verbs.errands())
 
     async def run(self) -> None:
         """From the heart's first word to its last.
@@ -143,7 +141,7 @@ class Lanes:
         self._nursery.prepare()
         self._say(Inventory(_held(store), found))
         self._wires.watch()
-        self._lane.open()
+        self._ways.open()
         server = ControlServer(self._runtime / SOCKET_NAME, self.settings.config.group, self._verbs.table())
         await server.open()
         try:
@@ -155,7 +153,7 @@ class Lanes:
             await self.errands.close()
             await self._dispatch.close()
             await asyncio.gather(*(charge.close() for charge in self.charges.values()))
-            await self._lane.close()
+            await self._ways.close()
             await self._nursery.close()
             speaking.cancel()
             store.close()
@@ -300,16 +298,18 @@ class Lanes:
 
     # --- peers ---
 
-    def _link_changed(self, peer: str, state: LinkState, reason: str) -> None:
-        """A connection stands: introduce ourselves. It is gone: so is every transfer on it."""
-        log.info("bulk lane to %s: %s%s", peer, state, f": {reason}" if reason else "")
+    def _way_changed(self, way: int, peer: str, state: LinkState, reason: str) -> None:
+        """A connection stands: introduce ourselves. It is gone: so is every transfer on it, and every word that took it."""
+        lane = "bulk lane" if way == BULK else f"lane {way}"
+        log.info("%s to %s: %s%s", lane, peer, state, f": {reason}" if reason else "")
         if state is LinkState.CONNECTED:
-            key = secrets.token_bytes(BEAT_KEY_SIZE)
-            config = self.settings.config
-            self._lane.say(peer, Hello(VERSION, self.settings.team.team, config.robot, self._life.boot, key))
+            key, config = self._ways.beat_key(peer), self.settings.config
+            self._ways.answer(way, peer, Hello(VERSION, self.settings.team.team, config.robot, self._life.boot, key))
             self._say(SpeakKey(peer, key))
-        else:
+            return
+        if way == BULK:
             self._shipper.lost(peer)
+        if not self._ways.has_better(way, peer):
             self.errands.lost(peer)
 
     async def _links_changed(self, sentences: list[str]) -> None:
@@ -318,21 +318,27 @@ class Lanes:
             self.tell(events.Noticed("", sentence))
         await self._lane.hold_to_devices()
 
-    def _hindrance(self, peer: str) -> str:
-        """Why nothing can be said to a peer on the bulk lane now; "" when it can."""
-        link = self._lane.links.get(peer)
-        if link is None or link.state is LinkState.CONNECTED:
-            return "" if link else "it is no robot of this team"
-        return f"the bulk lane is {link.state}" + (f", {link.reason}" if link.reason else "")
+    def hindrance(self, peer: str) -> str:
+        """Why nothing can be said to a peer now; "" when it can."""
+        return self._ways.hindrance(peer)
 
-    def _hear(self, peer: str, message: Bulk) -> None:
+    def _hear(self, way: int, peer: str, message: Bulk) -> None:
         match message:
             case Hello():
-                self._greeted(peer, message)
+                self._greeted(way, peer, message)
             case Goodbye(reason):
-                self._lane.links[peer].refuse(reason)
+                self._ways.refuse(way, peer, reason)
             case _ if peer in self._incompatible:
                 return
+            case Errand():
+                self.errands.received(peer, message)
+            case ErrandDone():
+                self.errands.done(peer, message)
+            case _ if way == BULK:
+                self._hear_of_a_snapshot(peer, message)
+
+    def _hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
+        match message:
             case Offer():
                 self._receiver.offered(peer, message)
             case Chunk():
@@ -341,12 +347,8 @@ class Lanes:
                 self._receiver.cancelled(peer, message)
             case Credit() | Taken() | Refuse():
                 self._shipper.heard(peer, message)
-            case Errand():
-                self.errands.received(peer, message)
-            case ErrandDone():
-                self.errands.done(peer, message)
 
-    def _greeted(self, peer: str, hello: Hello) -> None:
+    def _greeted(self, way: int, peer: str, hello: Hello) -> None:
         reason = ""
         if hello.version != VERSION:
             reason = f"{peer} speaks version {hello.version}, this robot {VERSION}; install the same release on both"
@@ -354,10 +356,11 @@ class Lanes:
             reason = f"{peer} belongs to team {hello.team!r}, this robot to {self.settings.team.team!r}"
         elif len(hello.beat_key) < KEY_SIZE_MIN:
             reason = f"{peer} sent a beat key of {len(hello.beat_key)} bytes; install the same release on both"
-        self._receiver.lost(peer)  # a new connection: what was half here stays half
+        if way == BULK:
+            self._receiver.lost(peer)  # a new connection: what was half here stays half
         if reason:
             self._incompatible[peer] = reason
-            self._lane.say(peer, Goodbye(reason))
+            self._ways.answer(way, peer, Goodbye(reason))
             log.warning("%s", reason)
             return
         self._incompatible.pop(peer, None)
@@ -381,6 +384,7 @@ class Lanes:
             *self._own_troubles,
             *self._incompatible.values(),
             *self._lane.troubles(),
+            *self._ways.troubles,
             *self._links.notes(),
             *self._around.store.notices[-NOTICES_SHOWN:],
         ]

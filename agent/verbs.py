@@ -65,6 +65,7 @@ class Lanes(Protocol):
     async def ask(self, what: Any) -> Told: ...
     async def command(self, make: Callable[[int], events.Command]) -> acts.Answer: ...
     def charge(self, name: str) -> Charge: ...
+    def hindrance(self, peer: str) -> str: ...
     def picture(self, told: Told) -> dict[str, Any]: ...
 
 
@@ -161,7 +162,7 @@ class Verbs:
     async def _reachable(self) -> list[str]:
         """The robots that live and can be asked."""
         peers = self._lanes.picture(await self._lanes.ask("status"))["peers"]
-        return [peer["name"] for peer in peers if peer["state"] == "live" and peer["lane"] == "connected"]
+        return [peer["name"] for peer in peers if peer["state"] == "live" and not self._lanes.hindrance(peer["name"])]
 
     async def _asked(self, peer: str, question: str, arguments: dict[str, Any]) -> dict[str, Any]:
         """A peer's answer; empty when it does not come soon."""

@@ -6,6 +6,7 @@ stands behind an Ethernet port. What the kernel itself knows of real radios: ``t
 
 from __future__ import annotations
 
+import json
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -132,3 +133,31 @@ def test_a_card_that_is_unplugged_and_plugged_in_again_carries_snapshots_again(t
         wire = traffic(first, "wire")
         robots.until(lambda: traffic(first, "wire") - wire > ENOUGH, "snapshots to travel again")
         assert robots.component(second, "count")["role"] == "standby"
+
+
+def test_an_agent_that_restarts_while_the_cable_is_out_is_heard_again_over_the_radio_and_nothing_moves(tmp_path: Path) -> None:
+    with robots.two_robots(tmp_path, AIR_IS_WIRELESS, cables=TWO) as pair:
+        first, second = pair
+        start(pair)
+        epoch = robots.component(first, "count")["epoch"]
+        robots.cable(first, "down")
+        robots.until_status(first, 1, "has no carrier")
+        robots.keep_on(second)
+        robots.stop_agent(second)
+        robots.start_agent(second)
+        robots.until(lambda: robots.answers(second), "the agent of robot2 to be back")
+        for robot in pair:
+            robots.until(lambda at=robot: heard(at), "beats under fresh keys")  # type: ignore[misc]
+        robots.until(lambda: robots.component(second, "count").get("role") == "standby", "robot2 to know who runs it")
+        counts_on(first)
+        assert robots.component(first, "count")["epoch"] == epoch
+        air = traffic(first, "air")
+        told = json.loads(robots.failover(second, "why", "--json").stdout)
+        assert all(one["answered"] for one in told["robots"]), "questions travel over the radio"
+        assert "has ended" in robots.failover(second, "stop", "count").stdout, "and orders"
+        assert traffic(first, "air") - air < ENOUGH // SHARE
+
+
+def heard(robot: RobotMachine) -> bool:
+    (peer,) = robot.status()["peers"]
+    return bool(peer["state"] == "live" and peer["hears_us"])
