@@ -23,6 +23,9 @@ Variable = Annotated[str, msgspec.Meta(pattern=r"\A[^\0=]+\Z")]
 Offset = Annotated[int, msgspec.Meta(ge=0)]
 """Of a byte in a stream, from its beginning."""
 
+Age = Annotated[int, msgspec.Meta(ge=0, le=1 << 50)]
+"""Milliseconds since something happened; 0 for no limit."""
+
 T = TypeVar("T")
 
 
@@ -75,7 +78,7 @@ class LogsArguments(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class NameArguments(msgspec.Struct, forbid_unknown_fields=True):
-    """Of ``release``, ``failback`` and ``why``."""
+    """Of ``release`` and ``failback``."""
 
     name: str = ""
 
@@ -100,6 +103,22 @@ class StatusArguments(msgspec.Struct, forbid_unknown_fields=True):
     watch: bool = False
     every_ms: Annotated[int, msgspec.Meta(ge=1, le=3_600_000)] = 500
     team: bool = False
+
+
+class WhyArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``why``."""
+
+    name: str = ""
+    robot: str = ""
+    age_ms_max: Age = 0
+
+
+class PageArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``story``: what another robot asks for when it tells a story; ``before``: life and number of a line."""
+
+    name: str = ""
+    age_ms_max: Age = 0
+    before: tuple[int, int] = (0, 0)
 
 
 class PieceArguments(msgspec.Struct, forbid_unknown_fields=True):

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import socket
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from agent.errors import LaneError
+from agent.rtnetlink import ANCILLARY_SIZE, allow_absent, interface_index, tell_interfaces
 from failover.client.team import Robot, split_address
 
 FRAME_LIMIT: Final = 1_472
@@ -31,12 +32,13 @@ class BeatLane:
     """This robot's beat sockets and everybody's beat addresses."""
 
     def __init__(self, me: Robot, peers: Mapping[str, Robot]) -> None:
-        """Bind one socket to each of this robot's beat addresses.
+        """Bind one socket to each of this robot's beat addresses; one that no interface has yet works once an interface has it.
 
         Raises:
             LaneError: an address cannot be had.
         """
         self._sockets = [_bound(address) for address in me.beats]
+        self._names: dict[int, str] = {}
         self._ways = {name: _ways(self._sockets, robot) for name, robot in peers.items()}
         self.unsent = 0
 
@@ -52,16 +54,27 @@ class BeatLane:
             except OSError:
                 self.unsent += 1  # no route, no buffer, link down: the peer's silence is the message
 
-    def receive(self, fileno: int) -> Iterator[bytes]:
-        """The datagrams that wait at one socket, at most `TURN_LIMIT`."""
+    def receive(self, fileno: int) -> Iterator[tuple[bytes, str]]:
+        """The datagrams that wait at one socket, at most `TURN_LIMIT`, each with the interface that it came over ("": not told).
+
+        Which one the kernel chose is not known by the address: where one link is gone, its packets may come over another.
+        """
         link = next(link for link in self._sockets if link.fileno() == fileno)
         for _ in range(TURN_LIMIT):
             try:
-                yield link.recv(FRAME_LIMIT + 1)
+                frame, ancillary, _, _ = link.recvmsg(FRAME_LIMIT + 1, ANCILLARY_SIZE)
+                yield frame, self._interface(ancillary)
             except BlockingIOError:
                 return
             except OSError:
                 continue  # an ICMP error of an earlier datagram; the next call has the next datagram
+
+    def _interface(self, ancillary: Iterable[tuple[int, int, bytes]]) -> str:
+        index = interface_index(ancillary)
+        if index and index not in self._names:
+            with contextlib.suppress(OSError):  # it has gone already
+                self._names[index] = socket.if_indextoname(index)
+        return self._names.get(index, "")
 
     def close(self) -> None:
         """Close the sockets."""
@@ -77,6 +90,8 @@ def _bound(address: str) -> socket.socket:
         link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         with contextlib.suppress(OSError):
             link.setsockopt(socket.IPPROTO_IP, socket.IP_TOS, EXPEDITED)
+        allow_absent(link)
+        tell_interfaces(link)
         link.bind(where)
     except OSError as error:
         raise LaneError(

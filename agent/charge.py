@@ -233,6 +233,7 @@ class Charge:
         try:
             if isinstance(act, acts.Freeze):
                 await component.freeze()
+                self._notice(f"it stands still here, as process {component.pid}", component)
                 return
             await component.lease(act.until_ns)
             if self._is_thaw_owed:
@@ -290,15 +291,12 @@ class Charge:
         self.figures.commits = Commits()  # of another process: its numbers begin anew
         self.figures.reasons = ()
         self.figures.outage_ms = (silent_ns + clock.now_ns() - began_ns) / 1e6
-        log.info(
-            "%s: resumed %.1f ms after its robot fell silent: silence %.1f ms, %s",
-            self.name,
-            self.figures.outage_ms,
-            silent_ns / 1e6,
-            laps,
-        )
+        since = f"the last word of the robot that ran it: silence {silent_ns / 1e6:.1f} ms, " if silent_ns else "the order: "
+        sentence = f"it acts again {self.figures.outage_ms:.1f} ms after {since}{laps}"
+        log.info("%s: %s", self.name, sentence)
         self.started.set()
         self.around.tell(events.Restored(self.name, act.epoch, act.position, age_ns + clock.now_ns() - read_ns))
+        self._notice(sentence)
         self._watch_the_end()
 
     async def _resumed(self, act: acts.Restore, chain: list[int], outage_ns: int, laps: clock.Laps) -> tuple[Component, int]:
@@ -441,6 +439,7 @@ class Charge:
         directory = self.around.places.logs.parent / "lost"
         path = await asyncio.to_thread(lost.keep, directory, self.name, act.epoch, content)
         log.warning("%s: the copy that lost is kept for inspection in %s: %s", self.name, path, act.reason)
+        self._notice(f"the copy that lost is kept for inspection in {path}; its output since is shown to nobody", component)
 
     async def _keep_house(self, act: acts.Forget | acts.Prune | acts.Drop) -> None:
         store = self.around.store
@@ -473,6 +472,11 @@ class Charge:
         if self.ended is None or (self.ended.done() and self.component is not None):
             self.ended = asyncio.get_running_loop().create_future()
         return self.ended
+
+    def _notice(self, sentence: str, component: Component | None = None) -> None:
+        """For ``failover why``; with how much a component has written that is in no checkpoint."""
+        pending = component.output_pending() if component is not None else -1
+        self.around.tell(events.Noticed(self.name, sentence, pending))
 
     def _present(self) -> Component:
         if self.component is None:

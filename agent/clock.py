@@ -5,9 +5,12 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
 from agent import kernel
+
+BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 
 HEART_PRIORITY: Final = 60
 """SCHED_FIFO priority of the heart: just above the interrupt threads of a PREEMPT_RT kernel (50), below its watchdogs (99)."""
@@ -35,10 +38,17 @@ def now_ns() -> int:
     return time.monotonic_ns()
 
 
-def calendar(instant_ns: int, reading_ns: int) -> str:
-    """An instant of the monotonic clock as local time, given that clock's present reading; for a person's eyes only."""
-    at_s = time.time() - (reading_ns - instant_ns) / 1e9
-    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(at_s)) + f".{int(at_s % 1 * 1_000):03d}"
+def wall_ns(instant_ns: int) -> int:
+    """An instant of the monotonic clock by this machine's calendar, in nanoseconds since 1970; for a person's eyes only."""
+    return time.time_ns() - (time.monotonic_ns() - instant_ns)
+
+
+def kernel_boot() -> str:
+    """A name for this boot of the kernel: the monotonic clock begins anew with it. Source: random(4)."""
+    try:
+        return BOOT_ID.read_text().strip()
+    except OSError:
+        return ""
 
 
 def become_realtime() -> tuple[str, ...]:

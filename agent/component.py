@@ -32,7 +32,7 @@ from agent.following import Following
 from agent.guard_messages import Described, Exited, Refused, Started, TaskConnected, TaskKeeps, VesselReady
 from agent.nursery import GuardLink
 from agent.places import Places, log_directory
-from agent.streams import OutputLogs
+from agent.streams import STREAMS, OutputLogs
 from checkpoint import channel
 from checkpoint.channel import close_all
 from checkpoint.engine import AUTO, COOPERATIVE, PTRACE
@@ -146,6 +146,15 @@ class Component:
         if self.engine_wanted != AUTO:
             return self.engine_wanted
         return COOPERATIVE if self.task_pid else PTRACE
+
+    def output_pending(self) -> int:
+        """Bytes that it has written and that are in no acknowledged checkpoint: a takeover now would lose them.
+
+        Raises:
+            OSError: its logs cannot be looked at.
+        """
+        bounds = [self.logs.bounds(stream) for stream in STREAMS]
+        return sum(stream.size - stream.committed for stream in bounds)
 
     async def resume(self) -> None:
         """After `births.restore`: commit to it and let it go on.

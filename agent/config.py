@@ -65,6 +65,8 @@ class Config:
         snapshot_period_ms: between two snapshots of a component; grows by itself when link or standby is slower.
         realtime: ask for SCHED_FIFO and locked memory.
         link_mbit_s: cap on snapshot traffic; 0 for none.
+        snapshots_over: wired: they never leave over a wireless link; any: over whichever has the bulk address.
+        wireless: interfaces that count as wireless though the kernel cannot know: an Ethernet port that leads to a radio.
     """
 
     robot: str
@@ -79,6 +81,8 @@ class Config:
     snapshot_period_ms: int = 100
     realtime: bool = True
     link_mbit_s: int = 0
+    snapshots_over: Literal["wired", "any"] = "wired"
+    wireless: list[str] = field(default_factory=list)
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     components: dict[str, ComponentConfig] = field(default_factory=dict)
 

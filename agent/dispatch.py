@@ -24,10 +24,18 @@ log = logging.getLogger("failover.dispatch")
 class Dispatch:
     """The transfers that the core ordered, each a task of its own."""
 
-    def __init__(self, store: Store, shipper: Shipper, tell: Callable[[Event], None]) -> None:
+    def __init__(
+        self, store: Store, shipper: Shipper, tell: Callable[[Event], None], hindrance: Callable[[], str] = lambda: ""
+    ) -> None:
+        """
+        Args:
+            hindrance: why no snapshot may leave this robot now; "" if they may.
+        """
+        self._hindrance = hindrance
         self._store = store
         self._shipper = shipper
         self._tell = tell
+        self._said = ""
         self._tasks: dict[tuple[str, Position, str], asyncio.Task[None]] = {}
 
     def ship(self, act: Ship) -> None:
@@ -59,11 +67,14 @@ class Dispatch:
             reason = str(error)
         except OSError as error:
             reason = f"snapshot {act.position.sequence} of {act.component} cannot be read here: {error.strerror}"
-        if reason:
+        if reason and reason != self._said:  # it may be tried again every second for days
             log.info("%s", reason)
+        self._said = reason
         self._tell(ShipEnded(act.component, act.epoch, act.position, act.to, not reason, reason))
 
     async def _send(self, act: Ship) -> None:
+        if hindrance := self._hindrance():
+            raise LaneError(f"snapshots wait: {hindrance}")
         entry = await asyncio.to_thread(self._entry, act)
         descriptor = os.open(entry.path, os.O_RDONLY | os.O_CLOEXEC)
         try:

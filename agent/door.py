@@ -13,7 +13,8 @@ from agent.errors import AgentError
 from failover.core import acts, events
 from failover.core.acts import Act
 from failover.core.events import Event
-from failover.core.types import Decision, Found, Held, StatusView
+from failover.core.story import Line
+from failover.core.types import Found, Held, StatusView
 
 ACTS: Final[dict[str, Any]] = {
     kind.__name__: kind
@@ -58,6 +59,7 @@ EVENTS: Final[dict[str, Any]] = {
         events.Stopped,
         events.Warmed,
         events.Exited,
+        events.Noticed,
         events.Run,
         events.Release,
         events.Stop,
@@ -120,7 +122,6 @@ class Ask(msgspec.Struct, frozen=True, tag=True):
 
     number: int
     what: Literal["status", "why"]
-    component: str = ""
 
 
 class BeatCounts(msgspec.Struct, frozen=True):
@@ -145,14 +146,19 @@ class BeatCounts(msgspec.Struct, frozen=True):
 
 
 class Told(msgspec.Struct, frozen=True, tag=True):
-    """Heart to lanes: the answer to `Ask`; ``ballot_trouble`` says why nothing can be made durable, "" if all is well."""
+    """Heart to lanes: the answer to `Ask`.
+
+    Attributes:
+        story: lines that are not on the disk yet; what is kept there the lanes read themselves.
+        troubles: sentences: why a ballot, or the story, cannot be written.
+    """
 
     number: int
     now_ns: int
     status: StatusView | None = None
-    story: tuple[Decision, ...] = ()
+    story: tuple[Line, ...] = ()
     beats: BeatCounts = BeatCounts()
-    ballot_trouble: str = ""
+    troubles: tuple[str, ...] = ()
 
 
 class Farewell(msgspec.Struct, frozen=True, tag=True):

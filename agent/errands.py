@@ -63,7 +63,7 @@ class Errands:
             RefusedError: it cannot be reached; it refused, with its reasons; or its answer did not come.
         """
         if hindrance := self._hindrance(peer):
-            raise RefusedError(f"cannot ask {peer}, where it runs: {hindrance}; ask there, or try again")
+            raise RefusedError(f"cannot ask {peer}: {hindrance}; ask there, or try again")
         number = next(self._numbers)
         answer: asyncio.Future[ErrandDone] = asyncio.get_running_loop().create_future()
         self._waiting[peer, number] = answer

@@ -12,7 +12,6 @@ import contextlib
 import itertools
 import logging
 import os
-import secrets
 import signal
 import socket
 import sys
@@ -31,14 +30,17 @@ from agent.door import Ask, Farewell, HearKey, Inventory, Life, Order, SpeakKey,
 from agent.errands import Errands
 from agent.errors import AgentError, GuardLostError
 from agent.journal import set_up_log
+from agent.links import Facts, Links
 from agent.nursery import Nursery
 from agent.places import Places, guard_sockets
 from agent.records import Records
 from agent.shipping import Receiver, Shipper
-from agent.transport import BulkLane, Keys, LinkState, public_key_of
+from agent.transport import Keys, LinkState, public_key_of
 from agent.units import starter
 from agent.verbs import Verbs
 from agent.view import team_view
+from agent.ways import BULK, Ways
+from agent.wires import Wires
 from checkpoint import format
 from checkpoint.channel import Channel, ChannelClosedError, ChannelError, close_all
 from checkpoint.engine import COOPERATIVE
@@ -65,7 +67,6 @@ from failover.core.messages import (
 from failover.core.types import HISTORY_MAX, Found, Held
 from failover.core.wire import KEY_SIZE_MIN
 
-BEAT_KEY_SIZE: Final = 32
 BYTES_A_MEGABIT: Final = 125_000
 ANSWER_PATIENCE_S: Final = 60.0
 """How long an operator's command may take; a handover's own limit in the core is shorter."""
@@ -108,11 +109,14 @@ class Lanes:
             keys = Keys(public_key_of(settings.secret_key), settings.secret_key, publics)
             if keys.public != settings.me.public_key:
                 self._own_troubles.append(UNFIT_KEY)
-        bulks = {name: robot.bulk for name, robot in settings.peers.items()}
-        self._lane = BulkLane(config.robot, settings.me.bulk, bulks, keys, self._hear, self._link_changed)
+        facts = Facts(frozenset(config.wireless))
+        self._links = Links(settings.me, facts, anywhere=config.snapshots_over == "any")
+        self._wires = Wires(self._links, self._links_changed)
+        self._ways = Ways(settings, keys, self._hear, self._way_changed, self._links)
+        self._lane = self._ways.bulk
         self._shipper = Shipper(self._lane, config.link_mbit_s * BYTES_A_MEGABIT)
         self._verbs = Verbs(self)
-        self.errands = Errands(self._lane.say, self._hindrance, self._verbs.errands())
+        self.errands = Errands(self._ways.say, self.hindrance, self._verbs.errands())
 
     async def run(self) -> None:
         """From the heart's first word to its last.
@@ -130,13 +134,14 @@ class Lanes:
         around = Surroundings(self.places, store, records, self.tell, self._silence_ns, self.settings.component)
         self._around = around
         self._deposit = Deposit(store, self.places, self.tell, self._stored)
-        self._dispatch = Dispatch(store, self._shipper, self.tell)
+        self._dispatch = Dispatch(store, self._shipper, self.tell, self._links.hindrance)
         self._receiver = Receiver(self._lane, self._store_path, self._deposit)
         found = await self._find_guards(around.records)
         await self._mend_logs(found)
         self._nursery.prepare()
         self._say(Inventory(_held(store), found))
-        self._lane.open()
+        self._wires.watch()
+        self._ways.open()
         server = ControlServer(self._runtime / SOCKET_NAME, self.settings.config.group, self._verbs.table())
         await server.open()
         try:
@@ -144,10 +149,11 @@ class Lanes:
         finally:
             loop.remove_reader(self._heart.fileno())
             await server.close()
+            self._wires.close()
             await self.errands.close()
             await self._dispatch.close()
             await asyncio.gather(*(charge.close() for charge in self.charges.values()))
-            await self._lane.close()
+            await self._ways.close()
             await self._nursery.close()
             speaking.cancel()
             store.close()
@@ -178,12 +184,12 @@ class Lanes:
         """Pass an event to the core."""
         self._say(door.happened(event))
 
-    async def ask(self, what: Literal["status", "why"], component: str = "") -> Told:
-        """Ask the core for its view."""
+    async def ask(self, what: Literal["status", "why"]) -> Told:
+        """Ask the heart for the core's view, or for what it has not written down yet."""
         number = next(self._numbers)
         answer: asyncio.Future[Told] = asyncio.get_running_loop().create_future()
         self._questions[number] = answer
-        self._say(Ask(number, what, component))
+        self._say(Ask(number, what))
         try:
             return await asyncio.wait_for(answer, ANSWER_PATIENCE_S)
         except TimeoutError:
@@ -292,33 +298,47 @@ class Lanes:
 
     # --- peers ---
 
-    def _link_changed(self, peer: str, state: LinkState, reason: str) -> None:
-        """A connection stands: introduce ourselves. It is gone: so is every transfer on it."""
-        log.info("bulk lane to %s: %s%s", peer, state, f": {reason}" if reason else "")
+    def _way_changed(self, way: int, peer: str, state: LinkState, reason: str) -> None:
+        """A connection stands: introduce ourselves. It is gone: so is every transfer on it, and every word that took it."""
+        lane = "bulk lane" if way == BULK else f"lane {way}"
+        log.info("%s to %s: %s%s", lane, peer, state, f": {reason}" if reason else "")
         if state is LinkState.CONNECTED:
-            key = secrets.token_bytes(BEAT_KEY_SIZE)
-            config = self.settings.config
-            self._lane.say(peer, Hello(VERSION, self.settings.team.team, config.robot, self._life.boot, key))
+            key, config = self._ways.beat_key(peer), self.settings.config
+            self._ways.answer(way, peer, Hello(VERSION, self.settings.team.team, config.robot, self._life.boot, key))
             self._say(SpeakKey(peer, key))
-        else:
+            return
+        if way == BULK:
             self._shipper.lost(peer)
+        if not self._ways.has_better(way, peer):
             self.errands.lost(peer)
 
-    def _hindrance(self, peer: str) -> str:
-        """Why nothing can be said to a peer on the bulk lane now; "" when it can."""
-        link = self._lane.links.get(peer)
-        if link is None or link.state is LinkState.CONNECTED:
-            return "" if link else "it is no robot of this team"
-        return f"the bulk lane is {link.state}" + (f", {link.reason}" if link.reason else "")
+    async def _links_changed(self, sentences: list[str]) -> None:
+        for sentence in sentences:
+            log.info("%s", sentence)
+            self.tell(events.Noticed("", sentence))
+        await self._lane.hold_to_devices()
 
-    def _hear(self, peer: str, message: Bulk) -> None:
+    def hindrance(self, peer: str) -> str:
+        """Why nothing can be said to a peer now; "" when it can."""
+        return self._ways.hindrance(peer)
+
+    def _hear(self, way: int, peer: str, message: Bulk) -> None:
         match message:
             case Hello():
-                self._greeted(peer, message)
+                self._greeted(way, peer, message)
             case Goodbye(reason):
-                self._lane.links[peer].refuse(reason)
+                self._ways.refuse(way, peer, reason)
             case _ if peer in self._incompatible:
                 return
+            case Errand():
+                self.errands.received(peer, message)
+            case ErrandDone():
+                self.errands.done(peer, message)
+            case _ if way == BULK:
+                self._hear_of_a_snapshot(peer, message)
+
+    def _hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
+        match message:
             case Offer():
                 self._receiver.offered(peer, message)
             case Chunk():
@@ -327,12 +347,8 @@ class Lanes:
                 self._receiver.cancelled(peer, message)
             case Credit() | Taken() | Refuse():
                 self._shipper.heard(peer, message)
-            case Errand():
-                self.errands.received(peer, message)
-            case ErrandDone():
-                self.errands.done(peer, message)
 
-    def _greeted(self, peer: str, hello: Hello) -> None:
+    def _greeted(self, way: int, peer: str, hello: Hello) -> None:
         reason = ""
         if hello.version != VERSION:
             reason = f"{peer} speaks version {hello.version}, this robot {VERSION}; install the same release on both"
@@ -340,10 +356,11 @@ class Lanes:
             reason = f"{peer} belongs to team {hello.team!r}, this robot to {self.settings.team.team!r}"
         elif len(hello.beat_key) < KEY_SIZE_MIN:
             reason = f"{peer} sent a beat key of {len(hello.beat_key)} bytes; install the same release on both"
-        self._receiver.lost(peer)  # a new connection: what was half here stays half
+        if way == BULK:
+            self._receiver.lost(peer)  # a new connection: what was half here stays half
         if reason:
             self._incompatible[peer] = reason
-            self._lane.say(peer, Goodbye(reason))
+            self._ways.answer(way, peer, Goodbye(reason))
             log.warning("%s", reason)
             return
         self._incompatible.pop(peer, None)
@@ -367,9 +384,11 @@ class Lanes:
             *self._own_troubles,
             *self._incompatible.values(),
             *self._lane.troubles(),
+            *self._ways.troubles,
+            *self._links.notes(),
             *self._around.store.notices[-NOTICES_SHOWN:],
         ]
-        return team_view(self.settings, self._life, told, self.charges, self._lane.links, notices)
+        return team_view(self.settings, self._life, told, self.charges, self._lane.links, notices, self._links.shown())
 
 
 UNFIT_KEY: Final = (

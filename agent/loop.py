@@ -15,6 +15,7 @@ import select
 import signal
 import socket
 from collections import Counter
+from pathlib import Path
 from typing import Final
 
 from agent import ballot as ballot_file
@@ -27,6 +28,7 @@ from agent.lanes_process import LanesProcess
 from agent.outbox import Due, Outbox
 from agent.persister import Persister
 from agent.rules import node_config
+from agent.scribe import Scribe
 from agent.systemd import Notifier, watchdog_period_ns
 from checkpoint.channel import ChannelClosedError, ChannelError
 from failover.core import ballot as core_ballot
@@ -76,6 +78,7 @@ class Heart:
         durable = core_ballot.decode(ballot.record.core)
         self._outbox = Outbox(durable, settings.config.beat_ms * NANOSECONDS_A_SECOND // 1_000)
         self._persister = Persister(lambda wanted: ballot.keep(core_ballot.encode(wanted)))
+        self._scribe = Scribe(Path(settings.config.state_directory), self._me, ballot.record.boot)
         self._poll = select.epoll()
         self._wake, self._signalled = socket.socketpair(
             socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
@@ -156,14 +159,16 @@ class Heart:
     def _step(self, event: Event) -> None:
         if self._node is not None:
             now_ns = clock.now_ns()
-            self._obey(self._outbox.take(self._node.step(event, now_ns), now_ns))
+            ready = self._node.step(event, now_ns)
+            self._obey(self._outbox.take(ready, now_ns))
+            self._scribe.note(ready.told)
 
     def _hear(self, descriptor: int) -> None:
-        for frame in self._beats.receive(descriptor):
+        for frame, link in self._beats.receive(descriptor):
             opened = self._hearing.open(frame)
             if isinstance(opened, Beat):
                 self._count(opened)
-                self._step(Received(opened))
+                self._step(Received(opened, link))
             else:
                 self._refused[str(opened.reason)] += 1
 
@@ -264,18 +269,18 @@ class Heart:
             self._gaps,
             dict(self._lost),
         )
-        trouble = self._persister.trouble
-        if self._node is None:
-            return Told(question.number, now_ns, beats=counts, ballot_trouble=trouble)
+        troubles = tuple(filter(None, (self._persister.trouble, self._scribe.trouble)))
         if question.what == "why":
-            return Told(question.number, now_ns, story=self._node.why(question.component), beats=counts, ballot_trouble=trouble)
-        return Told(question.number, now_ns, self._node.status(now_ns), beats=counts, ballot_trouble=trouble)
+            return Told(question.number, now_ns, story=self._scribe.unwritten(), beats=counts, troubles=troubles)
+        status = self._node.status(now_ns) if self._node is not None else None
+        return Told(question.number, now_ns, status, beats=counts, troubles=troubles)
 
     def _end(self) -> None:
         self._notifier.stopping()
         self._lanes.send(Farewell())
         self._lanes.flush()
         self._persister.close(PERSIST_PATIENCE_S)
+        self._scribe.close(PERSIST_PATIENCE_S)
         self._lanes.wait()
         self._beats.close()
         signal.set_wakeup_fd(-1)
@@ -288,8 +293,6 @@ def beat(settings: Settings, notifier: Notifier) -> None:
     Raises:
         AgentError: what is needed to begin cannot be had.
     """
-    from pathlib import Path
-
     directory = Path(settings.config.state_directory)
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -39,7 +39,7 @@ class Lanes(Protocol):
     charges: dict[str, Charge]
     errands: Errands
 
-    async def ask(self, what: Any, component: str = "") -> Told: ...
+    async def ask(self, what: Any) -> Told: ...
 
 
 class Outflow:

@@ -13,10 +13,11 @@ import asyncio
 import contextlib
 import enum
 import logging
+import socket
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import zmq
 import zmq.asyncio
@@ -24,7 +25,10 @@ from zmq.utils import z85
 from zmq.utils.monitor import parse_monitor_message
 
 from agent.errors import LaneError
+from agent.links import Device
 from agent.mistake import end_lanes_on_mistake
+from agent.rtnetlink import allow_absent
+from failover.client.team import split_address
 from failover.core.messages import CHUNK_SIZE_MAX, Bulk, Chunk
 from failover.core.wire import decode_bulk, encode_bulk
 
@@ -45,6 +49,12 @@ RETRANSMIT_LIMIT_MS: Final = 3_000
 """A connection whose bytes stay unacknowledged so long is dead (TCP_USER_TIMEOUT); the beats have known it much earlier."""
 
 HANDSHAKE_LIMIT_MS: Final = 5_000
+
+LISTEN_TRIES: Final = 100
+LISTEN_PAUSE_S: Final = 0.02
+
+BACKLOG: Final = 100
+"""Connections that wait to be accepted: more than a team has robots."""
 
 ZAP_ADDRESS: Final = "inproc://zeromq.zap.01"
 ZAP_DOMAIN: Final = b"failover"
@@ -75,6 +85,30 @@ class Keys:
         return bool(self.secret)
 
 
+class Devices(Protocol):
+    """Which interfaces connections are held to; see `agent.links.Links`."""
+
+    def device(self, host: str) -> Device | None:
+        """By which a connection to that host of a peer must leave; None for any."""
+
+    def listening(self, peers: Iterable[str]) -> Device | None:
+        """By which connections of the peers at those hosts must come; None for any."""
+
+
+class AnyDevice:
+    """Connections take whichever interface the kernel chooses."""
+
+    def device(self, _host: str) -> Device | None:
+        """Any."""
+        return None
+
+    def listening(self, _peers: Iterable[str]) -> Device | None:
+        """Any."""
+        return None
+
+
+ANY_DEVICE: Final = AnyDevice()
+
 Receive = Callable[[str, Bulk], None]
 """Called with (peer, message)."""
 
@@ -103,8 +137,22 @@ def public_key_of(secret: str) -> str:
 class Link:
     """The way to one peer: a DEALER socket, what waits for it, and how its connection stands."""
 
-    def __init__(self, context: zmq.asyncio.Context, me: str, peer: str, address: str, keys: Keys, changed: Changed) -> None:
+    def __init__(
+        self,
+        context: zmq.asyncio.Context,
+        me: str,
+        peer: str,
+        address: str,
+        keys: Keys,
+        changed: Changed,
+        device: Device | None = None,
+    ) -> None:
+        """
+        Args:
+            device: the interface that the connection is held to; None for whichever the kernel chooses.
+        """
         self.peer = peer
+        self.device = device
         self.state = LinkState.CONNECTING
         self.reason = ""
         self._changed = changed
@@ -115,6 +163,8 @@ class Link:
         _limits(self._socket)
         self._socket.setsockopt(zmq.IDENTITY, me.encode())
         self._socket.setsockopt(zmq.IMMEDIATE, 1)
+        if device is not None:
+            self._socket.setsockopt(zmq.BINDTODEVICE, device.name.encode())
         self._socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_FIRST_MS)
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MOST_MS)
         self._socket.setsockopt(zmq.TCP_MAXRT, RETRANSMIT_LIMIT_MS)
@@ -215,12 +265,25 @@ class Link:
 class BulkLane:
     """All connections of this robot. Lives in one asyncio loop."""
 
-    def __init__(self, me: str, bind: str, peers: Mapping[str, str], keys: Keys, receive: Receive, changed: Changed) -> None:
+    def __init__(
+        self,
+        me: str,
+        bind: str,
+        peers: Mapping[str, str],
+        keys: Keys,
+        receive: Receive,
+        changed: Changed,
+        devices: Devices = ANY_DEVICE,
+    ) -> None:
         """
         Args:
             bind: "host:port" to listen at.
             peers: "host:port" by name.
+            devices: which interfaces connections are held to.
         """
+        self._devices = devices
+        self._router: zmq.asyncio.Socket | None = None
+        self._listening: Device | None = None
         self._me = me
         self._bind = bind
         self._peers = peers
@@ -251,18 +314,72 @@ class BulkLane:
             router.curve_server = True
             router.curve_secretkey = self._keys.secret.encode()
             router.zap_domain = ZAP_DOMAIN
+        self._router = router
         try:
-            router.bind(f"tcp://{self._bind}")
-        except zmq.ZMQError as error:
+            self._listen(router)
+        except LaneError:
             router.close(0)
-            raise LaneError(
-                f"cannot listen for snapshots at {self._bind}: {error.strerror}; is another agent running, or is it not ours?"
-            ) from error
+            raise
         self._tasks.append(asyncio.create_task(self._hear(router)))
         for task in self._tasks:
             task.add_done_callback(end_lanes_on_mistake)
-        for peer, address in self._peers.items():
-            self.links[peer] = Link(self._context, self._me, peer, address, self._keys, self._changed)
+        for peer in self._peers:
+            self._connect(peer)
+
+    def _listen(self, router: zmq.asyncio.Socket) -> None:
+        """Take connections by the interface that they must come by.
+
+        Raises:
+            LaneError: the address cannot be had.
+        """
+        self._listening = self._devices.listening(self._hosts())
+        try:
+            router.setsockopt(zmq.USE_FD, _listener(self._bind, self._listening))
+            router.bind(f"tcp://{self._bind}")
+        except (zmq.ZMQError, OSError) as error:
+            raise LaneError(
+                f"cannot listen for snapshots at {self._bind}: {error.strerror}; is another agent running, or is it not ours?"
+            ) from error
+
+    def _hosts(self) -> list[str]:
+        return [split_address(address, "bulk address")[0] for address in self._peers.values()]
+
+    async def hold_to_devices(self) -> None:
+        """Interfaces have come or gone: connect, or listen, anew where it must be by another one than before.
+
+        Where an interface has only gone, what was held to it waits for its return.
+
+        Raises:
+            LaneError: the address cannot be had any more.
+        """
+        wanted = self._devices.listening(self._hosts())
+        if self._router is not None and wanted not in (None, self._listening):
+            await self._listen_anew(self._router)
+        for peer, link in list(self.links.items()):
+            if self._device_to(peer) not in (None, link.device):
+                await link.close()
+                self._changed(peer, LinkState.CONNECTING, "its interface is another one now")
+                self._connect(peer)
+
+    async def _listen_anew(self, router: zmq.asyncio.Socket) -> None:
+        """ZeroMQ lets an address go some time after it was told to."""
+        with contextlib.suppress(zmq.ZMQError):
+            router.unbind(f"tcp://{self._bind}")
+        for _ in range(LISTEN_TRIES):
+            try:
+                self._listen(router)
+                return
+            except LaneError as error:
+                trouble = error
+                await asyncio.sleep(LISTEN_PAUSE_S)
+        raise trouble
+
+    def _connect(self, peer: str) -> None:
+        address, device = self._peers[peer], self._device_to(peer)
+        self.links[peer] = Link(self._context, self._me, peer, address, self._keys, self._changed, device)
+
+    def _device_to(self, peer: str) -> Device | None:
+        return self._devices.device(split_address(self._peers[peer], "bulk address")[0])
 
     def say(self, peer: str, message: Bulk) -> bool:
         """Queue a small message to a peer; False: it is not connected, the message was dropped."""
@@ -347,6 +464,24 @@ def _limits(socket: zmq.asyncio.Socket) -> None:
     socket.setsockopt(zmq.MAXMSGSIZE, MESSAGE_LIMIT)
     socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_LIMIT_MS)
     socket.setsockopt(zmq.IPV6, 1)
+
+
+def _listener(address: str, device: Device | None) -> int:
+    """A descriptor that listens there, also where no interface has the address yet; it becomes ZeroMQ's.
+
+    Raises:
+        OSError: the address is taken, or is none.
+    """
+    host, port = split_address(address, "bulk address")
+    family, kind, protocol, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    with socket.socket(family, kind | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC, protocol) as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        allow_absent(listener)
+        if device is not None:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, device.name.encode() + b"\0")
+        listener.bind(where)
+        listener.listen(BACKLOG)
+        return listener.detach()
 
 
 def _refusal(peer: str, kind: int) -> str:

@@ -20,9 +20,10 @@ from agent.arguments import (
     RunArguments,
     StatusArguments,
     StopArguments,
+    WhyArguments,
     arguments_of,
 )
-from agent.caller import NOBODY, check_right, inheritance_for, owner_of
+from agent.caller import check_right, inheritance_for, owner_of
 from agent.charge import Charge
 from agent.config import Settings
 from agent.control import Conversation, Verb
@@ -32,6 +33,7 @@ from agent.errors import RefusedError
 from agent.outflow import Outflow
 from agent.places import Places
 from agent.rules import rules_for
+from agent.telling import Telling
 from agent.view import version
 from failover.core import acts, events
 from failover.core.names import check_component
@@ -42,7 +44,7 @@ STANDING_POLL_S: Final = 0.01
 """Between two questions to the robot that a component moves to: what an operator reads as the move's time."""
 
 SIGHT_PATIENCE_S: Final = 0.5
-"""How long a status, or a story, waits for the other robots' own."""
+"""How long a status waits for the other robots' own."""
 
 START_PATIENCE_S: Final = 30.0
 """How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
@@ -60,9 +62,10 @@ class Lanes(Protocol):
     charges: dict[str, Charge]
     errands: Errands
 
-    async def ask(self, what: Any, component: str = "") -> Told: ...
+    async def ask(self, what: Any) -> Told: ...
     async def command(self, make: Callable[[int], events.Command]) -> acts.Answer: ...
     def charge(self, name: str) -> Charge: ...
+    def hindrance(self, peer: str) -> str: ...
     def picture(self, told: Told) -> dict[str, Any]: ...
 
 
@@ -72,6 +75,7 @@ class Verbs:
     def __init__(self, lanes: Lanes) -> None:
         self._lanes = lanes
         self._outflow = Outflow(lanes)
+        self._telling = Telling(lanes)
 
     def table(self) -> dict[str, Verb]:
         """By name, as the client says them."""
@@ -92,7 +96,7 @@ class Verbs:
             "standing": self.standing,
             "picture": self.picture,
             "piece": self._outflow.piece,
-            "story": self.story,
+            "story": self._telling.page,
         }
 
     def orders(self) -> dict[str, Order]:
@@ -158,7 +162,7 @@ class Verbs:
     async def _reachable(self) -> list[str]:
         """The robots that live and can be asked."""
         peers = self._lanes.picture(await self._lanes.ask("status"))["peers"]
-        return [peer["name"] for peer in peers if peer["state"] == "live" and peer["lane"] == "connected"]
+        return [peer["name"] for peer in peers if peer["state"] == "live" and not self._lanes.hindrance(peer["name"])]
 
     async def _asked(self, peer: str, question: str, arguments: dict[str, Any]) -> dict[str, Any]:
         """A peer's answer; empty when it does not come soon."""
@@ -168,27 +172,10 @@ class Verbs:
             return {}
 
     async def why(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
-        """What was decided, when and by whom: this robot's story and those of the robots that it hears, in one."""
-        wanted = arguments_of(NameArguments, "why", arguments)
+        """What was decided, when and by whom: the stories of all robots that answer, in one."""
+        wanted = arguments_of(WhyArguments, "why", arguments)
         name = await self._known(wanted.name) if wanted.name else ""
-        mine = await self.story({"name": name}, NOBODY)
-        theirs = await asyncio.gather(*(self._asked(peer, "story", {"name": name}) for peer in await self._reachable()))
-        whole = [*mine["story"], *(line for story in theirs for line in story.get("story", ()))]
-        return {"story": sorted(whole, key=lambda line: str(line["at"]))}
-
-    async def story(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
-        """What this robot decided; of one component, or all."""
-        told = await self._lanes.ask("why", arguments_of(NameArguments, "story", arguments).name)
-        story = [
-            {
-                "at": clock.calendar(decision.at_ns, told.now_ns),
-                "robot": self._lanes.settings.config.robot,
-                "component": decision.component,
-                "did": decision.sentence,
-            }
-            for decision in told.story
-        ]
-        return {"story": story}
+        return await self._telling.whole(name, wanted.robot, wanted.age_ms_max)
 
     async def run(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """Start a program under protection; with ``wait`` pass its output on until it has ended."""

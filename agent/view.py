@@ -48,13 +48,17 @@ def version() -> str:
 
 
 def team_view(
-    settings: Settings, life: Life, told: Told, charges: Mapping[str, Charge], links: Mapping[str, Link], notices: list[str]
+    settings: Settings,
+    life: Life,
+    told: Told,
+    charges: Mapping[str, Charge],
+    links: Mapping[str, Link],
+    notices: list[str],
+    interfaces: list[dict[str, object]],
 ) -> dict[str, Any]:
     """The whole picture."""
     view = told.status
-    notes = [*life.notes, *notices]
-
-    notes += [told.ballot_trouble] if told.ballot_trouble else []
+    notes = [*life.notes, *notices, *told.troubles]
     beats = told.beats
     return {
         "robot": settings.config.robot,
@@ -69,6 +73,7 @@ def team_view(
         "promise": view.promise if view else "not decided yet: the agent is starting",
         "healthy": view.healthy if view else False,
         "notes": notes,
+        "links": interfaces,
         "peers": [_peer(peer, links.get(peer.robot), told) for peer in (view.peers if view else ())],
         "components": [_component(one, charges.get(one.name), settings) for one in (view.components if view else ())],
         "beats": {
@@ -92,6 +97,7 @@ def _peer(peer: PeerView, link: Link | None, told: Told) -> dict[str, Any]:
         "last_heard_ms": peer.silent_ns // NANOSECONDS_A_MILLISECOND if peer.silent_ns >= 0 else None,
         "hears_us": peer.hears_us,
         "load": peer.load,
+        "links": list(peer.links),
         "lane": str(link.state if link is not None else LinkState.DOWN),
         "beats_lost": told.beats.lost.get(peer.robot, 0),
         "notes": reason,

@@ -109,6 +109,17 @@ NUMBER_MAX: Final = (1 << 31) - 1
 """What a PID can be at most."""
 
 
+UNITS_MS: Final = {"ms": 1, "s": 1_000, "min": 60_000, "h": 3_600_000, "d": 86_400_000}
+
+
+def ago(text: str) -> int:
+    """A span of time such as 90s or 10min, in milliseconds."""
+    number, unit = text.rstrip("abcdefghijklmnopqrstuvwxyz"), text.lstrip("0123456789")
+    if not number.isdecimal() or len(number) > len(str(NUMBER_MAX)) or unit not in UNITS_MS or not int(number):
+        raise argparse.ArgumentTypeError(f"{text[:40]!r} is no span of time; write 90s, 10min, 2h or 3d")
+    return int(number) * UNITS_MS[unit]
+
+
 def positive(text: str) -> int:
     """A whole number above zero, as a PID or a period is."""
     number = int(text) if text.isdecimal() and len(text) <= len(str(NUMBER_MAX)) else 0
@@ -175,7 +186,10 @@ def _status(room: argparse.ArgumentParser) -> None:
 
 
 def _why(room: argparse.ArgumentParser) -> None:
-    room.add_argument("name", metavar="NAME", nargs="?", help="one component alone")
+    room.add_argument("name", metavar="NAME", nargs="?", help="one component alone, with what its robots noticed of each other")
+    room.add_argument("--robot", metavar="ROBOT", help="only what that robot saw and decided")
+    room.add_argument("--since", metavar="AGO", type=ago, help="only what is younger: 90s, 10min, 2h, 3d")
+    room.add_argument("-b", "--brief", action="store_true", help="one line each, without what stands behind it")
     _agent(room)
 
 
@@ -421,13 +435,17 @@ VERBS: Final = (
         "why",
         "the story of the last decisions",
         """
-        Tell what was seen, by whom, when, and what was done about it: the stories of all robots that answer, in one.
+        Tell what was seen, by whom, when, and what was done about it: the stories of all robots that answer, in one, in the order
+        in which it happened, whatever their clocks say. Below each decision stands what the robot knew: how long every peer had
+        been silent on which link, and after how long it counts as dead; whether its own loop had been late; which checkpoint it
+        could go on from, and how old that was. Kept on disk, so it goes back over restarts (about 4 MB a robot).
 
           failover why
-          failover why /lab/robot1/mapper
+          failover why /lab/robot1/mapper --since 10min
+          failover why --robot robot2 --brief
         """,
         _why,
-        "failover.cli.status:why",
+        "failover.cli.why:why",
     ),
     Verb(
         "handover",

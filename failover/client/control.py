@@ -18,7 +18,7 @@ verb           arguments                                                result, 
 ``release``    ``name`` *must*                                          ``{name, pid}``; the program runs on, unprotected
 ``stop``       ``name`` *must*, ``signal`` 15                           ``{name, exit_status}`` once it has ended
 ``logs``       ``name`` *must*, ``follow`` false, ``offsets`` [0, 0]     Output …, Result ``{name, totals, exit_status}``
-``why``        ``name`` ""                                              ``{"story": [{at, robot, component, did}, …]}``
+``why``        ``name`` "", ``robot`` "", ``age_ms_max`` 0               see `WHY`
 ``handover``   ``name`` *must*, ``to`` ""                               ``{name, to, epoch, took_ms, moved, sentence}``
 ``failback``   ``name`` *must*                                          as ``handover``
 ``prefer``     ``name`` *must*, ``robot`` *must*                        ``{name, robot}``
@@ -49,8 +49,12 @@ rule, promise: by which rule the team decides, and one sentence: what holds if t
 healthy: nothing is degraded, nothing has failed, nobody is silent, as far as this robot knows
 notes: [sentence, …]: what is missing or degraded on this robot
 beats: {sent, heard, unsent, refused, late_us_max, gap_us_max, gaps}: of this life; refused: {reason: count}
-peers: [{name, state, last_heard_ms, hears_us, load, beats_lost, lane, notes}]
-    state: unknown | live | suspect | dead; lane: connected | connecting | refused | down
+links: [{name, medium, because, carrier, addresses, snapshots, bytes_in, bytes_out}]: interfaces with an address of this robot
+    medium: wired | wireless | loopback; because: the fact that tells; carrier: its cable is in; snapshots: they may travel there
+    bytes_in, bytes_out: all that the kernel counted on it
+peers: [{name, state, last_heard_ms, hears_us, load, beats_lost, links, lane, notes}]
+    state: unknown | live | suspect | dead; links: ours, over which it was heard lately
+    lane: connected | connecting | refused | down
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
     freeze_us_max, snapshot_size, dirty_bytes, snapshots, restores, crashes, outage_ms, exit_status, promise, owner, reasons,
@@ -67,6 +71,24 @@ components: [{name, role, primary, home, prefer, state, protection, epoch, gener
     elsewhere: with ``team``: {robot: the same fields, as that robot sees the component}
 """
 """What ``status`` answers, field by field. A value that is not known is None."""
+
+WHY: Final = """
+robots: [{robot, answered, reason, lines, damaged, clock_offset_ms, clock_doubt_ms}]: who was asked
+    reason: why it did not answer; damaged: lines of its story that cannot be read any more
+    clock_offset_ms: by how much its calendar is ahead of the asked robot's, known within clock_doubt_ms
+story: [{at, doubt_ms, robot, component, did, life, number, repeats, epoch_before, epoch, state, late_ms, lease_left_ms,
+    checkpoint, checkpoint_age_ms, output_pending, seen}]: in the order in which it happened
+    at: seconds since 1970 by the calendar of the robot that was asked, whichever robot decided; known within doubt_ms
+    component: "" for what concerns the robot itself; did: a sentence
+    life, number: of that robot's agent, and of the line in it; repeats: how often the line before was said again
+    epoch_before, epoch, state: of the component at that robot; late_ms: the most that its own loop had been late lately
+    lease_left_ms: until it had to stand still; None without a lease
+    checkpoint, checkpoint_age_ms: the newest from which somebody could go on: what is younger would have been lost
+    output_pending: bytes the program had written that are in no checkpoint
+    seen: [{robot, state, silent_ms, limit_ms, links, hears_us, says, life, beat}]: every peer as that robot heard it
+        links: {link: silent_ms}; says: what that peer last said about the component
+"""
+"""What ``why`` answers, field by field. A value that is not known is None."""
 
 MESSAGE_LIMIT: Final = 16 << 20
 """Bytes of one message either way: a status of thousands of components fits, a runaway peer does not fill the memory."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from checkpoint.model import Position
 from failover.core.messages import Beat
+from failover.core.story import Decision
 from failover.core.types import Ballot, ComponentSpec
 
 
@@ -281,8 +282,10 @@ class Ready:
     Attributes:
         persist: the whole ballot, to be made durable before anything else; None when it has not changed.
         send: beats, each for every peer over every link.
+        told: what was decided, for ``failover why``; nothing waits for it.
     """
 
     persist: Ballot | None = None
     send: tuple[Beat, ...] = ()
     act: tuple[Act, ...] = ()
+    told: tuple[Decision, ...] = ()

@@ -9,12 +9,13 @@ from dataclasses import dataclass, field
 from checkpoint.model import Position
 from failover.core.acts import Act
 from failover.core.membership import Membership
+from failover.core.story import Decision, Facts, Sighting
 from failover.core.types import (
     HISTORY_MAX,
     HOLDING,
+    Ballot,
     ComponentSpec,
     Config,
-    Decision,
     OnLoss,
     Record,
     Rules,
@@ -22,9 +23,6 @@ from failover.core.types import (
     Waiting,
     WhenAlone,
 )
-
-JOURNAL_MAX = 512
-"""Decisions that are remembered for ``failover why``."""
 
 LOST_MAX = 8
 """Generations that lost and are remembered; the agent moves their snapshots out of the chain long before."""
@@ -129,6 +127,7 @@ class Component:
         resumed_ns: when the state was captured that this primacy began with, -1 for a fresh start; ``resumed_age_ns``: how old
             it was then.
         awaited: why there is nothing to capture, where that is as it should be.
+        stored_ns: on a standby, when its newest checkpoint was stored, -1 if it was before this life of the agent.
         undelivered: why the last snapshot did not become a checkpoint; ``unstored``: on a standby, why it was not stored.
         keeps_state: on a standby: to go on from the newest snapshot is to start the program again.
         waiting: on a standby: the program that was ordered to wait, under ``waiting_epoch``; it is ready (``warm``) or, after
@@ -174,6 +173,7 @@ class Component:
     waiting_epoch: int = 0
     warm: bool = False
     cold: str = ""
+    stored_ns: int = -1
     resumed_ns: int = -1
     resumed_age_ns: int = -1
     unprotected: bool = False
@@ -265,26 +265,22 @@ class Component:
 
 
 @dataclass(slots=True)
-class Journal:
-    """The last decisions, one sentence each."""
-
-    decisions: deque[Decision] = field(default_factory=lambda: deque(maxlen=JOURNAL_MAX))
-
-    def note(self, at_ns: int, component: str, sentence: str) -> None:
-        """Add a decision."""
-        self.decisions.append(Decision(at_ns, component, sentence))
-
-
-@dataclass(slots=True)
 class Turn:
-    """One step: its instant, what the rules may look at, and what they order."""
+    """One step: its instant, what the rules may look at, what they order, and what they say about it.
+
+    Attributes:
+        before: the ballot as the last step left it.
+        late_ns: see ``story.Facts``.
+    """
 
     now_ns: int
     config: Config
     team: Membership
-    journal: Journal
     next_counter: int
+    before: Ballot
+    late_ns: int
     acts: list[Act] = field(default_factory=list)
+    said: list[Decision] = field(default_factory=list)
 
     @property
     def me(self) -> str:
@@ -295,9 +291,31 @@ class Turn:
         """An act, after those ordered before."""
         self.acts.append(act)
 
-    def say(self, component: Component, sentence: str) -> None:
-        """For ``failover why``."""
-        self.journal.note(self.now_ns, component.name, sentence)
+    def say(self, component: Component, sentence: str, output_pending: int = -1) -> None:
+        """For ``failover why``: a decision about a component, with what is known now."""
+        before = next((record.epoch for record in self.before.records if record.name == component.name), 0)
+        checkpoint, age_ns = _newest_checkpoint(component, self.now_ns)
+        facts = Facts(
+            self.next_counter,
+            before,
+            component.epoch,
+            component.state,
+            self.late_ns,
+            max(component.lease_ns - self.now_ns, 0) if component.lease_ns else None,
+            checkpoint,
+            age_ns,
+            output_pending,
+            self._seen(component.name),
+        )
+        self.said.append(Decision(self.now_ns, component.name, sentence, facts))
+
+    def say_of_robot(self, sentence: str) -> None:
+        """For ``failover why``: something about this robot, or about a peer."""
+        facts = Facts(self.next_counter, late_ns=self.late_ns, seen=self._seen(""))
+        self.said.append(Decision(self.now_ns, "", sentence, facts))
+
+    def _seen(self, component: str) -> tuple[Sighting, ...]:
+        return self.team.sightings(component, self.now_ns)
 
     def alive(self, robot: str) -> bool:
         """Whether a peer is alive."""
@@ -306,3 +324,13 @@ class Turn:
     def dead(self, robot: str) -> bool:
         """Whether a peer is dead."""
         return self.team.dead(robot, self.now_ns)
+
+
+def _newest_checkpoint(component: Component, now_ns: int) -> tuple[int, int]:
+    """Number of the checkpoint from which somebody could go on, and its age; see ``story.Facts``."""
+    if component.holding and component.acked is not None:
+        return component.acked.sequence, now_ns - component.acked_ns
+    held = component.held[-1].sequence if component.held else 0
+    if component.holding and component.resumed_ns >= 0:
+        return held, now_ns - component.resumed_ns
+    return held, now_ns - component.stored_ns if held and component.stored_ns >= 0 else -1

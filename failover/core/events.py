@@ -193,6 +193,19 @@ class Exited:
 
 
 @dataclass(frozen=True, slots=True)
+class Noticed:
+    """Something that belongs in the story and changes nothing: about a component, or ("") about this robot.
+
+    Attributes:
+        output_pending: see ``story.Facts``.
+    """
+
+    component: str
+    sentence: str
+    output_pending: int = -1
+
+
+@dataclass(frozen=True, slots=True)
 class Run:
     """Operator: start this program here (or, with ``spec.launch.pid``, protect it where it runs). Answered by the act Answer."""
 
@@ -262,5 +275,6 @@ Event = (
     | Stopped
     | Warmed
     | Exited
+    | Noticed
     | Command
 )

@@ -11,7 +11,8 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from failover.core.messages import Beat, Entry
-from failover.core.types import COMPONENTS_MAX, Config, PeerView
+from failover.core.story import Sighting
+from failover.core.types import COMPONENTS_MAX, Config, PeerView, State
 
 ASKED_MAX = 512
 """Beats of ours whose instant of leaving is remembered; ten seconds of them at 20 ms."""
@@ -135,14 +136,40 @@ class Membership:
         """For the status."""
         return tuple(self._view(peer, now_ns) for peer in self.peers.values())
 
+    def sightings(self, component: str, now_ns: int) -> tuple[Sighting, ...]:
+        """For ``failover why``: every peer, and what it says of a component ("" for none)."""
+        return tuple(self._sighting(peer, component, now_ns) for peer in self.peers.values())
+
+    def _sighting(self, peer: Peer, component: str, now_ns: int) -> Sighting:
+        entry = peer.entry(component)
+        says = f"{_state_name(entry.state)}, epoch {entry.epoch}, primary {entry.primary or 'nobody'}" if entry else ""
+        return Sighting(
+            peer.robot,
+            self._state(peer, now_ns),
+            peer.boot,
+            peer.counter,
+            now_ns - peer.heard_ns,
+            self.loyal_until_ns(peer.robot) - peer.heard_ns,
+            tuple((link, now_ns - at) for link, at in sorted(peer.links.items())),
+            self.lease_ns(peer.robot) > now_ns,
+            says,
+        )
+
+    def _state(self, peer: Peer, now_ns: int) -> str:
+        if not peer.boot:
+            return "unheard"
+        if self.dead(peer.robot, now_ns):
+            return "dead"
+        return "suspect" if now_ns - peer.heard_ns > SUSPECT_BEATS * self._config.beat_ns else "alive"
+
     def _view(self, peer: Peer, now_ns: int) -> PeerView:
         silent_ns = now_ns - peer.heard_ns
-        if self.dead(peer.robot, now_ns):
-            state = "dead" if peer.boot else "unheard"
-        elif not peer.boot:
-            state = "unheard"
-        else:
-            state = "suspect" if silent_ns > SUSPECT_BEATS * self._config.beat_ns else "alive"
+        state = self._state(peer, now_ns)
         heard = tuple(link for link, at in sorted(peer.links.items()) if now_ns - at < self._config.loyalty_ns)
         hears_us = self.lease_ns(peer.robot) > now_ns
         return PeerView(peer.robot, state, peer.boot, silent_ns, hears_us, peer.load, heard)
+
+
+def _state_name(number: int) -> str:
+    states = tuple(State)
+    return states[number] if 0 <= number < len(states) else State.ABSENT

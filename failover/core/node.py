@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from failover.core import acts, commands, election, endings, handover, lease, replication, view, warmth
 from failover.core.acts import Ready
-from failover.core.component import Cause, Component, Journal, Turn
+from failover.core.component import Cause, Component, Turn
 from failover.core.events import (
     ActFailed,
     Captured,
@@ -20,6 +20,7 @@ from failover.core.events import (
     Failback,
     Handover,
     NothingToCapture,
+    Noticed,
     Prefer,
     Received,
     Release,
@@ -38,7 +39,8 @@ from failover.core.events import (
 from failover.core.membership import Membership
 from failover.core.messages import HOLDS, Beat, Echo, Entry
 from failover.core.speaker import Speaker, entry_of
-from failover.core.types import COMPONENTS_MAX, ENDED, MS, Ballot, Config, Decision, Found, Held, State, StatusView
+from failover.core.types import COMPONENTS_MAX, ENDED, MS, Ballot, Config, Found, Held, State, StatusView
+from failover.core.watch import Watch
 
 NS_PER_S = 1_000 * MS
 
@@ -82,7 +84,7 @@ class Node:
         self._durable = ballot
         self._team = Membership(config, boot, now_ns)
         self._speaker = Speaker(config.robot, boot)
-        self._journal = Journal()
+        self._watch = Watch()
         self._components = {record.name: Component.remembered(record) for record in ballot.records}
         self._found = {one.component: one for one in found}
         self._begun = False
@@ -91,9 +93,12 @@ class Node:
     def step(self, event: Event, now_ns: int) -> Ready:
         """Take in one event at ``now_ns`` (this machine's monotonic clock) and say what must be done about it."""
         self._now_ns = now_ns = max(now_ns, self._now_ns)
-        if now_ns - self._asked_ns > LATE_NS:
-            self._team.forgive(now_ns - self._asked_ns, now_ns)
+        late_ns = now_ns - self._asked_ns
+        if late_ns > LATE_NS:
+            self._team.forgive(late_ns, now_ns)
+        self._watch.late(late_ns, self._config.loyalty_ns, now_ns)
         turn = self._turn(now_ns)
+        self._watch.look(turn, event)
         if not self._begun:
             self._begin(turn)
         touched = self._take(event, turn)
@@ -101,7 +106,7 @@ class Node:
             _review(component, turn)
         send = self._speak(turn)
         self._asked_ns = self._deadline_ns()
-        return Ready(self._persist(), send, tuple(turn.acts))
+        return Ready(self._persist(), send, tuple(turn.acts), tuple(turn.said))
 
     def next_deadline_ns(self) -> int:
         """The instant at which a Tick is due."""
@@ -111,12 +116,8 @@ class Node:
         """The team as this robot sees it."""
         return view.status(self._components, self._turn(max(now_ns, self._now_ns)), self._boot)
 
-    def why(self, component: str = "") -> tuple[Decision, ...]:
-        """The last decisions, oldest first; of one component, or all."""
-        return tuple(one for one in self._journal.decisions if component in ("", one.component))
-
     def _turn(self, now_ns: int) -> Turn:
-        return Turn(now_ns, self._config, self._team, self._journal, self._speaker.counter + 1)
+        return Turn(now_ns, self._config, self._team, self._speaker.counter + 1, self._durable, self._watch.late_ns)
 
     # Birth
 
@@ -134,6 +135,7 @@ class Node:
     def _begin(self, turn: Turn) -> None:
         """The first step of this life: take over what the last one left running, clear away what it should not have left."""
         self._begun = True
+        turn.say_of_robot(f"the agent of {turn.me} begins, life {self._boot}")
         for component in self._components.values():
             found = self._found.pop(component.name, None)
             if component.state is State.PRIMARY:
@@ -153,6 +155,9 @@ class Node:
             return list(self._components.values())
         if isinstance(event, Received):
             return self._hear(event, turn)
+        if isinstance(event, Noticed):
+            self._note(event, turn)
+            return []
         name = event.spec.name if isinstance(event, Run) else event.component
         component = self._known(name) if isinstance(event, Run | Stored) else self._components.get(name)
         if component is None:
@@ -161,6 +166,13 @@ class Node:
             return []
         _tell(component, turn, event)
         return [component]
+
+    def _note(self, event: Noticed, turn: Turn) -> None:
+        component = self._components.get(event.component)
+        if component is not None:
+            turn.say(component, event.sentence, event.output_pending)
+        elif not event.component:
+            turn.say_of_robot(event.sentence)
 
     def _hear(self, event: Received, turn: Turn) -> list[Component]:
         beat = event.beat

@@ -374,12 +374,3 @@ class StatusView:
     healthy: bool
     peers: tuple[PeerView, ...]
     components: tuple[ComponentView, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Decision:
-    """One line of the journal: what was decided about which component ("" for the robot), when by this robot's clock, and why."""
-
-    at_ns: int
-    component: str
-    sentence: str

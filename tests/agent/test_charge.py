@@ -30,9 +30,13 @@ class Told:
         self.now_ns = 0
         self.runs = False
         self.refused = 0
+        self.pid = 1
 
     async def lease(self, until_ns: int) -> None:
         self.lease_ns = until_ns
+
+    def output_pending(self) -> int:
+        return 0
 
     async def freeze(self) -> None:
         self.runs = False

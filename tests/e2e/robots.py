@@ -10,13 +10,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from failover.cli.demo.robots import RobotMachine, Stage, agent_command, ip_command, means
+from failover.cli.demo.robots import CABLES, RobotMachine, Stage, agent_command, ip_inside, means
 from failover.client.control import Output, Result
 from failover.errors import LostAgentError, NoAgentError
 
@@ -36,7 +36,12 @@ T = TypeVar("T")
 
 @contextmanager
 def two_robots(
-    directory: Path, settings: str = "", prepare: Callable[[Path], None] = lambda _: None, *, own_network: bool = True
+    directory: Path,
+    settings: str = "",
+    prepare: Callable[[Path], None] = lambda _: None,
+    *,
+    own_network: bool = True,
+    cables: Sequence[tuple[str, str]] = CABLES,
 ) -> Iterator[tuple[RobotMachine, RobotMachine]]:
     """robot1 and robot2, beating and connected.
 
@@ -44,9 +49,11 @@ def two_robots(
         settings: lines added to their configurations.
         prepare: called with the directory in which each robot will have its own, before they start.
         own_network: of each robot, where that can be had; else they share the loopback, and outlive each other's cable.
+        cables: between the two; needs networks of their own.
     """
     allowed = means()
-    with Stage(directory / "stage", replace(allowed, own_network=allowed.own_network and own_network), settings) as stage:
+    allowed = replace(allowed, own_network=allowed.own_network and own_network)
+    with Stage(directory / "stage", allowed, settings, cables=cables) as stage:
         stage.directory.mkdir()
         prepare(stage.directory)
         stage.start()
@@ -188,10 +195,9 @@ def answers(robot: RobotMachine) -> bool:
     return True
 
 
-def cable(robot: RobotMachine, state: str) -> None:
-    """Plug the network cable "up" or "down"; needs robots with networks of their own."""
-    enter = ["nsenter", "--net", f"--target={robot.process.pid}", ip_command() or "ip"]
-    subprocess.run([*enter, "link", "set", "wire", state], check=True)
+def cable(robot: RobotMachine, state: str, name: str = "wire") -> None:
+    """Plug a network cable "up" or "down"; needs robots with networks of their own."""
+    subprocess.run(ip_inside(robot, "link", "set", name, state), check=True)
 
 
 def has_cable() -> bool:

@@ -48,7 +48,7 @@ async def knock(name, address, server_key):
         said.append((state, reason))
         if state in (LinkState.REFUSED, LinkState.CONNECTED):
             refused.set()
-    lane = BulkLane(name, "127.0.0.1:*", {"door": address}, Keys(public, secret, {"door": server_key}), print, changed)
+    lane = BulkLane(name, "127.0.0.1:7999", {"door": address}, Keys(public, secret, {"door": server_key}), print, changed)
     lane.open()
     await asyncio.wait_for(refused.wait(), 30)
     lane.say("door", Cancel(1))

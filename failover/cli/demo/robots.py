@@ -14,6 +14,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -34,6 +35,9 @@ START_S: Final = 20.0
 
 ADDRESS: Final = "10.71.7.{}"
 """Of the robots in network namespaces of their own; nothing outside them sees these addresses."""
+
+CABLES: Final = (("wire", ADDRESS),)
+"""Between the two, where they have networks of their own: each cable's name at both ends, and its addresses."""
 
 POLL_S: Final = 0.005
 
@@ -198,12 +202,21 @@ def cgroup_of(pid: int) -> Path | None:
 class Stage:
     """Both robots and the place where they stand. A context manager: leaving it ends them and removes the place."""
 
-    def __init__(self, directory: Path, allowed: Means, settings: str = "", interruption: Interruption | None = None) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        allowed: Means,
+        settings: str = "",
+        interruption: Interruption | None = None,
+        cables: Sequence[tuple[str, str]] = CABLES,
+    ) -> None:
         """
         Args:
             settings: lines of TOML added to each robot's configuration.
             interruption: held while a robot is begun, so that no robot goes unnoted.
+            cables: as `CABLES`; beats go over all of them, snapshots over the first.
         """
+        self._cables = cables
         self.directory = directory
         self._settings = settings
         self.means = allowed
@@ -232,7 +245,7 @@ class Stage:
             robot.control().close()
 
     def _write_team(self) -> None:
-        addresses = [ADDRESS.format(index) if self.means.own_network else "127.0.0.1" for index in (1, 2)]
+        formats = [address for _, address in self._cables] if self.means.own_network else ["127.0.0.1"]
         ports = [7420, 7421, 7420, 7421] if self.means.own_network else free_ports(4)
         members = Team("demo")
         for index, name in enumerate(NAMES):
@@ -240,8 +253,10 @@ class Stage:
             directory = self.directory / name / "team"
             directory.mkdir(parents=True)
             team.write_secret_key(directory, name, secret)
-            beats, bulk = (f"{addresses[index]}:{port}" for port in ports[2 * index : 2 * index + 2])
-            members = team.enrol(members, name, Robot((beats,), bulk, "robot", public))
+            beat_port, bulk_port = ports[2 * index : 2 * index + 2]
+            hosts = [address.format(index + 1) for address in formats]
+            beats = tuple(f"{host}:{beat_port}" for host in hosts)
+            members = team.enrol(members, name, Robot(beats, f"{hosts[0]}:{bulk_port}", "robot", public))
         for name in NAMES:
             team.write(self.directory / name / "team", members)
 
@@ -267,18 +282,27 @@ class Stage:
         return RobotMachine(name, directory, process)
 
     def _join(self) -> None:
-        """Lay a cable between the two network namespaces; one of its ends is in each."""
-        ip = ip_command()
-        assert ip is not None
-        first, second = (robot.process.pid for robot in self.robots)
+        """Lay the cables between the two network namespaces."""
         for robot in self.robots:
             wait_for_network(robot)
-        run([ip, "link", "add", "wire", "netns", str(first), "type", "veth", "peer", "name", "wire", "netns", str(second)])
-        for index, pid in enumerate((first, second), start=1):
-            enter = ["nsenter", "--net", f"--target={pid}", ip]
-            run([*enter, "address", "add", ADDRESS.format(index) + "/24", "dev", "wire"])
-            run([*enter, "link", "set", "lo", "up"])
-            run([*enter, "link", "set", "wire", "up"])
+            run(ip_inside(robot, "link", "set", "lo", "up"))
+        for cable, address in self._cables:
+            lay(self.robots, cable, address)
+
+
+def lay(robots: Sequence[RobotMachine], cable: str, address: str) -> None:
+    """Lay a cable between two robots; an end of it is in each network namespace, with that robot's address, and up."""
+    first, second = (str(robot.process.pid) for robot in robots)
+    kind = ["type", "veth", "peer", "name", cable, "netns", second]
+    run([ip_command() or "ip", "link", "add", cable, "netns", first, *kind])
+    for index, robot in enumerate(robots, start=1):
+        run(ip_inside(robot, "address", "add", address.format(index) + "/24", "dev", cable))
+        run(ip_inside(robot, "link", "set", cable, "up"))
+
+
+def ip_inside(robot: RobotMachine, *words: str) -> list[str]:
+    """An ip(8) command in a robot's network namespace."""
+    return ["nsenter", "--net", f"--target={robot.process.pid}", ip_command() or "ip", *words]
 
 
 def agent_command(config: Path) -> list[str]:

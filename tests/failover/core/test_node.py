@@ -128,11 +128,12 @@ def test_what_cannot_be_captured_degrades_and_names_the_reason() -> None:
 def test_a_program_that_has_committed_nothing_yet_is_captured_as_soon_as_it_has() -> None:
     node = Node(ALONE, 1, Ballot(), 0)
     running(node)
-    assert not node.step(NothingToCapture("/lab/x", 1, "it has committed nothing yet"), 5 * MS).act
+    ready = node.step(NothingToCapture("/lab/x", 1, "it has committed nothing yet"), 5 * MS)
+    assert not ready.act
     seen = node.status(6 * MS).components[0]
     assert (seen.protection, node.status(6 * MS).healthy) == ("none", True), "nothing is wrong"
     assert seen.notes == ("nothing to protect yet: it has committed nothing yet; there is no checkpoint yet",)
-    assert not any("not captured" in decision.sentence for decision in node.why("/lab/x"))
+    assert not any("not captured" in decision.sentence for decision in ready.told)
     (capture,) = only(node.step(Committed("/lab/x", 1), 7 * MS), acts.Capture)
     assert isinstance(capture, acts.Capture)
     node.step(Captured("/lab/x", 1, Position(capture.generation, capture.sequence, b"d"), None), 8 * MS)

@@ -1,0 +1,70 @@
+"""What a robot notices of its peers and of itself, for ``failover why``: who fell silent, who is heard again, an own stall.
+
+Nothing is decided here: `membership` judges, this only tells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from failover.core.component import Turn
+from failover.core.events import Event, Received
+from failover.core.types import MS
+
+TOLD_SHARE = 2
+"""An own stall is told from this part of the loyalty on: shorter ones come and go."""
+
+
+@dataclass(slots=True)
+class Watch:
+    """What was noticed so far.
+
+    Attributes:
+        late_ns: the most that our loop was late within the last loyalty.
+    """
+
+    late_ns: int = 0
+    _late_at_ns: int = 0
+    _stalled_ns: int = 0
+    _dead: set[str] = field(default_factory=set)
+
+    def late(self, late_ns: int, loyalty_ns: int, now_ns: int) -> None:
+        """A step came ``late_ns`` after the instant that was asked for (below 0: before it)."""
+        if late_ns >= self.late_ns or now_ns - self._late_at_ns > loyalty_ns:
+            self.late_ns, self._late_at_ns = max(late_ns, 0), now_ns
+        self._stalled_ns = late_ns if late_ns * TOLD_SHARE >= loyalty_ns else 0
+
+    def look(self, turn: Turn, event: Event) -> None:
+        """Tell of what is new. Called in each step after lateness was forgiven, and before the event is taken in."""
+        if self._stalled_ns:
+            late_ms = self._stalled_ns // MS
+            turn.say_of_robot(f"{turn.me} itself stood still for {late_ms} ms; that is not counted as its peers' silence")
+        for robot in turn.team.peers:
+            if turn.dead(robot) and robot not in self._dead:
+                self._dead.add(robot)
+                turn.say_of_robot(_farewell(turn, robot))
+        if isinstance(event, Received) and event.beat.sender in turn.team.peers:
+            self._greet(turn, event)
+
+    def _greet(self, turn: Turn, event: Received) -> None:
+        beat = event.beat
+        peer = turn.team.peers[beat.sender]
+        over = f" over {event.link}" if event.link else ""
+        if peer.boot and beat.boot > peer.boot:
+            turn.say_of_robot(f"the agent of {beat.sender} has started anew, life {beat.boot}")
+        elif not peer.boot:
+            turn.say_of_robot(f"{beat.sender} is heard{over}, life {beat.boot}")
+        elif beat.sender in self._dead and beat.boot == peer.boot:
+            silent_ms = (turn.now_ns - peer.heard_ns) // MS
+            turn.say_of_robot(f"{beat.sender} is heard again{over} after {silent_ms} ms of silence")
+        if beat.boot >= peer.boot:
+            self._dead.discard(beat.sender)
+
+
+def _farewell(turn: Turn, robot: str) -> str:
+    peer = turn.team.peers[robot]
+    limit_ms = (turn.team.loyal_until_ns(robot) - peer.heard_ns) // MS
+    if not peer.boot:
+        return f"{robot} has not been heard in the {limit_ms} ms since this agent started: it counts as dead"
+    links = ", ".join(link for link in sorted(peer.links) if link)
+    return f"{robot} was silent for {limit_ms} ms on every link{f' ({links})' if links else ''}: it counts as dead"
