@@ -199,7 +199,9 @@ def _open_guarded(name: str, state: KeptState, guard: Guarded, begin: Callable[[
     decoded = state.decode({region.name: bytes(kept.region(index)) for index, region in enumerate(kept.layout.regions)})
     epoch = guard.handed.begin.epoch
     resumed = Resumed(origin.robot, epoch, origin.generation, origin.why, origin.age_ns / 1e9, decoded.notes)
-    return Task(name, state, guard, decoded.value, resumed)
+    task = Task(name, state, guard, decoded.value, resumed)
+    task.commit()  # a standby gets it now, not at the end of the first step: until then nobody else may hold it
+    return task
 
 
 def _close_in_children(file: StateFile) -> None:
