@@ -75,7 +75,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return f"{what}, a view of this machine's kernel: let the program close it after reading"
     if first.target.startswith("/secretmem"):
         return f"{what}: secret memory cannot be read, that is its purpose; run the program without it"
-    if not (_was_found(held) if is_deleted(first) else _is_found(held)):
+    if not (_was_found(held) if is_deleted(first) else _is_found(held) or _has_just_lost_its_name(held)):
         return f"{what}, which no path leads to from here (a message queue, for one): that is not kept; run without it"
     return _refuse_deleted(held) if is_deleted(first) else None
 
@@ -109,6 +109,14 @@ def _is_found(held: OpenFile) -> bool:
     except OSError:
         return False
     return (about.st_dev, about.st_ino) == (held.first.device, held.first.inode)
+
+
+def _has_just_lost_its_name(held: OpenFile) -> bool:
+    """Whether it was deleted since we looked, by a program that runs meanwhile: the next look finds it deleted."""
+    try:
+        return os.readlink(f"/proc/{held.pid}/fd/{held.first.number}") == held.first.target + procfs.DELETED
+    except OSError:
+        return False
 
 
 def _was_found(held: OpenFile) -> bool:
