@@ -28,7 +28,7 @@ from agent.deposit import Deposit
 from agent.dispatch import Dispatch
 from agent.door import Ask, Farewell, HearKey, Inventory, Life, Order, SpeakKey, ToLanes, Told
 from agent.errands import Errands
-from agent.errors import AgentError, GuardLostError
+from agent.errors import AgentError, GuardLostError, LaneError
 from agent.journal import set_up_log
 from agent.links import Facts, Links
 from agent.nursery import Nursery
@@ -302,6 +302,7 @@ class Lanes:
         """A connection stands: introduce ourselves. It is gone: so is every transfer on it, and every word that took it."""
         lane = "bulk lane" if way == BULK else f"lane {way}"
         log.info("%s to %s: %s%s", lane, peer, state, f": {reason}" if reason else "")
+        had_words = self._ways.carried_words(way, peer, state)
         if state is LinkState.CONNECTED:
             key, config = self._ways.beat_key(peer), self.settings.config
             self._ways.answer(way, peer, Hello(VERSION, self.settings.team.team, config.robot, self._life.boot, key))
@@ -309,14 +310,18 @@ class Lanes:
             return
         if way == BULK:
             self._shipper.lost(peer)
-        if not self._ways.has_better(way, peer):
+        if had_words:
             self.errands.lost(peer)
 
     async def _links_changed(self, sentences: list[str]) -> None:
         for sentence in sentences:
             log.info("%s", sentence)
             self.tell(events.Noticed("", sentence))
-        await self._lane.hold_to_devices()
+        try:
+            await self._lane.hold_to_devices()
+        except LaneError as error:
+            log.critical("%s; the lanes begin anew", error)
+            self._end.set()
 
     def hindrance(self, peer: str) -> str:
         """Why nothing can be said to a peer now; "" when it can."""
@@ -339,6 +344,8 @@ class Lanes:
 
     def _hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
         match message:
+            case Offer() if hindrance := self._links.hindrance():
+                self._lane.say(peer, Refuse(message.transfer, f"snapshots wait: at {self.settings.config.robot} {hindrance}"))
             case Offer():
                 self._receiver.offered(peer, message)
             case Chunk():

@@ -177,6 +177,8 @@ class Node:
     def _hear(self, event: Received, turn: Turn) -> list[Component]:
         beat = event.beat
         news = self._team.hear(beat, event.link, turn.now_ns)
+        if beat.sender in self._team.peers:
+            self._team.peers[beat.sender].carried(event.copies)
         touched = {name: component for name, component in self._components.items() if component.holding}
         for entry in news:
             component = self._known(entry.name)
