@@ -53,6 +53,7 @@ class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
     wait: bool = True
     user: str = ""
     engine: Literal["auto", "ptrace", "cooperative"] = "auto"
+    output: Literal["immediate", "committed"] = "immediate"
 
 
 class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):

@@ -42,6 +42,7 @@ class Program:
     isolate: bool = True
     inheritance: Inheritance | None = None
     engine: str = PTRACE
+    holds_output: bool = False
 
 
 async def start(name: str, program: Program, places: Places, epoch: int = 0) -> Component:
@@ -59,6 +60,7 @@ async def start(name: str, program: Program, places: Places, epoch: int = 0) -> 
     component = Component(name, guard, places)
     component.engine_wanted = program.engine
     task = guard_messages.Task(epoch, engine=program.engine) if program.engine != PTRACE else None
+    component.logs.hold(program.holds_output)
     return await _born(component, _starting(name, program, places, task))
 
 

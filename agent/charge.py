@@ -39,7 +39,7 @@ from checkpoint.store import Store
 from failover.core import acts, events
 from failover.core.acts import Act
 from failover.core.events import Event
-from failover.core.types import Launch
+from failover.core.types import COMMITTED, Launch
 
 KILLED: Final = 9
 """The wait status of a program whose guard was lost: as of one that was killed."""
@@ -207,6 +207,8 @@ class Charge:
         """Say what went wrong, to the log and to the core where it waits for it."""
         message = str(trouble) or type(trouble).__name__
         reasons = tuple(getattr(trouble, "reasons", ())) or (message,)
+        if isinstance(act, acts.Capture) and self.component is not None and self.component.engine == COOPERATIVE:
+            self.component.limit_output(False)  # perhaps it is its output that keeps it from its next commit
         if isinstance(trouble, NothingCommittedError) and isinstance(act, acts.Capture):
             self.figures.reasons = ()
             self.around.tell(events.NothingToCapture(self.name, act.epoch, message))
@@ -515,4 +517,5 @@ def program_of(launch: Launch) -> Program:
         launch.isolate,
         msgspec.msgpack.decode(launch.inheritance, type=Inheritance) if launch.inheritance else None,
         launch.engine,
+        launch.output == COMMITTED,
     )

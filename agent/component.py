@@ -32,6 +32,7 @@ from agent.following import Following
 from agent.guard_messages import Described, Exited, Refused, Started, TaskConnected, TaskKeeps, VesselReady
 from agent.nursery import GuardLink
 from agent.places import Places, log_directory
+from agent.pump import HOLD_LIMIT
 from agent.streams import STREAMS, OutputLogs
 from checkpoint import channel
 from checkpoint.channel import close_all
@@ -137,6 +138,7 @@ class Component:
         self.prepared: Prepared | None = None
         self._lease_until_ns = 0
         self._held = False
+        self._output_limited: bool | None = None
         guard.dialogue.heard = self._heard
         guard.dialogue.ended = self._guard_lost
 
@@ -285,10 +287,21 @@ class Component:
         """
         totals = self._totals.pop(position, None)
         if totals is not None:
-            self.logs.commit(totals)
+            self.logs.commit(totals, is_safe=is_safe)
+        self.limit_output(self.engine == PTRACE or not is_safe)
         self.keeper.tell(channel.Acknowledge(position))
         if (commit := self._commits.pop(position, 0)) and is_safe:
             self._guard.dialogue.tell(guard_messages.CommitSafe(commit))
+
+    def limit_output(self, limited: bool) -> None:
+        """Bound how much of held output may wait, or do not.
+
+        A program that keeps its state makes no checkpoint while it waits in a write: it is bounded only while nobody stands by,
+        for then its checkpoints would not help.
+        """
+        if self.logs.is_held and limited != self._output_limited and self._guard.dialogue.open:
+            self._output_limited = limited
+            self._guard.dialogue.tell(guard_messages.LimitOutput(HOLD_LIMIT if limited else 0))
 
     @contextlib.asynccontextmanager
     async def _standing_still(self, wanted: bool) -> AsyncIterator[None]:
@@ -385,6 +398,7 @@ class Component:
         """Note what the guard said of it."""
         self.pid, self.inner_pid, self.isolated, self.notes = born.pid, born.inner_pid, born.isolated, born.notes
         self.streams = streams
+        self.limit_output(self.engine == PTRACE)
         if isinstance(born, Described):
             self.engine_wanted, self.task_pid, self.keeps = born.engine, born.task_pid, born.keeps
 

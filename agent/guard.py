@@ -44,6 +44,7 @@ from agent.guard_messages import (
     Kill,
     Lease,
     LetGo,
+    LimitOutput,
     MakeVessel,
     Refused,
     Request,
@@ -93,6 +94,7 @@ class Guard:
             Freeze: lambda request, _: self._act(lambda ward: ward.freeze(exposed=request.exposed)),
             Thaw: lambda _, __: self._act(lambda ward: ward.thaw()),
             CommitSafe: self._commit_safe,
+            LimitOutput: self._limit_output,
             Kill: lambda request, _: self._act(lambda ward: ward.kill(request.signal)),
             Describe: lambda _, __: self._reply(self._description(), self._ward.descriptors() if self._ward is not None else ()),
             LetGo: self._let_go,
@@ -248,6 +250,10 @@ class Guard:
     def _commit_safe(self, request: CommitSafe, _: tuple[int, ...]) -> None:
         if self._ward is not None and self._ward.task is not None and self._ward.exited is None:
             self._ward.task.tell_safe(request.commit)
+
+    def _limit_output(self, request: LimitOutput, _: tuple[int, ...]) -> None:
+        if self._ward is not None and self._ward.pump is not None:
+            self._ward.pump.limit(request.hold_limit)
 
     def _lease(self, request: Lease, _: tuple[int, ...]) -> None:
         self._guarded().set_lease(request.until_ns)

@@ -132,6 +132,12 @@ class CommitSafe(Message, frozen=True):
     commit: int
 
 
+class LimitOutput(Message, frozen=True):
+    """Let so many bytes of each stream wait to be safe at another robot, then have the program wait; 0: any number. No answer."""
+
+    hold_limit: int
+
+
 class Kill(Message, frozen=True):
     """Send the program a signal; SIGKILL goes to whatever else it started, too."""
 
@@ -246,6 +252,21 @@ class TaskKeeps(Message, frozen=True):
     pid: int
 
 
-Request = Start | BeginTask | MakeVessel | Watch | Commit | Lease | Freeze | Thaw | CommitSafe | Kill | Describe | LetGo | Forget
+Request = (
+    Start
+    | BeginTask
+    | MakeVessel
+    | Watch
+    | Commit
+    | Lease
+    | Freeze
+    | Thaw
+    | CommitSafe
+    | LimitOutput
+    | Kill
+    | Describe
+    | LetGo
+    | Forget
+)
 Reply = Started | VesselReady | Watching | Done | Described | Refused
 Event = Exited | FrozenByLease | TaskConnected | TaskKeeps

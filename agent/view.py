@@ -12,9 +12,10 @@ from agent.charge import Charge
 from agent.config import Settings
 from agent.door import Life, Told
 from agent.figures import Commits, Figures
+from agent.pump import HOLD_LIMIT
 from agent.transport import Link, LinkState
 from checkpoint.engine import COOPERATIVE, PTRACE
-from failover.core.types import ComponentView, PeerView, Protection, State
+from failover.core.types import COMMITTED, IMMEDIATE, ComponentView, PeerView, Protection, State
 
 NANOSECONDS_A_MILLISECOND: Final = 1_000_000
 
@@ -104,11 +105,23 @@ def _peer(peer: PeerView, link: Link | None, told: Told) -> dict[str, Any]:
     }
 
 
+def _waiting_output(view: ComponentView, waiting: int) -> tuple[str, ...]:
+    """What becomes of held output while no checkpoint of it reaches another robot."""
+    if not waiting or view.protection is Protection.PROTECTED:
+        return ()
+    limit = f"at {HOLD_LIMIT >> 20} MiB of a stream the program waits in its next write"
+    return (
+        f"{waiting} bytes of its output are held back (--output=committed): no other robot holds a checkpoint of them; {limit}",
+    )
+
+
 def _component(view: ComponentView, charge: Charge | None, settings: Settings) -> dict[str, Any]:
     figures = charge.figures if charge is not None else None
     running = charge.component if charge is not None else None
     newest = view.positions[0] if view.positions else None
     engine = running.engine if running is not None else figures.engine if figures is not None else PTRACE
+    held = running is not None and running.logs.is_held
+    waiting = running.logs.waiting() if running is not None and held else 0
     degraded = view.protection in (Protection.DEGRADED, Protection.STOPPED) and view.state is State.PRIMARY
     return {
         "name": view.name,
@@ -143,8 +156,15 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings) -
         "home": view.home,
         "prefer": view.prefer,
         "owner": view.owner,
+        "output": COMMITTED if held else IMMEDIATE,
+        "output_waiting": waiting,
         "reasons": list(figures.reasons) if figures else [],
-        "notes": [*view.notes, *(figures.notes if figures else ()), *_overdue(view, figures)],
+        "notes": [
+            *view.notes,
+            *(figures.notes if figures else ()),
+            *_overdue(view, figures),
+            *_waiting_output(view, waiting),
+        ],
     }
 
 

@@ -347,6 +347,10 @@ VERBS: Final = (
         While it waits, the agent may be restarted and the program may go to another robot and end there: it goes on waiting, and
         shows each byte once. An agent that does not come back within half a minute is status 3; the program runs on.
 
+        A takeover goes on from the newest checkpoint: what was written after it is written again, and may differ from what you
+        saw. With --output=committed nothing is shown before another robot holds it, here and by failover logs. While nobody
+        stands by it waits, and failover status says so; when 8 MiB of a stream wait, the program waits in its next write.
+
         It runs as you, with your groups, limits, priorities, environment, directory and umask, as if your shell had started it.
         Besides root only you may read its output, stop, release or move it, on any robot that knows you by the same number.
 
