@@ -319,7 +319,7 @@ class Component:
     # --- holding still ---
 
     async def lease(self, until_ns: int) -> None:
-        """The program may run until CLOCK_MONOTONIC passes ``until_ns``; renew in time. 0 for ever. Thaws what a lease froze."""
+        """The program may run until CLOCK_BOOTTIME passes ``until_ns``; renew in time. 0 for ever. Thaws what a lease froze."""
         self._lease_until_ns = until_ns
         if self.prepared is None:  # else it is given with the start
             await self.ask_guard(guard_messages.Lease(until_ns))

@@ -107,7 +107,7 @@ class Commit(Message, frozen=True):
 
 
 class Lease(Message, frozen=True):
-    """Freeze the component by yourself when CLOCK_MONOTONIC passes ``until_ns``; 0 for no lease. A later one thaws it again."""
+    """Freeze the component by yourself when CLOCK_BOOTTIME passes ``until_ns``; 0 for no lease. A later one thaws it again."""
 
     until_ns: int
 
