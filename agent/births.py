@@ -19,6 +19,7 @@ from agent.caller import ROOT
 from agent.clock import Laps
 from agent.component import Component, Prepared
 from agent.errors import GuardError, GuardLostError, KeeperLostError
+from agent.guest import Guest
 from agent.nursery import KeeperLink, connect
 from agent.places import Places, complete_logs, log_directory
 from agent.streams import discard, total_of
@@ -90,7 +91,10 @@ async def watch(name: str, pid: int, places: Places) -> Component:
     """
     component = Component(name, await places.nursery.guard(), places)
     component.pid = component.inner_pid = pid
-    return await _born(component, guard_messages.Watch(name, pid))
+    born = await _born(component, guard_messages.Watch(name, pid))
+    with contextlib.suppress(ProcessLookupError):  # it has just ended: its guard says so
+        born.guest = Guest(name, pid)
+    return born
 
 
 async def restore(
@@ -238,6 +242,9 @@ async def reconnect(socket_path: Path, places: Places) -> Component:
         raise GuardLostError(f"the guard of {socket_path.name} guards nothing; it ends")
     component = Component(described.component, guard, places)
     component.take(described, streams)
+    if described.watched and described.state != "ended":
+        with contextlib.suppress(ProcessLookupError):
+            component.guest = Guest(described.component, described.pid)
     if described.state == "ended" and not component.ended.done():
         component.ended.set_result(described.exit_status)
     return component

@@ -30,6 +30,7 @@ from agent import guard_messages
 from agent.errors import GuardError, GuardLostError, KeeperLostError
 from agent.following import Following
 from agent.guard_messages import Described, Exited, Refused, Started, TaskConnected, TaskKeeps, VesselReady
+from agent.guest import Guest
 from agent.nursery import GuardLink
 from agent.places import Places, log_directory
 from agent.pump import HOLD_LIMIT
@@ -105,6 +106,7 @@ class Component:
     Attributes:
         name, pid, inner_pid, isolated: as the guard said.
         logs: its output; `OutputLogs.read` serves ``failover logs``.
+        guest: where it is somebody else's child.
         engine_wanted: as it was asked for: `AUTO`, `PTRACE` or `COOPERATIVE`.
         task_pid: of the process that keeps its state, 0 before it has said so (``connected``); keeps: it has made a commit.
         committed: called at its first commit to each segment.
@@ -139,6 +141,7 @@ class Component:
         self._lease_until_ns = 0
         self._held = False
         self._output_limited: bool | None = None
+        self.guest: Guest | None = None
         guard.dialogue.heard = self._heard
         guard.dialogue.ended = self._guard_lost
 
@@ -372,6 +375,7 @@ class Component:
         """End protection; the program runs on, its guard keeps its streams until it ends."""
         with contextlib.suppress(CheckpointError, KeeperLostError):
             await self.keeper.let_loose()
+        self._forget_guest()  # its guard may be gone as soon as it has answered
         await self.ask_guard(guard_messages.LetGo())
         self.close()
 
@@ -391,6 +395,7 @@ class Component:
             self.prepared = None
         close_all(self.streams)
         self.streams = ()
+        self._forget_guest()
 
     # --- guard and keeper ---
 
@@ -443,6 +448,13 @@ class Component:
         return isinstance(message, guard_messages.FrozenByLease)
 
     def _guard_lost(self) -> None:
+        if self.guest is not None:
+            self.guest.end()
         if not self.ended.done():
             self.ended.set_exception(GuardLostError(f"the guard of {self.name} ended, and its program with it"))
             self.ended.exception()  # noted: after a release nobody waits for the end
+
+    def _forget_guest(self) -> None:
+        if self.guest is not None:
+            self.guest.close()
+            self.guest = None

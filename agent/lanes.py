@@ -26,7 +26,7 @@ from agent.config import Settings
 from agent.control import ControlServer
 from agent.deposit import Deposit
 from agent.dispatch import Dispatch
-from agent.door import Ask, Farewell, HearKey, Inventory, Life, Order, SpeakKey, ToLanes, Told
+from agent.door import Alive, Ask, Farewell, HearKey, Inventory, Life, Order, SpeakKey, ToLanes, Told
 from agent.errands import Errands
 from agent.errors import AgentError, GuardLostError
 from agent.journal import set_up_log
@@ -66,6 +66,9 @@ from failover.core.messages import (
 )
 from failover.core.types import HISTORY_MAX, Found, Held
 from failover.core.wire import KEY_SIZE_MIN
+
+ALIVE_S: Final = 0.5
+"""Between two signs of life to the heart."""
 
 BYTES_A_MEGABIT: Final = 125_000
 ANSWER_PATIENCE_S: Final = 60.0
@@ -128,6 +131,7 @@ class Lanes:
         self._prepare_directories()
         loop.add_reader(self._heart.fileno(), self._listen_to_heart)
         speaking = asyncio.create_task(self._speak_to_heart())
+        living = asyncio.create_task(self._show_life())
         self._life = await self._begun
         store = await self._open_store()
         records = Records(self._runtime / "running")
@@ -156,6 +160,7 @@ class Lanes:
             await self._ways.close()
             await self._nursery.close()
             speaking.cancel()
+            living.cancel()
             store.close()
 
     async def _open_store(self) -> Store:
@@ -212,6 +217,11 @@ class Lanes:
 
     def _say(self, message: door.ToHeart) -> None:
         self._outgoing.put_nowait(message)
+
+    async def _show_life(self) -> None:
+        while True:
+            self._say(Alive())
+            await asyncio.sleep(ALIVE_S)
 
     async def _speak_to_heart(self) -> None:
         loop = asyncio.get_running_loop()

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from importlib import metadata
 from typing import Any, Final
 
-from agent import clock
+from agent import clock, fence
 from agent.charge import Charge
 from agent.config import Settings
 from agent.door import Life, Told
@@ -72,6 +72,7 @@ def team_view(
         "realtime": not life.notes,
         "rule": view.rule if view else None,
         "promise": view.promise if view else "not decided yet: the agent is starting",
+        "fencing": fence.sentence(fence.watchdog()),
         "healthy": view.healthy if view else False,
         "notes": notes,
         "links": interfaces,

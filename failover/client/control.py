@@ -46,6 +46,7 @@ robot, team, role, pid, lanes_pid, version: of this agent; life: count of its st
 insecure: links are neither authenticated nor encrypted
 realtime: the heart runs at real-time priority with its memory locked
 rule, promise: by which rule the team decides, and one sentence: what holds if this robot dies now
+fencing: one sentence: what freezes a program that may not act, and what this robot does not have for the worst case
 healthy: nothing is degraded, nothing has failed, nobody is silent, as far as this robot knows
 notes: [sentence, …]: what is missing or degraded on this robot
 beats: {sent, heard, unsent, refused, late_us_max, gap_us_max, gaps}: of this life; refused: {reason: count}
