@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from agent.guest import Guest
 from agent.nursery import KeeperLink, connect
 from agent.places import Places, complete_logs, log_directory
 from agent.streams import discard, total_of
-from checkpoint import channel, format
+from checkpoint import channel, epoch_variable, format
 from checkpoint.engine import COOPERATIVE, PTRACE
 from checkpoint.engines.cooperative import age_ns as commit_age_ns
 from checkpoint.errors import CheckpointError, MismatchError
@@ -62,7 +62,13 @@ async def start(name: str, program: Program, places: Places, epoch: int = 0) -> 
     component.engine_wanted = program.engine
     task = guard_messages.Task(epoch, engine=program.engine) if program.engine != PTRACE else None
     component.logs.hold(program.holds_output)
-    return await _born(component, _starting(name, program, places, task))
+    return await _born(component, _starting(name, under_epoch(program, epoch), places, task))
+
+
+def under_epoch(program: Program, epoch: int) -> Program:
+    """The program with the fencing token in its environment; 0 while it waits for one."""
+    others = tuple(one for one in program.environment if not one.startswith(epoch_variable.VARIABLE.encode() + b"="))
+    return replace(program, environment=(*others, epoch_variable.assignment(epoch)))
 
 
 def _starting(
@@ -106,6 +112,7 @@ async def restore(
     owner: int | None = None,
     laps: Laps | None = None,
     task: guard_messages.Task | None = None,
+    epoch: int = 0,
 ) -> Component:
     """Rebuild a component from a chain (descriptors of encoded snapshots, oldest first), stopped, committed to nothing.
 
@@ -146,7 +153,9 @@ async def restore(
         laps.lap("guard and keeper")
         await _vessel(component, request, keeper)
         laps.lap("vessel")
-        order = channel.Restore(component.pid, name, outage_ns, streams=True, robot=places.robot, own_eyes=owner != ROOT)
+        order = channel.Restore(
+            component.pid, name, outage_ns, streams=True, robot=places.robot, own_eyes=owner != ROOT, epoch=epoch
+        )
         restored, _ = await component.keeper.ask(order, (*chain, *component.streams))
         laps.lap("restore")
     except (CheckpointError, GuardError, KeeperLostError):
@@ -197,7 +206,7 @@ async def begin_again(
     if waiting is not None:
         component.prepared = Prepared(guard_messages.BeginTask(epoch, origin, totals), segment, age_ns)
     else:
-        start = _starting(name, program, places, guard_messages.Task(epoch, origin), totals)
+        start = _starting(name, under_epoch(program, epoch), places, guard_messages.Task(epoch, origin), totals)
         component.prepared = Prepared(start, segment, age_ns)
     return component
 
@@ -212,7 +221,7 @@ async def start_to_wait(name: str, program: Program, places: Places, owner: int)
     _check_owner(name, program, owner)
     component = Component(name, await places.nursery.guard(), places)
     component.engine_wanted = COOPERATIVE
-    return await _born(component, _starting(name, program, places, guard_messages.Task(warm=True)))
+    return await _born(component, _starting(name, under_epoch(program, 0), places, guard_messages.Task(warm=True)))
 
 
 def _check_owner(name: str, program: Program, owner: int) -> None:

@@ -340,7 +340,9 @@ class Charge:
                 await waiting.undo()
             owner = spec.owner if spec is not None else None
             task = Task(act.epoch, engine=AUTO) if spec is not None and spec.launch.engine == AUTO else None
-            return await births.restore(self.name, chain, places, outage_ns=outage_ns, owner=owner, laps=laps, task=task)
+            return await births.restore(
+                self.name, chain, places, outage_ns=outage_ns, owner=owner, laps=laps, task=task, epoch=act.epoch
+            )
         if spec is None:
             raise RestoreError(f"cannot start {self.name} again: this robot was never told its command; start it by failover run")
         program = program_of(started_here(spec.launch, self.around.here(self.name)))

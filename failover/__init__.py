@@ -24,7 +24,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from failover.client.control import Control
-    from failover.client.task import Resumed, activations, commit, epoch, resume, resumed, transaction, wait_committed
+    from failover.client.epoch import epoch
+    from failover.client.task import Resumed, activations, commit, resume, resumed, transaction, wait_committed
     from failover.client.task_component import component, kept, run
     from failover.client.task_loop import FINISHED, every
     from failover.client.task_resumable import resumable
@@ -45,7 +46,7 @@ _HOMES = {
     "Resumed": "failover.client.task",
     "activations": "failover.client.task",
     "commit": "failover.client.task",
-    "epoch": "failover.client.task",
+    "epoch": "failover.client.epoch",
     "resume": "failover.client.task",
     "resumed": "failover.client.task",
     "transaction": "failover.client.task",
