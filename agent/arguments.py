@@ -54,6 +54,7 @@ class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
     user: str = ""
     engine: Literal["auto", "ptrace", "cooperative"] = "auto"
     output: Literal["immediate", "committed"] = "immediate"
+    on_resume: list[Text] = []
 
 
 class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):

@@ -199,7 +199,7 @@ async def begin_again(
     except (CheckpointError, GuardError, KeeperLostError):
         await component.undo()
         raise
-    why = RESTARTED if outline.machine.robot == places.robot else HANDED_OVER if is_planned else TAKEN_OVER
+    why = why_here(outline.machine.robot, places, is_planned=is_planned)
     age_ns = outage_ns + commit_age_ns(outline)
     origin = Origin(outline.machine.robot, filled.position.generation, why, age_ns)
     totals = total_of(outline.output)
@@ -230,6 +230,11 @@ def _check_owner(name: str, program: Program, owner: int) -> None:
     if owner not in (ROOT, inherited):
         reason = f"it is to run as uid {inherited}, which is not its owner, uid {owner}; start it as that user"
         raise MismatchError(f"cannot restore {name}: {reason}", (reason,))
+
+
+def why_here(source: str, places: Places, *, is_planned: bool) -> str:
+    """Why a component goes on at this robot whose checkpoint was made at ``source``."""
+    return RESTARTED if source == places.robot else HANDED_OVER if is_planned else TAKEN_OVER
 
 
 async def reconnect(socket_path: Path, places: Places) -> Component:

@@ -29,6 +29,7 @@ from agent.dispatch import Dispatch
 from agent.door import Alive, Ask, Farewell, HearKey, Inventory, Life, Order, SpeakKey, ToLanes, Told
 from agent.errands import Errands
 from agent.errors import AgentError, GuardLostError
+from agent.hooks import Hooks
 from agent.journal import set_up_log
 from agent.links import Facts, Links
 from agent.nursery import Nursery
@@ -94,7 +95,8 @@ class Lanes:
         self._runtime = runtime
         self._store_path = state / "store"
         sockets = runtime / "guards"
-        self._nursery = Nursery(sockets, starter())
+        self._starter = starter()
+        self._nursery = Nursery(sockets, self._starter)
         self.places = Places(sockets, state / "logs", self._nursery, robot=config.robot)
         self._heart = heart
         self._outgoing: asyncio.Queue[door.ToHeart] = asyncio.Queue()
@@ -135,12 +137,12 @@ class Lanes:
         self._life = await self._begun
         store = await self._open_store()
         records = Records(self._runtime / "running")
-        around = Surroundings(self.places, store, records, self.tell, self._silence_ns, self.settings.component)
-        self._around = around
+        hooks, here = Hooks(self._starter), self.settings.component
+        self._around = Surroundings(self.places, store, records, self.tell, self._silence_ns, here, hooks)
         self._deposit = Deposit(store, self.places, self.tell, self._stored)
         self._dispatch = Dispatch(store, self._shipper, self.tell, self._links.hindrance)
         self._receiver = Receiver(self._lane, self._store_path, self._deposit)
-        found = await self._find_guards(around.records)
+        found = await self._find_guards(records)
         await self._mend_logs(found)
         self._nursery.prepare()
         self._say(Inventory(_held(store), found))

@@ -193,6 +193,7 @@ class Verbs:
             inheritance=msgspec.msgpack.encode(inheritance),
             engine=wanted.engine,
             output=wanted.output,
+            on_resume=tuple(wanted.on_resume),
         )
         charge = await self._begin(name, launch, inheritance.uid)
         started: dict[str, Any] = {"name": name, "notes": list(charge.figures.notes), "reasons": list(charge.figures.reasons)}

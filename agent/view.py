@@ -106,6 +106,13 @@ def _peer(peer: PeerView, link: Link | None, told: Told) -> dict[str, Any]:
     }
 
 
+def _own_notes(view: ComponentView, figures: Figures | None) -> tuple[str, ...]:
+    """What this robot's own work on it found out."""
+    if figures is None:
+        return ()
+    return (*figures.notes, *_overdue(view, figures), *((figures.hook,) if figures.hook else ()))
+
+
 def _waiting_output(view: ComponentView, waiting: int) -> tuple[str, ...]:
     """What becomes of held output while no checkpoint of it reaches another robot."""
     if not waiting or view.protection is Protection.PROTECTED:
@@ -160,12 +167,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings) -
         "output": COMMITTED if held else IMMEDIATE,
         "output_waiting": waiting,
         "reasons": list(figures.reasons) if figures else [],
-        "notes": [
-            *view.notes,
-            *(figures.notes if figures else ()),
-            *_overdue(view, figures),
-            *_waiting_output(view, waiting),
-        ],
+        "notes": [*view.notes, *_own_notes(view, figures), *_waiting_output(view, waiting)],
     }
 
 

@@ -7,6 +7,7 @@ Only this file knows argparse. A verb is a row of the table at the bottom; the f
 from __future__ import annotations
 
 import argparse
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from textwrap import dedent
@@ -149,6 +150,20 @@ def _run(room: argparse.ArgumentParser) -> None:
         default="auto",
         help="ptrace: captured from outside, for a program that nobody prepared; cooperative: the program says by itself what "
         "must survive (failover.resume, failover.component), and is started again from that (default: auto, as it turns out)",
+    )
+    room.add_argument(
+        "--output",
+        choices=("immediate", "committed"),
+        default="immediate",
+        help="committed: show output once another robot holds a checkpoint that contains it, so that no takeover takes back or "
+        "repeats what was seen (default: immediate, as it is written)",
+    )
+    room.add_argument(
+        "--on-resume",
+        metavar="CMD",
+        type=shlex.split,
+        default=[],
+        help="run this, as you, on a robot where it went on; told which robot, epoch and why in FAILOVER_* variables",
     )
     room.add_argument("--user", metavar="USER", help="run it as this user, by name or number (only root may; default: as you)")
     room.add_argument("command", metavar="CMD", nargs="+", help="the program and its arguments, after --")

@@ -13,7 +13,8 @@ verb           arguments                                                result, 
 ``status``     ``watch`` false, ``every_ms`` 500, ``team`` false        see `STATUS`; with ``watch`` each picture is an Update
 ``run``        ``argv`` *must*, ``name`` = argv[0]'s, ``env``, ``cwd``,  Update ``{"started": {name, pid, inner_pid, isolated,
                ``umask`` 18, ``isolate`` true, ``wait`` true,           notes}}``; with ``wait`` Output … and Result
-               ``user`` "", ``engine`` "auto", ``output`` "immediate"   ``{name, exit_status}`` (a wait status); else at once
+               ``user`` "", ``engine`` "auto", ``output`` "immediate",  ``{name, exit_status}`` (a wait status); else at once
+               ``on_resume`` []
 ``protect``    ``pid`` *must*, ``name`` *must*                          ``{name, pid, notes}``
 ``release``    ``name`` *must*                                          ``{name, pid}``; the program runs on, unprotected
 ``stop``       ``name`` *must*, ``signal`` 15                           ``{name, exit_status}`` once it has ended

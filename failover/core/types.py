@@ -104,6 +104,7 @@ class Launch:
         environment: (name, value) pairs.
         pid: of a running program to protect (``failover protect``), 0 otherwise; means something on its home robot only.
         isolate: PID and time namespaces of its own.
+        on_resume: command that is run, as the program's user, after it went on somewhere; () for none.
         output: `IMMEDIATE` or `COMMITTED`: when what it writes is shown.
         inheritance: whose rights, limits and priorities it gets, packed (`checkpoint.linux.inheritance`); b"": the agent's own.
     """
@@ -118,6 +119,7 @@ class Launch:
     terminal: bool = False
     inheritance: bytes = b""
     output: str = IMMEDIATE
+    on_resume: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
