@@ -91,7 +91,7 @@ class Node:
         self._configure(held)
 
     def step(self, event: Event, now_ns: int) -> Ready:
-        """Take in one event at ``now_ns`` (this machine's monotonic clock) and say what must be done about it."""
+        """Take in one event at ``now_ns`` (our own clock, which counts sleep) and say what must be done about it."""
         self._now_ns = now_ns = max(now_ns, self._now_ns)
         late_ns = now_ns - self._asked_ns
         if late_ns > LATE_NS:
