@@ -53,6 +53,8 @@ class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
     wait: bool = True
     user: str = ""
     engine: Literal["auto", "ptrace", "cooperative"] = "auto"
+    output: Literal["immediate", "committed"] = "immediate"
+    on_resume: list[Text] = []
 
 
 class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):

@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,11 @@ from agent.caller import ROOT
 from agent.clock import Laps
 from agent.component import Component, Prepared
 from agent.errors import GuardError, GuardLostError, KeeperLostError
+from agent.guest import Guest
 from agent.nursery import KeeperLink, connect
 from agent.places import Places, complete_logs, log_directory
 from agent.streams import discard, total_of
-from checkpoint import channel, format
+from checkpoint import channel, epoch_variable, format
 from checkpoint.engine import COOPERATIVE, PTRACE
 from checkpoint.engines.cooperative import age_ns as commit_age_ns
 from checkpoint.errors import CheckpointError, MismatchError
@@ -42,6 +43,7 @@ class Program:
     isolate: bool = True
     inheritance: Inheritance | None = None
     engine: str = PTRACE
+    holds_output: bool = False
 
 
 async def start(name: str, program: Program, places: Places, epoch: int = 0) -> Component:
@@ -59,7 +61,14 @@ async def start(name: str, program: Program, places: Places, epoch: int = 0) -> 
     component = Component(name, guard, places)
     component.engine_wanted = program.engine
     task = guard_messages.Task(epoch, engine=program.engine) if program.engine != PTRACE else None
-    return await _born(component, _starting(name, program, places, task))
+    component.logs.hold(program.holds_output)
+    return await _born(component, _starting(name, under_epoch(program, epoch), places, task))
+
+
+def under_epoch(program: Program, epoch: int) -> Program:
+    """The program with the fencing token in its environment; 0 while it waits for one."""
+    others = tuple(one for one in program.environment if not one.startswith(epoch_variable.VARIABLE.encode() + b"="))
+    return replace(program, environment=(*others, epoch_variable.assignment(epoch)))
 
 
 def _starting(
@@ -88,7 +97,10 @@ async def watch(name: str, pid: int, places: Places) -> Component:
     """
     component = Component(name, await places.nursery.guard(), places)
     component.pid = component.inner_pid = pid
-    return await _born(component, guard_messages.Watch(name, pid))
+    born = await _born(component, guard_messages.Watch(name, pid))
+    with contextlib.suppress(ProcessLookupError):  # it has just ended: its guard says so
+        born.guest = Guest(name, pid)
+    return born
 
 
 async def restore(
@@ -100,6 +112,7 @@ async def restore(
     owner: int | None = None,
     laps: Laps | None = None,
     task: guard_messages.Task | None = None,
+    epoch: int = 0,
 ) -> Component:
     """Rebuild a component from a chain (descriptors of encoded snapshots, oldest first), stopped, committed to nothing.
 
@@ -140,7 +153,9 @@ async def restore(
         laps.lap("guard and keeper")
         await _vessel(component, request, keeper)
         laps.lap("vessel")
-        order = channel.Restore(component.pid, name, outage_ns, streams=True, robot=places.robot, own_eyes=owner != ROOT)
+        order = channel.Restore(
+            component.pid, name, outage_ns, streams=True, robot=places.robot, own_eyes=owner != ROOT, epoch=epoch
+        )
         restored, _ = await component.keeper.ask(order, (*chain, *component.streams))
         laps.lap("restore")
     except (CheckpointError, GuardError, KeeperLostError):
@@ -184,14 +199,14 @@ async def begin_again(
     except (CheckpointError, GuardError, KeeperLostError):
         await component.undo()
         raise
-    why = RESTARTED if outline.machine.robot == places.robot else HANDED_OVER if is_planned else TAKEN_OVER
+    why = why_here(outline.machine.robot, places, is_planned=is_planned)
     age_ns = outage_ns + commit_age_ns(outline)
     origin = Origin(outline.machine.robot, filled.position.generation, why, age_ns)
     totals = total_of(outline.output)
     if waiting is not None:
         component.prepared = Prepared(guard_messages.BeginTask(epoch, origin, totals), segment, age_ns)
     else:
-        start = _starting(name, program, places, guard_messages.Task(epoch, origin), totals)
+        start = _starting(name, under_epoch(program, epoch), places, guard_messages.Task(epoch, origin), totals)
         component.prepared = Prepared(start, segment, age_ns)
     return component
 
@@ -206,7 +221,7 @@ async def start_to_wait(name: str, program: Program, places: Places, owner: int)
     _check_owner(name, program, owner)
     component = Component(name, await places.nursery.guard(), places)
     component.engine_wanted = COOPERATIVE
-    return await _born(component, _starting(name, program, places, guard_messages.Task(warm=True)))
+    return await _born(component, _starting(name, under_epoch(program, 0), places, guard_messages.Task(warm=True)))
 
 
 def _check_owner(name: str, program: Program, owner: int) -> None:
@@ -215,6 +230,11 @@ def _check_owner(name: str, program: Program, owner: int) -> None:
     if owner not in (ROOT, inherited):
         reason = f"it is to run as uid {inherited}, which is not its owner, uid {owner}; start it as that user"
         raise MismatchError(f"cannot restore {name}: {reason}", (reason,))
+
+
+def why_here(source: str, places: Places, *, is_planned: bool) -> str:
+    """Why a component goes on at this robot whose checkpoint was made at ``source``."""
+    return RESTARTED if source == places.robot else HANDED_OVER if is_planned else TAKEN_OVER
 
 
 async def reconnect(socket_path: Path, places: Places) -> Component:
@@ -236,6 +256,9 @@ async def reconnect(socket_path: Path, places: Places) -> Component:
         raise GuardLostError(f"the guard of {socket_path.name} guards nothing; it ends")
     component = Component(described.component, guard, places)
     component.take(described, streams)
+    if described.watched and described.state != "ended":
+        with contextlib.suppress(ProcessLookupError):
+            component.guest = Guest(described.component, described.pid)
     if described.state == "ended" and not component.ended.done():
         component.ended.set_result(described.exit_status)
     return component

@@ -17,13 +17,14 @@ from typing import Any, Final
 
 import msgspec
 
-from agent import births, clock, lost
+from agent import births, clock, hooks, lost
 from agent.births import Program
 from agent.component import Captured, Component
 from agent.config import ComponentConfig
 from agent.errors import AgentError, GuardError, KeeperLostError
 from agent.figures import Commits, Figures, shortened
 from agent.guard_messages import Task
+from agent.hooks import Hook, Hooks, Kind, Occasion
 from agent.mistake import end_lanes_on_mistake
 from agent.places import Places
 from agent.records import Records
@@ -36,10 +37,11 @@ from checkpoint.errors import CheckpointError, NothingCommittedError, RestoreErr
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Position
 from checkpoint.store import Store
+from checkpoint.task_channel import TAKEN_OVER
 from failover.core import acts, events
 from failover.core.acts import Act
 from failover.core.events import Event
-from failover.core.types import Launch
+from failover.core.types import COMMITTED, ComponentSpec, Launch
 
 KILLED: Final = 9
 """The wait status of a program whose guard was lost: as of one that was killed."""
@@ -58,6 +60,7 @@ class Surroundings:
         tell: passes an event to the core.
         silence_ns: how long the robot that the component is taken over from has been silent, as far as known; for the outage.
         here: what this robot's operator wants for a component.
+        hooks: runs his commands.
     """
 
     places: Places
@@ -66,6 +69,7 @@ class Surroundings:
     tell: Callable[[Event], None]
     silence_ns: Callable[[str], Coroutine[Any, Any, int]]
     here: Callable[[str], ComponentConfig]
+    hooks: Hooks = field(default_factory=Hooks)
 
 
 @dataclass(slots=True)
@@ -207,6 +211,8 @@ class Charge:
         """Say what went wrong, to the log and to the core where it waits for it."""
         message = str(trouble) or type(trouble).__name__
         reasons = tuple(getattr(trouble, "reasons", ())) or (message,)
+        if isinstance(act, acts.Capture) and self.component is not None and self.component.engine == COOPERATIVE:
+            self.component.limit_output(False)  # perhaps it is its output that keeps it from its next commit
         if isinstance(trouble, NothingCommittedError) and isinstance(act, acts.Capture):
             self.figures.reasons = ()
             self.around.tell(events.NothingToCapture(self.name, act.epoch, message))
@@ -246,6 +252,8 @@ class Charge:
         adopted = self.component is not None
         self.around.records.note(self.name, act.epoch)
         if self.component is None:
+            if not act.spec.launch.pid:
+                await self._hook("before_start", act.spec, self._occasion(act.epoch, hooks.STARTED))
             self.component = await self._begun(act.spec.launch, act.epoch)
         await self.component.lease(self._lease_until_ns)
         await self._protect(refuse=act.spec.launch.pid != 0)
@@ -282,6 +290,8 @@ class Charge:
         laps.lap(f"opening {len(descriptors)} snapshots")
         try:
             outage_ns, read_ns = clock.age_ns(descriptors[-1]), clock.now_ns()
+            occasion = await self._prepared(act, descriptors[-1], outage_ns, is_lost=silent_ns > 0)
+            laps.lap("preparing")
             component, age_ns = await self._resumed(act, descriptors, outage_ns, laps)
         finally:
             close_all(tuple(descriptors))
@@ -298,6 +308,43 @@ class Charge:
         self.around.tell(events.Restored(self.name, act.epoch, act.position, age_ns + clock.now_ns() - read_ns))
         self._notice(sentence)
         self._watch_the_end()
+        if occasion is not None:
+            self._task(self._hook("on_resume", act.spec, occasion))
+
+    def _occasion(self, epoch: int, why: str, source: str = "", age_ns: int = 0) -> Occasion:
+        return Occasion(self.name, self.around.places.robot, epoch, why, source, age_ns)
+
+    async def _prepared(self, act: acts.Restore, newest: int, age_ns: int, *, is_lost: bool) -> Occasion | None:
+        """Run what this robot's operator wants before it goes on here; why it does, where anybody is to be told.
+
+        Args:
+            is_lost: another robot ran it and fell silent, perhaps before it made a checkpoint of its own.
+
+        Raises:
+            AgentError: as `_hook`.
+        """
+        here = self.around.here(self.name)
+        if not (here.before_start or here.on_resume or (act.spec is not None and act.spec.launch.on_resume)):
+            return None
+        source = (await asyncio.to_thread(format.read_outline, newest)).machine.robot
+        why = births.why_here(source, self.around.places, is_planned=act.is_planned)
+        occasion = self._occasion(act.epoch, TAKEN_OVER if is_lost and not act.is_planned else why, source, age_ns)
+        await self._hook("before_start", act.spec, occasion)
+        return occasion
+
+    async def _hook(self, kind: Kind, spec: ComponentSpec | None, occasion: Occasion) -> None:
+        """Run this robot's own command for the occasion, else the one that came with the program.
+
+        Raises:
+            AgentError: it failed, and the program must not run here without it.
+        """
+        here = self.around.here(self.name)
+        hook = Hook(here.before_start if kind == "before_start" else here.on_resume, here.hook_s)
+        if kind == "on_resume" and not hook.command and spec is not None:
+            hook = Hook(spec.launch.on_resume, here.hook_s, program_of(spec.launch).inheritance)
+        self.figures.hook = await self.around.hooks.run(kind, hook, occasion)
+        if self.figures.hook and kind == "before_start" and here.must_prepare:
+            raise AgentError(f"{self.name} does not run here unprepared: {self.figures.hook}")
 
     async def _resumed(self, act: acts.Restore, chain: list[int], outage_ns: int, laps: clock.Laps) -> tuple[Component, int]:
         """The component, running, and the age of its state: what waits here for it, or, where that fails, from its beginning."""
@@ -338,7 +385,9 @@ class Charge:
                 await waiting.undo()
             owner = spec.owner if spec is not None else None
             task = Task(act.epoch, engine=AUTO) if spec is not None and spec.launch.engine == AUTO else None
-            return await births.restore(self.name, chain, places, outage_ns=outage_ns, owner=owner, laps=laps, task=task)
+            return await births.restore(
+                self.name, chain, places, outage_ns=outage_ns, owner=owner, laps=laps, task=task, epoch=act.epoch
+            )
         if spec is None:
             raise RestoreError(f"cannot start {self.name} again: this robot was never told its command; start it by failover run")
         program = program_of(started_here(spec.launch, self.around.here(self.name)))
@@ -515,4 +564,5 @@ def program_of(launch: Launch) -> Program:
         launch.isolate,
         msgspec.msgpack.decode(launch.inheritance, type=Inheritance) if launch.inheritance else None,
         launch.engine,
+        launch.output == COMMITTED,
     )

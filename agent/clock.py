@@ -1,4 +1,8 @@
-"""The agent's only clock, and its real-time rights. Instants are integer nanoseconds of CLOCK_MONOTONIC, this machine's own."""
+"""The agent's only clock, and its real-time rights. Instants are integer nanoseconds of CLOCK_BOOTTIME, this machine's own.
+
+CLOCK_MONOTONIC stands still while a machine sleeps. A lease counted by it would go on after an hour's sleep where it stood, while
+another robot runs the component; by this clock the hour is a stall like any other, and the lease is over.
+"""
 
 from __future__ import annotations
 
@@ -34,17 +38,17 @@ class Laps:
 
 
 def now_ns() -> int:
-    """The instant, for the core."""
-    return time.monotonic_ns()
+    """The instant, for the core and for leases."""
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
 def wall_ns(instant_ns: int) -> int:
-    """An instant of the monotonic clock by this machine's calendar, in nanoseconds since 1970; for a person's eyes only."""
-    return time.time_ns() - (time.monotonic_ns() - instant_ns)
+    """An instant of our clock by this machine's calendar, in nanoseconds since 1970; for a person's eyes only."""
+    return time.time_ns() - (now_ns() - instant_ns)
 
 
 def kernel_boot() -> str:
-    """A name for this boot of the kernel: the monotonic clock begins anew with it. Source: random(4)."""
+    """A name for this boot of the kernel: our clock begins anew with it. Source: random(4)."""
     try:
         return BOOT_ID.read_text().strip()
     except OSError:

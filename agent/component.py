@@ -30,8 +30,10 @@ from agent import guard_messages
 from agent.errors import GuardError, GuardLostError, KeeperLostError
 from agent.following import Following
 from agent.guard_messages import Described, Exited, Refused, Started, TaskConnected, TaskKeeps, VesselReady
+from agent.guest import Guest
 from agent.nursery import GuardLink
 from agent.places import Places, log_directory
+from agent.pump import HOLD_LIMIT
 from agent.streams import STREAMS, OutputLogs
 from checkpoint import channel
 from checkpoint.channel import close_all
@@ -104,6 +106,7 @@ class Component:
     Attributes:
         name, pid, inner_pid, isolated: as the guard said.
         logs: its output; `OutputLogs.read` serves ``failover logs``.
+        guest: where it is somebody else's child.
         engine_wanted: as it was asked for: `AUTO`, `PTRACE` or `COOPERATIVE`.
         task_pid: of the process that keeps its state, 0 before it has said so (``connected``); keeps: it has made a commit.
         committed: called at its first commit to each segment.
@@ -137,6 +140,8 @@ class Component:
         self.prepared: Prepared | None = None
         self._lease_until_ns = 0
         self._held = False
+        self._output_limited: bool | None = None
+        self.guest: Guest | None = None
         guard.dialogue.heard = self._heard
         guard.dialogue.ended = self._guard_lost
 
@@ -285,10 +290,21 @@ class Component:
         """
         totals = self._totals.pop(position, None)
         if totals is not None:
-            self.logs.commit(totals)
+            self.logs.commit(totals, is_safe=is_safe)
+        self.limit_output(self.engine == PTRACE or not is_safe)
         self.keeper.tell(channel.Acknowledge(position))
         if (commit := self._commits.pop(position, 0)) and is_safe:
             self._guard.dialogue.tell(guard_messages.CommitSafe(commit))
+
+    def limit_output(self, limited: bool) -> None:
+        """Bound how much of held output may wait, or do not.
+
+        A program that keeps its state makes no checkpoint while it waits in a write: it is bounded only while nobody stands by,
+        for then its checkpoints would not help.
+        """
+        if self.logs.is_held and limited != self._output_limited and self._guard.dialogue.open:
+            self._output_limited = limited
+            self._guard.dialogue.tell(guard_messages.LimitOutput(HOLD_LIMIT if limited else 0))
 
     @contextlib.asynccontextmanager
     async def _standing_still(self, wanted: bool) -> AsyncIterator[None]:
@@ -306,7 +322,7 @@ class Component:
     # --- holding still ---
 
     async def lease(self, until_ns: int) -> None:
-        """The program may run until CLOCK_MONOTONIC passes ``until_ns``; renew in time. 0 for ever. Thaws what a lease froze."""
+        """The program may run until CLOCK_BOOTTIME passes ``until_ns``; renew in time. 0 for ever. Thaws what a lease froze."""
         self._lease_until_ns = until_ns
         if self.prepared is None:  # else it is given with the start
             await self.ask_guard(guard_messages.Lease(until_ns))
@@ -359,6 +375,7 @@ class Component:
         """End protection; the program runs on, its guard keeps its streams until it ends."""
         with contextlib.suppress(CheckpointError, KeeperLostError):
             await self.keeper.let_loose()
+        self._forget_guest()  # its guard may be gone as soon as it has answered
         await self.ask_guard(guard_messages.LetGo())
         self.close()
 
@@ -378,6 +395,7 @@ class Component:
             self.prepared = None
         close_all(self.streams)
         self.streams = ()
+        self._forget_guest()
 
     # --- guard and keeper ---
 
@@ -385,6 +403,7 @@ class Component:
         """Note what the guard said of it."""
         self.pid, self.inner_pid, self.isolated, self.notes = born.pid, born.inner_pid, born.isolated, born.notes
         self.streams = streams
+        self.limit_output(self.engine == PTRACE)
         if isinstance(born, Described):
             self.engine_wanted, self.task_pid, self.keeps = born.engine, born.task_pid, born.keeps
 
@@ -429,6 +448,13 @@ class Component:
         return isinstance(message, guard_messages.FrozenByLease)
 
     def _guard_lost(self) -> None:
+        if self.guest is not None:
+            self.guest.end()
         if not self.ended.done():
             self.ended.set_exception(GuardLostError(f"the guard of {self.name} ended, and its program with it"))
             self.ended.exception()  # noted: after a release nobody waits for the end
+
+    def _forget_guest(self) -> None:
+        if self.guest is not None:
+            self.guest.close()
+            self.guest = None

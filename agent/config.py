@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
 from agent.errors import ConfigError
 from failover.client import strict_toml
@@ -17,6 +17,9 @@ from failover.client.team import Robot, Team
 from failover.core.names import check_component
 from failover.core.types import BEAT_MS_MAX, BEATS_IN_LEASE_MIN, PERIOD_MS_MAX
 from failover.errors import FailoverError, NameFormatError
+
+HOOK_S_MAX: Final = 50
+"""The rules give a restore a minute."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +37,9 @@ class ComponentConfig:
         command: a program that keeps its state itself is started here again by this; () for the command line of `failover run`.
         directory: and in this one, an absolute path; "" for that of `failover run`.
         environment: and with these variables besides, or instead.
+        before_start, on_resume: this robot's own commands around a program that begins or goes on here, see `agent.hooks`; ().
+        hook_s: seconds that each of them may take.
+        must_prepare: where before_start fails, the program does not run on this robot.
     """
 
     on_loss: Literal["takeover", "hold"] = "takeover"
@@ -46,6 +52,10 @@ class ComponentConfig:
     command: tuple[str, ...] = field(default_factory=tuple)
     directory: str = ""
     environment: dict[str, str] = field(default_factory=dict)
+    before_start: tuple[str, ...] = field(default_factory=tuple)
+    on_resume: tuple[str, ...] = field(default_factory=tuple)
+    hook_s: int = 5
+    must_prepare: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,5 +201,10 @@ def _check_command(where: str, component: ComponentConfig) -> None:
     for name in component.environment:
         if not name or "=" in name:
             raise ConfigError(f"{where}: environment has a variable {name!r}; a name is not empty and has no '=' in it")
+    for key, hook in (("before_start", component.before_start), ("on_resume", component.on_resume)):
+        if hook and (not hook[0] or any("\0" in word for word in hook)):
+            raise ConfigError(f"{where}: {key} begins with an empty word, or holds a zero byte; the first word names the program")
+    if not 1 <= component.hook_s <= HOOK_S_MAX:
+        raise ConfigError(f"{where}: hook_s is {component.hook_s}; at least 1 and at most {HOOK_S_MAX}")
     if any("\0" in word for word in (*component.command, component.directory, *component.environment.values())):
         raise ConfigError(f"{where}: command, directory or environment holds a zero byte; no program can be given one")

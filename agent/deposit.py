@@ -18,6 +18,7 @@ from checkpoint.store import Store
 from failover.core.acts import Admit
 from failover.core.events import Event, Stored, StoreFailed
 from failover.core.messages import Offer
+from failover.core.types import COMMITTED
 
 log = logging.getLogger("failover.deposit")
 
@@ -105,7 +106,8 @@ class Deposit:
         snapshot = self._store.put(descriptor)
         logs = OutputLogs(log_directory(offer.component, self._places))
         try:
-            logs.apply(snapshot.output)
+            logs.hold(offer.spec.launch.output == COMMITTED)
+            logs.apply(snapshot.output, is_safe=True)
         finally:
             logs.close()
         return snapshot

@@ -11,7 +11,8 @@ from typing import Any
 import msgspec
 
 from agent.errors import AgentError
-from checkpoint.channel import Channel, ChannelError, close_all
+from agent.stalls import Watchman
+from checkpoint.channel import Channel, ChannelClosedError, ChannelError, close_all
 
 Answer = tuple[Any, tuple[int, ...]]
 """A reply and the descriptors that came with it, now the asker's to close."""
@@ -46,7 +47,12 @@ class Dialogue:
         self._waiting: deque[asyncio.Future[Answer]] = deque()
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self._channel.fileno(), self._readable)
+        self._watchman: Watchman | None = None
         self.open = True
+
+    def watch(self, pid: int) -> None:
+        """The other end is this process: it is ended if it does nothing while it owes us an answer."""
+        self._watchman = Watchman(pid, self._whom, lambda: self._waiting[0] if self.open and self._waiting else None)
 
     async def ask(self, message: msgspec.Struct, descriptors: tuple[int, ...] = ()) -> Answer:
         """Send a request and wait for its answer.
@@ -57,6 +63,8 @@ class Dialogue:
         self.tell(message, descriptors)
         answer: asyncio.Future[Answer] = self._loop.create_future()
         self._waiting.append(answer)
+        if self._watchman is not None:
+            self._watchman.awaits()
         return await answer
 
     def tell(self, message: msgspec.Struct, descriptors: tuple[int, ...] = ()) -> None:
@@ -66,6 +74,8 @@ class Dialogue:
         try:
             self._channel.send(message, descriptors)
         except ChannelError as error:
+            if self._watchman is not None and not isinstance(error, ChannelClosedError):
+                self._watchman.end(str(error))  # it must not live on while it counts as gone
             self._end()
             raise self._lost(f"{self._whom} has gone: {error}") from error
 
@@ -98,6 +108,8 @@ class Dialogue:
         if not self.open:
             return
         self.open = False
+        if self._watchman is not None:
+            self._watchman.close()
         self._loop.remove_reader(self._channel.fileno())
         self._channel.close()
         while self._waiting:

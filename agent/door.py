@@ -110,6 +110,10 @@ class SpeakKey(msgspec.Struct, frozen=True, tag=True):
     key: bytes
 
 
+class Alive(msgspec.Struct, frozen=True, tag=True):
+    """Lanes to heart, from time to time: this process turns."""
+
+
 class HearKey(msgspec.Struct, frozen=True, tag=True):
     """Lanes to heart: the peer says that it seals its beats to us with this key."""
 
@@ -166,7 +170,7 @@ class Farewell(msgspec.Struct, frozen=True, tag=True):
 
 
 ToLanes = Order | Life | Told | Farewell
-ToHeart = Happened | Inventory | SpeakKey | HearKey | Ask
+ToHeart = Happened | Inventory | SpeakKey | HearKey | Alive | Ask
 
 
 def order(act: Act) -> Order:

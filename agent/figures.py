@@ -78,6 +78,7 @@ class Figures:
     outage_ms: float | None = None
     reasons: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    hook: str = ""
     engine: str = PTRACE
     commits: Commits = field(default_factory=Commits)
 

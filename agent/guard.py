@@ -31,6 +31,7 @@ from typing import Any, Final
 import msgspec
 
 from agent import kernel
+from agent.clock import now_ns
 from agent.guard_messages import (
     BeginTask,
     Commit,
@@ -44,6 +45,7 @@ from agent.guard_messages import (
     Kill,
     Lease,
     LetGo,
+    LimitOutput,
     MakeVessel,
     Refused,
     Request,
@@ -65,7 +67,6 @@ SEND_TIMEOUT_S: Final = 1.0
 """An agent that does not read for so long is treated as lost; a lease must not wait for it."""
 
 REALTIME_PRIORITY: Final = 1
-NS_PER_MS: Final = 1_000_000
 _PEER: Final = struct.Struct("3i")
 
 
@@ -83,6 +84,7 @@ class Guard:
         self._told_to_end = False
         self._started_at = time.monotonic()
         self._signals = _wake_on_signals()
+        self._alarm = kernel.Alarm()
         self._answers: dict[type, Callable[[Any, tuple[int, ...]], None]] = {
             Start: self._start,
             BeginTask: self._begin_task,
@@ -93,6 +95,7 @@ class Guard:
             Freeze: lambda request, _: self._act(lambda ward: ward.freeze(exposed=request.exposed)),
             Thaw: lambda _, __: self._act(lambda ward: ward.thaw()),
             CommitSafe: self._commit_safe,
+            LimitOutput: self._limit_output,
             Kill: lambda request, _: self._act(lambda ward: ward.kill(request.signal)),
             Describe: lambda _, __: self._reply(self._description(), self._ward.descriptors() if self._ward is not None else ()),
             LetGo: self._let_go,
@@ -103,7 +106,7 @@ class Guard:
         """Serve until there is nothing left to guard."""
         while not self._over:
             ready = self._wait()
-            if self._ward is not None and self._ward.lapse(time.monotonic_ns()):  # first: a lease waits for nobody
+            if self._ward is not None and self._ward.lapse(now_ns()):  # first: a lease waits for nobody
                 self._tell(FrozenByLease())
             for act in ready:
                 act()
@@ -119,7 +122,8 @@ class Guard:
 
     def _wait(self) -> list[Callable[[], None]]:
         """Sleep until something is to be done, or a deadline passes; returns what is to be done."""
-        watched: dict[int, Callable[[], None]] = {self._signals.fileno(): self._heed_signals}
+        watched: dict[int, Callable[[], None]] = {self._signals.fileno(): self._heed_signals, self._alarm.fileno(): _wake_up}
+        self._alarm.set(self._ward.deadline_ns() if self._ward is not None else None)
         if self._listener.fileno() >= 0:  # it was not let go
             watched[self._listener.fileno()] = self._accept
         if self._agent is not None:
@@ -136,10 +140,7 @@ class Guard:
         return [watched[descriptor] for descriptor, _ in poll.poll(self._patience_ms())]
 
     def _patience_ms(self) -> float | None:
-        if self._ward is None:
-            return FIRST_CALL_S * 1000 if self._agent is None else None
-        deadline_ns = self._ward.deadline_ns()
-        return None if deadline_ns is None else max(deadline_ns - time.monotonic_ns(), 0) / NS_PER_MS
+        return FIRST_CALL_S * 1000 if self._ward is None and self._agent is None else None
 
     # --- the agent ---
 
@@ -248,6 +249,10 @@ class Guard:
     def _commit_safe(self, request: CommitSafe, _: tuple[int, ...]) -> None:
         if self._ward is not None and self._ward.task is not None and self._ward.exited is None:
             self._ward.task.tell_safe(request.commit)
+
+    def _limit_output(self, request: LimitOutput, _: tuple[int, ...]) -> None:
+        if self._ward is not None and self._ward.pump is not None:
+            self._ward.pump.limit(request.hold_limit)
 
     def _lease(self, request: Lease, _: tuple[int, ...]) -> None:
         self._guarded().set_lease(request.until_ns)
@@ -375,6 +380,10 @@ def _settle() -> tuple[str, ...]:
     except OSError as error:
         notes.append(f"the guard has no real-time priority, so its lease may be late on a busy machine: {error.strerror}")
     return tuple(notes)
+
+
+def _wake_up() -> None:
+    """The alarm rang: the loop's next turn looks at the lease."""
 
 
 def _wake_on_signals() -> socket.socket:

@@ -107,7 +107,7 @@ class Commit(Message, frozen=True):
 
 
 class Lease(Message, frozen=True):
-    """Freeze the component by yourself when CLOCK_MONOTONIC passes ``until_ns``; 0 for no lease. A later one thaws it again."""
+    """Freeze the component by yourself when CLOCK_BOOTTIME passes ``until_ns``; 0 for no lease. A later one thaws it again."""
 
     until_ns: int
 
@@ -130,6 +130,12 @@ class CommitSafe(Message, frozen=True):
     """A standby holds this commit of a program that keeps its state; told to it. No answer."""
 
     commit: int
+
+
+class LimitOutput(Message, frozen=True):
+    """Let so many bytes of each stream wait to be safe at another robot, then have the program wait; 0: any number. No answer."""
+
+    hold_limit: int
 
 
 class Kill(Message, frozen=True):
@@ -246,6 +252,21 @@ class TaskKeeps(Message, frozen=True):
     pid: int
 
 
-Request = Start | BeginTask | MakeVessel | Watch | Commit | Lease | Freeze | Thaw | CommitSafe | Kill | Describe | LetGo | Forget
+Request = (
+    Start
+    | BeginTask
+    | MakeVessel
+    | Watch
+    | Commit
+    | Lease
+    | Freeze
+    | Thaw
+    | CommitSafe
+    | LimitOutput
+    | Kill
+    | Describe
+    | LetGo
+    | Forget
+)
 Reply = Started | VesselReady | Watching | Done | Described | Refused
 Event = Exited | FrozenByLease | TaskConnected | TaskKeeps

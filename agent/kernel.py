@@ -1,12 +1,13 @@
 """The few system calls that a guard needs and that Python does not offer.
 
-Sources: prctl(2), mlockall(2), fallocate(2).
+Sources: prctl(2), mlockall(2), fallocate(2), timerfd_create(2).
 """
 
 from __future__ import annotations
 
 import ctypes
 import os
+import time
 from typing import Final
 
 PR_SET_CHILD_SUBREAPER: Final = 36
@@ -14,6 +15,10 @@ MCL_CURRENT: Final = 1
 MCL_FUTURE: Final = 2
 FALLOC_FL_KEEP_SIZE: Final = 1
 FALLOC_FL_PUNCH_HOLE: Final = 2
+TFD_TIMER_ABSTIME: Final = 1
+TFD_NONBLOCK: Final = os.O_NONBLOCK
+TFD_CLOEXEC: Final = os.O_CLOEXEC
+NS_PER_S: Final = 1_000_000_000
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _libc.fallocate.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_int64, ctypes.c_int64)
@@ -44,6 +49,35 @@ def punch_hole(descriptor: int, offset: int, size: int) -> None:
         OSError: EOPNOTSUPP where the filesystem cannot.
     """
     _check(_libc.fallocate(descriptor, FALLOC_FL_PUNCH_HOLE | FALLOC_FL_KEEP_SIZE, offset, size), "fallocate(PUNCH_HOLE)")
+
+
+class Alarm:
+    """A descriptor that is readable from an instant of CLOCK_BOOTTIME on; a sleep of the machine counts.
+
+    poll(2) counts its patience in the time that the machine was awake: after a sleep it would wait for the rest.
+    """
+
+    def __init__(self) -> None:
+        """
+        Raises:
+            OSError: no descriptor is left.
+        """
+        self._descriptor = _libc.timerfd_create(time.CLOCK_BOOTTIME, TFD_NONBLOCK | TFD_CLOEXEC)
+        _check(self._descriptor, "timerfd_create")
+
+    def fileno(self) -> int:
+        """For poll(2)."""
+        return int(self._descriptor)
+
+    def set(self, at_ns: int | None) -> None:
+        """Ring at this instant, at once if it is over; None: not at all."""
+        seconds, rest_ns = divmod(max(at_ns, 1), NS_PER_S) if at_ns is not None else (0, 0)
+        value = (ctypes.c_long * 4)(0, 0, seconds, rest_ns)  # struct itimerspec: interval, first
+        _check(_libc.timerfd_settime(self._descriptor, TFD_TIMER_ABSTIME, value, None), "timerfd_settime")
+
+    def close(self) -> None:
+        """Give the descriptor back."""
+        os.close(self._descriptor)
 
 
 def _check(result: int, what: str) -> None:

@@ -26,9 +26,10 @@ from agent.config import Settings
 from agent.control import ControlServer
 from agent.deposit import Deposit
 from agent.dispatch import Dispatch
-from agent.door import Ask, Farewell, HearKey, Inventory, Life, Order, SpeakKey, ToLanes, Told
+from agent.door import Alive, Ask, Farewell, HearKey, Inventory, Life, Order, SpeakKey, ToLanes, Told
 from agent.errands import Errands
-from agent.errors import AgentError, GuardLostError
+from agent.errors import AgentError, GuardLostError, LaneError
+from agent.hooks import Hooks
 from agent.journal import set_up_log
 from agent.links import Facts, Links
 from agent.nursery import Nursery
@@ -67,6 +68,9 @@ from failover.core.messages import (
 from failover.core.types import HISTORY_MAX, Found, Held
 from failover.core.wire import KEY_SIZE_MIN
 
+ALIVE_S: Final = 0.5
+"""Between two signs of life to the heart."""
+
 BYTES_A_MEGABIT: Final = 125_000
 ANSWER_PATIENCE_S: Final = 60.0
 """How long an operator's command may take; a handover's own limit in the core is shorter."""
@@ -91,7 +95,8 @@ class Lanes:
         self._runtime = runtime
         self._store_path = state / "store"
         sockets = runtime / "guards"
-        self._nursery = Nursery(sockets, starter())
+        self._starter = starter()
+        self._nursery = Nursery(sockets, self._starter)
         self.places = Places(sockets, state / "logs", self._nursery, robot=config.robot)
         self._heart = heart
         self._outgoing: asyncio.Queue[door.ToHeart] = asyncio.Queue()
@@ -128,15 +133,16 @@ class Lanes:
         self._prepare_directories()
         loop.add_reader(self._heart.fileno(), self._listen_to_heart)
         speaking = asyncio.create_task(self._speak_to_heart())
+        living = asyncio.create_task(self._show_life())
         self._life = await self._begun
         store = await self._open_store()
         records = Records(self._runtime / "running")
-        around = Surroundings(self.places, store, records, self.tell, self._silence_ns, self.settings.component)
-        self._around = around
+        hooks, here = Hooks(self._starter), self.settings.component
+        self._around = Surroundings(self.places, store, records, self.tell, self._silence_ns, here, hooks)
         self._deposit = Deposit(store, self.places, self.tell, self._stored)
         self._dispatch = Dispatch(store, self._shipper, self.tell, self._links.hindrance)
         self._receiver = Receiver(self._lane, self._store_path, self._deposit)
-        found = await self._find_guards(around.records)
+        found = await self._find_guards(records)
         await self._mend_logs(found)
         self._nursery.prepare()
         self._say(Inventory(_held(store), found))
@@ -156,6 +162,7 @@ class Lanes:
             await self._ways.close()
             await self._nursery.close()
             speaking.cancel()
+            living.cancel()
             store.close()
 
     async def _open_store(self) -> Store:
@@ -212,6 +219,11 @@ class Lanes:
 
     def _say(self, message: door.ToHeart) -> None:
         self._outgoing.put_nowait(message)
+
+    async def _show_life(self) -> None:
+        while True:
+            self._say(Alive())
+            await asyncio.sleep(ALIVE_S)
 
     async def _speak_to_heart(self) -> None:
         loop = asyncio.get_running_loop()
@@ -302,6 +314,7 @@ class Lanes:
         """A connection stands: introduce ourselves. It is gone: so is every transfer on it, and every word that took it."""
         lane = "bulk lane" if way == BULK else f"lane {way}"
         log.info("%s to %s: %s%s", lane, peer, state, f": {reason}" if reason else "")
+        had_words = self._ways.carried_words(way, peer, state)
         if state is LinkState.CONNECTED:
             key, config = self._ways.beat_key(peer), self.settings.config
             self._ways.answer(way, peer, Hello(VERSION, self.settings.team.team, config.robot, self._life.boot, key))
@@ -309,14 +322,18 @@ class Lanes:
             return
         if way == BULK:
             self._shipper.lost(peer)
-        if not self._ways.has_better(way, peer):
+        if had_words:
             self.errands.lost(peer)
 
     async def _links_changed(self, sentences: list[str]) -> None:
         for sentence in sentences:
             log.info("%s", sentence)
             self.tell(events.Noticed("", sentence))
-        await self._lane.hold_to_devices()
+        try:
+            await self._lane.hold_to_devices()
+        except LaneError as error:
+            log.critical("%s; the lanes begin anew", error)
+            self._end.set()
 
     def hindrance(self, peer: str) -> str:
         """Why nothing can be said to a peer now; "" when it can."""
@@ -339,6 +356,8 @@ class Lanes:
 
     def _hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
         match message:
+            case Offer() if hindrance := self._links.hindrance():
+                self._lane.say(peer, Refuse(message.transfer, f"snapshots wait: at {self.settings.config.robot} {hindrance}"))
             case Offer():
                 self._receiver.offered(peer, message)
             case Chunk():

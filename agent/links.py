@@ -166,7 +166,8 @@ class Links:
         Args:
             anywhere: snapshots may travel over wireless links too.
         """
-        self._hosts = tuple(dict.fromkeys(split_address(address, "address")[0] for address in (me.bulk, *me.beats)))
+        hosts = (resolved(split_address(address, "address")[0]) for address in (me.bulk, *me.beats))
+        self._hosts = tuple(dict.fromkeys(hosts))
         self._bulk = self._hosts[0]
         self._facts = facts
         self._anywhere = anywhere
@@ -247,7 +248,7 @@ class Links:
         ]
 
     def _found(self, host: str, scene: Scene) -> Link | None:
-        one = scene.at(host) or scene.at(_resolved(host))
+        one = scene.at(host)
         return self._facts.link(one, scene) if one is not None else None
 
     def _change(self, host: str, before: Link | None) -> str:
@@ -282,8 +283,8 @@ def can_pin(name: str) -> bool:
     return True
 
 
-def _resolved(host: str) -> str:
-    """The address that a host name of ours stands for; itself if it has none."""
+def resolved(host: str) -> str:
+    """The address that a host's name stands for, as the kernel would write it; the name itself if it has none now."""
     try:
         return str(socket.getaddrinfo(host, None, type=socket.SOCK_DGRAM)[0][4][0])
     except OSError:

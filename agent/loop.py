@@ -22,7 +22,7 @@ from agent import ballot as ballot_file
 from agent import clock, door
 from agent.beats import BeatLane
 from agent.config import Settings
-from agent.door import BeatCounts, Farewell, Happened, HearKey, Inventory, Life, SpeakKey, ToHeart, ToLanes, Told
+from agent.door import Alive, BeatCounts, Farewell, Happened, HearKey, Inventory, Life, SpeakKey, ToHeart, ToLanes, Told
 from agent.errors import AgentError
 from agent.lanes_process import LanesProcess
 from agent.outbox import Due, Outbox
@@ -38,6 +38,7 @@ from failover.core.events import Event, Received, Tick
 from failover.core.messages import Beat
 from failover.core.node import Node
 from failover.core.types import Ballot
+from failover.core.wire import Reason
 
 NANOSECONDS_A_SECOND: Final = 1_000_000_000
 SLEEP_LIMIT_S: Final = 0.5
@@ -48,6 +49,15 @@ PERSIST_PATIENCE_S: Final = 2.0
 
 GAP_BEATS: Final = 3
 """Periods of silence that count as a gap: one lost beat is none, and a lease is longer."""
+
+COPY_BEATS: Final = 16
+"""A beat that was heard on one link may come over a slower one by so many beats later; an older copy is somebody's replay."""
+
+LANES_SILENCE_NS: Final = 4 * NANOSECONDS_A_SECOND
+"""How long the lanes may say nothing; then another process takes their place. Meanwhile nobody renews the guards' leases."""
+
+LANES_BIRTH_NS: Final = 30 * NANOSECONDS_A_SECOND
+"""The same before their first word: an interpreter starts."""
 
 LANES_TRIES: Final = 5
 """Lanes processes that may die before their first word; then something is wrong that no restart cures."""
@@ -85,9 +95,13 @@ class Heart:
         )
         self._ending = False
         self._lanes_deaths = 0
+        self._turned_ns = clock.now_ns()
+        self._lanes_silent_ns = 0
+        self._lanes_allowed_ns = LANES_BIRTH_NS
         self._refused: Counter[str] = Counter()
         self._sent = self._heard = self._late_us_max = self._gap_us_max = self._gaps = 0
         self._heard_at: dict[str, int] = {}
+        self._copies: dict[str, dict[str, int]] = {}
         self._newest_beat: dict[str, tuple[int, int]] = {}
         self._lost: Counter[str] = Counter()
         self._notes: tuple[str, ...] = ()
@@ -127,6 +141,7 @@ class Heart:
     def _start_lanes(self) -> None:
         """Start the other process; the node is born, or told what was lost, when its inventory comes."""
         self._lanes.start()
+        self._lanes_silent_ns, self._lanes_allowed_ns = 0, LANES_BIRTH_NS
         self._poll.register(self._lanes.fileno(), select.EPOLLIN | select.EPOLLHUP)
         self._lanes.send(Life(self._ballot.record.boot, os.getpid(), self._notes))
 
@@ -142,11 +157,20 @@ class Heart:
                 self._note_persisted()
             elif descriptor == self._wake.fileno():
                 self._ending = True
+        self._watch_lanes()
         if self._node is not None:
             late_ns = clock.now_ns() - self._node.next_deadline_ns()
             if late_ns >= 0:
                 self._late_us_max = max(self._late_us_max, late_ns // 1_000)
                 self._step(Tick())
+
+    def _watch_lanes(self) -> None:
+        """Count how long the lanes say nothing; a turn of our own that took long proves nothing about them."""
+        now_ns = clock.now_ns()
+        self._lanes_silent_ns += min(now_ns - self._turned_ns, int(SLEEP_LIMIT_S * NANOSECONDS_A_SECOND))
+        self._turned_ns = now_ns
+        if self._lanes_silent_ns > self._lanes_allowed_ns:
+            self._replace_lanes(f"it said nothing for {self._lanes_silent_ns / NANOSECONDS_A_SECOND:.0f} s")
 
     def _pause_s(self) -> float:
         if self._node is None:
@@ -168,7 +192,9 @@ class Heart:
             opened = self._hearing.open(frame)
             if isinstance(opened, Beat):
                 self._count(opened)
-                self._step(Received(opened, link))
+                self._step(Received(opened, link, tuple(self._copies.pop(opened.sender, {}).items())))
+            elif opened.reason is Reason.REPLAYED and 0 <= opened.behind < COPY_BEATS and link:
+                self._copies.setdefault(opened.sender, {})[link] = clock.now_ns()
             else:
                 self._refused[str(opened.reason)] += 1
 
@@ -193,6 +219,7 @@ class Heart:
     def _listen_to_lanes(self) -> None:
         try:
             for message in self._lanes.receive():
+                self._lanes_silent_ns, self._lanes_allowed_ns = 0, LANES_SILENCE_NS
                 self._heed(message)
         except (ChannelClosedError, ChannelError) as error:
             self._replace_lanes(str(error))
@@ -209,6 +236,8 @@ class Heart:
                 self._keys[peer] = key
             case HearKey(peer, key):
                 self._hearing.accept(peer, key)
+            case Alive():
+                pass
             case _:
                 self._lanes.send(self._told(message))
 

@@ -170,7 +170,9 @@ class Nursery:
             end, pid = await self._keeper_called() if self._starter else self._keeper_forked()
         except GuardError as error:
             raise KeeperLostError(str(error)) from error
-        return KeeperLink(Dialogue(end, channel.Reply, KeeperLostError, "the keeper"), pid)
+        dialogue = Dialogue(end, channel.Reply, KeeperLostError, "the keeper")
+        dialogue.watch(pid)
+        return KeeperLink(dialogue, pid)
 
     async def _keeper_called(self) -> tuple[socket.socket, int]:
         """One that systemd started: it listens as a guard does."""
@@ -178,8 +180,7 @@ class Nursery:
         path = self._sockets / f"{name}.keeper"
         child = self._spawn("keeper", name, ["checkpoint", "keeper", str(path)])
         end = await self._connected(path, child, "a keeper")
-        pid, _, _ = _PEER.unpack(end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
-        return end, pid
+        return end, _peer_of(end)
 
     def _keeper_forked(self) -> tuple[socket.socket, int]:
         ours, theirs = channel.pair()
@@ -237,7 +238,15 @@ def connect(path: Path) -> GuardLink:
 
 def _guard_at(path: Path, end: socket.socket) -> GuardLink:
     incoming = guard_messages.Reply | guard_messages.Event
-    return GuardLink(Dialogue(end, incoming, GuardLostError, f"the guard at {path.name}"), path)
+    dialogue = Dialogue(end, incoming, GuardLostError, f"the guard at {path.name}")
+    dialogue.watch(_peer_of(end))
+    return GuardLink(dialogue, path)
+
+
+def _peer_of(end: socket.socket) -> int:
+    """The process that listens at the other end."""
+    pid, _, _ = _PEER.unpack(end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
+    return int(pid)
 
 
 def _call(path: Path) -> socket.socket:

@@ -109,9 +109,24 @@ class Outflow:
         return (view.state in ENDED, _where(view, peers)) if view is not None else (False, "")
 
     async def _has_ended(self, name: str) -> bool:
-        """The core's word: status shows it, and peers hear it, before it is written and our own charge is told."""
+        """The core's word: status shows it, and peers hear it, before it is written and our own charge is told.
+
+        Held output waits for the charge: then the end is on record at every robot that is heard.
+        """
         view, _ = await self._view(name)
-        return view is not None and view.state in ENDED
+        if view is None or view.state not in ENDED:
+            return False
+        if not self._is_held(name) or view.primary != self._lanes.settings.config.robot:
+            return True
+        charge = self._lanes.charges.get(name)
+        return charge is not None and charge.ended is not None and charge.ended.done()
+
+    def _is_held(self, name: str) -> bool:
+        logs = OutputLogs(log_directory(name, self._lanes.places))
+        try:
+            return logs.is_held
+        finally:
+            logs.close()
 
     async def _view(self, name: str) -> tuple[ComponentView | None, tuple[PeerView, ...]]:
         """The component as this robot's core sees it, and the peers."""

@@ -4,6 +4,10 @@ The counters are shared with the keeper, so that a snapshot's output is exact wi
 (ARCHITECTURE.md, section 4). A byte is counted when it leaves the pipe and written afterwards, outside ``busy``: a slow disk
 never prolongs a freeze, and the keeper finds the bytes in the log after the thaw.
 
+Held output (``--output=committed``) that nobody may see yet has a bound: when more of it waits than `HOLD_LIMIT`, the pump leaves
+the pipe as it is, and the program waits in its next write until another robot holds a checkpoint. A snapshot reads the pipe
+without emptying it (`checkpoint.engines.outputs`), so that checkpoints are made all the same.
+
 The disk is full: the oldest half of the log is given back to it first. If that does not help, nothing is dropped: the pump tries
 again until there is room, the pipe fills, and the program waits inside its next write: not killed, and later without a gap.
 """
@@ -17,6 +21,7 @@ import os
 import select
 import threading
 import time
+from collections.abc import Mapping
 from typing import Final
 
 from agent.streams import KEEP_LIMIT, STREAMS, TRIM_STEP, OutputLogs
@@ -33,6 +38,12 @@ LINE_LIMIT: Final = 200
 
 RETRY_S: Final = 0.1
 """Between two attempts to write to a disk that is full."""
+
+HOLD_LIMIT: Final = 8 << 20
+"""Bytes of a stream that wait unseen at most: half of what a snapshot carries (``BACKLOG_LIMIT``), so that a standby gets all."""
+
+HOLD_POLL_S: Final = 0.02
+"""How soon the program goes on once what waited has become safe."""
 
 CUT_FLOOR: Final = TRIM_STEP
 """Bytes of a log that are never given back for want of space: newer than any snapshot still being taken."""
@@ -88,6 +99,7 @@ class Pump:
 
     def __init__(self) -> None:
         self.counters = Counters()
+        self._hold_limit = 0
         self.blocked = ""
         """Why output is not being written now; "" while it is."""
         self.read_ends: dict[int, int] = {}
@@ -140,13 +152,9 @@ class Pump:
         return self._drained.wait(patience_s)
 
     def _run(self) -> None:
-        poll = select.poll()
-        poll.register(self._wake, select.POLLIN)
         streams = {pipe: stream for stream, pipe in self.read_ends.items()}
-        for pipe in streams:
-            poll.register(pipe, select.POLLIN)
         while True:
-            ready = [descriptor for descriptor, _ in poll.poll(0 if self._draining else None)]
+            ready = self._ready(streams)
             if not ready and self._draining:
                 self._draining = False
                 self._drained.set()
@@ -154,7 +162,23 @@ class Pump:
                 if descriptor == self._wake:
                     os.eventfd_read(self._wake)
                 elif not self._move(streams[descriptor], descriptor):
-                    poll.unregister(descriptor)  # every writer closed it: nothing will ever come again
+                    del streams[descriptor]  # every writer closed it: nothing will ever come again
+
+    def _ready(self, streams: Mapping[int, int]) -> list[int]:
+        """Wait until there is something to do: descriptors. A stream of which too much waits to be safe is left alone."""
+        left_alone = {pipe for pipe, stream in streams.items() if not self._draining and self._waits_too_much(stream)}
+        poll = select.poll()
+        for descriptor in (self._wake, *(streams.keys() - left_alone)):
+            poll.register(descriptor, select.POLLIN)
+        patience_ms = 0 if self._draining else HOLD_POLL_S * 1_000 if left_alone else None
+        return [descriptor for descriptor, _ in poll.poll(patience_ms)]
+
+    def _waits_too_much(self, stream: int) -> bool:
+        limit = self._hold_limit
+        if not limit:
+            return False
+        bounds = self.logs.bounds(stream)
+        return bounds.size - bounds.safe > limit
 
     def _move(self, stream: int, pipe: int) -> bool:
         """Move one pipeful; False at the end of the stream."""
@@ -179,6 +203,11 @@ class Pump:
             self.blocked = ""
         if offset % TRIM_STEP < READ_SIZE:
             self.logs.trim(stream, offset - KEEP_LIMIT)
+
+    def limit(self, hold_limit: int) -> None:
+        """From now on so much of a stream may wait to be safe."""
+        self._hold_limit = hold_limit
+        os.eventfd_write(self._wake, 1)
 
     def _make_room(self, stream: int, error: OSError) -> None:
         """Give the older half of both logs back, if the disk is full and they are long enough; else wait a moment."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Final
 
 from agent import clock
@@ -15,7 +15,7 @@ from agent.story import StoryFile
 from failover.core.story import Decision, Line
 
 WAITING_MAX: Final = 512
-"""Lines that wait for the disk; beyond it the oldest are given up, and counted."""
+"""Lines that wait for the disk; beyond it they are given up, and counted."""
 
 RETRY_S: Final = 1.0
 """Pause after the disk has refused."""
@@ -31,10 +31,10 @@ SENTENCE_MAX: Final = 2_000
 
 
 class Scribe:
-    """One life's lines. `note` and `unwritten` belong to the heart, everything else to the thread.
+    """One life's lines. `note` and `unwritten` belong to the heart, and no lock of the thread's can make them wait.
 
     Attributes:
-        trouble: why the story cannot be written now; "" while it can.
+        trouble: why the story cannot be written now, or what is missing in it; "" if all is well.
     """
 
     def __init__(self, state_directory: Path, robot: str, life: int) -> None:
@@ -43,35 +43,34 @@ class Scribe:
         self._robot, self._life, self._kernel = robot, life, clock.kernel_boot()
         self._number = 0
         self._last: dict[str, tuple[str, int, int]] = {}
-        self._waiting: deque[Line] = deque()
+        self._recent: deque[Line] = deque(maxlen=WAITING_MAX)
+        self._written = 0
         self._given_up = 0
-        self._change = threading.Condition()
-        self._ending = False
+        self._queue: SimpleQueue[Line | None] = SimpleQueue()
+        self._ending = threading.Event()
         self._thread = threading.Thread(target=self._work, name="scribe", daemon=True)
         self._thread.start()
 
     def note(self, decisions: Iterable[Decision]) -> None:
         """Pass decisions on to be written; returns at once."""
-        lines = [line for decision in decisions if (line := self._line(decision)) is not None]
-        if not lines:
-            return
-        with self._change:
-            self._waiting.extend(lines)
-            while len(self._waiting) > WAITING_MAX:
-                self._waiting.popleft()
+        for decision in decisions:
+            line = self._line(decision)
+            if line is None:
+                continue
+            self._recent.append(line)
+            if self._queue.qsize() < WAITING_MAX:
+                self._queue.put(line)
+            else:
                 self._given_up += 1
-            self._change.notify()
 
     def unwritten(self) -> tuple[Line, ...]:
         """Lines that are not on the disk yet, oldest first."""
-        with self._change:
-            return tuple(self._waiting)
+        return tuple(line for line in self._recent if line.number > self._written)
 
     def close(self, patience_s: float) -> None:
-        """End once nothing waits; a disk that takes longer is not waited for."""
-        with self._change:
-            self._ending = True
-            self._change.notify()
+        """End once nothing waits; a disk that takes longer, or refuses, is not waited for."""
+        self._ending.set()
+        self._queue.put(None)
         self._thread.join(patience_s)
 
     def _line(self, decision: Decision) -> Line | None:
@@ -89,28 +88,33 @@ class Scribe:
         return Line(self._robot, self._life, self._number, self._kernel, clock.wall_ns(decision.at_ns), short, repeats)
 
     def _work(self) -> None:
-        while (batch := self._next()) is not None:
-            try:
-                self._file.append(batch)
-            except OSError as error:
-                self.trouble = f"the story of its decisions cannot be written: {error.strerror}; failover why forgets them"
-                time.sleep(RETRY_S)
-                if self._ending:
+        is_last = False
+        while not is_last:
+            batch, is_last = self._batch()
+            while batch and not self._is_kept(batch):
+                if self._ending.wait(RETRY_S):
                     break
-                continue
-            self._written(batch)
         self._file.close()
 
-    def _next(self) -> tuple[Line, ...] | None:
-        with self._change:
-            while not self._waiting and not self._ending:
-                self._change.wait()
-            return tuple(self._waiting) or None
+    def _batch(self) -> tuple[list[Line], bool]:
+        """Wait for lines; returns all that have come, and whether they are the last ones."""
+        batch: list[Line] = []
+        item = self._queue.get()
+        while item is not None:
+            batch.append(item)
+            try:
+                item = self._queue.get_nowait()
+            except Empty:
+                return batch, False
+        return batch, True
 
-    def _written(self, batch: tuple[Line, ...]) -> None:
-        newest = batch[-1].number
-        with self._change:
-            while self._waiting and self._waiting[0].number <= newest:
-                self._waiting.popleft()
-            lost = self._given_up
+    def _is_kept(self, batch: list[Line]) -> bool:
+        try:
+            self._file.append(batch)
+        except OSError as error:
+            self.trouble = f"the story of its decisions cannot be written: {error.strerror}; failover why forgets them"
+            return False
+        self._written = batch[-1].number
+        lost = self._given_up
         self.trouble = f"{lost} decisions are missing in the story: the disk did not take them in time" if lost else ""
+        return True

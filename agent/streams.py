@@ -1,14 +1,16 @@
 """What a component wrote, as two log files in one directory: on its primary and, rebuilt from snapshots, on each standby.
 
 A byte's place in a log file is its place in the stream, from the component's first byte; no restart or takeover renumbers it.
-Three numbers bound a stream: ``start <= committed <= size``.
+Four numbers bound a stream: ``start <= committed <= size``, and ``safe <= committed``.
 
 * Bytes before ``start`` were given back to the disk (a log keeps `KEEP_LIMIT` bytes); they read as zeros and are never served.
 * Bytes before ``committed`` belong to a checkpoint: every robot that has them has the same ones, and no takeover takes them back.
+* Bytes before ``safe`` belong to a checkpoint that another robot holds. A component whose output is held (``--output=committed``)
+  shows these alone: not even a robot that is lost for good, while it was alone, takes back what was seen.
 * Bytes up to ``size`` were written by a program whose newest state is not acknowledged yet; a restore cuts them off.
 
-``start`` and ``committed`` stand in the file ``offsets`` (four little-endian u64: start 1, committed 1, start 2, committed 2).
-Neither needs to survive a power cut by itself: a restore gets its totals from the snapshot.
+They stand in the file ``offsets`` (seven little-endian u64: start 1, committed 1, start 2, committed 2, safe 1, safe 2, held).
+None needs to survive a power cut by itself: a restore gets its totals from the snapshot, and what is not known to be safe waits.
 """
 
 from __future__ import annotations
@@ -41,6 +43,9 @@ READ_LIMIT: Final = 1 << 20
 
 START: Final = 0
 COMMITTED: Final = 1
+SAFE: Final = 4
+"""Places in the file ``offsets``, for the first stream."""
+HELD: Final = 6
 _OFFSET: Final = struct.Struct("<Q")
 FAR_AWAY: Final = 1 << 40
 """An offset, a multiple of `TRIM_STEP`, to try out whether holes can be made."""
@@ -53,6 +58,7 @@ class Bounds:
     start: int
     committed: int
     size: int
+    safe: int
 
 
 class OutputLogs:
@@ -84,11 +90,26 @@ class OutputLogs:
     def bounds(self, stream: int) -> Bounds:
         """Where the stream stands now."""
         size = os.fstat(self._logs[stream]).st_size
-        return Bounds(min(self._offset(stream, START), size), min(self._offset(stream, COMMITTED), size), size)
+        start, committed, safe = (min(self._offset(stream, which), size) for which in (START, COMMITTED, SAFE))
+        return Bounds(start, committed, size, min(safe, committed))
 
     def totals(self) -> tuple[int, int]:
         """Bytes in each log, committed or not."""
         return self.bounds(1).size, self.bounds(2).size
+
+    @property
+    def is_held(self) -> bool:
+        """Whether nothing is shown before another robot holds it."""
+        return bool(self._word(HELD))
+
+    def hold(self, held: bool) -> None:
+        """Note, on this robot, what the component's record says of its output."""
+        if held != self.is_held:
+            self._set_word(HELD, int(held))
+
+    def waiting(self) -> int:
+        """Bytes of both streams that wait for another robot to hold them."""
+        return sum(bounds.size - bounds.safe for bounds in map(self.bounds, STREAMS))
 
     def read(self, stream: int, offset: int, size: int = READ_LIMIT, *, committed: bool = True) -> OutputPiece:
         """The stream's bytes from ``offset`` on, at most ``size``; fewer, or none, where the stream ends.
@@ -96,12 +117,13 @@ class OutputLogs:
         The piece says where it begins: later than asked where the beginning is no longer kept.
 
         Args:
-            committed: only what no takeover can take back; otherwise also what the program wrote since.
+            committed: only what no takeover can take back, of held output only what is safe; otherwise all that was written.
         """
         while True:
             bounds = self.bounds(stream)
+            shown = (bounds.safe if self.is_held else bounds.committed) if committed else bounds.size
             begin = max(offset, bounds.start)
-            end = min(bounds.committed if committed else bounds.size, begin + min(size, READ_LIMIT))
+            end = min(shown, begin + min(size, READ_LIMIT))
             content = os.pread(self._logs[stream], end - begin, begin) if end > begin else b""
             if self._offset(stream, START) <= begin:  # otherwise it was given back while we read, and we may have read zeros
                 return OutputPiece(stream, begin, content)
@@ -110,25 +132,36 @@ class OutputLogs:
         """Write at ``offset``; returns the bytes written, which may be fewer than given (write(2))."""
         return os.pwrite(self._logs[stream], content, offset)
 
-    def apply(self, pieces: Iterable[OutputPiece]) -> None:
+    def apply(self, pieces: Iterable[OutputPiece], *, is_safe: bool = False) -> None:
         """Make the committed stream end as a snapshot says it does. Applying the same snapshot again changes nothing.
 
         Pieces come from the snapshots of one chain, in its order. Whatever lay beyond a piece's end was written by a history
         that did not survive and goes. Where the log ends before a piece begins, the stream's kept part starts with the piece.
+
+        Args:
+            is_safe: they come from another robot, so that two hold them.
         """
         for piece in pieces:
             bounds = self.bounds(piece.stream)
             gap = piece.offset > bounds.size
             start = piece.offset if gap else min(bounds.start, piece.offset)
+            end = piece.offset + len(piece.content)
             _write_whole(self._logs[piece.stream], piece.content, piece.offset)
-            self._end_at(piece.stream, piece.offset + len(piece.content), start)
-            self.trim(piece.stream, piece.offset + len(piece.content) - KEEP_LIMIT)
+            self._end_at(piece.stream, end, start)
+            if is_safe:
+                self._set_offset(piece.stream, SAFE, end)
+            self.trim(piece.stream, end - KEEP_LIMIT)
 
-    def commit(self, totals: tuple[int, int]) -> None:
-        """Say that a checkpoint holds the streams up to ``totals``. Never goes back: an older acknowledgement changes nothing."""
+    def commit(self, totals: tuple[int, int], *, is_safe: bool = False) -> None:
+        """Say that a checkpoint holds the streams up to ``totals``. Never goes back: an older acknowledgement changes nothing.
+
+        Args:
+            is_safe: it is one that another robot holds.
+        """
         for stream, total in zip(STREAMS, totals, strict=True):
-            if total > self._offset(stream, COMMITTED):
-                self._set_offset(stream, COMMITTED, total)
+            for which in (COMMITTED, SAFE) if is_safe else (COMMITTED,):
+                if total > self._offset(stream, which):
+                    self._set_offset(stream, which, total)
 
     def truncate(self, totals: tuple[int, int]) -> None:
         """Make the streams end at ``totals``, all of it committed: what a program restored from there has written so far."""
@@ -152,13 +185,20 @@ class OutputLogs:
         os.ftruncate(self._logs[stream], total)
         self._set_offset(stream, START, min(start, total))
         self._set_offset(stream, COMMITTED, total)
+        self._set_offset(stream, SAFE, min(self._offset(stream, SAFE), total))
 
     def _offset(self, stream: int, which: int) -> int:
-        content = os.pread(self._offsets, _OFFSET.size, _place(stream, which))
-        return int(_OFFSET.unpack(content)[0]) if len(content) == _OFFSET.size else 0
+        return self._word(_place(stream, which))
 
     def _set_offset(self, stream: int, which: int, value: int) -> None:
-        os.pwrite(self._offsets, _OFFSET.pack(value), _place(stream, which))
+        self._set_word(_place(stream, which), value)
+
+    def _word(self, place: int) -> int:
+        content = os.pread(self._offsets, _OFFSET.size, place * _OFFSET.size)
+        return int(_OFFSET.unpack(content)[0]) if len(content) == _OFFSET.size else 0
+
+    def _set_word(self, place: int, value: int) -> None:
+        os.pwrite(self._offsets, _OFFSET.pack(value), place * _OFFSET.size)
 
 
 def discard(directory: Path) -> None:
@@ -180,7 +220,8 @@ def total_of(pieces: Iterable[OutputPiece]) -> tuple[int, int]:
 
 
 def _place(stream: int, which: int) -> int:
-    return ((stream - 1) * 2 + which) * _OFFSET.size
+    """Of a stream's number among the words of the file ``offsets``."""
+    return which + (stream - 1) * (1 if which == SAFE else 2)
 
 
 def _open(path: Path) -> int:

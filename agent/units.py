@@ -25,11 +25,12 @@ STARTED: Final = "SYSTEMD_EXEC_PID"
 STOP_S: Final = 5
 """How long a shutdown waits for a component to obey SIGTERM; one that is frozen never does, and the default is 90 s."""
 
-Kind = Literal["guard", "keeper"]
+Kind = Literal["guard", "keeper", "hook"]
 
 PROPERTIES: Final[dict[Kind, tuple[str, ...]]] = {
     "guard": ("Delegate=yes", f"TimeoutStopSec={STOP_S}s", "OOMScoreAdjust=-900", "UMask=0077"),
     "keeper": (f"TimeoutStopSec={STOP_S}s", "LimitNOFILE=65536", "UMask=0077"),
+    "hook": (f"TimeoutStopSec={STOP_S}s",),
 }
 """Without its guard a program ends, so memory is taken from others first; a keeper is replaced."""
 
@@ -55,7 +56,8 @@ def in_a_unit(program: str, kind: Kind, name: str) -> list[str]:
     order = (f"Before={service}",) if service else ()
     properties = [f"--property={one}" for one in (*PROPERTIES[kind], *order)]
     unit = f"--unit=failover-{kind}-{name}"
-    return [program, "--quiet", "--collect", "--service-type=exec", unit, f"--slice={SLICE}", *properties, "--"]
+    begun = "oneshot" if kind == "hook" else "exec"  # systemd-run waits until that has come about: the end of a hook
+    return [program, "--quiet", "--collect", f"--service-type={begun}", unit, f"--slice={SLICE}", *properties, "--"]
 
 
 def own_service(cgroups: str) -> str:

@@ -37,7 +37,7 @@ from agent.telling import Telling
 from agent.view import version
 from failover.core import acts, events
 from failover.core.names import check_component
-from failover.core.types import ComponentSpec, Launch, State
+from failover.core.types import COMMITTED, ComponentSpec, Launch, State
 from failover.errors import NameFormatError
 
 STANDING_POLL_S: Final = 0.01
@@ -192,6 +192,8 @@ class Verbs:
             isolate=wanted.isolate,
             inheritance=msgspec.msgpack.encode(inheritance),
             engine=wanted.engine,
+            output=wanted.output,
+            on_resume=tuple(wanted.on_resume),
         )
         charge = await self._begin(name, launch, inheritance.uid)
         started: dict[str, Any] = {"name": name, "notes": list(charge.figures.notes), "reasons": list(charge.figures.reasons)}
@@ -202,7 +204,7 @@ class Verbs:
         if not wanted.wait:
             return started
         await say.update({"started": started})
-        await self._outflow.pass_on(say, name, (0, 0), committed=False, follow=True)
+        await self._outflow.pass_on(say, name, (0, 0), committed=wanted.output == COMMITTED, follow=True)
         if charge.ended is not None and charge.ended.done():
             report = charge.ended.result()
             return {"name": name, "exit_status": report.status, "failed": report.failed, "reason": report.reason}

@@ -7,14 +7,15 @@ from collections.abc import Mapping
 from importlib import metadata
 from typing import Any, Final
 
-from agent import clock
+from agent import clock, fence
 from agent.charge import Charge
 from agent.config import Settings
 from agent.door import Life, Told
 from agent.figures import Commits, Figures
+from agent.pump import HOLD_LIMIT
 from agent.transport import Link, LinkState
 from checkpoint.engine import COOPERATIVE, PTRACE
-from failover.core.types import ComponentView, PeerView, Protection, State
+from failover.core.types import COMMITTED, IMMEDIATE, ComponentView, PeerView, Protection, State
 
 NANOSECONDS_A_MILLISECOND: Final = 1_000_000
 
@@ -71,6 +72,7 @@ def team_view(
         "realtime": not life.notes,
         "rule": view.rule if view else None,
         "promise": view.promise if view else "not decided yet: the agent is starting",
+        "fencing": fence.sentence(fence.watchdog()),
         "healthy": view.healthy if view else False,
         "notes": notes,
         "links": interfaces,
@@ -104,11 +106,30 @@ def _peer(peer: PeerView, link: Link | None, told: Told) -> dict[str, Any]:
     }
 
 
+def _own_notes(view: ComponentView, figures: Figures | None) -> tuple[str, ...]:
+    """What this robot's own work on it found out."""
+    if figures is None:
+        return ()
+    return (*figures.notes, *_overdue(view, figures), *((figures.hook,) if figures.hook else ()))
+
+
+def _waiting_output(view: ComponentView, waiting: int) -> tuple[str, ...]:
+    """What becomes of held output while no checkpoint of it reaches another robot."""
+    if not waiting or view.protection is Protection.PROTECTED:
+        return ()
+    limit = f"at {HOLD_LIMIT >> 20} MiB of a stream the program waits in its next write"
+    return (
+        f"{waiting} bytes of its output are held back (--output=committed): no other robot holds a checkpoint of them; {limit}",
+    )
+
+
 def _component(view: ComponentView, charge: Charge | None, settings: Settings) -> dict[str, Any]:
     figures = charge.figures if charge is not None else None
     running = charge.component if charge is not None else None
     newest = view.positions[0] if view.positions else None
     engine = running.engine if running is not None else figures.engine if figures is not None else PTRACE
+    held = running is not None and running.logs.is_held
+    waiting = running.logs.waiting() if running is not None and held else 0
     degraded = view.protection in (Protection.DEGRADED, Protection.STOPPED) and view.state is State.PRIMARY
     return {
         "name": view.name,
@@ -143,8 +164,10 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings) -
         "home": view.home,
         "prefer": view.prefer,
         "owner": view.owner,
+        "output": COMMITTED if held else IMMEDIATE,
+        "output_waiting": waiting,
         "reasons": list(figures.reasons) if figures else [],
-        "notes": [*view.notes, *(figures.notes if figures else ()), *_overdue(view, figures)],
+        "notes": [*view.notes, *_own_notes(view, figures), *_waiting_output(view, waiting)],
     }
 
 

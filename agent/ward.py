@@ -18,13 +18,13 @@ from __future__ import annotations
 import os
 import secrets
 import signal
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Literal
 
 from agent import freezer as freezing
+from agent.clock import now_ns
 from agent.freezer import Freezer
 from agent.guard_messages import BeginTask, Described, Exited, MakeVessel, Start, Watch
 from agent.pump import Pump
@@ -211,7 +211,7 @@ class Ward:
         self._check_alive("commit to it")
         self.committed = True
         self._listen_again()
-        self.lapse(time.monotonic_ns())
+        self.lapse(now_ns())
 
     def _listen_again(self) -> None:
         """A program that was restored before it said that it keeps its state looks for its guard where the last one listened."""
@@ -249,7 +249,7 @@ class Ward:
             WardError: it has ended, or its lease is over.
         """
         self._check_alive("thaw it")
-        if self._lease_is_over(time.monotonic_ns()):
+        if self._lease_is_over(now_ns()):
             raise WardError("cannot thaw it: its lease is over, another robot may run it; give it a new lease first")
         self.freezer.thaw()
         self.frozen_by = ""
@@ -257,7 +257,7 @@ class Ward:
     def set_lease(self, until_ns: int) -> None:
         """Take a new lease; what the old one froze goes on. What was frozen by order stays so."""
         self.lease_until_ns = until_ns
-        if self.frozen_by == "lease" and self.exited is None and not self._lease_is_over(time.monotonic_ns()):
+        if self.frozen_by == "lease" and self.exited is None and not self._lease_is_over(now_ns()):
             self.thaw()
 
     def lapse(self, now_ns: int) -> bool:
@@ -269,7 +269,7 @@ class Ward:
         return True
 
     def deadline_ns(self) -> int | None:
-        """When `lapse` has something to do, on CLOCK_MONOTONIC."""
+        """When `lapse` has something to do, on CLOCK_BOOTTIME."""
         pending = self.lease_until_ns and self.committed and not self.frozen_by and self.exited is None
         return self.lease_until_ns if pending else None
 

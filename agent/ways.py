@@ -44,6 +44,7 @@ class Ways:
 
     def __init__(self, settings: Settings, keys: Keys, heard: Heard, changed: Changed, links: Links) -> None:
         self.troubles: list[str] = []
+        self._connected: set[tuple[int, str]] = set()
         self._beat_keys: dict[str, bytes] = {}
         self._lanes: list[BulkLane] = []
         name = settings.config.robot
@@ -88,9 +89,15 @@ class Ways:
         """Talk no further with this peer there until it connects anew."""
         self._lanes[way].links[peer].refuse(reason)
 
-    def has_better(self, way: int, peer: str) -> bool:
-        """Whether an earlier way to the peer is connected: words do not take this one."""
-        return any(_is_connected(lane, peer) for lane in self._lanes[:way])
+    def carried_words(self, way: int, peer: str, state: LinkState) -> bool:
+        """Called at each change of a connection: whether words to the peer took this way until now, and may be lost with it."""
+        was_connected = (way, peer) in self._connected
+        if state is LinkState.CONNECTED:
+            self._connected.add((way, peer))
+        else:
+            self._connected.discard((way, peer))
+        has_better = any((better, peer) in self._connected for better in range(way))
+        return was_connected and not has_better
 
     def hindrance(self, peer: str) -> str:
         """Why nothing can be said to a peer now; "" when it can."""

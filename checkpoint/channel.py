@@ -233,7 +233,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
 
     Attributes:
         streams: the last five descriptors are the streams, as with `Protect`.
-        own_eyes: see `checkpoint.engine.RestoreOptions`.
+        own_eyes, epoch: see `checkpoint.engine.RestoreOptions`.
     """
 
     pid: int
@@ -243,6 +243,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
     streams: bool = False
     robot: str = ""
     own_eyes: bool = False
+    epoch: int = 0
 
 
 class Fill(msgspec.Struct, frozen=True, tag=True):

@@ -113,12 +113,14 @@ class RestoreOptions:
     Attributes:
         elapsed_ns: time between the snapshot and now, as far as known; the program's clocks go on by this much.
         accept_changed: paths of files that may differ from what the snapshot recorded (rule ``shared``).
+        epoch: of the primacy under which it goes on; a program that was born with one finds it in its environment. 0: none.
         own_eyes: open its files with its own user's rights, not with ours: that user could have put other files in their place.
     """
 
     elapsed_ns: int = 0
     accept_changed: tuple[str, ...] = ()
     own_eyes: bool = False
+    epoch: int = 0
 
 
 class Session(Protocol):

@@ -130,7 +130,7 @@ class Keeper:
             state = folded(files)
         finally:
             channel.close_all(files)
-        options = RestoreOptions(request.elapsed_ns, request.accept_changed, request.own_eyes)
+        options = RestoreOptions(request.elapsed_ns, request.accept_changed, request.own_eyes, request.epoch)
         self._restored = self._tracer.restore(request.pid, state, options)
         self._revived = request, ends
         return channel.Restored(self._restored.pid, self._restored.position, self._restored.notes), ()

@@ -55,6 +55,11 @@ class StreamCounts:
         fcntl.ioctl(self._pipes[index], termios.FIONREAD, self._found)
         return self._found[0]
 
+    def taken(self, index: int) -> int | None:
+        """Bytes of a stream (0 or 1) that the guard has taken out of its pipe; None while it does."""
+        busy, count = self._words[2 * index], self._words[2 * index + 1]
+        return None if busy else count
+
     def words(self) -> bytes:
         """The guard's counters as they are: while it does nothing, they stay the same."""
         return self._counters[: COUNTERS.size]

@@ -24,16 +24,20 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from failover.client.control import Control
-    from failover.client.task import Resumed, activations, commit, epoch, resume, resumed, transaction, wait_committed
+    from failover.client.epoch import epoch
+    from failover.client.gateway import Gateway
+    from failover.client.task import Resumed, activations, commit, resume, resumed, transaction, wait_committed
     from failover.client.task_component import component, kept, run
     from failover.client.task_loop import FINISHED, every
     from failover.client.task_resumable import resumable
     from failover.errors import (
         AgentRefusedError,
         FailoverError,
+        GatewayError,
         LostAgentError,
         NoAgentError,
         NotCommittedError,
+        StaleEpochError,
         StateTakenError,
         TaskError,
     )
@@ -45,7 +49,8 @@ _HOMES = {
     "Resumed": "failover.client.task",
     "activations": "failover.client.task",
     "commit": "failover.client.task",
-    "epoch": "failover.client.task",
+    "epoch": "failover.client.epoch",
+    "Gateway": "failover.client.gateway",
     "resume": "failover.client.task",
     "resumed": "failover.client.task",
     "transaction": "failover.client.task",
@@ -58,6 +63,8 @@ _HOMES = {
     "resumable": "failover.client.task_resumable",
     "AgentRefusedError": "failover.errors",
     "FailoverError": "failover.errors",
+    "GatewayError": "failover.errors",
+    "StaleEpochError": "failover.errors",
     "LostAgentError": "failover.errors",
     "NoAgentError": "failover.errors",
     "NotCommittedError": "failover.errors",
@@ -70,10 +77,13 @@ __all__ = [
     "AgentRefusedError",
     "Control",
     "FailoverError",
+    "Gateway",
+    "GatewayError",
     "LostAgentError",
     "NoAgentError",
     "NotCommittedError",
     "Resumed",
+    "StaleEpochError",
     "StateTakenError",
     "TaskError",
     "__version__",

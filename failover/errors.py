@@ -87,3 +87,21 @@ class StateTakenError(TaskError):
 
 class NotCommittedError(FailoverError, TimeoutError):
     """A commit is not known to survive yet; the program may go on, or wait again."""
+
+
+class GatewayError(FailoverError):
+    """A gateway cannot decide: its file cannot be used, or what came is no epoch. Nothing may be obeyed."""
+
+
+class StaleEpochError(FailoverError):
+    """A command comes from a program that was replaced: another primary has given one of a later epoch.
+
+    Attributes:
+        epoch: of the command.
+        newest: of the other one.
+    """
+
+    def __init__(self, epoch: int, newest: int) -> None:
+        super().__init__(f"epoch {epoch} is over, {newest} has begun: another robot runs this program now")
+        self.epoch = epoch
+        self.newest = newest

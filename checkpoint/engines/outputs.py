@@ -1,6 +1,7 @@
 """How much a guarded component has written to its standard streams, and the bytes themselves, without asking anybody.
 
 The guard counts a byte when it takes it out of the pipe, and writes it to the log a little later (ARCHITECTURE §4).
+Of held output it may leave bytes in the pipe: they are read there, and stay.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from checkpoint.engine import Streams
 from checkpoint.errors import CaptureError
 from checkpoint.model import OutputPiece
 from checkpoint.resources import Surroundings, pipes_of
+from checkpoint.resources.pipes import peek
 from checkpoint.stream_counts import StreamCounts, Totals
 
 LOG_TIMEOUT_S: Final = 2.0
@@ -53,19 +55,31 @@ class Outputs:
         )
 
     def _piece(self, index: int, begin: int, end: int) -> OutputPiece:
-        log = self._streams.logs[index]
         deadline = time.perf_counter() + LOG_TIMEOUT_S
-        while os.fstat(log).st_size < end:
+        while (content := self._written(index, begin, end)) is None:
             if time.perf_counter() > deadline:
                 raise CaptureError(
                     f"the guard has not written stream {index + 1} to its log within {LOG_TIMEOUT_S:g} s: "
                     "its disk is slow or full; make room, then capture again"
                 )
             time.sleep(0.0005)
-        content = os.pread(log, end - begin, begin) if end > begin else b""
         if len(content) != end - begin:
             raise CaptureError(f"the log of stream {index + 1} is shorter than its size says; capture it again")
         return OutputPiece(index + 1, begin, content)
+
+    def _written(self, index: int, begin: int, end: int) -> bytes | None:
+        """The bytes from the log, the last of them from the pipe where the guard leaves them; None: not to be had now."""
+        log = self._streams.logs[index]
+        if os.fstat(log).st_size >= end:
+            return os.pread(log, end - begin, begin) if end > begin else b""
+        taken = self._counts.taken(index)
+        if taken is None or os.fstat(log).st_size < taken:
+            return None
+        unread = peek(self._streams.outputs[index])
+        if taken + len(unread) < end or self._counts.taken(index) != taken:
+            return None
+        logged = os.pread(log, taken - begin, begin) if taken > begin else b""
+        return logged + unread[max(begin - taken, 0) : end - taken]
 
     def close(self) -> None:
         """Give the descriptors back."""

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from checkpoint import epoch_variable
 from checkpoint.arch import x86_64, x86_64_stub
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import restore_checks, restore_memory, restore_process, switches
@@ -139,6 +140,8 @@ class _Restore:
         stub.install(self._syscall_instruction(kernel_pages[-1]), size)
         self._notes += stub.run(first)
         restore_memory.fill(tracee.memory, state)
+        if self._options.epoch:
+            _renew_token(tracee, state, self._options.epoch)
         self._notes += stub.run(second)
         self._stub = stub
         _write_oom_score(tracee.pid, state.process.oom_score_adj, self._notes)
@@ -253,6 +256,17 @@ def content_at(state: Snapshot, address: int, size: int) -> bytes | None:
             return bytes(memoryview(state.contents)[offset : offset + size])
         position += run.size
     return None
+
+
+def _renew_token(tracee: Tracee, state: Snapshot, epoch: int) -> None:
+    """Write the epoch under which it goes on where the program was born with one."""
+    layout = state.process.layout
+    size = layout.env_end - layout.env_start
+    if not 0 < size <= epoch_variable.ENVIRONMENT_MAX:
+        return
+    place = epoch_variable.place_in(tracee.memory.read(layout.env_start, size))
+    if place is not None:
+        tracee.memory.write(layout.env_start + place, epoch_variable.digits(epoch))
 
 
 def look_at_vessel(pid: int) -> Vessel:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import array
 import ctypes
+import errno
 import fcntl
 import os
 import stat
@@ -32,6 +33,7 @@ KIND: Final = "pipes"
 
 F_SETPIPE_SZ: Final = 1031
 F_GETPIPE_SZ: Final = 1032
+SPLICE_F_NONBLOCK: Final = 2
 DEFAULT_CAPACITY: Final = 65536
 PIPES_KNOWN: Final = 1024
 """Pipes remembered as held by nobody else: others can only get hold of one by a fork or a socket, which are refused."""
@@ -127,12 +129,34 @@ def _copy_of(pipe: int, capacity: int) -> bytes:
     fcntl.ioctl(pipe, termios.FIONREAD, waiting)
     if not waiting[0]:
         return b""
+    content = _teed(pipe, waiting[0], capacity)
+    if len(content) != waiting[0]:
+        raise BlockingIOError(errno.EAGAIN, "somebody reads it meanwhile")
+    return content
+
+
+def peek(pipe: int) -> bytes:
+    """What waits in a pipe, by its reading end; it stays there. Nothing where it cannot be looked into, as a terminal cannot."""
+    try:
+        capacity = fcntl.fcntl(pipe, F_GETPIPE_SZ)
+        return _teed(pipe, capacity, capacity)
+    except OSError:
+        return b""
+
+
+def _teed(pipe: int, size: int, capacity: int) -> bytes:
+    """A copy of the first bytes of a pipe, as far as there are any.
+
+    Raises:
+        OSError: it is no pipe, or there is none to copy into.
+    """
     reader, writer = os.pipe()
     try:
         fcntl.fcntl(writer, F_SETPIPE_SZ, capacity)
-        if _libc.tee(pipe, writer, waiting[0], 0) != waiting[0]:
+        copied = _libc.tee(pipe, writer, size, SPLICE_F_NONBLOCK)
+        if copied < 0 and ctypes.get_errno() != errno.EAGAIN:
             abi.raise_errno("tee of a pipe")
-        return os.read(reader, waiting[0])
+        return os.read(reader, copied) if copied > 0 else b""
     finally:
         os.close(reader)
         os.close(writer)

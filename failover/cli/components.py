@@ -31,6 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Start a program under protection; its output and exit status become ours."""
     wanted: dict[str, Any] = {"argv": arguments.command, "env": dict(os.environ), "cwd": os.getcwd(), "umask": _umask()}
     wanted |= {"engine": arguments.engine, "isolate": arguments.isolate, "wait": not arguments.detach}
+    wanted |= {"output": arguments.output, "on_resume": arguments.on_resume}
     if arguments.name:
         wanted["name"] = arguments.name
     if arguments.user:

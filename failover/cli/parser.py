@@ -7,6 +7,7 @@ Only this file knows argparse. A verb is a row of the table at the bottom; the f
 from __future__ import annotations
 
 import argparse
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from textwrap import dedent
@@ -149,6 +150,20 @@ def _run(room: argparse.ArgumentParser) -> None:
         default="auto",
         help="ptrace: captured from outside, for a program that nobody prepared; cooperative: the program says by itself what "
         "must survive (failover.resume, failover.component), and is started again from that (default: auto, as it turns out)",
+    )
+    room.add_argument(
+        "--output",
+        choices=("immediate", "committed"),
+        default="immediate",
+        help="committed: show output once another robot holds a checkpoint that contains it, so that no takeover takes back or "
+        "repeats what was seen (default: immediate, as it is written)",
+    )
+    room.add_argument(
+        "--on-resume",
+        metavar="CMD",
+        type=shlex.split,
+        default=[],
+        help="run this, as you, on a robot where it went on; told which robot, epoch and why in FAILOVER_* variables",
     )
     room.add_argument("--user", metavar="USER", help="run it as this user, by name or number (only root may; default: as you)")
     room.add_argument("command", metavar="CMD", nargs="+", help="the program and its arguments, after --")
@@ -346,6 +361,10 @@ VERBS: Final = (
 
         While it waits, the agent may be restarted and the program may go to another robot and end there: it goes on waiting, and
         shows each byte once. An agent that does not come back within half a minute is status 3; the program runs on.
+
+        A takeover goes on from the newest checkpoint: what was written after it is written again, and may differ from what you
+        saw. With --output=committed nothing is shown before another robot holds it, here and by failover logs. While nobody
+        stands by it waits, and failover status says so; when 8 MiB of a stream wait, the program waits in its next write.
 
         It runs as you, with your groups, limits, priorities, environment, directory and umask, as if your shell had started it.
         Besides root only you may read its output, stop, release or move it, on any robot that knows you by the same number.

@@ -87,6 +87,8 @@ def plain_tree(status: dict[str, Any]) -> str:
     lines = [plain_table(picture.COLUMNS, [row.cells for row in picture.rows(status)])]
     if status.get("promise"):
         lines.append(f"promise: {status['promise']}")
+    if status.get("fencing"):
+        lines.append(f"fencing: {status['fencing']}")
     return "\n".join([*lines, *(f"note: {line}" for line in picture.remarks(status))])
 
 
@@ -172,6 +174,8 @@ def _rich_tree(status: dict[str, Any]) -> Any:
         parts = [_rich_table(picture.COLUMNS, lines, f"team {status.get('team') or ''}".strip())]
     if status.get("promise"):
         parts.append(Text(spoken(f"promise: {status['promise']}"), style="bold"))
+    if status.get("fencing"):
+        parts.append(Text(spoken(f"fencing: {status['fencing']}"), style="dim"))
     return Group(*parts, *(Text(spoken(line), style="yellow") for line in picture.remarks(status)))
 
 

@@ -15,6 +15,9 @@ COLUMNS: Final = ("when", "robot", "component", "what was seen and done")
 LATE_TOLD_MS: Final = 5.0
 """An own lateness below this has delayed nothing."""
 
+SHOWN_MAX: Final = 100
+"""Decisions that are told where nobody said how far back: the last ones."""
+
 NEAR_MS: Final = 1.0
 """Clocks that are closer together need no word."""
 
@@ -28,6 +31,8 @@ def why(arguments: argparse.Namespace) -> int:
         render.as_json(answer)
         return 0
     story = answer["story"]
+    earlier = 0 if arguments.since else max(len(story) - SHOWN_MAX, 0)
+    story = story[earlier:]
     witnesses = render.spoken(told_of_robots(answer.get("robots") or ()))
     if not story:
         print("no decisions yet" + (f" about {arguments.name}" if arguments.name else ""))
@@ -35,6 +40,8 @@ def why(arguments: argparse.Namespace) -> int:
         render.table(COLUMNS, [brief(line) for line in story])
     else:
         print(render.spoken("\n\n".join(paragraph(line) for line in story)))
+    if earlier:
+        print(f"\n{earlier} earlier decisions are not shown; failover why --since 7d, or --json, tells more")
     if witnesses:
         print(f"\n{witnesses}")
     return 0
@@ -69,7 +76,8 @@ def facts(line: Mapping[str, Any]) -> list[str]:
 def sighting(seen: Mapping[str, Any]) -> str:
     """One peer, as the robot had heard it."""
     state = seen.get("state")
-    silence = f"silent for {picture.milliseconds(seen.get('silent_ms'))} of {picture.milliseconds(seen.get('limit_ms'))}"
+    limit = picture.milliseconds(seen.get("limit_ms"))
+    silence = f"silent for {picture.milliseconds(seen.get('silent_ms'))} (the limit is {limit})"
     if state == "unheard":
         return f"{seen.get('robot')}: not heard yet, {silence}"
     links = seen.get("links") or {}

@@ -13,7 +13,8 @@ verb           arguments                                                result, 
 ``status``     ``watch`` false, ``every_ms`` 500, ``team`` false        see `STATUS`; with ``watch`` each picture is an Update
 ``run``        ``argv`` *must*, ``name`` = argv[0]'s, ``env``, ``cwd``,  Update ``{"started": {name, pid, inner_pid, isolated,
                ``umask`` 18, ``isolate`` true, ``wait`` true,           notes}}``; with ``wait`` Output … and Result
-               ``user`` "", ``engine`` "ptrace"                         ``{name, exit_status}`` (a wait status); else at once
+               ``user`` "", ``engine`` "auto", ``output`` "immediate",  ``{name, exit_status}`` (a wait status); else at once
+               ``on_resume`` []
 ``protect``    ``pid`` *must*, ``name`` *must*                          ``{name, pid, notes}``
 ``release``    ``name`` *must*                                          ``{name, pid}``; the program runs on, unprotected
 ``stop``       ``name`` *must*, ``signal`` 15                           ``{name, exit_status}`` once it has ended
@@ -46,6 +47,7 @@ robot, team, role, pid, lanes_pid, version: of this agent; life: count of its st
 insecure: links are neither authenticated nor encrypted
 realtime: the heart runs at real-time priority with its memory locked
 rule, promise: by which rule the team decides, and one sentence: what holds if this robot dies now
+fencing: one sentence: what freezes a program that may not act, and what this robot does not have for the worst case
 healthy: nothing is degraded, nothing has failed, nobody is silent, as far as this robot knows
 notes: [sentence, …]: what is missing or degraded on this robot
 beats: {sent, heard, unsent, refused, late_us_max, gap_us_max, gaps}: of this life; refused: {reason: count}
@@ -58,8 +60,8 @@ peers: [{name, state, last_heard_ms, hears_us, load, beats_lost, links, lane, no
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
     freeze_us_max, snapshot_size, dirty_bytes, snapshots, restores, crashes, outage_ms, exit_status, promise, owner, reasons,
-    notes, elsewhere, warm,
-    cold}]
+    output, output_waiting, notes, elsewhere, warm, cold}]
+    output: immediate | committed (--output); output_waiting: bytes that wait until another robot holds them
     warm: its program waits at its standby, started in advance; None where nothing could: it is restored from its memory
     cold: why it does not wait at this robot, where it should and something went wrong; "" otherwise
     owner: uid of the user who may give orders about it and read its output, besides root

@@ -359,15 +359,6 @@ def resumed() -> Resumed | None:
     return PROCESS.the_task("tell where the state came from").resumed
 
 
-def epoch() -> int:
-    """Number of the primacy under which this program runs: the fencing token, which only grows. 0 without an agent.
-
-    Give it along with every order to something outside (a motor controller, a gripper) that remembers the highest one it has
-    seen and refuses lower ones: then a program that was replaced and does not know it yet moves nothing any more.
-    """
-    return PROCESS.the_task("tell the epoch").epoch
-
-
 def activations() -> Activations:
     """The steps of this process's component so far: how many, and how many beginnings were missed."""
     return PROCESS.the_task("count steps").activations

@@ -20,10 +20,13 @@ class Received:
 
     Attributes:
         link: name of the link it came over.
+        copies: (link, instant) of the latest copy of a beat of this sender that came over each other link. They say nothing but
+            that the link carries.
     """
 
     beat: Beat
     link: str = ""
+    copies: tuple[tuple[str, int], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -72,6 +72,11 @@ class Peer:
             self.counter, self.settled, self.total, self.load = beat.counter, beat.settled, beat.total, beat.load
         return tuple(entry for entry in beat.entries if self._news(entry, beat.counter))
 
+    def carried(self, copies: tuple[tuple[str, int], ...]) -> None:
+        """Links over which copies of its beats came; whether it lives is for the first of each beat to say."""
+        for link, at_ns in copies:
+            self.links[link] = max(self.links.get(link, at_ns), at_ns)
+
     def _echoes(self, beat: Beat, own: tuple[str, int]) -> None:
         for echo in beat.echoes:
             if (echo.robot, echo.boot) == own:

@@ -91,7 +91,7 @@ class Node:
         self._configure(held)
 
     def step(self, event: Event, now_ns: int) -> Ready:
-        """Take in one event at ``now_ns`` (this machine's monotonic clock) and say what must be done about it."""
+        """Take in one event at ``now_ns`` (our own clock, which counts sleep) and say what must be done about it."""
         self._now_ns = now_ns = max(now_ns, self._now_ns)
         late_ns = now_ns - self._asked_ns
         if late_ns > LATE_NS:
@@ -177,6 +177,8 @@ class Node:
     def _hear(self, event: Received, turn: Turn) -> list[Component]:
         beat = event.beat
         news = self._team.hear(beat, event.link, turn.now_ns)
+        if beat.sender in self._team.peers:
+            self._team.peers[beat.sender].carried(event.copies)
         touched = {name: component for name, component in self._components.items() if component.holding}
         for entry in news:
             component = self._known(entry.name)

@@ -88,6 +88,13 @@ class Protection(enum.StrEnum):
     STOPPED = "stopped"
 
 
+IMMEDIATE = "immediate"
+"""Output is shown as it is written: after a takeover, what was written since the checkpoint is written again."""
+
+COMMITTED = "committed"
+"""Output is shown once another robot holds a checkpoint that contains it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Launch:
     """How a program begins. The rules carry it and never look inside.
@@ -97,6 +104,8 @@ class Launch:
         environment: (name, value) pairs.
         pid: of a running program to protect (``failover protect``), 0 otherwise; means something on its home robot only.
         isolate: PID and time namespaces of its own.
+        on_resume: command that is run, as the program's user, after it went on somewhere; () for none.
+        output: `IMMEDIATE` or `COMMITTED`: when what it writes is shown.
         inheritance: whose rights, limits and priorities it gets, packed (`checkpoint.linux.inheritance`); b"": the agent's own.
     """
 
@@ -109,6 +118,8 @@ class Launch:
     engine: str = "ptrace"
     terminal: bool = False
     inheritance: bytes = b""
+    output: str = IMMEDIATE
+    on_resume: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import enum
 import hmac
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from hashlib import blake2b
 
 import msgspec
@@ -67,10 +67,16 @@ class Reason(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """A frame that was not believed; ``sender`` is known only where the code was right."""
+    """A frame that was not believed.
+
+    Attributes:
+        sender: known only where the code was right.
+        behind: of a beat that was seen before: how many newer ones were heard since; the newest one's copy on another link has 0.
+    """
 
     reason: Reason
     sender: str = ""
+    behind: int = field(default=0, compare=False)
 
 
 def seal(beat: Beat, team: str, key: bytes) -> bytes:
@@ -200,8 +206,9 @@ class Receiver:
             return Refused(Reason.SENDER, sender)
         if not _sound(beat):
             return Refused(Reason.MALFORMED, sender)
-        refusal = self._windows[sender].take(beat.boot, beat.counter)
-        return beat if refusal is None else Refused(refusal, sender)
+        window = self._windows[sender]
+        refusal = window.take(beat.boot, beat.counter)
+        return beat if refusal is None else Refused(refusal, sender, window.highest - beat.counter)
 
 
 def _sound(beat: Beat) -> bool:

@@ -97,11 +97,16 @@ class GuardProcess:
         logs: directory of the streams.
     """
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, around: tuple[str, ...] = ()) -> None:
+        """
+        Args:
+            around: a command that runs the guard, as its last words say, and ends it with itself.
+        """
         self.directory = directory
         self.path = directory / "one.guard"
         self.logs = directory / "logs"
-        self.process = subprocess.Popen([sys.executable, "-m", "agent.guard", str(self.path)], start_new_session=True)
+        command = [*around, sys.executable, "-m", "agent.guard", str(self.path)]
+        self.process = subprocess.Popen(command, start_new_session=True)
         self._agents: list[Agent] = []
 
     def agent(self) -> Agent:
@@ -145,9 +150,9 @@ class GuardProcess:
 
 
 @contextmanager
-def guarding(directory: Path) -> Iterator[GuardProcess]:
+def guarding(directory: Path, around: tuple[str, ...] = ()) -> Iterator[GuardProcess]:
     """A guard, ended at last."""
-    guard = GuardProcess(directory)
+    guard = GuardProcess(directory, around)
     try:
         yield guard
     finally:

@@ -23,6 +23,7 @@ from agent.places import Places, guard_sockets
 from checkpoint import format
 from checkpoint.errors import CheckpointError, FormatError
 from checkpoint.model import OutputPiece
+from checkpoint.stream_counts import StreamCounts
 from tests.agent.guards import PATIENCE_S, POLL_S, PYTHON, lives
 
 NAME: Final = "/test/robot1/one"
@@ -238,6 +239,17 @@ def test_a_program_that_a_capture_holds_goes_on_when_it_is_thawed(tmp_path: Path
     live(tmp_path, story)
 
 
+async def written(component: Component) -> bytes:
+    """All that a program has written that stands still, also what its guard is still to take from the pipe."""
+    counts = StreamCounts(component.streams[0], (component.streams[1], component.streams[2]))
+    try:
+        while counts.totals() != (len(output(component)), 0):
+            await asyncio.sleep(POLL_S)
+        return output(component)
+    finally:
+        counts.close()
+
+
 @pytest.mark.parametrize("cgroup", ["", "/nonexistent"])
 def test_a_program_that_its_lease_has_frozen_can_be_captured_when_it_is_held_for_that(tmp_path: Path, cgroup: str) -> None:
     async def story(places: Places) -> None:
@@ -245,7 +257,7 @@ def test_a_program_that_its_lease_has_frozen_can_be_captured_when_it_is_held_for
             await more(component)
             await component.lease(1)
             await component.freeze(exposed=True)
-            standing = output(component)
+            standing = await written(component)
             captures = Captures(component)
             piece = piece_of(await captures.take(hold=True))
             assert piece.offset + len(piece.content) == len(standing)

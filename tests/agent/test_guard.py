@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from agent.clock import now_ns
 from agent.guard_messages import (
     Commit,
     Done,
@@ -40,6 +41,9 @@ SOON_NS = 30_000_000
 """How far ahead a lease ends that a test waits for."""
 
 FAR_NS = 3_600_000_000_000
+
+SLEPT_S = 100_000
+SLEPT = ("unshare", "--time", f"--boottime={SLEPT_S}", "--fork", "--kill-child", "--")
 
 COUNT = "i = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    __import__('time').sleep(0.0005)\n"
 COUNTING = (PYTHON, "-S", "-c", COUNT)
@@ -72,8 +76,8 @@ def undisturbed(script: str, directory: Path) -> int:
 
 
 def in_ns(ahead: int) -> int:
-    """An instant on CLOCK_MONOTONIC."""
-    return time.monotonic_ns() + ahead
+    """An instant on CLOCK_BOOTTIME."""
+    return now_ns() + ahead
 
 
 def stands_still(guard: GuardProcess) -> bool:
@@ -298,7 +302,7 @@ def test_a_lease_that_runs_out_at_the_instant_at_which_the_agent_dies_hurts_neit
     agent.ask(Lease(over_ns))
     guard.process.send_signal(signal.SIGSTOP)
     agent.close()
-    until(lambda: time.monotonic_ns() > over_ns, "the lease to be over")
+    until(lambda: now_ns() > over_ns, "the lease to be over")
     guard.process.send_signal(signal.SIGCONT)  # and both are news to it in one turn
     assert guard.agent().describe().frozen_by == "lease"
     assert lives(pid)
@@ -310,9 +314,21 @@ def test_a_lease_that_is_renewed_in_time_freezes_nothing(guard: GuardProcess) ->
     first_ends_ns = in_ns(SOON_NS)
     agent.ask(Lease(first_ends_ns))
     agent.ask(Lease(in_ns(FAR_NS)))
-    until(lambda: time.monotonic_ns() > first_ends_ns, "the first lease to have been over")
+    until(lambda: now_ns() > first_ends_ns, "the first lease to have been over")
     assert grows(guard) and agent.describe().state == "running"
     assert not agent.events
+
+
+@pytest.mark.root
+def test_a_lease_counts_the_time_that_the_machine_sleeps(tmp_path: Path) -> None:
+    """In a time namespace whose boot time is ahead, as after a sleep: by the monotonic clock the lease would last for hours."""
+    with guarding(tmp_path, SLEPT) as guard:
+        agent = guard.agent()
+        guard.start(agent, *COUNTING)
+        agent.ask(Lease(in_ns(SLEPT_S * 1_000_000_000 + SOON_NS)))
+        assert agent.event(FrozenByLease)
+        until(lambda: stands_still(guard), "what was in its pipe to be written")
+        assert agent.describe().frozen_by == "lease"
 
 
 def test_what_was_frozen_by_order_is_not_thawed_by_a_lease(guard: GuardProcess) -> None:

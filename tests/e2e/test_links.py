@@ -65,6 +65,11 @@ def prefer_the_air(pair: Pair) -> None:
         subprocess.run(ip_inside(robot, "route", "add", TWO[0][1].format(other) + "/32", "dev", "air"), check=True)
 
 
+def links_heard(robot: RobotMachine) -> list[str]:
+    (peer,) = robot.status()["peers"]
+    return list(peer["links"])
+
+
 def counts_on(robot: RobotMachine) -> None:
     """What it writes there is captured and shown only while it is protected; what it has written shows that it runs."""
     (log,) = (robot.directory / "state" / "logs").glob("*/stdout.log")
@@ -76,6 +81,8 @@ def test_a_cable_that_is_out_while_the_radio_lives_degrades_and_moves_nothing(tm
     with robots.two_robots(tmp_path, AIR_IS_WIRELESS, cables=TWO) as pair:
         first, second = pair
         assert {name: link["medium"] for name, link in links(first).items()} == {"wire": "wired", "air": "wireless"}
+        for robot in pair:  # a beat is believed once, and yet each link that brings it is known to carry
+            robots.until(lambda at=robot: links_heard(at) == ["air", "wire"], "both links to be heard")  # type: ignore[misc]
         prefer_the_air(pair)
         start(pair)
         wire, air = traffic(first, "wire"), traffic(first, "air")
@@ -118,6 +125,19 @@ def test_where_the_only_link_is_a_radio_snapshots_travel_only_if_the_operator_al
             first, 1, "wire, which carries snapshots, is wireless (the configuration says so)", 'snapshots_over = "any"'
         )
         counts_on(first)
+        assert not robots.checkpoints(second, "count")
+
+
+def test_a_robot_whose_own_link_is_a_radio_takes_no_snapshots_over_it(tmp_path: Path) -> None:
+    with robots.two_robots(tmp_path) as (first, second):
+        path = second.directory / "agent.toml"
+        path.write_text(path.read_text() + WIRE_IS_WIRELESS)
+        robots.keep_on(second)
+        robots.stop_agent(second)
+        robots.start_agent(second)
+        robots.until(lambda: robots.answers(second) and robots.connected(first), "robot2 to be back")
+        robots.run(first, "count", "/usr/bin/python3", "-S", "-c", BUSY)
+        robots.until_status(first, 1, "at robot2 wire, which carries snapshots, is wireless")
         assert not robots.checkpoints(second, "count")
 
 

@@ -9,14 +9,24 @@ from pathlib import Path
 
 import pytest
 
+from agent.stalls import activity
+from agent.streams import total_of
 from checkpoint import format
+from checkpoint.linux import procfs
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_deaths import COUNT, numbers, parts
 
 pytestmark = pytest.mark.root
 
-EVERYBODY = ("heart", "lanes", "keeper")
+STOPPED = {
+    "heart": ("heart",),
+    "agent": ("heart", "lanes"),
+    "heart_and_keeper": ("heart", "keeper"),
+    "agent_and_keeper": ("heart", "lanes", "keeper"),
+}
+"""Parts whose rest makes a robot silent; the guard, which stands by itself, freezes the program before its lease ends."""
+
 MORE = 30
 """Numbers that show that it counts on."""
 
@@ -60,16 +70,38 @@ def expect_one_history(pair: Pair) -> None:
         assert counted == list(range(len(counted))), robot.name
 
 
-def expect_kept_aside(robot: RobotMachine) -> None:
-    """What the old copy had become is there for inspection."""
+def kept_aside(robot: RobotMachine) -> int:
+    """What the old copy had become is there for inspection: how much it had written by then."""
     (kept,) = (robot.directory / "state" / "lost").glob("*.snapshot")
     assert format.verify(kept).component == "/demo/robot1/count"
+    with kept.open("rb") as file:
+        return total_of(format.read_outline(file.fileno()).output)[0]
 
 
-def test_a_stopped_agent_and_keeper_leave_a_frozen_program_and_wake_up_stale(pair: Pair) -> None:
+def parts_of_it(robot: RobotMachine, name: str) -> list[int]:
+    """The processes of that kind which the program has to do with: spare guards and keepers wait besides."""
+    if name == "lanes":
+        return parts(robot, name)
+    program = robots.host_pid(robot, robots.component(robot, "count")["pid"])
+    if name == "guard":
+        return [pid for pid in parts(robot, name) if pid == procfs.status(program).ppid]
+    return robots.until(lambda: busy_keepers(robot), "one keeper alone to work")
+
+
+def busy_keepers(robot: RobotMachine) -> list[int]:
+    """The keeper that uses processor time while snapshots are taken, once it is the only one."""
+    before = {pid: activity(pid)[1] for pid in parts(robot, "keeper")}
+    taken = robots.checkpoints(robot, "count")
+    robots.until(lambda: robots.checkpoints(robot, "count") > taken + 5, "snapshots")
+    busy = [pid for pid in before if activity(pid)[1] > before[pid]]
+    return busy if len(busy) == 1 else []
+
+
+@pytest.mark.parametrize("way", STOPPED)
+def test_who_stops_and_wakes_up_stale_has_not_run_on(pair: Pair, way: str) -> None:
     first, second = pair
     program = protected_count(pair)
-    stopped = [pid for name in EVERYBODY for pid in parts(first, name)]
+    stopped = [pid for name in STOPPED[way] for pid in parts(first, name)]
     for pid in stopped:
         os.kill(pid, signal.SIGSTOP)
     try:
@@ -84,4 +116,27 @@ def test_a_stopped_agent_and_keeper_leave_a_frozen_program_and_wake_up_stale(pai
             os.kill(pid, signal.SIGCONT)
     robots.until(lambda: not Path(f"/proc/{program}").exists(), "the old copy to be ended")
     expect_one_history(pair)
-    expect_kept_aside(first)
+    assert kept_aside(first) == len(standing), "and it did not run on before it was told"
+
+
+ALONE = [("lanes", signal.SIGSTOP), ("keeper", signal.SIGSTOP), ("guard", signal.SIGSTOP), ("guard", signal.SIGKILL)]
+
+
+@pytest.mark.parametrize(("part", "number"), ALONE)
+def test_a_part_that_stops_alone_is_replaced_and_nobody_takes_over(pair: Pair, part: str, number: int) -> None:
+    first, second = pair
+    protected_count(pair)
+    copies = {robots.component(first, "count")["pid"]}
+    (stopped,) = parts_of_it(first, part)
+    os.kill(stopped, number)
+    robots.until(lambda: not Path(f"/proc/{stopped}").exists(), f"the {part} to be ended")
+    robots.until(lambda: robots.answers(first), "the agent to answer")
+    robots.until(lambda: robots.component(first, "count").get("state") == "running", "it to run")
+    taken = robots.checkpoints(second, "count")
+    robots.until(lambda: robots.checkpoints(second, "count") > taken + 2, "checkpoints to be taken again")
+    copies.add(robots.component(first, "count")["pid"])
+    assert len(copies) == (2 if part == "guard" else 1), "it is resumed where it has lost its guard, else it ran on"
+    assert robots.component(first, "count")["primary"] == "robot1"
+    for robot in pair:
+        counted = numbers(robots.output(robot, "count"))
+        assert counted == list(range(len(counted))), robot.name

@@ -148,3 +148,25 @@ def test_the_program_ends_by_its_own_status_after_all_that(machine: Machine) -> 
     while component(machine, "brief").get("exit_status") is None and time.monotonic() < deadline:
         time.sleep(robots.POLL_S)
     assert os.waitstatus_to_exitcode(component(machine, "brief")["exit_status"]) == 7
+
+
+HOOKED = """
+[components."/lab/robot1/hooked"]
+before_start = ["/bin/sh", "-c", "grep CapEff /proc/self/status >/run/hooked; echo $FAILOVER_WHY >>/run/hooked"]
+[components."/lab/robot1/unhooked"]
+before_start = ["/bin/false"]
+"""
+
+
+def test_a_hook_is_not_shut_in_as_the_service_is_and_its_failure_is_told(machine: Machine) -> None:
+    config = machine.root / "etc" / "failover" / "agent.toml"
+    config.write_text(config.read_text() + HOOKED)
+    machine.run("systemctl", "restart", SERVICE)
+    robots.until(lambda: (machine.root / "run" / "failover" / "control.sock").exists(), "the agent to listen")
+    started(machine, "hooked")
+    capabilities, why = (machine.root / "run" / "hooked").read_text().splitlines()
+    assert int(capabilities.split()[1], 16) and why == "started"
+    started(machine, "unhooked")
+    assert any("before_start (/bin/false) failed" in note for note in component(machine, "unhooked")["notes"])
+    for name in ("hooked", "unhooked"):
+        machine.run("failover", "stop", name)

@@ -12,6 +12,7 @@ import pytest
 
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
+from tests.e2e.test_deaths import parts
 
 COUNT = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.01)\n"
 HOLDING_A_SOCKET = "import socket\nkept = socket.socketpair()\n" + COUNT
@@ -86,3 +87,17 @@ def test_a_stranger_that_is_released_runs_on_and_can_be_protected_again(pair: Pa
         assert f"runs on as pid {pid}, unprotected" in released.stdout
         expect_more(written)
     os.kill(robots.host_pid(first, pid), signal.SIGKILL)
+
+
+def test_a_stranger_that_loses_its_guard_does_not_run_twice(pair: Pair, tmp_path: Path) -> None:
+    first, _ = pair
+    written = tmp_path / "stranger.out"
+    pid = stranger(first, COUNT, written)
+    assert robots.failover(first, "protect", str(pid), "--name", "count").returncode == 0
+    robots.until(lambda: robots.component(first, "count").get("protection") == "protected", "a checkpoint at robot2")
+    program = robots.host_pid(first, pid)
+    for guard in parts(first, "guard"):
+        os.kill(guard, signal.SIGKILL)
+    robots.until(lambda: not Path(f"/proc/{program}").exists(), "the stranger to be ended")
+    robots.until(lambda: robots.component(first, "count").get("restores"), "it to be resumed")
+    expect_more(written)

@@ -67,6 +67,9 @@ def test_a_takeover_is_told_with_what_was_seen_and_what_it_cost_and_outlives_the
         (line["life"], line["number"], line["did"]) for line in before
     ]
     assert lines(second, "begins, life 2", "--robot", "robot2")
+    assert why(second, "--since", "1h")["story"] and why(second, "--since", "1ms")["story"] == []
+    assert robots.failover(second, "why", "--since", "yesterday").returncode == 2
+    assert "the team knows no robot 'mars', only robot2, robot1" in robots.failover(second, "why", "--robot", "mars").stderr
 
 
 SKEW = r"""
@@ -137,12 +140,3 @@ def expect_the_order(story: list[dict[str, Any]]) -> None:
     assert places == sorted(places), did
     instants = [story[place]["at"] for place in places]
     assert instants == sorted(instants), "by the one clock that they are shown on"
-
-
-def test_only_what_is_young_enough_is_told(pair: Pair) -> None:
-    first, _ = pair
-    robots.until(lambda: bool(lines(first, "is its standby")), "the story to be told")
-    assert why(first, "--since", "1h")["story"]
-    assert why(first, "--since", "1ms")["story"] == []
-    assert robots.failover(first, "why", "--since", "yesterday").returncode == 2
-    assert "the team knows no robot 'mars', only robot1, robot2" in robots.failover(first, "why", "--robot", "mars").stderr

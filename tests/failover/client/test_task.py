@@ -184,9 +184,7 @@ def test_a_transaction_commits_at_its_end_and_not_in_the_middle() -> None:
     assert failover.resume("mission", default=Mission()).leg == 2
 
 
-@pytest.mark.parametrize(
-    "call", [failover.commit, failover.wait_committed, failover.resumed, failover.activations, failover.epoch]
-)
+@pytest.mark.parametrize("call", [failover.commit, failover.wait_committed, failover.resumed, failover.activations])
 def test_without_a_state_every_call_says_how_to_begin(call: object) -> None:
     with pytest.raises(failover.TaskError, match=r"failover.resume\("):
         call()  # type: ignore[operator]

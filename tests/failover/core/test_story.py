@@ -59,6 +59,16 @@ def test_a_silent_peer_is_told_once_and_once_more_when_it_is_heard_again() -> No
     assert again.sentence == "robot2 is heard again over air after 780 ms of silence" and again.component == ""
 
 
+def test_a_link_that_brings_only_copies_is_not_silent_and_keeps_nobody_alive() -> None:
+    node = standing_by()
+    node.step(Received(Beat("robot2", 7, 3), "wire", (("air", 28 * MS),)), 30 * MS)
+    (noticed,) = told(node, Noticed("", "look"), 40)
+    assert dict(noticed.facts.seen[0].links) == {"wire": 10 * MS, "air": 12 * MS}
+    node.step(Received(Beat("robot2", 7, 4), "wire", (("air", 10**18),)), 50 * MS)
+    said = [one.sentence for at_ms in range(50, 400, 5) for one in told(node, Tick(), at_ms)]
+    assert any("counts as dead" in one for one in said)
+
+
 def test_an_own_stall_is_told_and_stands_beside_the_decisions_after_it() -> None:
     node = standing_by()
     stall = told(node, Tick(), 5_000)

@@ -1,0 +1,58 @@
+"""What keeps a program here from acting when it may not, in one sentence, and what this robot does not have for it.
+
+Each part alone, and agent and keeper together, may die or stand still: the guard freezes its program before the lease ends, and a
+guard that stands still is ended with its program. Only if all of them stand still at once, as in a machine that hangs for a while
+and goes on, does nothing here help: then a hardware watchdog resets the robot, or somebody outside switches it off.
+
+Source: the kernel's Documentation/watchdog/watchdog-api.rst and Documentation/ABI/testing/sysfs-class-watchdog.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+WATCHDOGS: Final = Path("/sys/class/watchdog")
+ACTIVE: Final = "active"
+
+GUARDED: Final = "a program whose lease is over is frozen by its guard, whatever becomes of the agent"
+
+
+@dataclass(frozen=True, slots=True)
+class Watchdog:
+    """A hardware watchdog that somebody feeds.
+
+    Attributes:
+        timeout_s: without a sign of life for so long it resets the machine; 0: not told.
+    """
+
+    identity: str
+    timeout_s: int
+
+
+def watchdog(directory: Path = WATCHDOGS) -> Watchdog | None:
+    """The first one that is active; None where there is none, or the kernel does not tell."""
+    for place in sorted(directory.glob("watchdog*")):
+        if _fact(place, "state") == ACTIVE:
+            timeout = _fact(place, "timeout")
+            return Watchdog(_fact(place, "identity") or place.name, int(timeout) if timeout.isdecimal() else 0)
+    return None
+
+
+def sentence(found: Watchdog | None) -> str:
+    """For ``failover status``."""
+    if found is None:
+        return (
+            f"{GUARDED}; if all of this robot stood still at once and went on later, nothing here would help: no hardware "
+            "watchdog is active; switch such a robot off from outside, or let actuators check the epoch (failover.Gateway)"
+        )
+    after = f"after {found.timeout_s} s" if found.timeout_s else "after its timeout"
+    return f"{GUARDED}; if all of this robot stood still at once, its watchdog ({found.identity}) would reset it {after}"
+
+
+def _fact(place: Path, name: str) -> str:
+    try:
+        return (place / name).read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return ""
