@@ -71,7 +71,8 @@ class Config:
         group: unix group that may use the control socket besides its owner; "" for nobody.
         beat_ms: period of beats to each peer.
         lease_ms: how long a primary acts without being heard, and how long a standby stays loyal to a silent one.
-        when_alone: when no other robot is heard, what is started here runs on, or is held still.
+        rule: who decides that a silent robot is replaced: pair, majority, or auto: a majority wherever more than two belong.
+        when_alone: under the pair rule: when no other robot is heard, what is started here runs on, or is held still.
         snapshot_period_ms: between two snapshots of a component; grows by itself when link or standby is slower.
         realtime: ask for SCHED_FIFO and locked memory.
         link_mbit_s: cap on snapshot traffic; 0 for none.
@@ -87,6 +88,7 @@ class Config:
     group: str = ""
     beat_ms: int = 20
     lease_ms: int = 200
+    rule: Literal["auto", "pair", "majority"] = "auto"
     when_alone: Literal["run", "freeze"] = "run"
     snapshot_period_ms: int = 100
     realtime: bool = True
@@ -159,6 +161,7 @@ def load(path: Path) -> Settings:
     except FailoverError as error:
         raise ConfigError(str(error)) from error
     _check_keys(path, config, members)
+    _check_rule(path, config, members)
     _check_components(path, config, members)
     return Settings(path, config, members, secret)
 
@@ -171,6 +174,14 @@ def _check_keys(path: Path, config: Config, members: Team) -> None:
             f"{path}: {', '.join(without)} in {config.team_directory} have no public key; enrol them with failover team enrol, "
             "or set insecure = true on every robot"
         )
+
+
+def _check_rule(path: Path, config: Config, members: Team) -> None:
+    """Servers and witnesses are there to vote."""
+    voters = sorted(name for name, member in members.robots.items() if member.role != "robot")
+    by_pair = config.rule == "pair" or (config.rule == "auto" and len(members.robots) <= 2)
+    if voters and by_pair:
+        raise ConfigError(f'{path}: {", ".join(voters)} would have no vote; set rule = "majority" on every member of the team')
 
 
 def _check_components(path: Path, config: Config, members: Team) -> None:

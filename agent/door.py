@@ -65,6 +65,7 @@ EVENTS: Final[dict[str, Any]] = {
         events.Stop,
         events.Failback,
         events.Handover,
+        events.Promote,
         events.Prefer,
     )
 }

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from agent.config import ComponentConfig, Config, Settings
 from failover.core import types
-from failover.core.types import Launch, OnCrash, OnLoss, OnUnsupported, Rules, WhenAlone
+from failover.core.types import Launch, OnCrash, OnLoss, OnUnsupported, Rule, Rules, WhenAlone
 
 
 def node_config(settings: Settings) -> types.Config:
@@ -21,7 +21,20 @@ def node_config(settings: Settings) -> types.Config:
         peers=tuple(sorted(settings.peers)),
         beat_ms=config.beat_ms,
         lease_ms=config.lease_ms,
+        rule=_rule(settings),
+        servers=_members(settings, "server"),
+        witnesses=_members(settings, "witness"),
     )
+
+
+def _rule(settings: Settings) -> Rule:
+    if settings.config.rule == "auto":
+        return Rule.MAJORITY if len(settings.team.robots) > 2 else Rule.PAIR
+    return Rule(settings.config.rule)
+
+
+def _members(settings: Settings, role: str) -> tuple[str, ...]:
+    return tuple(sorted(name for name, member in settings.team.robots.items() if member.role == role))
 
 
 def rules_for(config: Config, component: ComponentConfig) -> Rules:

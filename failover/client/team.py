@@ -22,8 +22,8 @@ from failover.client import strict_toml
 from failover.core import names
 from failover.errors import NameFormatError, TeamFileError
 
-Role = Literal["robot"]
-"""Servers (they store and vote) and witnesses (they vote) are not offered yet; the key stands in team files for them."""
+Role = Literal["robot", "server", "witness"]
+"""Robots run components; servers keep checkpoints and vote; witnesses vote."""
 
 TEAM_FILE: Final = "team.toml"
 KEY_CHARACTERS: Final = 40
@@ -42,7 +42,7 @@ class Robot:
     """One member.
 
     Attributes:
-        role: robot: runs components and protects those of others.
+        role: robot: runs components and protects those of others; server: keeps checkpoints of all; witness: votes only.
         beats: "host:port" for each of its links; beats go to all of them.
         bulk: "host:port" on the wired link, for snapshots.
         public_key: Z85, or "" in a team without keys.

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from failover.core import acts, handover
+from failover.core import acts, handover, majority
 from failover.core.component import Cause, Component, Turn
 from failover.core.election import claim, drop, vacant
-from failover.core.events import Command, Failback, Handover, Prefer, Release, Run, Stop
+from failover.core.events import Command, Failback, Handover, Prefer, Promote, Release, Run, Stop
 from failover.core.types import ENDED, State
 
 _RUNNING = frozenset({State.PRIMARY, State.FROZEN})
@@ -29,6 +29,8 @@ def obey(component: Component, turn: Turn, command: Command) -> None:
                 handover.resume_here(component, turn, command.request)
             else:
                 handover.begin(component, turn, command.to, command.request)
+        case Promote():
+            _promote(component, turn, command)
         case Failback():
             _fail_back(component, turn, command)
 
@@ -47,6 +49,13 @@ def _run(component: Component, turn: Turn, command: Run) -> None:
 
 def _why_not_run(component: Component, turn: Turn) -> str:
     name = component.name
+    if not turn.config.runs(turn.me):
+        return f"cannot run {name}: {turn.me} runs nothing; ask at a robot"
+    heard, voters = 1 + len(turn.team.living(turn.now_ns)), len(turn.config.peers) + 1
+    if turn.config.by_majority and (heard < turn.config.quorum or not majority.is_free(component, turn)):
+        return (
+            f"cannot run {name}: of {voters} that vote {turn.me} hears {heard} and needs {turn.config.quorum}; start the others"
+        )
     if component.holding or component.state is State.STOPPING:
         how = "it runs here" if component.state is State.PRIMARY else f"here it is {component.state}"
         return f"cannot run {name}: {how}; failover stop or release it first, or choose another name"
@@ -84,7 +93,7 @@ def _stop(component: Component, turn: Turn, command: Stop) -> None:
 
 
 def _prefer(component: Component, turn: Turn, command: Prefer) -> None:
-    known = ("", turn.me, *turn.config.peers)
+    known = ("", *(robot for robot in (turn.me, *turn.config.peers) if turn.config.runs(robot)))
     if command.robot not in known:
         refusal = f"cannot prefer {command.robot!r}: the team knows {', '.join(known[1:])}"
         turn.order(acts.Answer(command.request, False, refusal))
@@ -94,6 +103,13 @@ def _prefer(component: Component, turn: Turn, command: Prefer) -> None:
         component.spec = replace(component.spec, rules=replace(component.spec.rules, prefer=command.robot))
         component.retry_ns = turn.now_ns
         turn.order(acts.Answer(command.request, True, f"{component.name} prefers {command.robot or 'to stay where it is'}"))
+
+
+def _promote(component: Component, turn: Turn, command: Promote) -> None:
+    if component.holding or component.state is State.STOPPING:
+        _elsewhere(component, turn, command.request, "promote a robot for")
+    else:
+        handover.resume_here(component, turn, command.request, promoted=True)
 
 
 def _fail_back(component: Component, turn: Turn, command: Failback) -> None:

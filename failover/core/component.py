@@ -128,6 +128,10 @@ class Component:
             it was then.
         awaited: why there is nothing to capture, where that is as it should be.
         stored_ns: on a standby, when its newest checkpoint was stored, -1 if it was before this life of the agent.
+        elects: primaries are elected. free, open: then, what this robot would vote for (``majority.py``).
+        ordered: the claim was, by an operator.
+        seen: highest epoch that anybody told of; a claim goes above it.
+        trail: the last acknowledged positions and their parents, for servers (``archive.py``); ``archives``: on their way there.
         undelivered: why the last snapshot did not become a checkpoint; ``unstored``: on a standby, why it was not stored.
         keeps_state: on a standby: to go on from the newest snapshot is to start the program again.
         waiting: on a standby: the program that was ordered to wait, under ``waiting_epoch``; it is ready (``warm``) or, after
@@ -144,6 +148,7 @@ class Component:
     status: int = 0
     reason: str = ""
     spec: ComponentSpec | None = None
+    claimed: bool = False
 
     held: list[Position] = field(default_factory=list)
     autostart: bool = False
@@ -189,6 +194,14 @@ class Component:
     tries: int = 0
     retry_ns: int = 0
     reported: bool = False
+    free: bool = False
+    open: bool = False
+    ordered: bool = False
+    elects: bool = False
+    seen: int = 0
+    trail: deque[tuple[Position, Position | None]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
+    archives: dict[str, Flight] = field(default_factory=dict)
+    archived_ns: int = 0
 
     @property
     def rules(self) -> Rules:
@@ -209,6 +222,15 @@ class Component:
     def holding(self) -> bool:
         """Whether this robot says: the primacy is mine."""
         return self.state in HOLDING
+
+    @property
+    def named(self) -> str:
+        """The robot that beats tell of as entrusted."""
+        if self.unprotected and self.holding:
+            return ""
+        if self.holding and not self.elects:
+            return self.standby if self.standby in self.entrusted else ""
+        return self.entrusted[0] if self.entrusted else ""
 
     @property
     def newest(self) -> Position | None:
@@ -245,6 +267,7 @@ class Component:
             self.status,
             self.reason,
             self.spec,
+            self.claimed,
         )
 
     @classmethod
@@ -261,6 +284,7 @@ class Component:
             record.status,
             record.reason,
             record.spec,
+            record.claimed,
         )
 
 
@@ -279,6 +303,7 @@ class Turn:
     next_counter: int
     before: Ballot
     late_ns: int
+    load: int = 0
     acts: list[Act] = field(default_factory=list)
     said: list[Decision] = field(default_factory=list)
 
@@ -320,6 +345,10 @@ class Turn:
     def alive(self, robot: str) -> bool:
         """Whether a peer is alive."""
         return self.team.alive(robot, self.now_ns)
+
+    def gone(self, robot: str) -> bool:
+        """Whether a peer cannot act any more on anything that we told it."""
+        return self.team.gone(robot, self.now_ns)
 
     def dead(self, robot: str) -> bool:
         """Whether a peer is dead."""

@@ -16,7 +16,7 @@ from failover.core import acts, lease
 from failover.core.component import LOST_MAX, Cause, Component, Turn
 from failover.core.consent import grants, state_of
 from failover.core.messages import HOLDS, UNPROTECTED, Entry
-from failover.core.names import weight
+from failover.core.names import Weight, weight
 from failover.core.types import ENDED, HOLDING, MS, PEERS_MAX, State
 
 ACTS_FULLY = 2
@@ -34,15 +34,17 @@ def consider(component: Component, turn: Turn) -> None:
     """Claim the component if it is vacant and this robot is the one to run it."""
     if component.state not in (State.ABSENT, State.STANDBY) or turn.now_ns < component.retry_ns or not vacant(component, turn):
         return
-    entries = _living_entries(component, turn)
+    if not turn.config.runs(turn.me):
+        return
+    entries = living_entries(component, turn)
     best = max((position for _, entry in entries if (position := entry.position)), default=None)
     mine = component.newest
     if component.waits and component.held:
         chosen = component.primary == turn.me and mine is not None and (best is None or best <= mine)
     elif mine is None:
-        chosen = best is None and _may_start_afresh(component)
+        chosen = best is None and may_start_afresh(component)
     else:
-        chosen = best is None or best < mine or (best == mine and _first_of_equals(component, turn, entries, mine))
+        chosen = best is None or best < mine or (best == mine and first_of_equals(component, turn, entries, mine))
     if chosen and _may_go_on(component, turn):
         claim(component, turn, mine, "nobody runs it")
 
@@ -50,7 +52,7 @@ def consider(component: Component, turn: Turn) -> None:
 def vacant(component: Component, turn: Turn) -> bool:
     """Nobody who lives holds it or knows its end, and everybody is heard or dead."""
     for robot, peer in turn.team.peers.items():
-        if turn.dead(robot):
+        if turn.gone(robot):
             continue
         if not turn.alive(robot):
             return False
@@ -58,16 +60,25 @@ def vacant(component: Component, turn: Turn) -> bool:
         if entry is None:
             if not peer.complete:
                 return False
-        elif state_of(entry) in HOLDING or (state_of(entry) in ENDED and entry.epoch >= component.epoch):
+        elif _takes(component, robot, entry):
             return False
     return True
+
+
+def _takes(component: Component, robot: str, entry: Entry) -> bool:
+    """Whether this word says that the component is somebody's, or has ended."""
+    state = state_of(entry)
+    if state is State.FROZEN and component.elects and component.primary != robot:
+        return False  # it contends for the primacy with a copy that stands still: votes decide
+    return state in HOLDING or (state in ENDED and entry.epoch >= component.epoch)
 
 
 def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, is_planned: bool = False) -> None:
     """Open a new epoch as its primary-to-be. The ballot holds it before anybody hears of it."""
     component.alone_right = not component.freezes or _right_to_act_alone(component, turn)
+    component.claimed = not component.alone_right
     component.move(Cause.CLAIM)
-    component.epoch += 1
+    component.epoch = max(component.epoch, component.seen) + 1
     component.primary = turn.me
     component.entrusted, component.trusted, component.standby = (), False, ""
     component.plan, component.is_planned = plan, is_planned
@@ -78,6 +89,7 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     component.undelivered = component.unstored = ""
     component.resumed_ns = component.resumed_age_ns = -1
     component.handing, component.ending, component.reported = None, False, False
+    component.ordered = False
     component.crashed, component.reason = 0, ""
     component.lease_ns = component.told_ns = 0
     open_line(component, turn)
@@ -87,9 +99,14 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
 
 def advance(component: Component, turn: Turn) -> None:
     """A claim: go on once it is granted, or once nobody is left whose consent is needed."""
-    if not _consented(component, turn):
-        return
-    entrust_holder(component, turn)
+    if _consented(component, turn):
+        entrust_holder(component, turn)
+        begin(component, turn)
+
+
+def begin(component: Component, turn: Turn) -> None:
+    """The claim is granted: start the program, or restore it."""
+    component.claimed = False
     component.until_ns = turn.now_ns + turn.config.restore_ms * MS
     component.born = component.epoch
     lease_ns = lease.first_ns(component, turn)
@@ -123,12 +140,16 @@ def open_line(component: Component, turn: Turn) -> None:
 def restart_line(component: Component, turn: Turn) -> None:
     """The program is another process now: the next snapshot is a base, and no number is used twice."""
     component.parent = component.flight = None
+    component.trail.clear()
+    component.archives.clear()
     component.base_wanted = True
     component.due_ns = turn.now_ns
 
 
 def renew(component: Component, turn: Turn, above: int) -> None:
-    """The running primary goes on under an epoch above one that came to nothing."""
+    """The running primary goes on under an epoch above one that came to nothing; a capture under way is waited for."""
+    if component.flight is not None and component.flight.position is None:
+        return
     component.epoch = above + 1
     component.handing = None
     open_line(component, turn)
@@ -148,27 +169,30 @@ def _consented(component: Component, turn: Turn) -> bool:
     return True
 
 
-def _living_entries(component: Component, turn: Turn) -> list[tuple[str, Entry]]:
+def living_entries(component: Component, turn: Turn) -> list[tuple[str, Entry]]:
     found = ((peer.robot, peer.entry(component.name)) for peer in turn.team.living(turn.now_ns))
     return [(robot, entry) for robot, entry in found if entry is not None]
 
 
-def _may_start_afresh(component: Component) -> bool:
+def may_start_afresh(component: Component) -> bool:
     """Configured to run, and no checkpoint of it was ever given away."""
     return component.autostart and component.spec is not None and not component.entrusted and not component.trusted
 
 
-def _first_of_equals(component: Component, turn: Turn, entries: list[tuple[str, Entry]], mine: Position) -> bool:
-    rivals = [robot for robot, entry in entries if entry.position == mine]
-    prefer = component.rules.prefer
-    if prefer in (turn.me, *rivals):
-        return prefer == turn.me
-    return all(weight(turn.me) < weight(robot) for robot in rivals)
+def first_of_equals(component: Component, turn: Turn, entries: list[tuple[str, Entry]], mine: Position) -> bool:
+    rivals = [robot for robot, entry in entries if entry.position == mine and turn.config.runs(robot)]
+    own = placing(component, turn.me, turn.load)
+    return all(own < placing(component, robot, turn.team.peers[robot].load) for robot in rivals)
+
+
+def placing(component: Component, robot: str, load: int) -> tuple[bool, int, Weight]:
+    """Of robots that could run it equally well the least of these does: preferred, least loaded, lesser name."""
+    return robot != component.rules.prefer, load, weight(robot)
 
 
 def _right_to_act_alone(component: Component, turn: Turn) -> bool:
     if component.primary == turn.me:
-        return component.epoch > 0 and not component.entrusted
+        return component.epoch > 0 and not component.entrusted and not component.claimed
     return component.trusted and turn.dead(component.primary)
 
 
@@ -187,14 +211,14 @@ def heard(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
     if theirs in HOLDING:
         _heard_holder(component, turn, sender, entry, theirs)
     elif theirs in ENDED and entry.epoch >= component.epoch:
-        _heard_end(component, turn, sender, entry, theirs)
+        heard_end(component, turn, sender, entry, theirs)
     elif entry.epoch > component.epoch:
         _heard_later_epoch(component, turn, sender, entry)
 
 
 def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
     if component.holding:
-        if _stronger(component, turn, sender, entry, theirs):
+        if stronger(component, turn, sender, entry, theirs):
             lose(component, turn, sender, entry)
         return
     if entry.epoch < component.epoch or (component.state in ENDED and entry.epoch == component.epoch):
@@ -202,12 +226,17 @@ def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry, t
     if entry.epoch > component.epoch or component.primary != sender:
         if not _may_switch(component, turn, sender, entry):
             return
-        _accept(component, turn, sender, entry.epoch)
+        accept(component, turn, sender, entry.epoch)
+    follow(component, turn, sender, entry)
+
+
+def follow(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
+    """The accepted primary's word: keep its checkpoints, and claim the component when it gives way to us."""
     if component.state in ENDED:
         drop(component, turn, f"{sender} runs it anew")
     if component.state is not State.STANDBY and component.state is not State.STOPPING:
         component.move(Cause.FOLLOW)
-    component.trusted = entry.standby == turn.me
+    component.trusted = entry.standby == turn.me and turn.config.runs(turn.me)
     admit(component, turn, sender)
     if entry.flags & UNPROTECTED:
         drop(component, turn, f"{sender} protects it no longer")
@@ -215,7 +244,7 @@ def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry, t
         claim(component, turn, component.newest, f"{sender} hands it over", is_planned=True)
 
 
-def _stronger(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> bool:
+def stronger(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> bool:
     """Whether their hold on the component beats ours: the later epoch, then the one that acts, then the lesser name."""
     their_claim = (entry.epoch, _ACTS.get(theirs, ACTS_FULLY))
     our_claim = (component.epoch, _ACTS.get(component.state, ACTS_FULLY))
@@ -229,9 +258,10 @@ def _may_switch(component: Component, turn: Turn, sender: str, entry: Entry) -> 
     return weight(sender) < weight(component.primary)
 
 
-def _accept(component: Component, turn: Turn, primary: str, epoch: int) -> None:
+def accept(component: Component, turn: Turn, primary: str, epoch: int) -> None:
     component.epoch, component.primary = epoch, primary
     component.entrusted, component.trusted = (), False
+    component.ordered = component.claimed = False
     component.unable, component.tries, component.retry_ns = "", 0, 0
     component.needs_base = False
     turn.say(component, f"{turn.me} accepts {primary} as primary of epoch {epoch}")
@@ -257,7 +287,7 @@ def lose(component: Component, turn: Turn, winner: str, entry: Entry) -> None:
     component.handing = component.flight = None
     component.standby, component.lease_ns, component.told_ns = "", 0, 0
     component.crashed = 0
-    _accept(component, turn, winner, entry.epoch)
+    accept(component, turn, winner, entry.epoch)
     component.trusted = entry.standby == turn.me
     admit(component, turn, winner)
 
@@ -269,7 +299,7 @@ def refuse_request(component: Component, turn: Turn, sentence: str) -> None:
         component.request = 0
 
 
-def _heard_end(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
+def heard_end(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
     if component.holding:
         if entry.epoch > component.epoch:
             lose(component, turn, sender, entry)
@@ -309,11 +339,12 @@ def _heard_later_epoch(component: Component, turn: Turn, sender: str, entry: Ent
             component.move(Cause.FOLLOW)
 
 
-def admit(component: Component, turn: Turn, sender: str) -> None:
-    """Take snapshots from this robot, of the present epoch, and from nobody else."""
-    if component.admitted != (sender, component.epoch):
-        component.admitted = (sender, component.epoch)
-        turn.order(acts.Admit(component.name, component.epoch, sender))
+def admit(component: Component, turn: Turn, sender: str, epoch: int | None = None) -> None:
+    """Take snapshots from this robot, of the present epoch (or of that one), and from nobody else."""
+    wanted = (sender, component.epoch if epoch is None else epoch)
+    if component.admitted != wanted and turn.config.keeps(turn.me):
+        component.admitted = wanted
+        turn.order(acts.Admit(component.name, wanted[1], sender))
 
 
 def drop(component: Component, turn: Turn, why: str) -> None:

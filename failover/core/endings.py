@@ -95,7 +95,8 @@ def report(component: Component, turn: Turn) -> None:
         return
     living = turn.team.living(turn.now_ns)
     known = [entry is not None and state_of(entry) in ENDED for entry in (peer.entry(component.name) for peer in living)]
-    if all(known):
+    agreed = not turn.config.by_majority or 1 + sum(known) >= turn.config.quorum
+    if all(known) and agreed:
         component.reported = True
         failed_here = component.state is State.FAILED
         turn.order(

@@ -243,6 +243,14 @@ class Handover:
 
 
 @dataclass(frozen=True, slots=True)
+class Promote:
+    """Operator: this robot runs what nobody runs from the checkpoint that it holds, even if another holds a newer one."""
+
+    request: int
+    component: str
+
+
+@dataclass(frozen=True, slots=True)
 class Failback:
     """Operator: move the component back to the robot that is preferred, or else to where it was started."""
 
@@ -259,7 +267,7 @@ class Prefer:
     robot: str
 
 
-Command = Run | Release | Stop | Handover | Failback | Prefer
+Command = Run | Release | Stop | Handover | Promote | Failback | Prefer
 
 Event = (
     Tick

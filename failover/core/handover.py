@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from failover.core import acts, replication
+from failover.core import acts, majority, replication
 from failover.core.component import Cause, Component, Handing, Turn
+from failover.core.contest import step_down
 from failover.core.election import claim, renew, vacant
 from failover.core.types import MS, State
 
@@ -20,15 +21,22 @@ def begin(component: Component, turn: Turn, to: str, request: int) -> None:
     turn.say(component, f"{turn.me} begins to hand it over to {target}")
 
 
-def resume_here(component: Component, turn: Turn, request: int) -> None:
-    """By order: run what nobody runs, from the checkpoint that this robot holds."""
+def resume_here(component: Component, turn: Turn, request: int, *, promoted: bool = False) -> None:
+    """By order: run what nobody runs, from the checkpoint held here; ``promoted``: even if another robot has a newer one."""
     if component.newest is None:
         _answer(turn, request, False, f"{turn.me} holds no checkpoint of {component.name}")
-    elif not vacant(component, turn):
+    elif not turn.config.runs(turn.me):
+        _answer(turn, request, False, f"{turn.me} runs nothing; ask at a robot")
+    elif not vacant(component, turn) or (turn.config.by_majority and not majority.is_free(component, turn)):
         _answer(turn, request, False, f"{component.name} belongs to {component.primary}; ask there")
+    elif component.elects and not promoted and not majority.may_claim(component, turn, component.newest):
+        where = " or ".join(one for one in (*component.entrusted, component.primary) if one)
+        refusal = f"a newer checkpoint of {component.name} may be at {where}; start it, or promote {turn.me}"
+        _answer(turn, request, False, refusal)
     else:
-        claim(component, turn, component.newest, "an operator asked for it")
         component.request = request
+        claim(component, turn, component.newest, "an operator asked for it")
+        component.ordered = promoted
 
 
 def advance(component: Component, turn: Turn) -> None:
@@ -36,7 +44,11 @@ def advance(component: Component, turn: Turn) -> None:
     handing = component.handing
     if handing is None or component.state is not State.HANDING_OVER:
         return
-    if turn.now_ns >= handing.until_ns or _has_gone(component, turn, handing):
+    if handing.yielded and turn.config.by_majority:
+        if turn.dead(handing.to) or turn.now_ns >= handing.until_ns:
+            _answer(turn, handing.request, False, f"{handing.to} did not take {component.name}; it is claimed anew")
+            step_down(component, turn)
+    elif turn.now_ns >= handing.until_ns or _has_gone(component, turn, handing):
         _call_off(component, turn, handing)
     elif not handing.yielded:
         replication.capture(component, turn, final=True)
@@ -54,7 +66,11 @@ def _call_off(component: Component, turn: Turn, handing: Handing) -> None:
     if handing.yielded:
         renew(component, turn, component.epoch + 1)
     component.move(Cause.CALL_OFF)
-    component.handing = component.flight = None
+    component.handing = None
+    if component.flight is not None and component.flight.position is None:
+        component.flight.final = False  # it is being taken still, and no second one may be at once
+    else:
+        component.flight = None
     turn.order(acts.Freeze(component.name, component.epoch))
     why = component.degraded or component.awaited or component.undelivered
     sentence = f"{handing.to} did not take {component.name} in time; it stays at {turn.me}" + (f": {why}" if why else "")
@@ -69,6 +85,8 @@ def _refusal(component: Component, turn: Turn, target: str) -> str:
         return f"{component.name} runs at {turn.me} already"
     if not target:
         return f"{component.name} runs at {turn.me} and has no standby to go to; wait until it has one"
+    if not turn.config.runs(target):
+        return f"cannot hand {component.name} over to {target}: it runs nothing; name a robot"
     if target not in turn.config.peers:
         return f"cannot hand {component.name} over to {target!r}: the team knows {', '.join((turn.me, *turn.config.peers))}"
     if target != component.standby or not turn.alive(target):

@@ -5,13 +5,13 @@ Invariant: while anybody else may start the component, it runs here only before 
 
 from __future__ import annotations
 
-from failover.core import acts
+from failover.core import acts, majority
 from failover.core.component import Cause, Component, Turn
 from failover.core.consent import grants
 from failover.core.types import State
 
 TELL_SHARE = 4
-"""The guard is told of a new lease when it is longer by this part of a lease: not for every beat."""
+"""The guard is told of a new lease when it is longer by this part of a lease: not for every beat. Less is not worth a thaw."""
 
 ACTING = frozenset({State.PRIMARY, State.STARTING, State.RECOVERING, State.TAKING_OVER})
 """It runs here, or is about to: a restore may take longer than a lease."""
@@ -24,7 +24,7 @@ def watch(component: Component, turn: Turn) -> None:
     """Count the lease anew; hold the component still when it is over, let it go on when it is back."""
     ran_out = component.told_ns > 0 and turn.now_ns >= component.told_ns - turn.config.lease_ns // RACE_SHARE
     component.lease_ns = counted_ns(component, turn)
-    over = bool(component.entrusted) and (ran_out or turn.now_ns >= component.lease_ns)
+    over = on_lease(component, turn) and (ran_out or turn.now_ns >= component.lease_ns)
     if component.state is State.PRIMARY and over:
         component.move(Cause.LEASE_OVER)
         turn.order(acts.Freeze(component.name, component.epoch))
@@ -54,8 +54,10 @@ def entrust(component: Component, turn: Turn, robot: str) -> bool:
 
 def counted_ns(component: Component, turn: Turn) -> int:
     """Until when this robot may act; 0 where nobody else may start the component. What was granted once stays granted."""
-    if not component.entrusted:
+    if not on_lease(component, turn):
         return 0
+    if turn.config.by_majority:
+        return max(component.lease_ns, majority.granted_ns(component, turn))
     if not component.freezes:
         return turn.now_ns + turn.config.lease_ns
     return max(component.lease_ns, min(_granted_ns(component, turn, robot) for robot in component.entrusted))
@@ -63,7 +65,12 @@ def counted_ns(component: Component, turn: Turn) -> int:
 
 def first_ns(component: Component, turn: Turn) -> int:
     """The lease that a program begins with: 0 only where it needs none; one that is over holds it still from the start."""
-    return max(counted_ns(component, turn), 1) if component.entrusted else 0
+    return max(counted_ns(component, turn), 1) if on_lease(component, turn) else 0
+
+
+def on_lease(component: Component, turn: Turn) -> bool:
+    """Whether anybody else may start the component."""
+    return turn.config.quorum > 1 if turn.config.by_majority else bool(component.entrusted)
 
 
 def _granted_ns(component: Component, turn: Turn, robot: str) -> int:
@@ -72,9 +79,9 @@ def _granted_ns(component: Component, turn: Turn, robot: str) -> int:
 
 
 def _may_thaw(component: Component, turn: Turn) -> bool:
-    """Under ``freeze`` a lease; otherwise everybody entrusted agrees by its newest word, or is dead."""
-    if component.freezes:
-        return not component.entrusted or turn.now_ns < component.lease_ns
+    """Under majority and ``freeze`` a lease; otherwise everybody entrusted agrees by its newest word, or is dead."""
+    if component.freezes or turn.config.by_majority:
+        return not on_lease(component, turn) or turn.now_ns < component.lease_ns - turn.config.lease_ns // TELL_SHARE
     heard = (turn.dead(robot) or _granted_ns(component, turn, robot) > turn.now_ns for robot in component.entrusted)
     return all(heard)
 

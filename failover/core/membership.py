@@ -10,12 +10,15 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 
-from failover.core.messages import Beat, Entry
+from failover.core.messages import Beat, Echo, Entry
 from failover.core.story import Sighting
 from failover.core.types import COMPONENTS_MAX, Config, PeerView, State
 
 ASKED_MAX = 512
 """Beats of ours whose instant of leaving is remembered; ten seconds of them at 20 ms."""
+
+DEAF_LOYALTIES = 2
+"""Loyalties for which a peer that we hear may show no sign of hearing us."""
 
 SUSPECT_BEATS = 3
 """Beats that may be missing before a peer is called suspect."""
@@ -33,13 +36,21 @@ class Peer:
 
     Attributes:
         heard_ns: instant of its last beat (before the first: of our own birth).
-        echoed: counter of the newest beat of our present life that it has heard; 0 for none.
+        since_ns: when its present life was heard first.
+        echoed: counter of the newest beat of our present life that it lets us act on, 0 for none; ``asked_ns``: when it left.
+        heard_us_ns: when the newest beat of ours left that it has heard.
+        told_ns: when we last let it act on a beat of its own.
         settled: see ``messages.Beat``.
     """
 
     robot: str
     heard_ns: int
     boot: int = 0
+    since_ns: int = 0
+    asked_ns: int = 0
+    heard_us: int = 0
+    heard_us_ns: int = 0
+    told_ns: int = 0
     counter: int = 0
     echoed: int = 0
     settled: int = 0
@@ -63,8 +74,9 @@ class Peer:
         if beat.boot < self.boot:
             return ()
         if beat.boot > self.boot:
-            self.boot, self.counter, self.echoed, self.settled = beat.boot, 0, 0, 0
+            self.boot, self.counter, self.echoed, self.heard_us, self.settled = beat.boot, 0, 0, 0, 0
             self.entries.clear()
+            self.since_ns = now_ns
         self.heard_ns = max(self.heard_ns, now_ns)
         self.links[link] = now_ns
         self._echoes(beat, own)
@@ -81,6 +93,7 @@ class Peer:
         for echo in beat.echoes:
             if (echo.robot, echo.boot) == own:
                 self.echoed = max(self.echoed, echo.counter)
+                self.heard_us = max(self.heard_us, abs(echo.counter))
 
     def _news(self, entry: Entry, counter: int) -> bool:
         known = self.entries.get(entry.name)
@@ -98,13 +111,26 @@ class Membership:
     def __init__(self, config: Config, boot: int, now_ns: int) -> None:
         self._config = config
         self._own = (config.robot, boot)
+        self._born_ns = now_ns
+        self._loyalty_ns, self._grace_ns = config.loyalty_ns, config.grace_ns
+        self._elects = config.by_majority
         self._asked: deque[tuple[int, int]] = deque(maxlen=ASKED_MAX)
         self.peers = {robot: Peer(robot, now_ns) for robot in config.peers}
 
     def hear(self, beat: Beat, link: str, now_ns: int) -> tuple[Entry, ...]:
         """Take in a beat; returns its entries that are news. A stranger's beat is none."""
         peer = self.peers.get(beat.sender)
-        return peer.take(beat, self._own, link, now_ns) if peer else ()
+        if peer is None:
+            return ()
+        before = (peer.echoed, peer.heard_us)
+        news = peer.take(beat, self._own, link, now_ns)
+        if (peer.echoed, peer.heard_us) != before:
+            peer.asked_ns, peer.heard_us_ns = self._left_ns(peer.echoed), self._left_ns(peer.heard_us)
+        return news
+
+    def _left_ns(self, counter: int) -> int:
+        """When our beat of that number left, or the one before it; 0 if that is forgotten."""
+        return next((at for number, at in reversed(self._asked) if number <= counter), 0)
 
     def asked(self, counter: int, now_ns: int) -> None:
         """Remember when our own beat left."""
@@ -114,11 +140,15 @@ class Membership:
         """Our own loop slept too long by ``late_ns``: what peers said meanwhile may still wait to be read."""
         for peer in self.peers.values():
             peer.heard_ns = min(peer.heard_ns + late_ns, now_ns)
+            peer.told_ns = min(peer.told_ns + late_ns, now_ns)
+            peer.heard_us_ns = min(peer.heard_us_ns + late_ns, now_ns)
+            peer.since_ns = min(peer.since_ns + late_ns, now_ns)
+        self._born_ns += late_ns
 
     def loyal_until_ns(self, robot: str) -> int:
         """Until when this robot must not be replaced, as far as we know now."""
         peer = self.peers[robot]
-        return peer.heard_ns + (self._config.loyalty_ns if peer.boot else self._config.grace_ns)
+        return peer.heard_ns + (self._loyalty_ns if peer.boot else self._grace_ns)
 
     def dead(self, robot: str, now_ns: int) -> bool:
         """Silent for longer than any lease that it may still act on. A robot that is no peer at all is dead to us."""
@@ -128,14 +158,40 @@ class Membership:
         """Heard in this life of ours, and not silent for too long."""
         return robot in self.peers and self.peers[robot].boot > 0 and not self.dead(robot, now_ns)
 
+    def echoes(self, now_ns: int) -> tuple[Echo, ...]:
+        """Whom we hear, for the next beat. Under majority a peer that has not heard us for long may not act on that."""
+        return tuple(self._echo(peer, now_ns) for peer in self.peers.values() if peer.boot)
+
+    def _echo(self, peer: Peer, now_ns: int) -> Echo:
+        if self._deaf(peer, now_ns):
+            return Echo(peer.robot, peer.boot, -peer.counter)
+        peer.told_ns = now_ns
+        return Echo(peer.robot, peer.boot, peer.counter)
+
+    def gone(self, robot: str, now_ns: int) -> bool:
+        """Dead, or so deaf to us that nothing we ever told it lets it act any more."""
+        if self.dead(robot, now_ns):
+            return True
+        peer = self.peers[robot]
+        return self._deaf(peer, now_ns) and now_ns >= peer.told_ns + self._loyalty_ns
+
+    def rested(self, now_ns: int) -> bool:
+        """Whether whatever an earlier life of ours has told anybody is over."""
+        return now_ns >= self._born_ns + self._loyalty_ns
+
+    def _deaf(self, peer: Peer, now_ns: int) -> bool:
+        if not self._elects or not peer.boot:
+            return False
+        return now_ns - max(peer.heard_us_ns, peer.since_ns) > DEAF_LOYALTIES * self._loyalty_ns
+
     def living(self, now_ns: int) -> tuple[Peer, ...]:
         """The peers that are alive."""
         return tuple(peer for peer in self.peers.values() if self.alive(peer.robot, now_ns))
 
     def lease_ns(self, robot: str) -> int:
         """Until when this peer's hearing us lets us act: the newest beat of ours that it echoed, and a lease."""
-        echoed = self.peers[robot].echoed if robot in self.peers else 0
-        return next((at + self._config.lease_ns for counter, at in reversed(self._asked) if counter <= echoed), 0)
+        asked_ns = self.peers[robot].asked_ns if robot in self.peers else 0
+        return asked_ns + self._config.lease_ns if asked_ns else 0
 
     def views(self, now_ns: int) -> tuple[PeerView, ...]:
         """For the status."""
@@ -170,7 +226,7 @@ class Membership:
     def _view(self, peer: Peer, now_ns: int) -> PeerView:
         silent_ns = now_ns - peer.heard_ns
         state = self._state(peer, now_ns)
-        heard = tuple(link for link, at in sorted(peer.links.items()) if now_ns - at < self._config.loyalty_ns)
+        heard = tuple(link for link, at in sorted(peer.links.items()) if now_ns - at < self._loyalty_ns)
         hears_us = self.lease_ns(peer.robot) > now_ns
         return PeerView(peer.robot, state, peer.boot, silent_ns, hears_us, peer.load, heard)
 

@@ -17,7 +17,11 @@ VERSION = 1
 
 
 class Echo(msgspec.Struct, frozen=True, array_like=True):
-    """The newest beat that the sender has heard of one robot: what lets that robot count its lease from the asking."""
+    """The newest beat that the sender has heard of one robot: what lets that robot count its lease from the asking.
+
+    Attributes:
+        counter: of that beat; negative: heard, but no lease may be counted from it (that robot seems deaf to the sender).
+    """
 
     robot: str
     boot: int
@@ -31,10 +35,10 @@ class Entry(msgspec.Struct, frozen=True, array_like=True):
         state: index into ``STATES``.
         primary: whom the sender takes for the primary of ``epoch``; naming a peer *is* the vote for it.
         generation, sequence, digest: newest position it can restore from; for a standby, its acknowledgement. Sequence 0: none.
-        standby: (primary) the robot it has entrusted, "" if none.
+        standby: the robot that the primary has entrusted, "" if none; under majority its followers repeat what they have noted.
         yields_to: (primary, handing over) the robot that may claim now.
         flags: ``NEEDS_BASE`` (standby), ``UNPROTECTED`` (primary has stopped protecting), ``HOLDS`` (on_loss is hold),
-            ``WARM`` (standby: its program waits there, started already).
+            ``WARM`` (standby: its program waits there, started already); ``FREE``, ``OPEN``, ``STARTS``, ``ORDERED`` (majority).
         status: of a finished component, waitpid's.
     """
 
@@ -60,6 +64,17 @@ NEEDS_BASE = 1
 UNPROTECTED = 2
 HOLDS = 4
 WARM = 8
+FREE = 16
+"""The sender is bound to no primary: it would vote for a robot that holds all that was acknowledged."""
+
+OPEN = 32
+"""It has waited long enough for those robots: it would vote for any other."""
+
+STARTS = 64
+"""It would start the component from the beginning, as configured."""
+
+ORDERED = 128
+"""An operator asked for this claim: a robot with an older checkpoint may have it."""
 
 
 class Beat(msgspec.Struct, frozen=True, array_like=True):

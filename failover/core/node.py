@@ -6,7 +6,21 @@ The agent feeds it one event at a time with the instant of its own clock and obe
 
 from __future__ import annotations
 
-from failover.core import acts, commands, election, endings, handover, lease, replication, view, warmth
+from failover.core import (
+    acts,
+    archive,
+    commands,
+    contest,
+    election,
+    endings,
+    handover,
+    lease,
+    majority,
+    promise,
+    replication,
+    view,
+    warmth,
+)
 from failover.core.acts import Ready
 from failover.core.component import Cause, Component, Turn
 from failover.core.events import (
@@ -22,6 +36,7 @@ from failover.core.events import (
     NothingToCapture,
     Noticed,
     Prefer,
+    Promote,
     Received,
     Release,
     Restored,
@@ -37,7 +52,7 @@ from failover.core.events import (
     Warmed,
 )
 from failover.core.membership import Membership
-from failover.core.messages import HOLDS, Beat, Echo, Entry
+from failover.core.messages import Beat, Entry
 from failover.core.speaker import Speaker, entry_of
 from failover.core.types import COMPONENTS_MAX, ENDED, MS, Ballot, Config, Found, Held, State, StatusView
 from failover.core.watch import Watch
@@ -88,6 +103,8 @@ class Node:
         self._components = {record.name: Component.remembered(record) for record in ballot.records}
         self._found = {one.component: one for one in found}
         self._begun = False
+        self._load = 0
+        self._promise = ""
         self._configure(held)
 
     def step(self, event: Event, now_ns: int) -> Ready:
@@ -102,6 +119,8 @@ class Node:
         if not self._begun:
             self._begin(turn)
         touched = self._take(event, turn)
+        if isinstance(event, Tick):
+            self._note_promise(turn)
         for component in touched:
             _review(component, turn)
         send = self._speak(turn)
@@ -117,7 +136,14 @@ class Node:
         return view.status(self._components, self._turn(max(now_ns, self._now_ns)), self._boot)
 
     def _turn(self, now_ns: int) -> Turn:
-        return Turn(now_ns, self._config, self._team, self._speaker.counter + 1, self._durable, self._watch.late_ns)
+        return Turn(now_ns, self._config, self._team, self._speaker.counter + 1, self._durable, self._watch.late_ns, self._load)
+
+    def _note_promise(self, turn: Turn) -> None:
+        """The journal has the team's promise at each change."""
+        sentence = promise.team(turn)
+        if sentence != self._promise:
+            self._promise = sentence
+            turn.say_of_robot(sentence)
 
     # Birth
 
@@ -126,6 +152,8 @@ class Node:
             component = self._components.setdefault(spec.name, Component(spec.name, spec=spec))
             component.spec = component.spec or spec
             component.autostart = True
+        for component in self._components.values():
+            component.elects = self._config.by_majority
         for one in held:
             if one.component in self._components:
                 component = self._components[one.component]
@@ -179,19 +207,20 @@ class Node:
         news = self._team.hear(beat, event.link, turn.now_ns)
         if beat.sender in self._team.peers:
             self._team.peers[beat.sender].carried(event.copies)
+        rules = contest if self._config.by_majority else election
         touched = {name: component for name, component in self._components.items() if component.holding}
         for entry in news:
             component = self._known(entry.name)
             if component is None:
                 continue
-            election.heard(component, turn, beat.sender, entry)
+            rules.heard(component, turn, beat.sender, entry)
             replication.acknowledged(component, turn, beat.sender, entry)
             touched[component.name] = component
         return list(touched.values())
 
     def _known(self, name: str) -> Component | None:
         if name not in self._components and len(self._components) < COMPONENTS_MAX:
-            self._components[name] = Component(name)
+            self._components[name] = Component(name, elects=self._config.by_majority)
         return self._components.get(name)
 
     # What leaves
@@ -203,15 +232,16 @@ class Node:
             self._next_beat_ns = min(self._next_beat_ns, self._last_beat_ns + URGENT_GAP_NS)
         if turn.now_ns < self._next_beat_ns:
             return ()
-        echoes = tuple(Echo(peer.robot, peer.boot, peer.counter) for peer in self._team.peers.values() if peer.boot)
-        beat = self._speaker.beat(entries, echoes)
+        beat = self._speaker.beat(entries, self._team.echoes(turn.now_ns))
+        self._load = beat.load
         self._team.asked(beat.counter, turn.now_ns)
         self._last_beat_ns = turn.now_ns
         self._next_beat_ns = turn.now_ns + self._config.beat_ns
         return (beat,)
 
     def _entries(self) -> dict[str, Entry]:
-        known = (component for component in self._components.values() if component.epoch)
+        starts = self._config.by_majority
+        known = (component for component in self._components.values() if component.epoch or (starts and component.autostart))
         return {component.name: entry_of(component, self._config.robot) for component in known}
 
     def _persist(self) -> Ballot | None:
@@ -233,7 +263,7 @@ def _instants(component: Component) -> list[int]:
     match component.state:
         case State.PRIMARY:
             due = [] if component.flight or component.unprotected else [component.due_ns]
-            return [*due, *([component.lease_ns] if component.entrusted else [])]
+            return [*due, *([component.lease_ns] if component.lease_ns else [])]
         case _:
             return []
 
@@ -249,7 +279,7 @@ def _take_up(component: Component, turn: Turn, found: Found | None) -> None:
     election.open_line(component, turn)
     if not found.running:
         endings.exited(component, turn, Exited(component.name, component.epoch, found.status))
-    elif component.entrusted:
+    elif lease.on_lease(component, turn):
         turn.order(acts.Freeze(component.name, component.epoch))
         turn.say(component, f"{turn.me} is back and holds it still until it is heard, or knows that nobody else runs it")
     else:
@@ -272,6 +302,7 @@ def _tell(component: Component, turn: Turn, event: Event) -> None:
             replication.committed(component, turn, event)
         case ShipEnded():
             replication.ship_ended(component, turn, event)
+            archive.ship_ended(component, turn, event)
         case Stored():
             replication.stored(component, turn, event)
         case StoreFailed():
@@ -285,7 +316,7 @@ def _tell(component: Component, turn: Turn, event: Event) -> None:
         case Stopped():
             if component.state is State.STOPPING:
                 component.move(Cause.CLEARED)
-        case Run() | Release() | Stop() | Handover() | Failback() | Prefer():
+        case Run() | Release() | Stop() | Handover() | Promote() | Failback() | Prefer():
             commands.obey(component, turn, event)
 
 
@@ -310,10 +341,12 @@ def _runs(component: Component, turn: Turn, event: Started | Restored) -> None:
 def _review(component: Component, turn: Turn) -> None:
     """What the passing of time, or what was just heard, makes due for one component."""
     endings.overdue(component, turn)
+    if turn.config.by_majority:
+        majority.look(component, turn)
     if component.state in (State.ABSENT, State.STANDBY):
         _review_idle(component, turn)
     if component.state is State.CLAIMING:
-        election.advance(component, turn)
+        (contest if turn.config.by_majority else election).advance(component, turn)
     if component.holding and component.state is not State.CLAIMING:
         _review_held(component, turn)
     if component.state in ENDED:
@@ -323,10 +356,10 @@ def _review(component: Component, turn: Turn) -> None:
 
 def _review_idle(component: Component, turn: Turn) -> None:
     endings.retry(component, turn)
-    _admit_a_return(component, turn)
-    election.consider(component, turn)
+    archive.admit_a_return(component, turn)
+    (contest if turn.config.by_majority else election).consider(component, turn)
     if component.state in (State.ABSENT, State.STANDBY):
-        replication.give_back(component, turn)
+        archive.give_back(component, turn)
 
 
 def _review_held(component: Component, turn: Turn) -> None:
@@ -334,9 +367,11 @@ def _review_held(component: Component, turn: Turn) -> None:
     if component.crashed:
         endings.crashed(component, turn, component.crashed)
     replication.overdue(component, turn)
+    replication.confirm(component, turn)
     if component.state is State.PRIMARY:
         replication.choose_standby(component, turn)
         replication.capture(component, turn)
+        archive.advance(component, turn)
         _fail_back(component, turn)
     handover.advance(component, turn)
 
@@ -349,15 +384,3 @@ def _fail_back(component: Component, turn: Turn) -> None:
     if component.acked is not None and component.flight is None and turn.alive(prefer):
         component.retry_ns = turn.now_ns + FAILBACK_PAUSE * turn.config.retry_ms * MS
         handover.begin(component, turn, prefer, 0)
-
-
-def _admit_a_return(component: Component, turn: Turn) -> None:
-    """``on_loss = hold``: the checkpoint that another robot kept for us may come back."""
-    if component.primary != turn.me:
-        return
-    for peer in turn.team.living(turn.now_ns):
-        entry = peer.entry(component.name)
-        if entry is None or not entry.flags & HOLDS or entry.primary != turn.me or entry.epoch != component.epoch:
-            continue
-        if entry.position is not None and (component.newest is None or component.newest < entry.position):
-            election.admit(component, turn, peer.robot)

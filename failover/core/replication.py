@@ -7,30 +7,45 @@ acknowledged to the keeper only when it is safe elsewhere, or nobody else is the
 from __future__ import annotations
 
 from checkpoint.model import Position
-from failover.core import acts, lease
+from failover.core import acts, lease, majority
 from failover.core.component import Component, Flight, Turn
 from failover.core.consent import grants
 from failover.core.election import supersede
 from failover.core.events import Captured, CaptureFailed, Committed, NothingToCapture, ShipEnded, Stored, StoreFailed, Unchanged
+from failover.core.membership import Peer
 from failover.core.messages import NEEDS_BASE, Entry
 from failover.core.names import weight
-from failover.core.types import HISTORY_MAX, MS, OnUnsupported, State
+from failover.core.types import HISTORY_MAX, MS, OnUnsupported
 
 
 def choose_standby(component: Component, turn: Turn) -> None:
     """The operator's choice, else the least loaded living robot, else the lesser name. Under ``freeze`` it stays for good."""
-    if component.standby and (turn.alive(component.standby) or component.freezes):
+    if component.standby and _stays(component, turn):
         return
     wanted = component.rules.standby
     able = [
         peer
         for peer in turn.team.living(turn.now_ns)
-        if grants(component, peer, turn.me) and (not wanted or peer.robot == wanted)
+        if grants(component, peer, turn.me) and turn.config.keeps(peer.robot) and (not wanted or peer.robot == wanted)
     ]
     if able:
-        component.standby = min(able, key=lambda peer: (peer.load, weight(peer.robot))).robot
+        component.standby = min(able, key=lambda peer: (not turn.config.runs(peer.robot), peer.load, weight(peer.robot))).robot
         component.due_ns = turn.now_ns
         turn.say(component, f"{component.standby} is its standby")
+
+
+def _stays(component: Component, turn: Turn) -> bool:
+    if not turn.config.by_majority:
+        return turn.alive(component.standby) or component.freezes
+    if not turn.alive(component.standby) or not grants(component, turn.team.peers[component.standby], turn.me):
+        return False
+    return turn.config.runs(component.standby) or component.rules.standby == component.standby or not _robots(component, turn)
+
+
+def _robots(component: Component, turn: Turn) -> list[Peer]:
+    """Living robots that could run it: better standbys than a server."""
+    living = (peer for peer in turn.team.living(turn.now_ns) if turn.config.runs(peer.robot))
+    return [peer for peer in living if grants(component, peer, turn.me)]
 
 
 def capture(component: Component, turn: Turn, final: bool = False) -> None:
@@ -66,7 +81,7 @@ def captured(component: Component, turn: Turn, event: Captured) -> None:
         return
     entry = _standby_entry(component, turn)
     fits = event.parent is None or (entry is not None and entry.position == event.parent)
-    if not fits or not lease.entrust(component, turn, to) or component.spec is None:
+    if not fits or not (turn.config.by_majority or lease.entrust(component, turn, to)) or component.spec is None:
         _give_up(component, turn)
         return
     flight.to = to
@@ -142,11 +157,29 @@ def acknowledged(component: Component, turn: Turn, sender: str, entry: Entry) ->
     if flight is None or flight.position is None or flight.to != sender or not _follows_us(component, turn, entry):
         return
     if entry.position == flight.position:
-        _checkpoint(component, turn, flight.position, is_safe=True)
+        if not turn.config.by_majority:
+            _checkpoint(component, turn, flight.position, is_safe=True)
     elif entry.flags & NEEDS_BASE and flight.parent is not None:
         turn.order(acts.CancelShip(component.name, component.epoch, flight.position, sender))
         _give_up(component, turn, f"{sender} needs a base")
         component.due_ns = turn.now_ns
+
+
+def confirm(component: Component, turn: Turn) -> None:
+    """Under majority: what the standby holds is a checkpoint once a majority has noted whose word that is.
+
+    Whoever is named holds all that was acknowledged before: it is named when it has taken the newest snapshot.
+    """
+    flight = component.flight
+    if not turn.config.by_majority or flight is None or flight.position is None or flight.to != component.standby:
+        return
+    entry = _standby_entry(component, turn)
+    if entry is None or entry.position != flight.position or not flight.to:
+        return
+    if flight.to not in component.entrusted:
+        component.entrusted = (flight.to,)
+    if majority.noted(component, turn):
+        _checkpoint(component, turn, flight.position, is_safe=True)
 
 
 def overdue(component: Component, turn: Turn) -> None:
@@ -168,6 +201,7 @@ def _checkpoint(component: Component, turn: Turn, position: Position, *, is_safe
     turn.order(acts.Acknowledge(component.name, component.epoch, position, is_safe))
     component.undelivered = ""
     component.parent = component.acked = position
+    component.trail.append((position, flight.parent))
     component.acked_ns = flight.state_ns
     component.due_ns = max(flight.started_ns + _period_ns(component, turn, flight), turn.now_ns)
     component.flight = None
@@ -217,7 +251,7 @@ def _tell_prune(component: Component, turn: Turn) -> None:
 
 def stored(component: Component, turn: Turn, event: Stored) -> None:
     """A snapshot of the primary's is durable here: our next beat acknowledges it."""
-    if (event.sender, event.epoch) != component.admitted or event.epoch != component.epoch or component.holding:
+    if (event.sender, event.epoch) != component.admitted or component.holding:
         return
     supersede(component, turn, event.position)
     component.hold(event.position)
@@ -234,26 +268,3 @@ def store_failed(component: Component, turn: Turn, event: StoreFailed) -> None:
     component.needs_base = component.needs_base or event.needs_base
     component.unstored = event.message
     turn.say(component, f"a snapshot from {event.sender} was not stored: {event.message}")
-
-
-def give_back(component: Component, turn: Turn) -> None:
-    """``on_loss = hold``: the primary is back without its state, or with an older one: send it what we keep."""
-    flight, mine = component.flight, component.newest
-    if flight is not None and (turn.now_ns >= flight.until_ns or not turn.alive(flight.to)):
-        component.flight = flight = None
-    home = component.primary
-    if turn.now_ns < component.due_ns:  # it was refused just now: what home says and what it takes may differ for a moment
-        return
-    if not component.waits or mine is None or component.spec is None or flight is not None or not turn.alive(home):
-        return
-    peer = turn.team.peers[home]
-    entry = peer.entry(component.name)
-    idle = entry is not None and entry.epoch == component.epoch and entry.state in _IDLE_NUMBERS
-    if idle and entry is not None and (entry.position is None or entry.position < mine):
-        until_ns = turn.now_ns + turn.config.ship_ms * MS
-        component.flight = Flight(turn.now_ns, until_ns, True, home, mine)
-        turn.order(acts.Ship(component.name, component.epoch, mine, None, home, component.spec, whole=True))
-        turn.say(component, f"{turn.me} gives its checkpoint back to {home}")
-
-
-_IDLE_NUMBERS = frozenset(tuple(State).index(state) for state in (State.ABSENT, State.STANDBY))

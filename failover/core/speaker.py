@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from failover.core.component import Component
 from failover.core.consent import STATES
-from failover.core.messages import HOLDS, NEEDS_BASE, UNPROTECTED, WARM, Beat, Echo, Entry
+from failover.core.messages import FREE, HOLDS, NEEDS_BASE, OPEN, ORDERED, STARTS, UNPROTECTED, WARM, Beat, Echo, Entry
 from failover.core.types import HOLDING, State
 from failover.core.wire import BODY_SIZE_MAX, beat_size, entry_size
 
@@ -21,6 +21,8 @@ def entry_of(component: Component, me: str) -> Entry:
     handing = component.handing
     flags = NEEDS_BASE * component.needs_base | UNPROTECTED * component.unprotected
     flags |= HOLDS * component.waits | WARM * component.warm
+    flags |= FREE * component.free | OPEN * component.open | ORDERED * component.ordered
+    flags |= STARTS * (component.autostart and not component.held and not component.entrusted)
     return Entry(
         component.name,
         STATES.index(component.state),
@@ -29,7 +31,7 @@ def entry_of(component: Component, me: str) -> Entry:
         newest.generation if newest else 0,
         newest.sequence if newest else 0,
         newest.digest if newest else b"",
-        component.standby if component.standby in component.entrusted and not component.unprotected else "",
+        component.named,
         handing.to if handing and handing.yielded else "",
         flags,
         component.status,
@@ -40,7 +42,7 @@ def urgent(entry: Entry, before: Entry | None) -> bool:
     """Whether others wait for this change: everything but a primary's own progress."""
     if before is None or STATES[entry.state] in (State.STANDBY, State.ABSENT, State.HANDING_OVER):
         return entry != before
-    return _essence(entry) != _essence(before) or (entry.standby, entry.yields_to) != (before.standby, before.yields_to)
+    return _essence(entry) != _essence(before) or entry.yields_to != before.yields_to
 
 
 class Speaker:
@@ -104,6 +106,6 @@ class Speaker:
         return self._said[name][1] if name in self._said else 0
 
 
-def _essence(entry: Entry) -> tuple[int, int, str]:
+def _essence(entry: Entry) -> tuple[int, int, str, str]:
     """What unsettles an entry when it changes."""
-    return entry.epoch, entry.state, entry.primary
+    return entry.epoch, entry.state, entry.primary, entry.standby

@@ -37,6 +37,13 @@ class WhenAlone(enum.StrEnum):
     FREEZE = "freeze"
 
 
+class Rule(enum.StrEnum):
+    """Who decides that a silent primary is replaced: each robot that hears it no longer, or the majority of all that vote."""
+
+    PAIR = "pair"
+    MAJORITY = "majority"
+
+
 class OnUnsupported(enum.StrEnum):
     """What becomes of the protection when the program turns into something that cannot be captured."""
 
@@ -182,7 +189,7 @@ class Config:
 
     Attributes:
         robot: own name.
-        peers: the other robots of the team that vote or protect.
+        peers: the other members of the team: robots, servers and witnesses.
         components: to be run from the start wherever nobody runs them yet (the same list may stand on every robot).
         beat_ms: between two beats.
         lease_ms: how long a primary may act without being heard; also the silence after which a primary may be replaced,
@@ -194,6 +201,12 @@ class Config:
         grace_ms: after its own start a robot waits that long for peers that it has not heard yet (keys are handed over first).
         ship_ms: a snapshot that is still on its way after that is given up.
         restore_ms: a restore or start that says nothing for that long has failed.
+        rule: by which primaries are replaced.
+        servers: members, perhaps this one, that keep checkpoints and vote, and run nothing.
+        witnesses: members, perhaps this one, that only vote.
+        patience_ms: under majority, how long the robots that hold what was acknowledged are waited for before another one goes on
+            from an older checkpoint.
+        archive_ms: between two whole checkpoints for a server that does not keep up with the deltas.
     """
 
     robot: str
@@ -209,6 +222,11 @@ class Config:
     grace_ms: int = 3_000
     ship_ms: int = 120_000
     restore_ms: int = 60_000
+    rule: Rule = Rule.PAIR
+    servers: tuple[str, ...] = ()
+    witnesses: tuple[str, ...] = ()
+    patience_ms: int = 30_000
+    archive_ms: int = 10_000
 
     def __post_init__(self) -> None:
         if not 1 <= self.beat_ms <= BEAT_MS_MAX:
@@ -224,6 +242,29 @@ class Config:
             raise RulesError(f"robot {self.robot!r} is listed among its own peers; remove it there")
         if len(self.peers) > PEERS_MAX:
             raise RulesError(f"{len(self.peers)} peers: at most {PEERS_MAX} robots share a team")
+        if not self.by_majority and (self.servers or self.witnesses):
+            raise RulesError("rule = pair with a server or a witness: they vote, so choose rule = majority")
+        strangers = {*self.servers, *self.witnesses} - {self.robot, *self.peers}
+        if strangers or set(self.servers) & set(self.witnesses):
+            raise RulesError(f"servers {self.servers} and witnesses {self.witnesses}: each a member of the team, with one role")
+
+    @property
+    def by_majority(self) -> bool:
+        """Whether primaries are elected."""
+        return self.rule is Rule.MAJORITY
+
+    @property
+    def quorum(self) -> int:
+        """How many members, oneself among them, are a majority."""
+        return (len(self.peers) + 1) // 2 + 1
+
+    def runs(self, robot: str) -> bool:
+        """Whether this member runs components."""
+        return robot not in self.servers and robot not in self.witnesses
+
+    def keeps(self, robot: str) -> bool:
+        """Whether this member keeps checkpoints."""
+        return robot not in self.witnesses
 
     @property
     def beat_ns(self) -> int:
@@ -270,11 +311,13 @@ class Record:
         epoch: the highest that was seen or claimed; only grows.
         primary: robot whose primacy of ``epoch`` this robot accepts: itself, a peer, or "" (nobody's).
         state: PRIMARY while this robot holds the primacy, STANDBY, ABSENT, or one of the records FINISHED, FAILED, RELEASED.
-        entrusted: robots that may take over if they stop hearing this primary; while there are any, this robot acts on leases.
+        entrusted: robots that may take over if they stop hearing the primary: they hold all that it has acknowledged. A primary
+            acts on leases while there are any (under majority always); a follower remembers what its primary told (majority).
         trusted: the primary of ``epoch`` has entrusted this robot.
         lost: generations of this robot's own that lost against another primary; never resumed from.
         status: exit status (waitpid's) of a finished component.
         reason: why it failed.
+        claimed: this robot's claim of ``epoch`` needs consent that it did not have yet.
     """
 
     name: str
@@ -287,6 +330,7 @@ class Record:
     status: int = 0
     reason: str = ""
     spec: ComponentSpec | None = None
+    claimed: bool = False
 
 
 @dataclass(frozen=True, slots=True)

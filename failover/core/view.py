@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from failover.core import promise
 from failover.core.component import Component, Turn
-from failover.core.types import ENDED, MS, ComponentView, Protection, State, StatusView
+from failover.core.types import MS, ComponentView, Protection, State, StatusView
 from failover.core.warmth import is_warm
 
 NS_PER_S = 10**9
@@ -21,20 +22,7 @@ def status(components: dict[str, Component], turn: Turn, boot: int) -> StatusVie
     bad = any(view.protection is Protection.DEGRADED or view.state is State.FAILED for view in views)
     bad = bad or any(view.cold for view in views)
     lost = any(peer.state == "dead" for peer in peers)
-    return StatusView(turn.me, boot, "pair", _team_promise(turn), not bad and not lost, peers, views)
-
-
-def _team_promise(turn: Turn) -> str:
-    living = [peer.robot for peer in turn.team.living(turn.now_ns)]
-    if not turn.team.peers:
-        return f"{turn.me} is alone in its team: a lost robot takes its programs with it."
-    if not living:
-        return f"{turn.me} hears nobody: what runs here is not protected."
-    silence_ms = turn.config.loyalty_ns // 10**6
-    return (
-        f"{turn.me} and {', '.join(living)} protect each other: whoever is silent for {silence_ms} ms is replaced; "
-        "a total cut between two that live can run a component twice, except where when_alone is freeze."
-    )
+    return StatusView(turn.me, boot, str(turn.config.rule), promise.team(turn), not bad and not lost, peers, views)
 
 
 def _component(component: Component, turn: Turn) -> ComponentView:
@@ -50,7 +38,7 @@ def _component(component: Component, turn: Turn) -> ComponentView:
         lag_ns,
         component.freeze_us,
         tuple(reversed(component.held)),
-        _promise(component, turn, protection),
+        promise.one(component, turn, protection),
         _notes(component, turn),
         component.status,
         component.lease_ns,
@@ -100,21 +88,6 @@ def _age(component: Component, turn: Turn) -> str:
     )
 
 
-def _promise(component: Component, turn: Turn, protection: Protection) -> str:
-    if component.state in ENDED:
-        return f"It is {component.state}; nobody runs it."
-    if not component.holding:
-        return f"{turn.me} keeps its checkpoints for {component.primary or 'whoever runs it'}."
-    if component.unprotected:
-        return f"If {turn.me} is lost now, so is its state: no robot keeps a checkpoint of it."
-    if protection is not Protection.PROTECTED:
-        return "If this robot is lost now, it goes on from its last checkpoint, if there is one."
-    if component.waits:
-        return f"If {turn.me} is lost, {component.standby} keeps its newest checkpoint until {turn.me} is back."
-    alone = "stands still here first" if component.freezes else "may run twice if both live on and cannot hear each other"
-    return f"If {turn.me} is silent for {turn.config.loyalty_ns // 10**6} ms, {component.standby} runs it; it {alone}."
-
-
 def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
     notes = []
     if component.degraded and component.holding:
@@ -134,7 +107,8 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
     if component.unable:
         notes.append(f"{turn.me} cannot run it: {component.unable}")
     if component.state is State.FROZEN:
-        notes.append("held still: nobody entrusted with it hears this robot; it goes on when the peer is back")
+        who = "no majority" if component.elects else "nobody entrusted with it"
+        notes.append(f"held still: {who} hears this robot; it goes on when the peers are back")
     if component.state is State.CLAIMING and turn.now_ns > component.until_ns:
         notes.append("waiting for the others' consent: when_alone = freeze")
     if component.reason:

@@ -13,11 +13,11 @@ import pytest
 from agent import config as configuration
 from agent.config import ComponentConfig, Config
 from agent.errors import ConfigError
-from agent.rules import started_here
+from agent.rules import node_config, started_here
 from agent.transport import new_keys
 from failover.client import team
-from failover.client.team import Robot, Team
-from failover.core.types import Launch
+from failover.client.team import Robot, Role, Team
+from failover.core.types import Launch, Rule
 
 DOCUMENTED = Path(__file__).parents[2] / "systemd" / "agent.toml"
 ROBOT = Robot(("127.0.0.1:7420",), "127.0.0.1:7421")
@@ -73,7 +73,7 @@ def test_a_program_is_started_again_by_this_robots_own_command(directory: Path) 
         (("baet_ms = 10",), 4, "did you mean 'beat_ms'"),
         (("# fine", 'beat_ms = "often"'), 5, "Expected `int`"),
         (('when_alone = "panic"',), 4, "Invalid enum value 'panic'"),
-        (('rule = "majority"',), 4, "unknown key 'rule'"),
+        (('rule = "dice"',), 4, "Invalid enum value 'dice'"),
         (("keep_chains = 2",), 4, "unknown key 'keep_chains'"),
         (("# fine", "beat_ms = 0"), 5, "must be at least 1"),
         (("beat_ms = 100_000",), 4, "at most 10000"),
@@ -162,3 +162,31 @@ def test_a_robot_that_no_other_could_hear_or_let_in_is_refused(directory: Path, 
 def test_every_key_that_is_made_is_a_key(directory: Path) -> None:
     for _ in range(20):
         team.enrol(Team("lab"), "robot1", Robot(ROBOT.beats, ROBOT.bulk, "robot", new_keys()[0]))
+
+
+@pytest.mark.parametrize(
+    ("roles", "line", "rule"),
+    [
+        (("robot", "robot"), "", Rule.PAIR),
+        (("robot", "robot", "witness"), "", Rule.MAJORITY),
+        (("robot", "robot", "server"), "", Rule.MAJORITY),
+        (("robot", "robot", "robot"), 'rule = "pair"', Rule.PAIR),
+        (("robot", "robot"), 'rule = "majority"', Rule.MAJORITY),
+    ],
+)
+def test_more_than_two_members_decide_by_majority_unless_told_otherwise(
+    directory: Path, roles: tuple[Role, ...], line: str, rule: Rule
+) -> None:
+    members = {f"robot{number + 1}": Robot(ROBOT.beats, ROBOT.bulk, role) for number, role in enumerate(roles)}
+    team.write(directory / "team", Team("lab", members))
+    config = node_config(configuration.load(written(directory, line)))
+    assert config.rule is rule
+    assert [config.runs(name) for name in members] == [role == "robot" for role in roles]
+    assert [config.keeps(name) for name in members] == [role != "witness" for role in roles]
+
+
+def test_a_witness_under_the_pair_rule_is_refused(directory: Path) -> None:
+    members = {"robot1": ROBOT, "robot2": Robot(ROBOT.beats, ROBOT.bulk, "witness")}
+    team.write(directory / "team", Team("lab", members))
+    with pytest.raises(ConfigError, match=r'robot2 would have no vote; set rule = "majority"'):
+        configuration.load(written(directory))

@@ -1,33 +1,63 @@
-"""``python -m tests.simulation --seeds N``: play more seeds than the tests do, and stop at the first that breaks."""
+"""``python -m tests.simulation``: play more seeds than the tests do, or longer lives, and stop at the first that breaks."""
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 
 from tests.simulation.chaos import life
-from tests.simulation.invariants import Broken
+
+FAULTS_A_LIFE = 150
+"""Of a long life."""
 
 
 def main() -> int:
     """Play the seeds; 1 if one broke, with its story."""
+    arguments = _parser().parse_args()
+    lives = -(-arguments.faults // FAULTS_A_LIFE) or arguments.seeds
+    each = FAULTS_A_LIFE if arguments.faults else 0
+    began, broken, faults = time.monotonic(), 0, 0
+    for seed, (happened, story) in _played(range(arguments.first, arguments.first + lives), each, arguments.jobs):
+        faults += happened
+        if story:
+            broken += 1
+            print(f"seed {seed}: {story if not arguments.keep_going else story.splitlines()[0]}", flush=True)
+            if not arguments.keep_going:
+                return 1
+    print(f"{lives} seeds, {faults} faults in {time.monotonic() - began:.1f} s, {broken} broken")
+    return 1 if broken else 0
+
+
+def play(seed: int, faults: int) -> tuple[int, str]:
+    """One life: how many faults there were, and the story if it broke a promise."""
+    try:
+        return life(seed, faults=faults).faults, ""
+    except AssertionError as story:
+        return 0, str(story) or repr(story)
+
+
+def _played(seeds: range, faults: int, jobs: int) -> Iterator[tuple[int, tuple[int, str]]]:
+    if jobs == 1:
+        yield from ((seed, play(seed, faults)) for seed in seeds)
+        return
+    with ProcessPoolExecutor(jobs) as pool:
+        yield from zip(seeds, pool.map(play, seeds, itertools.repeat(faults), chunksize=8), strict=True)
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m tests.simulation", description=__doc__)
     parser.add_argument("--seeds", type=int, default=1_000, help="how many")
     parser.add_argument("--first", type=int, default=0, help="the first one")
+    parser.add_argument(
+        "--faults", type=int, default=0, help=f"instead: long lives of {FAULTS_A_LIFE} faults, until there were as many"
+    )
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--keep-going", action="store_true", help="do not stop at the first that breaks")
-    arguments = parser.parse_args()
-    began, broken = time.monotonic(), 0
-    for seed in range(arguments.first, arguments.first + arguments.seeds):
-        try:
-            life(seed)
-        except Broken as story:
-            broken += 1
-            print(f"seed {seed}: {story if not arguments.keep_going else str(story).splitlines()[0]}")
-            if not arguments.keep_going:
-                return 1
-    print(f"{arguments.seeds} seeds in {time.monotonic() - began:.1f} s, {broken} broken")
-    return 1 if broken else 0
+    return parser
 
 
 if __name__ == "__main__":

@@ -1,30 +1,29 @@
-"""One seed, one life: what goes wrong, when, and how it ends well."""
+"""One seed, one life: which team, what goes wrong, when, and how it ends well."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from random import Random
 from unittest.mock import patch
 
 from failover.core import speaker
-from failover.core.events import Handover
-from failover.core.types import MS, ComponentSpec, Launch, OnLoss, Rules, WhenAlone
+from failover.core.types import MS, ComponentSpec, Config, Launch, OnLoss, Rule, Rules, WhenAlone
 from tests.simulation.invariants import Broken, Invariants
-from tests.simulation.world import KEEPS_STATE, World, pair
+from tests.simulation.troubles import Trouble
+from tests.simulation.world import KEEPS_STATE, World, elective, pair
 
 TROUBLE_NS = 3_000 * MS
+FAULT_NS = 200 * MS
+"""Between two faults of a long life, on the average."""
+
 HEALING_NS = 4_000 * MS
 LOOK_NS = 250 * MS
 """Between two looks whether a healed world is well."""
-
-CRASH = 11
-FINISHES = 0.3
-"""Of the occasions: a life whose programs have all ended shows little."""
 
 NARROW = 5
 """Every so many-th seed has frames that hold one entry, so that components are told of in turn."""
 
 NARROW_BODY_SIZE = 130
+ECHO_SIZE = 14
 
 SELDOM = 7
 """Every so many-th seed has programs that commit seldom, so that most captures find nothing new."""
@@ -32,25 +31,58 @@ SELDOM = 7
 
 ENGINES = ("ptrace", KEEPS_STATE)
 
+TEAMS = ((2, 0, 0), (2, 0, 0), (3, 0, 0), (2, 0, 1), (2, 1, 0), (3, 0, 2), (3, 1, 1))
+"""Robots, servers, witnesses. Two alone live by the rule ``pair``, the others elect."""
 
-def life(seed: int, engines: tuple[str, ...] = ENGINES) -> World:
-    """Play one seed to its end; raises ``Broken`` when an invariant does not hold."""
+DRIFTS = (0.01, 0.05, 0.05)
+"""How far rates are off; with 0.05 both ways a lease of 150 ms and a loyalty of 170 are but 4 ms apart."""
+
+HARSH = 3
+"""Every so many-th voting team has a long lease, on which drift weighs more than beats and disks do; the robot whose name is the
+least, which tends to be the primary, has the slowest clock, and everybody else the fastest."""
+
+LONG_LEASE_MS = 600
+DRIFT_MAX = 0.05
+
+PACES = (1.0, 0.02)
+"""How long disks, captures and restores take: as on a robot, or next to nothing, so that no delay hides a mistake."""
+
+
+def life(seed: int, engines: tuple[str, ...] = ENGINES, team: tuple[int, int, int] | None = None, faults: int = 0) -> World:
+    """Play one seed to its end; raises ``Broken`` when an invariant does not hold.
+
+    Args:
+        team: of ``TEAMS``; None for what the seed says.
+        faults: how many, in a life that is as long as they take and whose programs do not end; 0 for what the seed says.
+    """
     random, engine = Random(seed ^ 0x5EED), Random(seed)
     specs = tuple(_spec(random, index, engine.choice(engines)) for index in range(random.choice((1, 1, 2, 3))))
-    with patch.object(speaker, "BODY_SIZE_MAX", speaker.BODY_SIZE_MAX if seed % NARROW else NARROW_BODY_SIZE):
-        return _live(seed, random, specs)
+    robots, servers, witnesses = team or TEAMS[seed // HARSH % len(TEAMS)]
+    configs = pair(specs)
+    if robots + servers + witnesses > 2:
+        configs = elective(robots, specs, servers, witnesses, lease_ms=150 if seed % HARSH else LONG_LEASE_MS)
+    narrow = NARROW_BODY_SIZE + ECHO_SIZE * (len(configs) - 2)
+    with patch.object(speaker, "BODY_SIZE_MAX", speaker.BODY_SIZE_MAX if seed % NARROW else narrow):
+        return _live(seed, random, configs, specs, faults)
 
 
-def _live(seed: int, random: Random, specs: tuple[ComponentSpec, ...]) -> World:
-    invariants = Invariants(safe={spec.name for spec in specs if spec.rules.when_alone is WhenAlone.FREEZE})
-    world = World(seed, pair(specs), (invariants,))
+def _live(seed: int, random: Random, configs: list[Config], specs: tuple[ComponentSpec, ...], faults: int) -> World:
+    votes = configs[0].rule is Rule.MAJORITY
+    safe = {spec.name for spec in specs if votes or spec.rules.when_alone is WhenAlone.FREEZE}
+    invariants = Invariants(safe=safe, votes=votes)
+    world = World(seed, configs, (invariants,), random.choice(DRIFTS))
     _weather(world, random)
     world.unchanged = 0.8 if seed % SELDOM == SELDOM - 2 else 0.0
+    if votes and not seed % HARSH:
+        _make_harsh(world)
     for name in world.robots:
         world.at(random.randrange(300) * MS, lambda name=name: world.power_on(name))
-    for _ in range(random.randrange(1, 9)):
-        world.at(random.randrange(TROUBLE_NS), _trouble(world, invariants, random, specs))
-    world.run(TROUBLE_NS)
+    trouble_ns = faults * FAULT_NS or TROUBLE_NS
+    for _ in range(faults or (random.randrange(4, 16) if votes else random.randrange(1, 9))):
+        world.at(random.randrange(trouble_ns), Trouble(world, invariants, random, specs, endless=faults > 0))
+    if votes and random.random() < 0.3:
+        _lose_a_disk(world, random)
+    world.run(trouble_ns)
     _heal(world)
     while True:
         world.run(world.now_ns + LOOK_NS)
@@ -58,7 +90,7 @@ def _live(seed: int, random: Random, specs: tuple[ComponentSpec, ...]) -> World:
             invariants.ended_well(world)
             return world
         except Broken:
-            if world.now_ns >= TROUBLE_NS + HEALING_NS:
+            if world.now_ns >= trouble_ns + HEALING_NS:
                 raise
 
 
@@ -75,58 +107,37 @@ def _weather(world: World, random: Random) -> None:
     network.loss = random.choice((0, 0, 0.02, 0.2))
     network.duplicate = random.choice((0, 0.1))
     network.spread_ns = random.choice((1, 5, 30, 60)) * MS
+    world.pace = random.choice(PACES)
+    if world.pace < 1:
+        network.delay_ns, network.spread_ns = MS // 20, random.choice((MS // 20, network.spread_ns))
     for robot in world.robots.values():
         robot.slow = random.choice((1, 1, 1, 4))
 
 
-def _trouble(world: World, invariants: Invariants, random: Random, specs: tuple[ComponentSpec, ...]) -> Callable[[], None]:
-    name = random.choice(list(world.robots))
-    other = next(robot for robot in world.robots if robot != name)
-    spec = random.choice(specs)
-    pause_ns = int(random.choice((30, 100, 200, 400, 900)) * MS * random.uniform(0.5, 1.5))
+def _make_harsh(world: World) -> None:
+    world.pace, world.network.delay_ns, world.network.spread_ns = min(PACES), MS // 20, MS // 20
+    for place, robot in enumerate(world.robots.values()):
+        robot.slow, robot.clock.rate = 1, 1 + DRIFT_MAX * (1 if place else -1)
 
-    def cut(*ways: tuple[str, str]) -> None:
-        world.note(f"cut {ways} for {pause_ns / MS:.0f} ms")
-        world.network.cuts.update(ways)
-        world.after(pause_ns, lambda: world.network.cuts.difference_update(ways))
 
-    def outage(stop: Callable[[str], None]) -> None:
-        stop(name)
-        world.after(pause_ns, lambda: world.power_on(name))
+def _lose_a_disk(world: World, random: Random) -> None:
+    """One robot of the team, once: it comes back empty."""
+    name, ballot = random.choice(list(world.robots)), random.random() < 0.3
+    at_ns = random.randrange(TROUBLE_NS)
 
-    def crash() -> None:
-        invariants.crashing.add((name, spec.name))
-        world.program_ends(name, spec.name, CRASH)
+    def lose() -> None:
+        world.faults += 1
+        world.power_off(name)
+        world.new_disk(name, ballot)
 
-    def finish() -> None:
-        if random.random() < FINISHES:
-            world.program_ends(name, spec.name, 0)
-
-    def full() -> None:
-        world.robots[name].broken_store = True
-        world.after(pause_ns, lambda: setattr(world.robots[name], "broken_store", False))
-
-    kinds: list[Callable[[], None]] = [
-        lambda: cut((name, other), (other, name)),
-        lambda: cut((name, other)),
-        lambda: outage(world.power_off),
-        lambda: outage(world.power_off),
-        lambda: outage(world.agent_dies),
-        lambda: world.stall(name, pause_ns),
-        lambda: world.jump(name, pause_ns),
-        lambda: world.command(name, Handover(world.request(), spec.name)),
-        crash,
-        finish,
-        full,
-    ]
-    return random.choice(kinds)
+    world.at(at_ns, lose)
+    world.at(at_ns + random.randrange(10, 500) * MS, lambda: world.power_on(name))
 
 
 def _heal(world: World) -> None:
     world.note("healing")
     world.network.cuts.clear()
-    world.network.loss = world.network.duplicate = 0
-    world.network.spread_ns = 1 * MS
+    world.network.calm((0, 0, 1 * MS))
     for name, robot in world.robots.items():
         robot.slow, robot.broken_store = 1, False
         world.power_on(name)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from checkpoint.model import Position
 from failover.core import acts
 from failover.core.messages import Beat
-from failover.core.types import Ballot, ComponentView, OnLoss, State, WhenAlone
-from tests.simulation.world import KEEPS_STATE, World, ballot_of
+from failover.core.types import ENDED, Ballot, ComponentView, OnLoss, State, WhenAlone
+from tests.simulation.world import KEEPS_STATE, NewDisk, World, ballot_of
 
 
 class Broken(AssertionError):
@@ -20,13 +20,18 @@ class Invariants:
     """Watches one world.
 
     Attributes:
-        safe: components whose ``when_alone`` is freeze.
+        safe: components that must never act twice: ``when_alone`` is freeze, or primaries are elected.
+        votes: primaries are elected; ``given``: who voted for whom, of which component, in which epoch.
+        gone: positions that were on a disk that was lost.
         split: components that computed in two places at once (allowed under ``run``, after a cut).
         acknowledged: newest position that each component's primaries acknowledged while a standby held it.
         last: components whose end was reported as acknowledged.
     """
 
     safe: set[str] = field(default_factory=set)
+    votes: bool = False
+    gone: set[Position] = field(default_factory=set)
+    given: dict[tuple[str, str, int], str] = field(default_factory=dict)
     split: set[str] = field(default_factory=set)
     epochs: dict[tuple[str, str], int] = field(default_factory=dict)
     acknowledged: dict[str, Position] = field(default_factory=dict)
@@ -42,6 +47,9 @@ class Invariants:
                 self._one_acts(world)
             case Ballot():
                 self._epochs_grow(world, robot, what)
+                self._one_vote_an_epoch(world, robot, what)
+            case NewDisk():
+                self._forget(robot, what)
             case Beat():
                 self._durable_before_said(world, robot, what)
             case acts.Capture():
@@ -78,6 +86,9 @@ class Invariants:
             raise _broken(world, f"{component} should wait at {standby or 'no robot'}: it waits at {waiting}")
 
     def _one_primary(self, world: World, robot: str, act: acts.Start | acts.Restore) -> None:
+        others = [name for name in world.acting(act.component) if name != robot]
+        if others and act.component in self.safe:
+            raise _broken(world, f"{robot} is to run {act.component} while the lease of {' and '.join(others)} is valid")
         owner = self.owners.setdefault((act.component, act.epoch), robot)
         if owner != robot and act.component in self.safe:
             raise _broken(world, f"epoch {act.epoch} of {act.component} is {owner}'s and {robot}'s")
@@ -89,6 +100,25 @@ class Invariants:
                 raise _broken(world, f"{robot}: the epoch of {component} fell from {epoch} to {kept.get(component, 0)}")
         self.epochs.update({(robot, component): epoch for component, epoch in kept.items()})
 
+    def _one_vote_an_epoch(self, world: World, robot: str, ballot: Ballot) -> None:
+        for record in ballot.records:
+            if not self.votes or not record.primary or record.state in ENDED:
+                continue
+            key = (robot, record.name, record.epoch)
+            before = self.given.setdefault(key, record.primary)
+            for_it = sum(self.given.get((name, *key[1:])) == record.primary for name in world.robots)
+            if before == robot and for_it > len(world.robots) // 2:
+                self.given[key] = record.primary  # its own claim was in vain: it follows the one that was elected
+            elif before != record.primary:
+                story = f"{robot} votes for {before} and {record.primary} in epoch {record.epoch} of {record.name}"
+                raise _broken(world, story)
+
+    def _forget(self, robot: str, loss: NewDisk) -> None:
+        self.gone.update(loss.lost)
+        if loss.ballot:
+            self.epochs = {key: epoch for key, epoch in self.epochs.items() if key[0] != robot}
+            self.given = {key: primary for key, primary in self.given.items() if key[0] != robot}
+
     def _durable_before_said(self, world: World, robot: str, beat: Beat) -> None:
         durable = {record.name: record.epoch for record in ballot_of(world.robots[robot]).records}
         for entry in beat.entries:
@@ -99,6 +129,7 @@ class Invariants:
         elsewhere = any(
             act.position in other.store.get(act.component, []) for name, other in world.robots.items() if name != robot
         )
+        elsewhere = elsewhere or act.position in self.gone
         is_told = act.is_safe and len(world.robots) > 1
         if not elsewhere and (is_told or self.shipped.get(act.component) == act.position):
             raise _broken(world, f"{robot} acknowledges {act.position} of {act.component}, which nobody else holds")

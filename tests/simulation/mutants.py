@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from typing import Any
 from unittest.mock import patch
 
-from failover.core import acts, election, endings, lease, node, replication, warmth
+from failover.core import acts, archive, contest, election, endings, handover, lease, majority, node, replication, warmth
 from failover.core.component import Component, Turn
-from failover.core.membership import Membership
+from failover.core.membership import Membership, Peer
 from failover.core.messages import Entry
-from failover.core.types import Config
+from failover.core.types import Config, State
 
 Mutant = Callable[[], Any]
 
@@ -38,12 +39,12 @@ def forgetful_ballot() -> Any:
 
 def deaf_to_stale() -> Any:
     """A primary does not give up to a higher epoch."""
-    return patch.object(election, "_stronger", lambda *_: False)
+    return patch.object(election, "stronger", lambda *_: False)
 
 
 def everybody_yields() -> Any:
     """Of two claims both give up: nobody decides."""
-    return patch.object(election, "_stronger", lambda *_: True)
+    return patch.object(election, "stronger", lambda *_: True)
 
 
 def no_consent() -> Any:
@@ -101,17 +102,17 @@ def same_epoch_again() -> Any:
     """A takeover does not open a new epoch."""
     honest = election.claim
 
-    def claim(component: Component, turn: Turn, plan: Any, why: str) -> None:
+    def claim(component: Component, turn: Turn, plan: Any, why: str, *, is_planned: bool = False) -> None:
         if component.epoch:
-            component.epoch -= 1
-        honest(component, turn, plan, why)
+            component.epoch, component.seen = component.epoch - 1, 0
+        honest(component, turn, plan, why, is_planned=is_planned)
 
-    return patch.object(election, "claim", claim)
+    return patch.object(election, "claim", claim), patch.object(contest, "claim", claim)
 
 
 def runs_the_finished() -> Any:
     """The standby does not take the record of an end."""
-    return patch.object(election, "_heard_end", lambda *_: None)
+    return patch.object(election, "heard_end", lambda *_: None), patch.object(contest, "heard_end", lambda *_: None)
 
 
 def crash_is_the_end() -> Any:
@@ -126,7 +127,7 @@ def no_grace() -> Any:
 
 def blind_to_the_better() -> Any:
     """Whoever holds a checkpoint claims, although another robot holds a newer one."""
-    return patch.object(election, "_living_entries", lambda *_: [])
+    return patch.object(election, "living_entries", lambda *_: [])
 
 
 def loyal_to_the_lost() -> Any:
@@ -167,9 +168,150 @@ def waits_where_it_may_not_run() -> Any:
     return patch.object(warmth, "_wanted", lambda component: component.spec if component.keeps_state else None)
 
 
+# Mistakes in the rule ``majority``
+
+
+def double_voting() -> Any:
+    """A member votes for whoever asks, also twice in one epoch."""
+    honest = majority.may_follow
+
+    def generous(component: Component, turn: Turn, sender: str, entry: Entry) -> bool:
+        again = entry.epoch == component.epoch and component.primary != turn.me
+        return again or honest(component, turn, sender, entry)
+
+    return patch.object(majority, "may_follow", generous)
+
+
+def no_margin() -> Any:
+    """The drift margin is removed: loyal for exactly a lease."""
+    return patch.object(Config, "loyalty_ns", property(lambda self: self.lease_ns))
+
+
+def disloyal_voter() -> Any:
+    """A member votes for another although it hears the primary that it follows."""
+    honest = majority.is_free
+
+    def free(component: Component, turn: Turn) -> bool:
+        return component.state is State.STANDBY or honest(component, turn)
+
+    return patch.object(majority, "is_free", free)
+
+
+def minority_rules() -> Any:
+    """One vote less than a majority is enough."""
+    return patch.object(Config, "quorum", property(lambda self: (len(self.peers) + 1) // 2))
+
+
+def anybody_may_have_it() -> Any:
+    """Votes go to robots with older checkpoints, too."""
+    return patch.object(majority, "eligible", lambda *_: True), patch.object(majority, "holds_all", lambda *_: True)
+
+
+def named_in_advance() -> Any:
+    """A standby is named before it holds what was acknowledged."""
+    honest = replication.choose_standby
+
+    def hasty(component: Component, turn: Turn) -> None:
+        honest(component, turn)
+        if component.standby:
+            component.entrusted = (component.standby,)
+
+    return patch.object(replication, "choose_standby", hasty)
+
+
+def best_lease_counts() -> Any:
+    """The lease is the longest that anybody grants, not what a majority grants."""
+
+    def longest(component: Component, turn: Turn) -> int:
+        return max((turn.team.lease_ns(peer.robot) for peer in turn.team.peers.values()), default=0)
+
+    return patch.object(majority, "granted_ns", longest)
+
+
+def lease_from_strangers() -> Any:
+    """Whoever hears us lengthens our lease, also one that votes for another."""
+
+    def granted(component: Component, turn: Turn) -> int:
+        leases = sorted((turn.team.lease_ns(peer.robot) for peer in turn.team.peers.values()), reverse=True)
+        return leases[turn.config.quorum - 2]
+
+    return patch.object(majority, "granted_ns", granted)
+
+
+def deafness_at_once() -> Any:
+    """A peer that seems deaf is replaced at once, while what it was told still lets it act."""
+
+    def gone(self: Membership, robot: str, now_ns: int) -> bool:
+        return self.dead(robot, now_ns) or now_ns - self.peers[robot].heard_us_ns > self._config.lease_ns // 4
+
+    return patch.object(Membership, "gone", gone)
+
+
+def votes_with_a_copy() -> Any:
+    """A robot whose copy is still being stopped counts as one that agrees."""
+
+    def agrees(component: Component, peer: Peer, me: str) -> bool:
+        entry = peer.entry(component.name)
+        return entry is not None and (entry.epoch, entry.primary) == (component.epoch, me)
+
+    return patch.object(majority, "grants", agrees), patch.object(majority, "_BOUND", frozenset())
+
+
+def generous_lease() -> Any:
+    """A lease is longer than was granted."""
+    honest = majority.granted_ns
+
+    def longer(component: Component, turn: Turn) -> int:
+        return honest(component, turn) + turn.config.lease_ns // 4
+
+    return patch.object(majority, "granted_ns", longer)
+
+
+def proud_primary() -> Any:
+    """A primary without a lease gives up to nobody."""
+    return patch.object(contest, "lose", lambda *_: None)
+
+
+def claims_for_ever() -> Any:
+    """A claim that was split is never withdrawn."""
+    return patch.object(contest, "withdraw", lambda *_: None)
+
+
+def forgotten_votes() -> Any:
+    """Epochs are durable, votes are not."""
+    honest = Component.record
+    return patch.object(Component, "record", lambda self: replace(honest(self), primary=""))
+
+
+def never_deaf() -> Any:
+    """A peer that is heard counts as one that hears."""
+    return patch.object(Membership, "_deaf", lambda *_: False)
+
+
+def no_pre_vote() -> Any:
+    """A robot claims without asking whether anybody would vote for it."""
+    return patch.object(majority, "may_claim", lambda *_: True), patch.object(contest, "vacant", lambda *_: True)
+
+
+def unfinished_business() -> Any:
+    """A handover that was not taken up is never called off."""
+    return patch.object(handover, "step_down", lambda *_: None)
+
+
+def miserly_server() -> Any:
+    """A server gives nothing back."""
+    honest = archive._heir
+    return patch.object(archive, "_heir", lambda component, turn: honest(component, turn) if turn.config.runs(turn.me) else "")
+
+
 SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (blind_to_the_better, "the_newest_checkpoint_wins_over_the_lesser_name"),
     (loyal_to_the_lost, "three_robots_stand_in_for_one_another"),
+    (no_pre_vote, "whoever_is_cut_off_raises_no_epoch"),
+    (never_deaf, "a_deaf_primary_is_replaced"),
+    (miserly_server, "both_robots_dead_one_is_back_empty_the_server_returns_it"),
+    (anybody_may_have_it, "an_older_checkpoint_waits_for_the_newest"),
+    (minority_rules, "without_a_majority_nothing_acts"),
     (tireless_giver, "a_chain_that_is_not_taken_is_offered_again_after_a_pause"),
 )
 """Mistakes that a pair survives, or that cost no promise but the peace: each spoils a scenario."""
@@ -196,8 +338,40 @@ MUTANTS: tuple[Mutant, ...] = (
 )
 
 
+ELECTIVE_MUTANTS: tuple[Mutant, ...] = (
+    double_voting,
+    no_margin,
+    impatient_standby,
+    lease_from_the_answer,
+    forgetful_ballot,
+    forgotten_votes,
+    disloyal_voter,
+    minority_rules,
+    anybody_may_have_it,
+    named_in_advance,
+    best_lease_counts,
+    lease_from_strangers,
+    deafness_at_once,
+    votes_with_a_copy,
+    generous_lease,
+    proud_primary,
+    claims_for_ever,
+    oldest_checkpoint,
+    same_epoch_again,
+    runs_the_finished,
+)
+"""Mistakes that lives of voting teams catch."""
+
+
+NEAR: dict[str, int] = {"no_margin": 99, "anybody_may_have_it": 89, "nobody_needs_the_right": 76}
+"""The first seed that catches a mistake, where that is a late one: it is tried first."""
+
+
 @contextmanager
 def mistaken(mutant: Mutant) -> Iterator[None]:
     """The rules with this mistake in them, for the body."""
-    with mutant():
+    patches = mutant()
+    with ExitStack() as stack:
+        for one in patches if isinstance(patches, tuple) else (patches,):
+            stack.enter_context(one)
         yield

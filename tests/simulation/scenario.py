@@ -3,6 +3,7 @@
 A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment. ``expect`` looks at the world at that instant:
 
     team robot1 robot2 robot3              who is in the team, if not robot1 and robot2; before everything else
+    votes robot1 robot2 witness1           the same, and primaries are elected; servers have their role by their name, too
     rule when_alone=freeze on_loss=hold    rules of the component, before everything but that
     0    on robot1                         start a robot; off: power cut; agent-dies: guards and programs live on
     100  run robot1                        an operator starts the component there
@@ -11,9 +12,12 @@ A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment. ``expect`` 
     700  exit robot1 0                     its program ends with this wait status (11: crash)
     800  handover robot1                   an operator moves it to the standby
     850  new-disk robot1                   its checkpoints are gone; what it has decided is not
+    850  new-robot robot1                  both are gone
     900  expect robot1 primary             its state there
+    900  epoch robot1 2                    the epoch it knows
     900  standby robot1 robot2             where the checkpoints of the one that runs at robot1 go
     900  acts robot1                       where it computes: robots, or nobody
+    900  gives-up                          from now on an older checkpoint than the acknowledged one may be used
     900  offers robot2 1 4                 how often it has offered a checkpoint since the last such line: at least, at most
 """
 
@@ -26,9 +30,9 @@ import msgspec
 
 from failover.core import acts
 from failover.core.events import Handover, Run, Stop
-from failover.core.types import MS, ComponentSpec, Launch, Rules
+from failover.core.types import MS, ComponentSpec, Config, Launch, Rules
 from tests.simulation.invariants import Invariants, seen_at, state_at
-from tests.simulation.world import World, pair
+from tests.simulation.world import World, elective, pair
 
 COMPONENT = "/team/part"
 
@@ -46,11 +50,13 @@ class Story:
     def play(self, text: str) -> World:
         """Play the lines in order; raises AssertionError with the story when an expectation is not met."""
         lines = [words for line in text.splitlines() if (words := line.split("#")[0].split())]
-        names = tuple(lines.pop(0)[1:]) if lines[0][0] == "team" else ("robot1", "robot2")
+        kind, *members = lines.pop(0) if lines[0][0] in ("team", "votes") else ("team", "robot1", "robot2")
+        names, votes = tuple(members), kind == "votes"
         if lines[0][0] == "rule":
             self.rules = _rules(lines.pop(0)[1:])
-        self.invariants = Invariants(safe={COMPONENT} if self.rules.when_alone == "freeze" else set())
-        self.world = World(1, pair(names=names), (self.invariants, self._count))
+        safe = {COMPONENT} if votes or self.rules.when_alone == "freeze" else set()
+        self.invariants = Invariants(safe=safe, votes=votes)
+        self.world = World(1, _voters(names) if votes else pair(names=names), (self.invariants, self._count))
         for at_ms, verb, *arguments in lines:
             self.world.run(int(at_ms) * MS)
             self._play(verb, arguments)
@@ -87,8 +93,12 @@ class Story:
                 world.network.cuts.add((robot, arguments[1]))
             case "mend":
                 world.network.cuts.clear()
-            case "new-disk":
-                world.robots[robot].store.clear()
+            case "new-disk" | "new-robot":
+                world.new_disk(robot, ballot=verb == "new-robot")
+            case "epoch":
+                self._expect(f"the epoch at {robot} is", str(seen_at(world, robot, COMPONENT).epoch), arguments[1])
+            case "gives-up":
+                self.invariants.split.add(COMPONENT)
             case "offers":
                 least, most = map(int, arguments[1:])
                 found = self.offers.pop(robot, 0)
@@ -105,6 +115,13 @@ class Story:
     def _expect(self, what: str, found: str, wanted: str) -> None:
         if found != wanted:
             self.failures.append(f"at {self.world.now_ns // MS} ms {what} {found}, not {wanted}")
+
+
+def _voters(names: tuple[str, ...]) -> list[Config]:
+    def count(kind: str) -> int:
+        return sum(name.startswith(kind) for name in names)
+
+    return elective(count("robot"), servers=count("server"), witnesses=count("witness"), patience_ms=1_000)
 
 
 def _rules(words: list[str]) -> Rules:

@@ -34,14 +34,25 @@ from failover.core.events import (
     Warmed,
 )
 from failover.core.node import Node
-from failover.core.types import MS, Ballot, ComponentSpec, Config, Found, Held, Launch
+from failover.core.story import Decision
+from failover.core.types import MS, PEERS_MAX, Ballot, ComponentSpec, Config, Found, Held, Launch, Rule
 
 TEAM = "simulated"
 KEY = bytes(range(32))
 QUEUE_MAX = 4_096
 """Events that may wait for one robot; more means that somebody floods."""
 
-RESTARTS_AT_LEAST_NS = 30 * MS
+TORN = 0.5
+"""Of the writes that a crash interrupts: those that got to the disk all the same."""
+
+
+@dataclass(frozen=True, slots=True)
+class NewDisk:
+    """A robot has lost its checkpoints; ``ballot``: and its votes."""
+
+    ballot: bool
+    lost: tuple[Position, ...]
+
 
 KEEPS_STATE = "cooperative"
 """The engine of programs that keep their state, and so wait at a standby."""
@@ -98,14 +109,18 @@ class Robot:
     serial: dict[str, int] = field(default_factory=dict)
     leases: dict[str, int] = field(default_factory=dict)
     capturing: set[str] = field(default_factory=set)
+    unheld: set[str] = field(default_factory=set)
     warm: dict[str, Launch] = field(default_factory=dict)
     inbox: list[Event] = field(default_factory=list)
     receiver: wire.Receiver = field(default_factory=lambda: wire.Receiver(TEAM))
     life: int = 0
     busy: bool = False
     stalled_until_ns: int = 0
-    slow: int = 1
+    slow: float = 1
     broken_store: bool = False
+    pending: Ballot | None = None
+    told: list[Decision] = field(default_factory=list)
+    writing: list[tuple[str, Position]] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -118,6 +133,10 @@ class Network:
     spread_ns: int = 1 * MS
     cuts: set[tuple[str, str]] = field(default_factory=set)
 
+    def calm(self, weather: tuple[float, float, int]) -> None:
+        """Set loss, duplication and spread."""
+        self.loss, self.duplicate, self.spread_ns = weather
+
 
 Watcher = Callable[["World", str, object], None]
 """Called with (world, robot, what happened): an act that is carried out, a ballot that became durable, beats that leave."""
@@ -126,8 +145,14 @@ Watcher = Callable[["World", str, object], None]
 class World:
     """All robots, the network between them, and what is going to happen."""
 
-    def __init__(self, seed: int, configs: list[Config], watchers: tuple[Watcher, ...] = ()) -> None:
+    def __init__(self, seed: int, configs: list[Config], watchers: tuple[Watcher, ...] = (), drift: float = 0.01) -> None:
+        """
+        Args:
+            drift: how far a clock's rate may be off, of 1.
+        """
         self.random = Random(seed)
+        self.pace = 1.0
+        self.faults = 0
         self.now_ns = 0
         self.unchanged = 0.0
         """Share of captures that find nothing new: of programs that commit seldom."""
@@ -141,7 +166,9 @@ class World:
         self._requests = itertools.count(1)
         self.robots: dict[str, Robot] = {}
         for config in configs:
-            clock = Clock(1 + self.random.uniform(-0.01, 0.01), self.random.randrange(10**15))
+            clock = Clock(
+                1 + self.random.choice((-1, 1, -1, 1, self.random.uniform(-1, 1))) * drift, self.random.randrange(10**15)
+            )
             self.robots[config.robot] = Robot(config.robot, config, clock)
 
     # Time
@@ -171,7 +198,7 @@ class World:
             watcher(self, robot, what)
 
     def _soon(self, low_ms: float, high_ms: float) -> int:
-        return int(self.random.uniform(low_ms, high_ms) * MS)
+        return int(self.random.uniform(low_ms, high_ms) * self.pace * MS)
 
     # Lives of robots
 
@@ -204,14 +231,35 @@ class World:
         self._feed(robot, Tick())
 
     def agent_dies(self, name: str) -> None:
-        """Kill the agent and the keepers; guards and programs live on."""
+        """Kill the agent and the keepers; guards and programs live on. What was being written is written, or is not."""
         robot = self.robots[name]
+        self._tear(robot)
         robot.node = None
         robot.life += 1
         robot.warm.clear()
         for component in robot.serial:
             robot.serial[component] += 1
         self.note(f"{name}: its agent dies")
+
+    def _tear(self, robot: Robot) -> None:
+        """A rename, or a new file, that was on its way to the disk: it got there and nobody was told, or it did not."""
+        if robot.pending is not None and self.random.random() < TORN:
+            robot.ballot = encode(robot.pending)
+            self._tell(robot.name, robot.pending)
+        for component, position in robot.writing:
+            if self.random.random() < TORN:
+                robot.store.setdefault(component, []).append(position)
+        robot.pending = None
+        robot.writing.clear()
+
+    def new_disk(self, name: str, ballot: bool) -> None:
+        """The checkpoints of a robot that is off are gone; perhaps what it has decided, too (not how often it started)."""
+        robot = self.robots[name]
+        lost = tuple(position for positions in robot.store.values() for position in positions)
+        robot.store.clear()
+        robot.ballot = robot.ballot if not ballot else b""
+        self.note(f"{name} gets a new disk{', and forgets its votes' if ballot else ''}")
+        self._tell(name, NewDisk(ballot, lost))
 
     def power_off(self, name: str) -> None:
         """Take everything that is not on the disk."""
@@ -287,12 +335,14 @@ class World:
         ready = robot.node.step(robot.inbox.pop(0), now_ns)
         life = robot.life
         robot.busy = True
+        robot.pending = ready.persist
         disk_ns = self._soon(0.1, 4) * robot.slow if ready.persist is not None else 0
         self.after(disk_ns, lambda: self._persisted(robot, life, ready))
 
     def _persisted(self, robot: Robot, life: int, ready: acts.Ready) -> None:
         if robot.life != life:
             return
+        robot.pending = None
         if ready.persist is not None:
             robot.ballot = encode(ready.persist)
             self._tell(robot.name, ready.persist)
@@ -303,6 +353,7 @@ class World:
         if robot.life != life:
             return
         robot.busy = False
+        robot.told += ready.told
         for beat in ready.send:
             self._tell(robot.name, beat)
             frame = wire.seal(beat, TEAM, KEY + robot.name.encode())
@@ -375,6 +426,7 @@ class World:
             case acts.Freeze():
                 program.frozen = True
             case acts.Thaw():
+                robot.unheld.add(act.component)
                 program.frozen, program.lease_ns = False, act.lease_until_ns
             case acts.SetLease():
                 program.lease_ns = act.until_ns
@@ -419,8 +471,9 @@ class World:
         robot.warm.pop(name, None)
         if not isinstance(act, acts.Stop):
             robot.leases[name] = act.lease_until_ns
-        if not isinstance(act, acts.Start):
+        if isinstance(act, acts.Restore):
             robot.programs.pop(name, None)
+        if not isinstance(act, acts.Start):
             robot.keeper.pop(name, None)
 
         def done() -> None:
@@ -428,6 +481,7 @@ class World:
                 return
             match act:
                 case acts.Stop():
+                    robot.programs.pop(name, None)
                     self._feed(robot, Stopped(name, act.epoch))
                 case acts.Start():
                     robot.programs[name] = Program(act.epoch, robot.leases[name], since_ns=self.now_ns)
@@ -452,6 +506,7 @@ class World:
         if program is not None:
             program.epoch = max(program.epoch, act.epoch)
         robot.capturing.add(name)
+        robot.unheld.discard(name)
 
         def done() -> None:
             if robot.life != life or robot.serial.get(name, 0) != serial:
@@ -467,14 +522,28 @@ class World:
                 self._feed(robot, Unchanged(name, act.epoch, act.sequence, known))
                 return
             self._settle(robot, program)
-            program.frozen = program.frozen or act.hold
+            program.frozen = program.frozen or (act.hold and name not in robot.unheld)
             position = Position(act.generation, act.sequence, next(self._digests).to_bytes(8, "big"))
             parent = None if act.base else robot.keeper.get(name)
             self.values[position] = program.value
-            robot.store.setdefault(name, []).append(position)
-            self._feed(robot, Captured(name, act.epoch, position, parent, freeze_us=900))
+            self._write(robot, name, position, Captured(name, act.epoch, position, parent, freeze_us=900))
 
         self.after(self._soon(1, 8) * robot.slow, done)
+
+    def _write(self, robot: Robot, component: str, position: Position, then: Event) -> None:
+        """Keep a snapshot in a robot's store, durably; only then it is told."""
+        life, written = robot.life, (component, position)
+        robot.writing.append(written)
+
+        def done() -> None:
+            if robot.life != life:
+                return
+            robot.writing.remove(written)
+            if position not in robot.store.get(component, []):
+                robot.store[component] = [*robot.store.get(component, []), position]
+            self._feed(robot, then)
+
+        self.after(self._soon(0, 2) * robot.slow, done)
 
     def _ship(self, robot: Robot, act: acts.Ship) -> None:
         life, to = robot.life, self.robots[act.to]
@@ -483,7 +552,8 @@ class World:
             ok = (
                 robot.life == life and self.passes(robot.name, act.to) and self.passes(act.to, robot.name) and to.node is not None
             )
-            admitted = to.admitted.get(act.component) == (robot.name, act.epoch)
+            sender, epoch = to.admitted.get(act.component, ("", 0))
+            admitted = sender == robot.name and epoch_of(act.position) >= epoch
             if robot.life == life:
                 self._feed(robot, ShipEnded(act.component, act.epoch, act.position, act.to, ok and admitted))
             if ok and admitted:
@@ -499,13 +569,13 @@ class World:
                 return
             kept = robot.store.get(act.component, [])
             if robot.broken_store:
-                self._feed(robot, StoreFailed(act.component, act.epoch, sender, "no space left", False))
+                self._feed(robot, StoreFailed(act.component, epoch_of(act.position), sender, "no space left", False))
             elif act.parent is not None and act.parent not in kept:
-                self._feed(robot, StoreFailed(act.component, act.epoch, sender, "its parent is not here", True))
+                self._feed(robot, StoreFailed(act.component, epoch_of(act.position), sender, "its parent is not here", True))
             else:
-                robot.store[act.component] = [*kept, act.position]
                 keeps = act.spec.launch.engine == KEEPS_STATE
-                self._feed(robot, Stored(act.component, act.epoch, act.position, sender, act.spec, keeps))
+                stored = Stored(act.component, epoch_of(act.position), act.position, sender, act.spec, keeps)
+                self._write(robot, act.component, act.position, stored)
 
         self.after(self._soon(1, 10) * robot.slow, done)
 
@@ -514,6 +584,38 @@ def pair(components: tuple[ComponentSpec, ...] = (), names: tuple[str, ...] = ("
     """Configurations of a small team, with times that make a minute of life cheap to simulate."""
     plain = Config(names[0], (), components, 25, 150, 20, 10, 300, 200, 2_000, 400, 3_000, 2_000)
     return [replace(plain, robot=name, peers=tuple(other for other in names if other != name)) for name in names]
+
+
+def elective(
+    robots: int,
+    components: tuple[ComponentSpec, ...] = (),
+    servers: int = 0,
+    witnesses: int = 0,
+    patience_ms: int = 60_000,
+    lease_ms: int = 150,
+) -> list[Config]:
+    """Configurations of a team that votes."""
+    kinds = {"robot": robots, "server": servers, "witness": witnesses}
+    names = {kind: tuple(f"{kind}{number + 1}" for number in range(count)) for kind, count in kinds.items()}
+    return [
+        replace(
+            config,
+            rule=Rule.MAJORITY,
+            servers=names["server"],
+            witnesses=names["witness"],
+            patience_ms=patience_ms,
+            lease_ms=lease_ms,
+            margin_percent=12,
+            archive_ms=500,
+            components=components if config.robot in names["robot"] else (),
+        )
+        for config in pair(components, sum(names.values(), ()))
+    ]
+
+
+def epoch_of(position: Position) -> int:
+    """The epoch under which a snapshot was captured, as its file says."""
+    return position.generation // (PEERS_MAX + 1)
 
 
 def ballot_of(robot: Robot) -> Ballot:

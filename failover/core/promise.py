@@ -1,0 +1,72 @@
+"""What is promised now, in one sentence: for the team as one robot sees it, and for each component.
+
+``failover status`` shows the sentences, and the journal has the team's at each change. ``tests/failover/core/test_promises.py``
+holds every sentence against what the rules do.
+"""
+
+from __future__ import annotations
+
+from failover.core.component import Component, Turn
+from failover.core.types import ENDED, MS, Protection
+
+
+def team(turn: Turn) -> str:
+    """What the rule in force promises, given who is heard."""
+    living = [peer.robot for peer in turn.team.living(turn.now_ns)]
+    if not turn.team.peers:
+        return f"{turn.me} is alone in its team: a lost robot takes its programs with it."
+    if turn.config.by_majority:
+        return _elected(turn, 1 + len(living))
+    if not living:
+        return f"{turn.me} hears nobody: what runs here is not protected."
+    return (
+        f"{turn.me} and {', '.join(living)} protect each other: whoever is silent for {_silence_ms(turn)} ms is replaced; "
+        "a total cut between two that live can run a component twice, except where when_alone is freeze."
+    )
+
+
+def _elected(turn: Turn, heard: int) -> str:
+    voters, quorum = len(turn.team.peers) + 1, turn.config.quorum
+    if heard < quorum:
+        return (
+            f"{turn.me} hears {heard} of {voters} that vote, itself among them, and {quorum} are a majority: what runs here "
+            "stands still, and nothing is taken over, until more are heard."
+        )
+    return (
+        f"{turn.me} hears {heard} of {voters} that vote, itself among them, and {quorum} are a majority: no component acts at "
+        f"two robots at once; whoever is silent for {_silence_ms(turn)} ms is replaced when a majority agrees."
+    )
+
+
+def one(component: Component, turn: Turn, protection: Protection) -> str:
+    """What becomes of a component if its robot is lost now."""
+    if component.state in ENDED:
+        return f"It is {component.state}; nobody runs it."
+    if not component.holding:
+        return _standing_by(component, turn)
+    if component.unprotected:
+        return f"If {turn.me} is lost now, so is its state: no robot keeps a checkpoint of it."
+    if protection is not Protection.PROTECTED:
+        return "If this robot is lost now, it goes on from its last checkpoint, if there is one."
+    if component.waits:
+        return f"If {turn.me} is lost, {component.standby} keeps its newest checkpoint until {turn.me} is back."
+    if not turn.config.runs(component.standby):
+        return f"If {turn.me} is lost, {component.standby} gives its newest checkpoint to the first robot that can run it."
+    if component.elects:
+        return (
+            f"If {turn.me} is silent for {_silence_ms(turn)} ms and a majority agrees, {component.standby} runs it; "
+            "it stands still here first."
+        )
+    alone = "stands still here first" if component.freezes else "may run twice if both live on and cannot hear each other"
+    return f"If {turn.me} is silent for {_silence_ms(turn)} ms, {component.standby} runs it; it {alone}."
+
+
+def _standing_by(component: Component, turn: Turn) -> str:
+    whose = component.primary or "whoever runs it"
+    if not turn.config.keeps(turn.me):
+        return f"{turn.me} votes for who runs it; now that is {whose}."
+    return f"{turn.me} keeps its checkpoints for {whose}."
+
+
+def _silence_ms(turn: Turn) -> int:
+    return turn.config.loyalty_ns // MS

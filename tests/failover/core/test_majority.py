@@ -1,0 +1,220 @@
+"""Single rules of votes, one event at a time. Whole lives, scenarios and promises are in ``tests/simulation``."""
+
+from __future__ import annotations
+
+import pytest
+
+from checkpoint.model import Position
+from failover.core import acts
+from failover.core.component import Component
+from failover.core.consent import STATES
+from failover.core.election import placing
+from failover.core.events import Captured, Received, Run, Started, Tick
+from failover.core.messages import FREE, Beat, Echo, Entry
+from failover.core.node import Node
+from failover.core.types import MS, Ballot, ComponentSpec, Config, Held, Launch, Record, Rule, Rules, State, WhenAlone
+from failover.errors import RulesError
+
+NAME = "/lab/x"
+SPEC = ComponentSpec(NAME, launch=Launch(("x",)))
+WITNESS = Config("witness1", ("robot1", "robot2"), rule=Rule.MAJORITY, witnesses=("witness1",), grace_ms=300)
+ROBOT = Config("robot1", ("robot2", "witness1"), rule=Rule.MAJORITY, witnesses=("witness1",), grace_ms=300)
+NEWEST = Position(64, 5, b"d")
+
+
+def entry(state: State, epoch: int, primary: str, position: Position | None = None, standby: str = "", flags: int = 0) -> Entry:
+    at = position or Position(0, 0, b"")
+    return Entry(NAME, STATES.index(state), epoch, primary, at.generation, at.sequence, at.digest, standby, flags=flags)
+
+
+class Talk:
+    """A node, and what its peers say to it. Time goes on in small steps, so that the node is never late."""
+
+    def __init__(self, config: Config, ballot: Ballot | None = None, held: tuple[Held, ...] = ()) -> None:
+        self.node = Node(config, 1, ballot or Ballot(), 0, held)
+        self.now_ns = 0
+        self.readies: list[acts.Ready] = []
+        self._counters: dict[str, int] = {}
+
+    def tick(self, ms: int) -> None:
+        until_ns = self.now_ns + ms * MS
+        while (at_ns := self.node.next_deadline_ns()) < until_ns:
+            self.readies.append(self.node.step(Tick(), at_ns))
+        self.now_ns = until_ns
+
+    def hear(self, sender: str, *entries: Entry) -> acts.Ready:
+        counter = self._counters[sender] = self._counters.get(sender, 0) + 1
+        said = [beat for ready in self.readies for beat in ready.send]
+        echoes = (Echo(said[-1].sender, 1, said[-1].counter),) if said else ()
+        beat = Beat(sender, 1, counter, counter, 0, len(entries), echoes, entries)
+        ready = self.node.step(Received(beat, "wire"), self.now_ns)
+        self.readies.append(ready)
+        return ready
+
+    def vote(self) -> tuple[int, str]:
+        """Epoch and primary on the newest ballot."""
+        ballots = [ready.persist for ready in self.readies if ready.persist is not None]
+        return next(((record.epoch, record.primary) for record in ballots[-1].records), (0, "")) if ballots else (0, "")
+
+    def said(self) -> list[Entry]:
+        """What the node told of the component, oldest first."""
+        return [one for ready in self.readies for beat in ready.send for one in beat.entries]
+
+    def orders(self, kind: type[acts.Act]) -> list[acts.Act]:
+        return [act for ready in self.readies for act in ready.act if isinstance(act, kind)]
+
+
+def followed() -> Talk:
+    """A witness that follows robot1, whose standby is robot2."""
+    talk = Talk(WITNESS)
+    talk.tick(400)
+    for _ in range(3):
+        talk.hear("robot2", entry(State.STANDBY, 1, "robot1", NEWEST, "robot2"))
+        talk.hear("robot1", entry(State.PRIMARY, 1, "robot1", NEWEST, "robot2"))
+        talk.tick(20)
+    assert talk.vote() == (1, "robot1")
+    return talk
+
+
+def test_a_member_that_hears_its_primary_votes_for_nobody_else() -> None:
+    talk = followed()
+    talk.hear("robot1", entry(State.PRIMARY, 1, "robot1", NEWEST, "robot2"))
+    talk.hear("robot2", entry(State.CLAIMING, 2, "robot2", NEWEST))
+    assert talk.vote() == (1, "robot1")
+
+
+def test_a_member_whose_primary_is_silent_votes_once_an_epoch() -> None:
+    talk = followed()
+    talk.tick(WITNESS.loyalty_ns // MS + 5)
+    ready = talk.hear("robot2", entry(State.CLAIMING, 2, "robot2", NEWEST))
+    assert ready.persist is not None and talk.vote() == (2, "robot2")
+    talk.hear("robot1", entry(State.CLAIMING, 2, "robot1", NEWEST))
+    assert talk.vote() == (2, "robot2")
+
+
+def test_a_vote_survives_a_restart() -> None:
+    record = Record(NAME, 2, "robot2", State.STANDBY)
+    talk = Talk(WITNESS, Ballot((record,)))
+    talk.tick(400)
+    talk.hear("robot1", entry(State.CLAIMING, 2, "robot1", NEWEST))
+    assert talk.vote() == (0, "")  # nothing new to persist
+
+
+def test_a_member_says_when_it_is_free() -> None:
+    talk = followed()
+    bound = talk.said()[-1]
+    talk.tick(WITNESS.loyalty_ns // MS + 40)
+    assert not bound.flags & FREE and talk.said()[-1].flags & FREE
+
+
+def test_a_robot_without_what_was_acknowledged_gets_no_vote() -> None:
+    talk = followed()
+    talk.hear("robot1", entry(State.PRIMARY, 1, "robot1", NEWEST, "robot1"))
+    talk.tick(WITNESS.loyalty_ns // MS + 5)
+    talk.hear("robot2", entry(State.CLAIMING, 2, "robot2", Position(64, 4, b"d")))
+    assert talk.vote() == (1, "robot1")
+
+
+def test_a_witness_claims_nothing_and_takes_no_snapshots() -> None:
+    talk = followed()
+    talk.tick(WITNESS.patience_ms + 1_000)
+    assert not talk.orders(acts.Admit) and not talk.orders(acts.Start) and talk.vote() == (1, "robot1")
+
+
+def running() -> Talk:
+    """robot1 is primary by its own vote and the witness's, and holds a first snapshot that robot2 has stored."""
+    talk = Talk(ROBOT)
+    talk.tick(400)
+    for peer in ROBOT.peers:
+        talk.hear(peer)
+    talk.readies.append(talk.node.step(Run(1, SPEC), talk.now_ns))
+    talk.tick(5)
+    talk.hear("witness1", entry(State.STANDBY, 1, "robot1"))
+    assert talk.orders(acts.Start)
+    talk.readies.append(talk.node.step(Started(NAME, 1), talk.now_ns))
+    talk.hear("robot2", entry(State.STANDBY, 1, "robot1"))
+    talk.tick(5)
+    (capture,) = talk.orders(acts.Capture)
+    assert isinstance(capture, acts.Capture)
+    position = Position(capture.generation, capture.sequence, b"d")
+    talk.readies.append(talk.node.step(Captured(NAME, 1, position, None), talk.now_ns))
+    return talk
+
+
+def test_a_claim_is_carried_out_once_a_majority_votes_for_it() -> None:
+    talk = Talk(ROBOT)
+    talk.tick(400)
+    for peer in ROBOT.peers:
+        talk.hear(peer)
+    talk.readies.append(talk.node.step(Run(1, SPEC), talk.now_ns))
+    talk.tick(5)
+    assert talk.vote() == (1, "robot1") and not talk.orders(acts.Start)
+    talk.hear("robot2", entry(State.STANDBY, 1, "robot1"))
+    assert talk.orders(acts.Start)
+
+
+def test_a_checkpoint_counts_once_a_majority_has_noted_who_holds_it() -> None:
+    talk = running()
+    (ship,) = talk.orders(acts.Ship)
+    assert isinstance(ship, acts.Ship) and ship.to == "robot2"
+    talk.hear("robot2", entry(State.STANDBY, 1, "robot1", ship.position))
+    assert not talk.orders(acts.Acknowledge)
+    talk.hear("robot2", entry(State.STANDBY, 1, "robot1", ship.position, "robot2"))
+    assert talk.orders(acts.Acknowledge)
+
+
+def test_a_primary_with_a_valid_lease_answers_a_later_epoch_by_one_above_it() -> None:
+    talk = running()
+    talk.hear("witness1", entry(State.STANDBY, 1, "robot1"))
+    (ship,) = talk.orders(acts.Ship)
+    assert isinstance(ship, acts.Ship)
+    talk.hear("robot2", entry(State.CLAIMING, 2, "robot2", ship.position))
+    assert talk.vote() == (3, "robot1") and not talk.orders(acts.Stop)
+
+
+def test_a_primary_that_nobody_hears_stands_still() -> None:
+    talk = running()
+    talk.tick(ROBOT.lease_ms)
+    assert talk.orders(acts.Freeze)
+
+
+def test_a_leap_of_the_clock_makes_no_peer_deaf() -> None:
+    talk = running()
+    talk.hear("robot2", entry(State.STANDBY, 1, "robot1"))
+    leap_ns = 10 * ROBOT.loyalty_ns
+    talk.node.step(Tick(), talk.now_ns + leap_ns)
+    talk.now_ns += leap_ns
+    said = talk.hear("robot2", entry(State.STANDBY, 1, "robot1"))
+    talk.tick(30)
+    echoes = [echo for ready in (said, *talk.readies) for beat in ready.send for echo in beat.echoes]
+    assert all(echo.counter > 0 for echo in echoes)
+
+
+def test_a_claim_without_consent_gives_no_right_to_act_alone_after_a_restart() -> None:
+    spec = ComponentSpec(NAME, launch=Launch(("x",)), rules=Rules(when_alone=WhenAlone.FREEZE))
+    pair = Config("robot1", ("robot2",), grace_ms=300)
+    held = (Held(NAME, (NEWEST,)),)
+    for claimed in (True, False):
+        record = Record(NAME, 2, "robot1", State.PRIMARY, spec=spec, claimed=claimed)
+        talk = Talk(pair, Ballot((record,)), held)
+        talk.tick(1_000)
+        assert bool(talk.orders(acts.Restore)) is not claimed
+
+
+def test_of_robots_with_the_same_checkpoint_the_preferred_one_then_the_least_loaded_then_the_lesser_name() -> None:
+    component = Component(NAME, spec=ComponentSpec(NAME, rules=Rules(prefer="robot9")))
+    loads = {"robot10": 0, "robot2": 0, "robot1": 3, "robot9": 7}
+    assert sorted(loads, key=lambda robot: placing(component, robot, loads[robot])) == ["robot9", "robot2", "robot10", "robot1"]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"rule": Rule.MAJORITY, "witnesses": ("stranger",)},
+        {"rule": Rule.MAJORITY, "witnesses": ("robot2",), "servers": ("robot2",)},
+        {"witnesses": ("robot2",)},
+    ],
+)
+def test_roles_that_contradict_each_other_are_refused(settings: dict[str, object]) -> None:
+    with pytest.raises(RulesError):
+        Config("robot1", ("robot2",), **settings)  # type: ignore[arg-type]

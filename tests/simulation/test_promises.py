@@ -1,0 +1,221 @@
+"""Each sentence that ``failover status`` says of the rule in force (``failover/core/promise.py``), held against what happens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from failover.core import acts
+from failover.core.events import Handover, Promote
+from failover.core.types import MS, ComponentSpec, Launch, Rules, State, WhenAlone
+from tests.simulation.invariants import Invariants, seen_at, state_at
+from tests.simulation.world import World, elective, pair
+
+PART = "/team/part"
+SETTLED_NS = 2_000 * MS
+
+
+@dataclass(slots=True)
+class Team:
+    """A world: ``/team/part`` runs at robot1, robot2 is its standby. ``aside``: robots that kept a copy's state aside."""
+
+    world: World
+    invariants: Invariants
+    aside: list[str] = field(default_factory=list)
+
+    def after(self, ms: int) -> list[str]:
+        """Where it acts some time later."""
+        self.world.run(self.world.now_ns + ms * MS)
+        return self.world.acting(PART)
+
+    def cut(self, one: str, *others: str) -> None:
+        self.world.network.cuts |= {way for other in others for way in ((one, other), (other, one))}
+
+    def says(self, robot: str) -> str:
+        """The team's promise, as a robot tells it now."""
+        node = self.world.robots[robot].node
+        assert node is not None
+        return node.status(self.world.local(self.world.robots[robot])).promise
+
+    def says_of_it(self, robot: str) -> str:
+        return seen_at(self.world, robot, PART).promise
+
+    def journal(self, robot: str) -> list[str]:
+        """The team's promises in the journal, oldest first."""
+        said = (one.sentence for one in self.world.robots[robot].told if not one.component)
+        return [sentence for sentence in said if "that vote" in sentence]
+
+
+def team(witnesses: int = 0, alone: WhenAlone = WhenAlone.RUN, robots: int = 2, servers: int = 0) -> Team:
+    specs = (ComponentSpec(PART, launch=Launch(("part",)), rules=Rules(when_alone=alone)),)
+    votes = robots + witnesses + servers > 2
+    configs = elective(robots, specs, servers, witnesses) if votes else pair(specs)
+    invariants = Invariants(safe={PART} if votes or alone is WhenAlone.FREEZE else set(), votes=votes)
+    seen: list[str] = []
+
+    def watch(world: World, robot: str, what: object) -> None:
+        if isinstance(what, acts.KeepAside):
+            seen.append(robot)
+
+    world = World(1, configs, (invariants, watch))
+    for name in world.robots:
+        world.power_on(name)
+    world.run(SETTLED_NS)
+    assert world.acting(PART) == ["robot1"] and seen_at(world, "robot1", PART).standby == "robot2"
+    return Team(world, invariants, seen)
+
+
+# rule = "pair"
+
+
+def test_whoever_is_silent_is_replaced() -> None:
+    two = team()
+    assert "whoever is silent for 170 ms is replaced" in two.says("robot1")
+    two.world.power_off("robot1")
+    assert two.after(160) == []
+    assert two.after(200) == ["robot2"]
+
+
+def test_a_total_cut_between_two_that_live_can_run_a_component_twice() -> None:
+    two = team()
+    assert "a total cut between two that live can run a component twice" in two.says("robot1")
+    two.cut("robot1", "robot2")
+    assert two.after(500) == ["robot1", "robot2"]
+
+
+def test_when_they_meet_again_the_higher_epoch_goes_on_and_the_losers_state_is_kept_aside() -> None:
+    two = team()
+    two.cut("robot1", "robot2")
+    two.after(500)
+    two.world.network.cuts.clear()
+    assert two.after(300) == ["robot2"]
+    assert two.aside == ["robot1"] and state_at(two.world, "robot1", PART) is State.STANDBY
+
+
+def test_except_where_when_alone_is_freeze_there_it_stands_still_here_first() -> None:
+    two = team(alone=WhenAlone.FREEZE)
+    assert "except where when_alone is freeze" in two.says("robot1")
+    assert two.says_of_it("robot1") == "If robot1 is silent for 170 ms, robot2 runs it; it stands still here first."
+    two.cut("robot1", "robot2")
+    seen = [two.after(5) for _ in range(100)]
+    stood = seen.index([])
+    assert all(one == ["robot1"] for one in seen[:stood]) and all(one in ([], ["robot2"]) for one in seen[stood:])
+    assert seen[-1] == ["robot2"]
+
+
+def test_a_robot_whose_beats_are_refused_counts_as_silent_so_it_can_run_twice_as_in_a_cut() -> None:
+    two = team()
+    two.world.robots["robot2"].receiver.accept("robot1", b"another key, of another life")
+    two.world.robots["robot2"].receiver.accept("robot1", b"and one more: the old is forgotten")
+    assert set(two.after(500)) == {"robot2"} or set(two.after(0)) == {"robot1", "robot2"}
+
+
+def test_who_hears_nobody_says_that_nothing_is_protected() -> None:
+    two = team()
+    two.world.power_off("robot2")
+    two.after(500)
+    assert two.says("robot1") == "robot1 hears nobody: what runs here is not protected."
+
+
+# rule = "majority"
+
+
+def test_with_a_majority_no_component_acts_at_two_robots_at_once() -> None:
+    three = team(robots=3)
+    assert three.says("robot1").startswith(
+        "robot1 hears 3 of 3 that vote, itself among them, and 2 are a majority: no component acts"
+    )
+    three.cut("robot1", "robot2", "robot3")
+    seen = [three.after(5) for _ in range(100)]
+    assert all(len(one) < 2 for one in seen) and seen[-1] == ["robot2"]
+
+
+def test_without_a_majority_what_runs_here_stands_still_and_nothing_is_taken_over_until_more_are_heard() -> None:
+    three = team(robots=2, witnesses=1)
+    three.world.power_off("witness1")
+    assert three.after(500) == ["robot1"]
+    three.cut("robot1", "robot2")
+    assert three.after(500) == [] and three.after(1_000) == []
+    sentence = "1 of 3 that vote, itself among them, and 2 are a majority: what runs here stands still, and nothing is taken over"
+    assert sentence in three.says("robot1") and sentence in three.says("robot2")
+    three.world.power_on("witness1")
+    assert three.after(500) == ["robot1"]
+
+
+def test_the_journal_has_the_promise_at_each_change() -> None:
+    three = team(robots=2, witnesses=1)
+    before = three.journal("robot1")
+    three.after(500)
+    assert three.journal("robot1") == before
+    three.world.power_off("witness1")
+    three.after(500)
+    assert three.journal("robot1") == [*before, three.says("robot1")] and "hears 2 of 3" in three.says("robot1")
+
+
+def test_a_witness_votes_and_holds_nothing() -> None:
+    three = team(robots=2, witnesses=1)
+    assert three.says_of_it("witness1") == "witness1 votes for who runs it; now that is robot1."
+    assert not three.world.robots["witness1"].store
+
+
+def test_a_server_holds_what_was_acknowledged_besides_the_standby() -> None:
+    three = team(robots=2, servers=1)
+    three.after(500)
+    held = {name: robot.store[PART][-1].sequence for name, robot in three.world.robots.items()}
+    assert held["robot1"] - held["server1"] <= 2 and held["robot1"] - held["robot2"] <= 1
+
+
+def test_two_robots_that_protect_each_other_are_cut_in_turn_and_both_components_live_on() -> None:
+    names = ("/team/a", "/team/b")
+    specs = tuple(
+        ComponentSpec(name, launch=Launch(("part",)), rules=Rules(prefer=f"robot{number + 1}"))
+        for number, name in enumerate(names)
+    )
+    world = World(1, elective(2, specs, servers=1), (Invariants(safe=set(names), votes=True),))
+    for name in world.robots:
+        world.power_on(name)
+    world.run(4_000 * MS)
+    assert [world.acting(name) for name in names] == [["robot1"], ["robot2"]]
+    for lost, other in (("robot1", "robot2"), ("robot2", "robot1")):
+        world.power_off(lost)
+        world.run(world.now_ns + 1_000 * MS)
+        assert [world.acting(name) for name in names] == [[other], [other]]
+        world.power_on(lost)
+        world.run(world.now_ns + 4_000 * MS)
+        assert [world.acting(name) for name in names] == [["robot1"], ["robot2"]]
+
+
+def test_both_are_dead_one_is_back_with_a_new_disk_and_the_server_returns_both_components() -> None:
+    names = ("/team/a", "/team/b")
+    specs = tuple(ComponentSpec(name, launch=Launch(("part",))) for name in names)
+    world = World(1, elective(2, specs, servers=1, patience_ms=1_000))
+    for name in world.robots:
+        world.power_on(name)
+    world.run(SETTLED_NS)
+    values = {name: world.values[world.robots["server1"].store[name][-1]] for name in names}
+    world.power_off("robot2")
+    world.power_off("robot1")
+    world.new_disk("robot2", ballot=True)
+    world.run(world.now_ns + 500 * MS)
+    world.power_on("robot2")
+    world.run(world.now_ns + 3_000 * MS)
+    assert [world.acting(name) for name in names] == [["robot2"], ["robot2"]]
+    assert all(world.robots["robot2"].programs[name].value >= values[name] for name in names)
+
+
+def test_a_handover_at_a_robot_with_an_older_checkpoint_is_refused_and_a_promotion_is_obeyed() -> None:
+    five = team(robots=3, witnesses=2)
+    world = five.world
+    world.power_off("robot2")
+    five.after(500)
+    world.power_on("robot2")
+    five.after(500)
+    world.power_off("robot1")
+    world.power_off("robot3")
+    assert five.after(1_000) == []
+    world.command("robot2", Handover(world.request(), PART, "robot2"))
+    assert five.after(500) == []
+    assert "a newer checkpoint of /team/part may be at robot3 or robot1" in world.log[-1]
+    epoch = seen_at(world, "robot2", PART).epoch
+    five.invariants.split.add(PART)  # an older checkpoint than the acknowledged one is what the operator asks for
+    world.command("robot2", Promote(world.request(), PART))
+    assert five.after(500) == ["robot2"] and seen_at(world, "robot2", PART).epoch > epoch

@@ -1,0 +1,79 @@
+"""Simultaneous starts: of robots that would all run a component the one with the lesser name does, in any alphabet."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from random import Random
+
+import pytest
+
+from failover.core.names import weight
+from failover.core.types import MS, ComponentSpec, Config, Launch, Rule
+from tests.simulation.invariants import Invariants
+from tests.simulation.world import World, pair
+
+SPEC = ComponentSpec("/team/part", launch=Launch(("part",)))
+STARTS = 1_000
+BLOCK = 250
+DECIDED_NS = 1_500 * MS
+
+STEMS = ("robot", "Robot", "Робот", "робот", "机器人", "ロボット", "ρομπότ", "r2-unit-", "ROBOT")
+DIGITS = ("0123456789", "٠١٢٣٤٥٦٧٨٩", "０１２３４５６７８９")
+
+
+def name_of(random: Random) -> str:
+    """A robot's name: any stem, a number of one to three places, in any digits."""
+    number = str(random.randrange(1, random.choice((10, 100, 1_000))))
+    return random.choice(STEMS) + number.translate(str.maketrans(DIGITS[0], random.choice(DIGITS)))
+
+
+def names_of(random: Random) -> tuple[str, ...]:
+    """Two or three names, often of one stem."""
+    names: set[str] = set()
+    while len(names) < 2 + (random.random() < 0.3):
+        names.add(name_of(random))
+    return tuple(sorted(names, key=lambda _: random.random()))
+
+
+def started(seed: int, configs: list[Config]) -> World:
+    """A world whose robots all begin at one instant, with beats that take up to 5 ms."""
+    world = World(seed, configs, (Invariants(safe={SPEC.name}, votes=configs[0].by_majority),))
+    world.network.spread_ns = 5 * MS
+    for config in configs:
+        world.power_on(config.robot)
+    while not world.acting(SPEC.name) and world.now_ns < DECIDED_NS:
+        world.run(world.now_ns + 20 * MS)
+    world.run(world.now_ns + 100 * MS)
+    return world
+
+
+@pytest.mark.parametrize("first", range(0, STARTS, BLOCK))
+def test_of_simultaneous_claims_the_lesser_name_wins(first: int) -> None:
+    for seed in range(first, first + BLOCK):
+        random = Random(seed)
+        names = names_of(random)
+        configs = pair((SPEC,), names)
+        if len(names) > 2:
+            configs = [replace(config, rule=Rule.MAJORITY) for config in configs]
+        found = started(seed, configs).acting(SPEC.name)
+        assert found == [min(names, key=weight)], f"seed {seed}: of {names} {found} runs it"
+
+
+@pytest.mark.parametrize("rule", list(Rule))
+def test_robot2_runs_it_and_not_robot10(rule: Rule) -> None:
+    names = ("robot10", "robot2") if rule is Rule.PAIR else ("robot10", "robot2", "robot33")
+    configs = [replace(config, rule=rule) for config in pair((SPEC,), names)]
+    assert started(1, configs).acting(SPEC.name) == ["robot2"]
+
+
+@pytest.mark.parametrize("rule", list(Rule))
+def test_the_late_comer_is_the_standby_whatever_its_name(rule: Rule) -> None:
+    names = ("robot1", "robot2") if rule is Rule.PAIR else ("robot1", "robot2", "robot3")
+    world = World(1, [replace(config, rule=rule) for config in pair((SPEC,), names)])
+    for name in names[1:]:
+        world.power_on(name)
+    world.run(3_000 * MS)
+    assert world.acting(SPEC.name) == ["robot2"]
+    world.power_on("robot1")
+    world.run(5_000 * MS)
+    assert world.acting(SPEC.name) == ["robot2"]
