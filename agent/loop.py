@@ -22,6 +22,7 @@ from agent import ballot as ballot_file
 from agent import clock, door
 from agent.beats import BeatLane
 from agent.config import Settings
+from agent.copies import Copies
 from agent.door import Alive, BeatCounts, Farewell, Happened, HearKey, Inventory, Life, SpeakKey, ToHeart, ToLanes, Told
 from agent.errors import AgentError
 from agent.lanes_process import LanesProcess
@@ -38,7 +39,6 @@ from failover.core.events import Event, Received, Tick
 from failover.core.messages import Beat
 from failover.core.node import Node
 from failover.core.types import Ballot
-from failover.core.wire import Reason
 
 NANOSECONDS_A_SECOND: Final = 1_000_000_000
 SLEEP_LIMIT_S: Final = 0.5
@@ -49,9 +49,6 @@ PERSIST_PATIENCE_S: Final = 2.0
 
 GAP_BEATS: Final = 3
 """Periods of silence that count as a gap: one lost beat is none, and a lease is longer."""
-
-COPY_BEATS: Final = 16
-"""A beat that was heard on one link may come over a slower one by so many beats later; an older copy is somebody's replay."""
 
 LANES_SILENCE_NS: Final = 4 * NANOSECONDS_A_SECOND
 """How long the lanes may say nothing; then another process takes their place. Meanwhile nobody renews the guards' leases."""
@@ -101,7 +98,7 @@ class Heart:
         self._refused: Counter[str] = Counter()
         self._sent = self._heard = self._late_us_max = self._gap_us_max = self._gaps = 0
         self._heard_at: dict[str, int] = {}
-        self._copies: dict[str, dict[str, int]] = {}
+        self._copies = Copies()
         self._newest_beat: dict[str, tuple[int, int]] = {}
         self._lost: Counter[str] = Counter()
         self._notes: tuple[str, ...] = ()
@@ -192,10 +189,9 @@ class Heart:
             opened = self._hearing.open(frame)
             if isinstance(opened, Beat):
                 self._count(opened)
-                self._step(Received(opened, link, tuple(self._copies.pop(opened.sender, {}).items())))
-            elif opened.reason is Reason.REPLAYED and 0 <= opened.behind < COPY_BEATS and link:
-                self._copies.setdefault(opened.sender, {})[link] = clock.now_ns()
-            else:
+                self._copies.heard(opened, link)
+                self._step(Received(opened, link, self._copies.take(opened.sender)))
+            elif not self._copies.admit(opened, link, clock.now_ns()):
                 self._refused[str(opened.reason)] += 1
 
     def _count(self, beat: Beat) -> None:

@@ -71,12 +71,12 @@ class Refused:
 
     Attributes:
         sender: known only where the code was right.
-        behind: of a beat that was seen before: how many newer ones were heard since; the newest one's copy on another link has 0.
+        counter: of a beat that was seen before, or is too old.
     """
 
     reason: Reason
     sender: str = ""
-    behind: int = field(default=0, compare=False)
+    counter: int = field(default=0, compare=False)
 
 
 def seal(beat: Beat, team: str, key: bytes) -> bytes:
@@ -206,9 +206,8 @@ class Receiver:
             return Refused(Reason.SENDER, sender)
         if not _sound(beat):
             return Refused(Reason.MALFORMED, sender)
-        window = self._windows[sender]
-        refusal = window.take(beat.boot, beat.counter)
-        return beat if refusal is None else Refused(refusal, sender, window.highest - beat.counter)
+        refusal = self._windows[sender].take(beat.boot, beat.counter)
+        return beat if refusal is None else Refused(refusal, sender, beat.counter)
 
 
 def _sound(beat: Beat) -> bool:
