@@ -40,6 +40,9 @@ print(sorted(os.environ.items()), sys.argv[1:])
 """
 """Everything that a program inherits, as it sees it itself."""
 
+OURS = r"\('FAILOVER_EPOCH', '\d{20}'\), \('FAILOVER_TASK', '@failover\.[0-9a-f]{16}'\), "
+"""What a portrait shows besides, of a program under an agent: the fencing token, and where its guard listens."""
+
 ODD = "umask 027; ulimit -S -n 345; ulimit -l 99; ulimit -c 0; echo 321 >/proc/self/oom_score_adj; export COLOUR=green"
 """What a shell may have set up before it runs something."""
 
@@ -96,7 +99,7 @@ def test_a_program_inherits_what_it_would_in_the_shell_of_whoever_asked(machine:
     portrait = "nice -n 5 taskset 1 python3 /etc/portrait.py 'of me'"
     _, expected = as_user(machine, user, f"cd /var; {ODD}; {portrait}")
     _, seen = as_user(machine, user, f"cd /var; {ODD}; {portrait.replace('python3', 'failover run -- python3')}")
-    assert re.sub(r"\('FAILOVER_TASK', '@failover\.[0-9a-f]{16}'\), ", "", seen, count=1) == expected
+    assert re.sub(OURS, "", seen, count=1) == expected
     assert "345" in seen and "'COLOUR', 'green'" in seen  # the script did set things up
 
 
