@@ -92,6 +92,14 @@ class HandoverArguments(msgspec.Struct, forbid_unknown_fields=True):
     to: str = ""
 
 
+class PromoteArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``promote``."""
+
+    name: str
+    robot: str = ""
+    sure: bool = False
+
+
 class PreferArguments(msgspec.Struct, forbid_unknown_fields=True):
     """Of ``prefer``."""
 

@@ -16,6 +16,7 @@ from agent.arguments import (
     LogsArguments,
     NameArguments,
     PreferArguments,
+    PromoteArguments,
     ProtectArguments,
     RunArguments,
     StatusArguments,
@@ -36,7 +37,7 @@ from agent.rules import rules_for
 from agent.telling import Telling
 from agent.view import version
 from failover.core import acts, events
-from failover.core.names import check_component
+from failover.core.names import check_component, weight
 from failover.core.types import COMMITTED, ComponentSpec, Launch, State
 from failover.errors import NameFormatError
 
@@ -86,6 +87,7 @@ class Verbs:
             "protect": self.protect,
             "logs": self.logs,
             "why": self.why,
+            "promote": self.promote,
             **{name: functools.partial(self._order, name) for name in self.orders()},
         }
 
@@ -97,6 +99,7 @@ class Verbs:
             "picture": self.picture,
             "piece": self._outflow.piece,
             "story": self._telling.page,
+            "promoted": functools.partial(self._permitted, self._promoted),
         }
 
     def orders(self) -> dict[str, Order]:
@@ -295,6 +298,39 @@ class Verbs:
         await self._command(lambda number: events.Prefer(number, name, wanted.robot))
         return {"name": name, "robot": wanted.robot}
 
+    async def promote(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Have a robot run what nobody is heard to run; or, unless it is ``sure``, tell what that would risk."""
+        wanted = arguments_of(PromoteArguments, "promote", arguments)
+        name, me = await self._known(wanted.name), self._lanes.settings.config.robot
+        robot = wanted.robot or await self._newest_at(name)
+        if robot not in self._lanes.settings.team.robots:
+            known = ", ".join(sorted(self._lanes.settings.team.robots))
+            raise RefusedError(f"cannot promote {robot!r} for {name}: the team knows {known}")
+        order = {"name": name, "robot": robot, "sure": wanted.sure}
+        if robot == me:
+            return await self._permitted(self._promoted, order, say.caller.uid)
+        return await self._lanes.errands.send(robot, "promoted", order, say.caller.uid)
+
+    async def _promoted(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Promote this robot, or tell what that would risk."""
+        wanted = arguments_of(PromoteArguments, "promote", arguments)
+        answer = await self._command(lambda number: events.Promote(number, wanted.name, not wanted.sure))
+        view = await self._view(wanted.name)
+        told = {"name": wanted.name, "to": wanted.robot, "epoch": view["epoch"], "sentence": answer.sentence}
+        return {**told, "promoted": wanted.sure, "risks": list(answer.risks)}
+
+    async def _newest_at(self, name: str) -> str:
+        """The living robot with the newest checkpoint; this one, or the lesser name, of several."""
+        me, team = self._lanes.settings.config.robot, self._lanes.settings.team.robots
+        seen = [(me, await self._view(name))]
+        others = await self._reachable()
+        asked = (self._asked(peer, "standing", {"name": name}) for peer in others)
+        seen += zip(others, await asyncio.gather(*asked), strict=True)
+        able = [(robot, view) for robot, view in seen if team[robot].role == "robot" and view]
+        if not able:
+            raise RefusedError(f"no robot that is heard knows {name}; start one, or name it with --robot")
+        return min(able, key=lambda one: (_age_of(one[1]), one[0] != me, weight(one[0])))[0]
+
     async def logs(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """The component's output as far as no takeover can take it back; all of it once it has ended."""
         wanted = arguments_of(LogsArguments, "logs", arguments)
@@ -390,3 +426,8 @@ class Verbs:
             return check_component(name)
         except NameFormatError as error:
             raise RefusedError(str(error), "NameFormatError") from error
+
+
+def _age_of(view: dict[str, Any]) -> tuple[int, int]:
+    """Of what a robot could go on from: the newest sorts first, nothing at all last."""
+    return -(view.get("generation") or 0), -(view.get("sequence") or 0)

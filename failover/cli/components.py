@@ -1,4 +1,4 @@
-"""run, protect, release, stop, logs, handover, failback, prefer: what is done with one component."""
+"""run, protect, release, stop, logs, handover, failback, promote, prefer: what is done with one component."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any, Final
 from failover.cli import picture, render
 from failover.cli.agent import connect
 from failover.client.control import Control, Output, Result, Update
-from failover.errors import FailoverError, LostAgentError, NoAgentError
+from failover.errors import AgentRefusedError, FailoverError, LostAgentError, NoAgentError
 
 RECONNECT_S: Final = 30.0
 """How long ``failover run`` waits for its agent to come back: a restart takes a second, an upgrade some more."""
@@ -259,6 +259,30 @@ def _moved(answer: dict[str, Any]) -> str:
     if not answer.get("moved", True):
         return str(answer["sentence"])
     return f"{answer['name']} runs on {answer['to']} now; the move took {answer['took_ms']:.0f} ms"
+
+
+def promote(arguments: argparse.Namespace) -> int:
+    """Have a robot run what nobody is heard to run, once whoever orders it knows what that risks."""
+    wanted = {"name": arguments.name, "robot": arguments.robot or ""}
+    with connect(arguments) as agent:
+        would = agent.ask("promote", **wanted)
+        wanted["robot"] = would["to"]
+        if not arguments.json:
+            print(f"failover: {would['sentence']}", *would["risks"], sep="\n  - ", file=sys.stderr)
+        if would["risks"] and not (arguments.yes or _agreed(f"promote {would['to']} all the same?")):
+            told = tuple(would["risks"]) if arguments.json else ()
+            raise AgentRefusedError(f"{would['name']} is left as it is; --yes promotes {would['to']} all the same", "Risk", told)
+        answer = agent.ask("promote", **wanted, sure=True)
+    answer["risks"] = would["risks"]
+    return _tell(arguments, answer, f"{answer['name']} runs on {answer['to']} now, epoch {answer['epoch']}")
+
+
+def _agreed(question: str) -> bool:
+    """Whether a person at the terminal says yes; without one nobody does."""
+    if not sys.stdin.isatty():
+        return False
+    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 def prefer(arguments: argparse.Namespace) -> int:

@@ -219,6 +219,13 @@ def _failback(room: argparse.ArgumentParser) -> None:
     _agent(room)
 
 
+def _promote(room: argparse.ArgumentParser) -> None:
+    _name(room)
+    room.add_argument("--robot", metavar="ROBOT", help="who shall run it (default: the robot with the newest checkpoint)")
+    room.add_argument("-y", "--yes", action="store_true", help="do not ask, whatever is at risk")
+    _agent(room)
+
+
 def _prefer(room: argparse.ArgumentParser) -> None:
     _name(room)
     room.add_argument("robot", metavar="ROBOT", help="the robot that should run it whenever it can")
@@ -490,6 +497,23 @@ VERBS: Final = (
         """,
         _failback,
         "failover.cli.components:failback",
+    ),
+    Verb(
+        "promote",
+        "run what is held still, without waiting for robots that are silent",
+        """
+        Have a robot run the component now, from the checkpoint that it holds, or on from where it stands still: after the loss of
+        a robot under on_loss = "hold", or where when_alone = "freeze" holds it, or where a majority waits for a robot that may
+        hold a newer checkpoint. What it would lose is told before, and what may go wrong: a silent robot may be alive, cut off,
+        and run it too. Then it asks; without a terminal it does nothing unless --yes. It runs under a new epoch, above any that
+        a silent robot can have opened. Refused while a robot that is heard has it, and without a majority where majority is the
+        rule. May be given at any robot.
+
+          failover promote /lab/robot1/mapper
+          failover promote /lab/robot1/mapper --robot robot2 --yes
+        """,
+        _promote,
+        "failover.cli.components:promote",
     ),
     Verb(
         "prefer",

@@ -23,6 +23,8 @@ verb           arguments                                                result, 
 ``handover``   ``name`` *must*, ``to`` ""                               ``{name, to, epoch, took_ms, moved, sentence}``
 ``failback``   ``name`` *must*                                          as ``handover``
 ``prefer``     ``name`` *must*, ``robot`` *must*                        ``{name, robot}``
+``promote``    ``name`` *must*, ``robot`` = newest checkpoint's,         ``{name, to, epoch, promoted, sentence, risks}``; unless
+               ``sure`` false                                           ``sure`` nothing is done, and they tell what would be
 =============  =======================================================  ========================================================
 """
 

@@ -243,11 +243,16 @@ class ReportExit:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The reply to an operator's command; ``sentence`` says what was done, or why not and what to do about it."""
+    """The reply to an operator's command; ``sentence`` says what was done, or why not and what to do about it.
+
+    Attributes:
+        risks: of a promotion that was only asked about: a sentence for each reason to think before it is ordered.
+    """
 
     request: int
     ok: bool
     sentence: str
+    risks: tuple[str, ...] = ()
 
 
 Act = (

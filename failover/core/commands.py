@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from failover.core import acts, handover, majority
+from failover.core import acts, handover, majority, promotion
 from failover.core.component import Cause, Component, Turn
 from failover.core.election import claim, drop, vacant
 from failover.core.events import Command, Failback, Handover, Prefer, Promote, Release, Run, Stop
@@ -30,7 +30,7 @@ def obey(component: Component, turn: Turn, command: Command) -> None:
             else:
                 handover.begin(component, turn, command.to, command.request)
         case Promote():
-            _promote(component, turn, command)
+            promotion.obey(component, turn, command)
         case Failback():
             _fail_back(component, turn, command)
 
@@ -103,13 +103,6 @@ def _prefer(component: Component, turn: Turn, command: Prefer) -> None:
         component.spec = replace(component.spec, rules=replace(component.spec.rules, prefer=command.robot))
         component.retry_ns = turn.now_ns
         turn.order(acts.Answer(command.request, True, f"{component.name} prefers {command.robot or 'to stay where it is'}"))
-
-
-def _promote(component: Component, turn: Turn, command: Promote) -> None:
-    if component.holding or component.state is State.STOPPING:
-        _elsewhere(component, turn, command.request, "promote a robot for")
-    else:
-        handover.resume_here(component, turn, command.request, promoted=True)
 
 
 def _fail_back(component: Component, turn: Turn, command: Failback) -> None:

@@ -244,10 +244,15 @@ class Handover:
 
 @dataclass(frozen=True, slots=True)
 class Promote:
-    """Operator: this robot runs what nobody runs from the checkpoint that it holds, even if another holds a newer one."""
+    """Operator: this robot runs what nobody else is heard to run, without waiting for robots that are silent.
+
+    Attributes:
+        is_trial: nothing is done; the answer says what it would be, and what would be at risk.
+    """
 
     request: int
     component: str
+    is_trial: bool = False
 
 
 @dataclass(frozen=True, slots=True)

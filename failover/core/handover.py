@@ -21,22 +21,21 @@ def begin(component: Component, turn: Turn, to: str, request: int) -> None:
     turn.say(component, f"{turn.me} begins to hand it over to {target}")
 
 
-def resume_here(component: Component, turn: Turn, request: int, *, promoted: bool = False) -> None:
-    """By order: run what nobody runs, from the checkpoint held here; ``promoted``: even if another robot has a newer one."""
+def resume_here(component: Component, turn: Turn, request: int) -> None:
+    """By order: run what nobody runs, from the checkpoint held here, unless another robot may have a newer one."""
     if component.newest is None:
         _answer(turn, request, False, f"{turn.me} holds no checkpoint of {component.name}")
     elif not turn.config.runs(turn.me):
         _answer(turn, request, False, f"{turn.me} runs nothing; ask at a robot")
     elif not vacant(component, turn) or (turn.config.by_majority and not majority.is_free(component, turn)):
         _answer(turn, request, False, f"{component.name} belongs to {component.primary}; ask there")
-    elif component.elects and not promoted and not majority.may_claim(component, turn, component.newest):
+    elif component.elects and not majority.may_claim(component, turn, component.newest):
         where = " or ".join(one for one in (*component.entrusted, component.primary) if one)
         refusal = f"a newer checkpoint of {component.name} may be at {where}; start it, or promote {turn.me}"
         _answer(turn, request, False, refusal)
     else:
         component.request = request
         claim(component, turn, component.newest, "an operator asked for it")
-        component.ordered = promoted
 
 
 def advance(component: Component, turn: Turn) -> None:

@@ -21,7 +21,22 @@ from tests.e2e.robots import RobotMachine
 SEED = int(os.environ.get("FAILOVER_FUZZ_SEED", random.randrange(1 << 30)))
 TURNS = int(os.environ.get("FAILOVER_FUZZ_TURNS", "300"))
 
-VERBS = ("ping", "status", "run", "protect", "release", "stop", "logs", "why", "handover", "failback", "prefer", "", "picture")
+VERBS = (
+    "ping",
+    "status",
+    "run",
+    "protect",
+    "release",
+    "stop",
+    "logs",
+    "why",
+    "handover",
+    "failback",
+    "prefer",
+    "promote",
+    "",
+    "picture",
+)
 KEYS = (
     "name",
     "argv",

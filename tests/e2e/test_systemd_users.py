@@ -117,7 +117,9 @@ def test_the_program_can_open_its_own_output(machine: Machine) -> None:
     assert as_user(machine, "bob", "failover run -- sh -c 'echo again >/dev/stdout'") == (0, "again\n")
 
 
-@pytest.mark.parametrize("order", ["logs {}", "stop {}", "release {}", "handover {}", "failback {}", "prefer {} robot1"])
+@pytest.mark.parametrize(
+    "order", ["logs {}", "stop {}", "release {}", "handover {}", "failback {}", "prefer {} robot1", "promote {} --yes"]
+)
 def test_orders_about_another_ones_component_are_refused(machine: Machine, alices: str, order: str) -> None:
     status, said = as_user(machine, "bob", f"failover {order.format(alices)}")
     assert status == 1 and "belongs to uid 7001" in said, said

@@ -412,7 +412,7 @@ class World:
             case acts.Warm() | acts.Cool():
                 self._warm(robot, act)
             case acts.Answer():
-                self.note(f"{robot.name} answers: {act.sentence}")
+                self.note(f"{robot.name} answers: {'; '.join((act.sentence, *act.risks))}")
 
     def _guard(self, robot: Robot, act: acts.Freeze | acts.Thaw | acts.SetLease | acts.End | acts.LetGo) -> None:
         program = robot.programs.get(act.component)

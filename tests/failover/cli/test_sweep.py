@@ -21,6 +21,7 @@ UNDER_AN_AGENT = {
     "handover": ["x"],
     "failback": ["x"],
     "prefer": ["x", "y"],
+    "promote": ["x"],
 }
 FILES = ("missing", "directory", "empty", "junk", "sparse", "/dev/null", "/dev/zero", "/proc/self/mem", "x" * 300, "locked")
 NO_PIDS = ("0", "-1", "me", "99999999999999999999")

@@ -225,6 +225,47 @@ def test_a_verb_says_in_a_sentence_what_came_of_it(agent: Start, words: list[str
     assert json.loads(failover(*words, "--json", socket=stand_in.path).stdout) == answer
 
 
+WOULD = {"name": "/a", "to": "r2", "epoch": 4, "promoted": False, "sentence": "/a would go on at r2", "risks": ["r1 may live"]}
+
+
+def promoting(agent: Start, would: dict[str, Any]) -> StandIn:
+    """An agent that tells what a promotion would risk, and obeys whoever is sure."""
+    done = {"name": "/a", "to": "r2", "epoch": 6, "promoted": True, "sentence": "/a runs at r2", "risks": []}
+    return agent(lambda request: [Result(done if request.arguments.get("sure") else would)])
+
+
+def test_what_a_promotion_risks_is_told_and_without_a_yes_nothing_is_done(agent: Start) -> None:
+    stand_in = promoting(agent, WOULD)
+    ran = failover("promote", "/a", socket=stand_in.path)
+    assert ran.returncode == 1 and "/a would go on at r2\n  - r1 may live\n" in ran.stderr and "--yes" in ran.stderr
+    assert json.loads(failover("promote", "/a", "--json", socket=stand_in.path).stdout)["reasons"] == ["r1 may live"]
+    assert not any(request.arguments.get("sure") for request in stand_in.asked)
+
+
+def test_a_promotion_is_ordered_at_the_robot_whose_risks_were_told(agent: Start) -> None:
+    stand_in = promoting(agent, WOULD)
+    ran = failover("promote", "/a", "--yes", socket=stand_in.path)
+    assert (ran.returncode, ran.stdout) == (0, "/a runs on r2 now, epoch 6\n") and "r1 may live" in ran.stderr
+    assert stand_in.asked[-1].arguments == {"name": "/a", "robot": "r2", "sure": True}
+
+
+def test_a_promotion_without_risk_needs_no_yes(agent: Start) -> None:
+    ran = failover("promote", "/a", socket=promoting(agent, WOULD | {"risks": []}).path)
+    assert (ran.returncode, ran.stdout) == (0, "/a runs on r2 now, epoch 6\n")
+
+
+@pytest.mark.parametrize(("said", "returncode"), [(b"y\n", 0), (b"\n", 1)])
+def test_a_person_at_a_terminal_is_asked_before_a_promotion(agent: Start, said: bytes, returncode: int) -> None:
+    ours, theirs = os.openpty()
+    try:
+        os.write(ours, said)
+        ran = failover("promote", "/a", socket=promoting(agent, WOULD).path, stdin=theirs)
+    finally:
+        os.close(ours)
+        os.close(theirs)
+    assert ran.returncode == returncode and "promote r2 all the same? [y/N]" in ran.stderr
+
+
 def test_logs_can_show_one_stream_alone(agent: Start) -> None:
     stand_in = agent(
         lambda request: [Output(1, 0, b"a"), Output(2, 0, b"b"), Result({"name": "x", "totals": [1, 1], "exit_status": 0})]
@@ -250,7 +291,7 @@ def test_an_agent_that_goes_away_is_an_error_and_not_a_hang(agent: Start) -> Non
 
 AGENT_VERBS = [
     ["run", "--", "x"], ["protect", "1"], ["release", "x"], ["stop", "x"], ["status"], ["logs", "x"], ["why"], ["handover", "x"],
-    ["prefer", "x", "r"],
+    ["prefer", "x", "r"], ["promote", "x"],
 ]  # fmt: skip
 
 
