@@ -130,7 +130,8 @@ class Component:
         stored_ns: on a standby, when its newest checkpoint was stored, -1 if it was before this life of the agent.
         elects: primaries are elected. free, open: then, what this robot would vote for (``majority.py``).
         ordered: the claim was, by an operator.
-        seen: highest epoch that anybody told of; a claim goes above it.
+        seen: highest epoch that anybody told of; a claim goes above it. contested_ns: when this copy, which stands still, last
+            met another that does.
         trail: the last acknowledged positions and their parents, for servers (``archive.py``); ``archives``: on their way there.
         undelivered: why the last snapshot did not become a checkpoint; ``unstored``: on a standby, why it was not stored.
         keeps_state: on a standby: to go on from the newest snapshot is to start the program again.
@@ -199,6 +200,7 @@ class Component:
     ordered: bool = False
     elects: bool = False
     seen: int = 0
+    contested_ns: int = 0
     trail: deque[tuple[Position, Position | None]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
     archives: dict[str, Flight] = field(default_factory=dict)
     archived_ns: int = 0

@@ -138,11 +138,33 @@ def _heard_rival(component: Component, turn: Turn, sender: str, entry: Entry, th
     elif majority.leased(component, turn):
         if later and component.state in _SETTLED:
             renew(component, turn, entry.epoch)
-    elif theirs is State.CLAIMING:
-        if later and (entry.flags & ORDERED or majority.eligible(component, turn, sender, entry.position)):
-            lose(component, turn, sender, entry)
-    elif stronger(component, turn, sender, entry, theirs):
+    elif _prevails(component, turn, sender, entry):
         lose(component, turn, sender, entry)
+    elif theirs is not State.CLAIMING and component.state in _SETTLED:
+        _contend(component, turn, sender, entry, theirs)
+
+
+def _prevails(component: Component, turn: Turn, sender: str, entry: Entry) -> bool:
+    """Whether a rival of ours, who have no lease, was elected, or loses nothing that was acknowledged if we follow it.
+
+    A later epoch alone says little: a robot that comes back with an old copy raises its epoch above all that it hears of.
+    """
+    if entry.epoch >= component.epoch and majority.elected(component, turn, sender, entry.epoch):
+        return True
+    if entry.epoch <= component.epoch:
+        return False
+    return bool(entry.flags & ORDERED) or not component.held or majority.eligible(component, turn, sender, entry.position)
+
+
+def _contend(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
+    """Two copies stand still, neither was elected: go above the other's epoch, once a loyalty, so that voters are heard first."""
+    if entry.epoch < component.epoch or (entry.epoch == component.epoch and stronger(component, turn, sender, entry, theirs)):
+        return
+    waited_ns = turn.now_ns - component.contested_ns
+    if waited_ns >= turn.config.loyalty_ns:
+        component.contested_ns = turn.now_ns
+        if waited_ns < 2 * turn.config.loyalty_ns:
+            renew(component, turn, entry.epoch)
 
 
 def _heard_later_epoch(component: Component, turn: Turn, entry: Entry) -> None:

@@ -8,8 +8,8 @@
 * *Pre-vote.* Members say in beats whether they are free. Nobody claims before a majority is: whoever is cut off raises no epoch.
 * *Nothing acknowledged is lost.* A primary acknowledges what a standby holds once a majority has noted that standby. Members
   vote for robots that hold as much; for others only when those were out of reach for ``patience_ms``, or by an operator's order.
-* *Whoever has a valid lease is the primary.* It answers a later epoch that was claimed in vain by one above that; whoever hears
-  a later epoch without having a lease gives its copy up.
+* *Whoever has a valid lease is the primary.* It answers a later epoch that was claimed in vain by one above that. Whoever has
+  none gives its copy up to one that was elected, and to a later epoch's that holds as much; otherwise it contends for votes.
 """
 
 from __future__ import annotations

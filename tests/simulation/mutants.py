@@ -272,6 +272,11 @@ def proud_primary() -> Any:
     return patch.object(contest, "lose", lambda *_: None)
 
 
+def humble_primary() -> Any:
+    """A primary without a lease gives up to whoever has a later epoch, also to an old copy that nobody elected."""
+    return patch.object(contest, "_prevails", lambda component, turn, sender, entry: entry.epoch > component.epoch)
+
+
 def claims_for_ever() -> Any:
     """A claim that was split is never withdrawn."""
     return patch.object(contest, "withdraw", lambda *_: None)
@@ -311,6 +316,7 @@ SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (never_deaf, "a_deaf_primary_is_replaced"),
     (miserly_server, "both_robots_dead_one_is_back_empty_the_server_returns_it"),
     (anybody_may_have_it, "an_older_checkpoint_waits_for_the_newest"),
+    (humble_primary, "an_old_copy_that_raises_its_epoch_is_not_believed"),
     (minority_rules, "without_a_majority_nothing_acts"),
     (tireless_giver, "a_chain_that_is_not_taken_is_offered_again_after_a_pause"),
 )

@@ -178,6 +178,22 @@ def test_a_primary_that_nobody_hears_stands_still() -> None:
     assert talk.orders(acts.Freeze)
 
 
+def test_two_copies_that_stand_still_unelected_are_told_apart_by_what_was_acknowledged() -> None:
+    talk = running()
+    (ship,) = talk.orders(acts.Ship)
+    assert isinstance(ship, acts.Ship)
+    talk.tick(ROBOT.lease_ms)
+    older = entry(State.FROZEN, 2, "robot2", Position(1, 1, b"d"))
+    talk.hear("robot2", older)
+    assert talk.vote() == (1, "robot1") and not talk.orders(acts.Stop), "it holds less, and nobody has elected it"
+    for _ in range(ROBOT.loyalty_ns // (20 * MS) + 1):
+        talk.tick(20)
+        talk.hear("robot2", older)
+    assert talk.vote() == (3, "robot1"), "voters may follow a later epoch"
+    talk.hear("robot2", entry(State.FROZEN, 4, "robot2", ship.position))
+    assert talk.vote() == (4, "robot2") and talk.orders(acts.Stop), "nothing is lost if that one goes on"
+
+
 def test_a_leap_of_the_clock_makes_no_peer_deaf() -> None:
     talk = running()
     talk.hear("robot2", entry(State.STANDBY, 1, "robot1"))
