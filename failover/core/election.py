@@ -212,8 +212,14 @@ def heard(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
         _heard_holder(component, turn, sender, entry, theirs)
     elif theirs in ENDED and entry.epoch >= component.epoch:
         heard_end(component, turn, sender, entry, theirs)
-    elif entry.epoch > component.epoch:
+    elif entry.epoch > component.epoch or _is_taken(component, sender, entry):
         _heard_later_epoch(component, turn, sender, entry)
+
+
+def _is_taken(component: Component, sender: str, entry: Entry) -> bool:
+    """Whether the sender, back without a copy, has run the component under the epoch that we claim."""
+    ours = component.state is State.CLAIMING and entry.epoch == component.epoch
+    return ours and component.freezes and entry.primary == sender
 
 
 def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
@@ -252,8 +258,12 @@ def stronger(component: Component, turn: Turn, sender: str, entry: Entry, theirs
 
 
 def _may_switch(component: Component, turn: Turn, sender: str, entry: Entry) -> bool:
-    """One consent an epoch, except that the lesser name's claim overtakes."""
-    if entry.epoch > component.epoch or component.primary in ("", turn.me) or turn.dead(component.primary):
+    """One consent an epoch, except that the lesser name's claim overtakes; none to an epoch that we have used (``freeze``)."""
+    if entry.epoch > component.epoch or not component.primary:
+        return True
+    if component.primary == turn.me:
+        return component.claimed or not component.freezes
+    if turn.dead(component.primary):
         return True
     return weight(sender) < weight(component.primary)
 

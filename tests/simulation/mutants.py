@@ -152,6 +152,16 @@ def tireless_giver() -> Any:
     return patch.object(replication, "ship_ended", hasty)
 
 
+def forgets_what_it_ran() -> Any:
+    """A robot consents to another's claim of an epoch under which it has run the component itself."""
+    honest = election._may_switch
+
+    def generous(component: Component, turn: Turn, sender: str, entry: Entry) -> bool:
+        return component.primary == turn.me or honest(component, turn, sender, entry)
+
+    return patch.object(election, "_may_switch", generous)
+
+
 def waits_for_ever() -> Any:
     """What waits at a robot is not ended when the component has ended, or has another standby."""
 
@@ -316,6 +326,7 @@ SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (never_deaf, "a_deaf_primary_is_replaced"),
     (miserly_server, "both_robots_dead_one_is_back_empty_the_server_returns_it"),
     (anybody_may_have_it, "an_older_checkpoint_waits_for_the_newest"),
+    (forgets_what_it_ran, "an_epoch_that_was_used_is_not_consented_to"),
     (humble_primary, "an_old_copy_that_raises_its_epoch_is_not_believed"),
     (minority_rules, "without_a_majority_nothing_acts"),
     (tireless_giver, "a_chain_that_is_not_taken_is_offered_again_after_a_pause"),
