@@ -18,6 +18,9 @@ from failover.core.names import check_component
 from failover.core.types import BEAT_MS_MAX, BEATS_IN_LEASE_MIN, PERIOD_MS_MAX
 from failover.errors import FailoverError, NameFormatError
 
+PATIENCE_S_MAX: Final = 86_400
+"""A day. Whoever would wait longer may as well promote."""
+
 HOOK_S_MAX: Final = 50
 """The rules give a restore a minute."""
 
@@ -71,6 +74,7 @@ class Config:
         group: unix group that may use the control socket besides its owner; "" for nobody.
         beat_ms: period of beats to each peer.
         lease_ms: how long a primary acts without being heard, and how long a standby stays loyal to a silent one.
+        patience_s: under the majority rule: how long the robots that hold the newest checkpoint are waited for.
         rule: who decides that a silent robot is replaced: pair, majority, or auto: a majority wherever more than two belong.
         when_alone: under the pair rule: when no other robot is heard, what is started here runs on, or is held still.
         snapshot_period_ms: between two snapshots of a component; grows by itself when link or standby is slower.
@@ -90,6 +94,7 @@ class Config:
     lease_ms: int = 200
     rule: Literal["auto", "pair", "majority"] = "auto"
     when_alone: Literal["run", "freeze"] = "run"
+    patience_s: int = 30
     snapshot_period_ms: int = 100
     realtime: bool = True
     link_mbit_s: int = 0
@@ -116,6 +121,8 @@ class Config:
             raise ValueError(
                 f"snapshot_period_ms is {self.snapshot_period_ms}; it must be at least 1 and at most {PERIOD_MS_MAX}"
             )
+        if not 1 <= self.patience_s <= PATIENCE_S_MAX:
+            raise ValueError(f"patience_s is {self.patience_s}; it must be at least 1 and at most {PATIENCE_S_MAX}")
         if self.link_mbit_s < 0:
             raise ValueError(f"link_mbit_s is {self.link_mbit_s}; 0 means no cap")
 
@@ -192,15 +199,23 @@ def _check_components(path: Path, config: Config, members: Team) -> None:
             check_component(name)
         except NameFormatError as error:
             raise ConfigError(f"{where}: {error}") from error
-        for key, robot in (("prefer", component.prefer), ("standby", component.standby)):
-            if robot not in ("", *members.robots):
-                known = ", ".join(sorted(members.robots))
-                raise ConfigError(f"{where}: {key} = {robot!r}: the team knows {known}")
+        _check_choice(where, "prefer", component.prefer, members, {"robot"})
+        _check_choice(where, "standby", component.standby, members, {"robot", "server"})
         if not 0 <= component.snapshot_period_ms <= PERIOD_MS_MAX:
             raise ConfigError(
                 f"{where}: snapshot_period_ms is {component.snapshot_period_ms}; at most {PERIOD_MS_MAX}; 0 means the agent's own"
             )
         _check_command(where, component)
+
+
+def _check_choice(where: str, key: str, chosen: str, members: Team, roles: set[str]) -> None:
+    """Who only votes, or only keeps checkpoints, cannot be chosen for what it never does."""
+    if chosen and chosen not in members.robots:
+        raise ConfigError(f"{where}: {key} = {chosen!r}: the team knows {', '.join(sorted(members.robots))}")
+    if chosen and members.robots[chosen].role not in roles:
+        able = ", ".join(sorted(name for name, member in members.robots.items() if member.role in roles)) or "nobody"
+        what = "runs nothing" if key == "prefer" else "keeps no checkpoints"
+        raise ConfigError(f"{where}: {key} = {chosen!r}: it is a {members.robots[chosen].role} and {what}; choose among {able}")
 
 
 def _check_command(where: str, component: ComponentConfig) -> None:

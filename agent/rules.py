@@ -24,6 +24,7 @@ def node_config(settings: Settings) -> types.Config:
         rule=_rule(settings),
         servers=_members(settings, "server"),
         witnesses=_members(settings, "witness"),
+        patience_ms=config.patience_s * 1_000,
     )
 
 

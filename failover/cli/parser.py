@@ -288,13 +288,18 @@ def _team(room: argparse.ArgumentParser) -> None:
     create = _act(acts, "create", shared, "begin a team", CREATE_STORY)
     create.add_argument("name", metavar="TEAM", help="the team's name")
     create.set_defaults(function="failover.cli.teams:create")
-    enrol = _act(acts, "enrol", shared, "add a robot and make its key", ENROL_STORY)
+    enrol = _act(acts, "enrol", shared, "add a robot, a server or a witness and make its key", ENROL_STORY)
     enrol.add_argument("name", metavar="ROBOT", help="the robot's name")
     enrol.add_argument(
         "address", metavar="HOST[:PORT]", nargs="+", help="where it hears beats: one address for each of its links (port 7420)"
     )
     enrol.add_argument(
         "--bulk", metavar="HOST[:PORT]", help="where it takes snapshots, on the wired link (default: first HOST, port 7421)"
+    )
+    enrol.add_argument(
+        "--role",
+        choices=("robot", "server", "witness"),
+        help="robot: runs components; server: keeps checkpoints of all and votes; witness: votes only (default: robot)",
     )
     enrol.add_argument("--public-key", metavar="KEY", help="the public half of a key made on the robot itself")
     enrol.add_argument("--replace", action="store_true", help="give a known robot new addresses and a new key")
@@ -316,6 +321,7 @@ ENROL_STORY: Final = """
 
       failover team enrol robot1 192.168.7.11
       failover team enrol robot2 192.168.7.12 10.0.0.12 --bulk 192.168.7.12
+      failover team enrol hall 192.168.7.2 --role server
       failover team enrol robot3 192.168.7.13 --public-key 'lU^njTi%j-s0Um6-=T!3XtpbYKc@&EDt>F+fX01f'
     """
 

@@ -24,7 +24,7 @@ def create(arguments: argparse.Namespace) -> int:
 
 
 def enrol(arguments: argparse.Namespace) -> int:
-    """Add a robot, with a key made here or brought along."""
+    """Add a member, with a key made here or brought along. One that is replaced keeps its role unless another is given."""
     directory = Path(arguments.directory)
     members = team.read(directory)
     if arguments.name in members.robots and not arguments.replace:
@@ -34,9 +34,10 @@ def enrol(arguments: argparse.Namespace) -> int:
     beats = tuple(_with_port(address, DEFAULT_BEAT_PORT) for address in arguments.address)
     bulk = _with_port(arguments.bulk or beats[0].rpartition(":")[0], DEFAULT_BULK_PORT)
     public, secret = (arguments.public_key, "") if arguments.public_key else keys.new_pair()
-    enrolled = team.enrol(members, arguments.name, Robot(beats, bulk, public_key=public))
-    answer = {"robot": arguments.name, "role": "robot", "beats": beats, "bulk": bulk, "public_key": public}
-    sentence = f"{arguments.name} is enrolled; carry {directory / team.TEAM_FILE} to every robot"
+    role = arguments.role or (members.robots[arguments.name].role if arguments.name in members.robots else "robot")
+    enrolled = team.enrol(members, arguments.name, Robot(beats, bulk, role, public))
+    answer = {"robot": arguments.name, "role": role, "beats": beats, "bulk": bulk, "public_key": public}
+    sentence = f"{arguments.name} is enrolled as a {role}; carry {directory / team.TEAM_FILE} to every member"
     if secret:
         if arguments.replace:
             team.forget_secret_key(directory, arguments.name)

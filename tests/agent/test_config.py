@@ -13,6 +13,7 @@ import pytest
 from agent import config as configuration
 from agent.config import ComponentConfig, Config
 from agent.errors import ConfigError
+from agent.main import main as agent_main
 from agent.rules import node_config, started_here
 from agent.transport import new_keys
 from failover.client import team
@@ -82,6 +83,7 @@ def test_a_program_is_started_again_by_this_robots_own_command(directory: Path) 
         (("link_mbit_s = -1",), 4, "0 means no cap"),
         (('[components."mapper"]', 'on_loss = "hold"'), 4, "mapper"),
         (('[components."/lab/a"]', 'prefer = "robot7"'), 4, "the team knows robot1, robot2"),
+        (("patience_s = 0",), 4, "must be at least 1"),
         (('[components."/lab/a"]', 'on_lost = "hold"'), 5, "did you mean 'on_loss'"),
         (('[components."/lab/a"]', 'on_loss = "give up"'), 5, "Invalid enum value 'give up'"),
         (('[components."/lab/a"]', 'command = "/opt/a"'), 5, "Expected `array`"),
@@ -183,6 +185,29 @@ def test_more_than_two_members_decide_by_majority_unless_told_otherwise(
     assert config.rule is rule
     assert [config.runs(name) for name in members] == [role == "robot" for role in roles]
     assert [config.keeps(name) for name in members] == [role != "witness" for role in roles]
+
+
+@pytest.mark.parametrize(
+    ("choice", "said"),
+    [
+        ('prefer = "hall"', "it is a server and runs nothing; choose among robot1, robot2"),
+        ('prefer = "gate"', "it is a witness and runs nothing; choose among robot1, robot2"),
+        ('standby = "gate"', "it is a witness and keeps no checkpoints; choose among hall, robot1, robot2"),
+        ('standby = "hall"', ""),
+    ],
+)
+def test_nobody_is_chosen_for_what_his_role_never_does(directory: Path, choice: str, said: str) -> None:
+    roles: dict[str, Role] = {"robot1": "robot", "robot2": "robot", "hall": "server", "gate": "witness"}
+    members = {name: Robot(ROBOT.beats, ROBOT.bulk, role) for name, role in roles.items()}
+    team.write(directory / "team", Team("lab", members))
+    path = written(directory, '[components."/lab/a"]', choice)
+    if not said:
+        assert configuration.load(path).component("/lab/a").standby == "hall"
+        return
+    with pytest.raises(ConfigError, match=said) as caught:
+        configuration.load(path)
+    assert str(caught.value).startswith(f"{path}:4: ")
+    assert agent_main(["check", "--config", str(path)]) == 1
 
 
 def test_a_witness_under_the_pair_rule_is_refused(directory: Path) -> None:

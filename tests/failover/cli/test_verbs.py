@@ -368,6 +368,17 @@ def test_a_team_is_created_enrolled_into_and_shown(tmp_path: Path) -> None:
     assert shown["robots"]["robot2"]["beats"] == ["[fe80::1]:7420"]
 
 
+def test_servers_and_witnesses_are_enrolled_and_stay_what_they_are(tmp_path: Path) -> None:
+    place = ["--directory", str(tmp_path), "--json"]
+    failover("team", "create", "lab", *place)
+    ran = failover("team", "enrol", "hall", "10.0.0.1", "--role", "server", "--public-key", KEY, *place)
+    assert json.loads(ran.stdout)["role"] == "server"
+    assert failover("team", "enrol", "gate", "10.0.0.2", "--role", "witness", *place).returncode == 0
+    assert failover("team", "enrol", "gate", "10.0.0.9", "--replace", *place).returncode == 0
+    shown = json.loads(failover("team", "show", *place).stdout)["robots"]
+    assert {name: one["role"] for name, one in shown.items()} == {"hall": "server", "gate": "witness"}
+
+
 def test_without_a_team_file_the_way_to_one_is_named(tmp_path: Path) -> None:
     ran = failover("team", "show", "--directory", str(tmp_path))
     assert ran.returncode == 1

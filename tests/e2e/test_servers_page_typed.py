@@ -1,0 +1,55 @@
+"""What docs/servers.md tells to type, typed: both robots die, one comes back with an empty disk, and the counter counts on."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.e2e import robots
+from tests.e2e.test_decorator_page_typed import PAGE as DECORATOR_PAGE
+from tests.e2e.test_decorator_page_typed import Terminal, terminal
+
+PAGE = DECORATOR_PAGE.with_name("servers.md")
+MEMBERS = ("r1", "r2", "hall")
+KEPT = "json=$(failover status --json --socket hall/run/control.sock); echo $json"
+SEEN = 50
+"""Numbers that are counted before the robots die, and after."""
+
+pytestmark = [pytest.mark.root, pytest.mark.command("unshare"), pytest.mark.command("ip")]
+
+
+@contextmanager
+def ending(typed: Terminal) -> Iterator[None]:
+    """The server ends with the test; the terminal ends the robots."""
+    try:
+        yield
+    finally:
+        typed.type("kill -9 $(cat hall/pid)")
+
+
+def test_the_server_returns_a_component_to_an_empty_robot_as_the_page_tells_it(tmp_path: Path) -> None:
+    begin, protect, lose = re.findall(r"```sh\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    counter = re.search(r"```python\n(.*?)```", DECORATOR_PAGE.read_text().split(" In five lines\n")[1], re.DOTALL)
+    assert counter is not None
+    (tmp_path / "counter.py").write_text(counter[1])
+    with terminal(tmp_path) as typed, ending(typed):
+        said = typed.type(begin)
+        sockets = [tmp_path / member / "run" / "control.sock" for member in MEMBERS]
+        robots.until(lambda: all(socket.exists() for socket in sockets), f"three agents after: {said}")
+        robots.until(lambda: "hears 3 of 3" in typed.type(protect.splitlines()[1]), "a majority")
+        logs, why = lose.splitlines()[3:]
+        at_r1 = logs.replace("r2/", "r1/")
+        said = typed.type(protect)
+        robots.until(lambda: len(typed.type(at_r1).split()) > SEEN, f"the counter to count after: {said}")
+        robots.until(lambda: '"role": "standby"' in typed.type(KEPT), "a checkpoint at the server")
+        typed.type(lose)
+        robots.until(lambda: "it goes on from checkpoint" in typed.type(why), "the counter to go on")
+        before = len(typed.type(logs).split())
+        robots.until(lambda: len(typed.type(logs).split()) > before + SEEN, "the counter to count on")
+        numbers = typed.type(logs).split()
+        assert numbers == [str(number) for number in range(1, len(numbers) + 1)]
+        assert "hall gives its checkpoint back to r2" in typed.type(why)
