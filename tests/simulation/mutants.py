@@ -153,13 +153,13 @@ def tireless_giver() -> Any:
 
 
 def forgets_what_it_ran() -> Any:
-    """A robot consents to another's claim of an epoch under which it has run the component itself."""
+    """A robot consents to another's claim of an epoch under which it has run the component, and the other does not notice."""
     honest = election._may_switch
 
     def generous(component: Component, turn: Turn, sender: str, entry: Entry) -> bool:
         return component.primary == turn.me or honest(component, turn, sender, entry)
 
-    return patch.object(election, "_may_switch", generous)
+    return patch.object(election, "_may_switch", generous), patch.object(election, "_is_taken", lambda *_: False)
 
 
 def waits_for_ever() -> Any:
