@@ -76,7 +76,7 @@ def team_view(
         "healthy": view.healthy if view else False,
         "notes": notes,
         "links": interfaces,
-        "peers": [_peer(peer, links.get(peer.robot), told) for peer in (view.peers if view else ())],
+        "peers": [_peer(peer, links.get(peer.robot), told, settings) for peer in (view.peers if view else ())],
         "components": [_component(one, charges.get(one.name), settings) for one in (view.components if view else ())],
         "beats": {
             "sent": beats.sent,
@@ -91,10 +91,11 @@ def team_view(
     }
 
 
-def _peer(peer: PeerView, link: Link | None, told: Told) -> dict[str, Any]:
+def _peer(peer: PeerView, link: Link | None, told: Told, settings: Settings) -> dict[str, Any]:
     reason = [link.reason] if link is not None and link.reason else []
     return {
         "name": peer.robot,
+        "role": settings.team.robots[peer.robot].role,
         "state": PEER_STATES.get(peer.state, peer.state),
         "last_heard_ms": peer.silent_ns // NANOSECONDS_A_MILLISECOND if peer.silent_ns >= 0 else None,
         "hears_us": peer.hears_us,
@@ -161,6 +162,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings) -
         "outage_ms": figures.outage_ms if figures else None,
         "exit_status": view.status if view.state is State.FINISHED else None,
         "promise": view.promise,
+        "promise_differs": view.differs,
         "home": view.home,
         "prefer": view.prefer,
         "owner": view.owner,

@@ -92,7 +92,7 @@ def _robot_row(status: Mapping[str, Any], name: str, peer: Mapping[str, Any] | N
     lost = peer.get("beats_lost")
     links = ", ".join(part for part in (peer.get("lane") or "", f"{lost} beat{'s' * (lost > 1)} lost" if lost else "") if part)
     mood: Mood = "good" if state == "live" else "bad" if state == "dead" else "warning"
-    return Row((name, "", state, "", "", "", "", "", links), mood)
+    return Row((name, str(peer.get("role") or ""), state, "", "", "", "", "", links), mood)
 
 
 def _lanes(status: Mapping[str, Any]) -> str:
@@ -162,6 +162,15 @@ def mood_of(component: Mapping[str, Any]) -> Mood:
     return "warning" if state in UNSETTLED_STATES or doubtful else "good"
 
 
+def promises(status: Mapping[str, Any]) -> tuple[str, ...]:
+    """What holds now: for the team, and for the components for which something else holds."""
+    found = [f"promise: {status['promise']}"] if status.get("promise") else []
+    for component in map(sight, status["components"]):
+        if component.get("promise_differs") and component.get("promise"):
+            found.append(f"promise for {component['name']}: {component['promise']}")
+    return tuple(found)
+
+
 def remarks(status: Mapping[str, Any]) -> tuple[str, ...]:
     """What stands below the tree: reasons, promises that do not hold, and notes, each a sentence said once."""
     found: list[str] = []
@@ -190,7 +199,7 @@ def _remarks_on(component: Mapping[str, Any]) -> list[str]:
         lines += [f"{robot}: {line}" if robot else line for line in notes if line not in lines]
         lines += [line for line in reasons[:REASONS_SHOWN] if not any(line in other for other in said)]
     seen = sight(component)
-    if seen.get("promise") and (seen.get("state") == "degraded" or is_unprotected(seen)):
+    if seen.get("promise") and not seen.get("promise_differs") and (seen.get("state") == "degraded" or is_unprotected(seen)):
         lines.append(str(seen["promise"]))
     return [f"{component['name']}: {line}" for line in lines]
 

@@ -85,8 +85,7 @@ def tree(status: dict[str, Any]) -> None:
 def plain_tree(status: dict[str, Any]) -> str:
     """The team as aligned text."""
     lines = [plain_table(picture.COLUMNS, [row.cells for row in picture.rows(status)])]
-    if status.get("promise"):
-        lines.append(f"promise: {status['promise']}")
+    lines += picture.promises(status)
     if status.get("fencing"):
         lines.append(f"fencing: {status['fencing']}")
     return "\n".join([*lines, *(f"note: {line}" for line in picture.remarks(status))])
@@ -172,8 +171,7 @@ def _rich_tree(status: dict[str, Any]) -> Any:
         parts: list[Any] = [Text(line, style=style) for cells, style in lines for line in _stacked(cells)]
     else:
         parts = [_rich_table(picture.COLUMNS, lines, f"team {status.get('team') or ''}".strip())]
-    if status.get("promise"):
-        parts.append(Text(spoken(f"promise: {status['promise']}"), style="bold"))
+    parts += [Text(spoken(line), style="bold") for line in picture.promises(status)]
     if status.get("fencing"):
         parts.append(Text(spoken(f"fencing: {status['fencing']}"), style="dim"))
     return Group(*parts, *(Text(spoken(line), style="yellow") for line in picture.remarks(status)))

@@ -133,6 +133,7 @@ class Component:
         seen: highest epoch that anybody told of; a claim goes above it. contested_ns: when this copy, which stands still, last
             met another that does.
         trail: the last acknowledged positions and their parents, for servers (``archive.py``); ``archives``: on their way there.
+        promise: what the journal has been told of it, where it differs from the team's.
         undelivered: why the last snapshot did not become a checkpoint; ``unstored``: on a standby, why it was not stored.
         keeps_state: on a standby: to go on from the newest snapshot is to start the program again.
         waiting: on a standby: the program that was ordered to wait, under ``waiting_epoch``; it is ready (``warm``) or, after
@@ -204,6 +205,7 @@ class Component:
     trail: deque[tuple[Position, Position | None]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
     archives: dict[str, Flight] = field(default_factory=dict)
     archived_ns: int = 0
+    promise: str = ""
 
     @property
     def rules(self) -> Rules:

@@ -139,11 +139,16 @@ class Node:
         return Turn(now_ns, self._config, self._team, self._speaker.counter + 1, self._durable, self._watch.late_ns, self._load)
 
     def _note_promise(self, turn: Turn) -> None:
-        """The journal has the team's promise at each change."""
+        """The journal has the team's promise at each change, and a component's while it differs from that."""
         sentence = promise.team(turn)
         if sentence != self._promise:
             self._promise = sentence
             turn.say_of_robot(sentence)
+        for component in self._components.values():
+            sentence = promise.exception(component, turn)
+            if sentence and sentence != component.promise:
+                component.promise = sentence
+                turn.say(component, sentence)
 
     # Birth
 

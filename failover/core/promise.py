@@ -1,7 +1,7 @@
 """What is promised now, in one sentence: for the team as one robot sees it, and for each component.
 
-``failover status`` shows the sentences, and the journal has the team's at each change. ``tests/failover/core/test_promises.py``
-holds every sentence against what the rules do.
+``failover status`` shows the team's, and a component's where it is another than the team's; the journal has both at each change.
+``tests/simulation/test_promises.py`` holds every sentence against what the rules do.
 """
 
 from __future__ import annotations
@@ -59,6 +59,22 @@ def one(component: Component, turn: Turn, protection: Protection) -> str:
         )
     alone = "stands still here first" if component.freezes else "may run twice if both live on and cannot hear each other"
     return f"If {turn.me} is silent for {_silence_ms(turn)} ms, {component.standby} runs it; it {alone}."
+
+
+def differs(component: Component, turn: Turn) -> bool:
+    """Whether what was chosen for a component, or who stands by, promises something else than the team's sentence says."""
+    if not component.holding:
+        return False
+    if component.unprotected or component.waits or (component.freezes and not component.elects):
+        return True
+    return bool(component.named) and not turn.config.runs(component.named)
+
+
+def exception(component: Component, turn: Turn) -> str:
+    """For the journal: the component's promise where it differs and somebody stands by already; "" otherwise."""
+    if not differs(component, turn) or not (component.named or component.unprotected):
+        return ""
+    return one(component, turn, Protection.PROTECTED)
 
 
 def _standing_by(component: Component, turn: Turn) -> str:

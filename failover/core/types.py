@@ -395,6 +395,7 @@ class ComponentView:
         owner: uid; None where this robot has heard no more of it than its name.
         warm: its program waits at its standby, started already: only one that keeps its state itself can.
         cold: why it does not wait here, where it should and something went wrong.
+        differs: its promise is another than the team's.
     """
 
     name: str
@@ -416,6 +417,7 @@ class ComponentView:
     owner: int | None = None
     warm: bool = False
     cold: str = ""
+    differs: bool = False
 
 
 @dataclass(frozen=True, slots=True)

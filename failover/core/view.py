@@ -48,6 +48,7 @@ def _component(component: Component, turn: Turn) -> ComponentView:
         component.spec.owner if component.spec else None,
         is_warm(component, turn),
         component.cold,
+        promise.differs(component, turn),
     )
 
 

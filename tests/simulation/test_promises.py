@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from failover.core import acts
 from failover.core.events import Handover, Promote
-from failover.core.types import MS, ComponentSpec, Launch, Rules, State, WhenAlone
+from failover.core.types import MS, ComponentSpec, Launch, OnLoss, Rules, State, WhenAlone
 from tests.simulation.invariants import Invariants, seen_at, state_at
 from tests.simulation.world import World, elective, pair
 
@@ -39,14 +39,24 @@ class Team:
     def says_of_it(self, robot: str) -> str:
         return seen_at(self.world, robot, PART).promise
 
+    def story_of_it(self, robot: str) -> list[str]:
+        """The component's own promises in the journal, oldest first."""
+        return [one.sentence for one in self.world.robots[robot].told if one.component and one.sentence.startswith("If ")]
+
     def journal(self, robot: str) -> list[str]:
         """The team's promises in the journal, oldest first."""
         said = (one.sentence for one in self.world.robots[robot].told if not one.component)
         return [sentence for sentence in said if "that vote" in sentence]
 
 
-def team(witnesses: int = 0, alone: WhenAlone = WhenAlone.RUN, robots: int = 2, servers: int = 0) -> Team:
-    specs = (ComponentSpec(PART, launch=Launch(("part",)), rules=Rules(when_alone=alone)),)
+def team(
+    witnesses: int = 0,
+    alone: WhenAlone = WhenAlone.RUN,
+    robots: int = 2,
+    servers: int = 0,
+    on_loss: OnLoss = OnLoss.TAKEOVER,
+) -> Team:
+    specs = (ComponentSpec(PART, launch=Launch(("part",)), rules=Rules(when_alone=alone, on_loss=on_loss)),)
     votes = robots + witnesses + servers > 2
     configs = elective(robots, specs, servers, witnesses) if votes else pair(specs)
     invariants = Invariants(safe={PART} if votes or alone is WhenAlone.FREEZE else set(), votes=votes)
@@ -149,6 +159,32 @@ def test_the_journal_has_the_promise_at_each_change() -> None:
     three.world.power_off("witness1")
     three.after(500)
     assert three.journal("robot1") == [*before, three.says("robot1")] and "hears 2 of 3" in three.says("robot1")
+
+
+def test_what_on_loss_holds_is_kept_for_the_return_and_is_told_apart_from_the_teams_promise() -> None:
+    two = team(on_loss=OnLoss.HOLD)
+    sentence = "If robot1 is lost, robot2 keeps its newest checkpoint until robot1 is back."
+    assert two.says_of_it("robot1") == sentence and seen_at(two.world, "robot1", PART).differs
+    assert two.story_of_it("robot1") == [sentence]
+    two.world.power_off("robot1")
+    assert two.after(2_000) == []
+    two.world.power_on("robot1")
+    assert two.after(2_000) == ["robot1"]
+
+
+def test_where_a_server_stands_by_it_gives_the_checkpoint_to_the_first_robot_that_can_run_it() -> None:
+    three = team(robots=2, servers=1)
+    assert not seen_at(three.world, "robot1", PART).differs and three.story_of_it("robot1") == []
+    three.world.power_off("robot2")
+    three.after(2_000)
+    sentence = "If robot1 is lost, server1 gives its newest checkpoint to the first robot that can run it."
+    assert three.says_of_it("robot1") == sentence and three.story_of_it("robot1") == [sentence]
+    value = three.world.values[three.world.robots["server1"].store[PART][-1]]
+    three.world.power_off("robot1")
+    three.world.new_disk("robot2", ballot=True)
+    three.world.power_on("robot2")
+    assert three.after(3_000) == ["robot2"]
+    assert three.world.robots["robot2"].programs[PART].value >= value
 
 
 def test_a_witness_votes_and_holds_nothing() -> None:

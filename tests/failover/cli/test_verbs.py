@@ -28,7 +28,7 @@ COMPONENT = {
     "snapshots": 41, "restores": 0, "crashes": 0, "exit_status": None, "reasons": [], "notes": [],
 }  # fmt: skip
 PEER = {
-    "name": "robot2", "state": "live", "last_heard_ms": 12, "beats_lost": 0, "lane": "connected", "notes": [],
+    "name": "robot2", "role": "witness", "state": "live", "last_heard_ms": 12, "beats_lost": 0, "lane": "connected", "notes": [],
 }  # fmt: skip
 STATUS = {
     "robot": "robot1", "team": "lab", "role": "robot", "pid": 4, "version": "0.1.0", "insecure": False,
@@ -74,7 +74,7 @@ def test_status_shows_the_team_as_a_tree_and_is_healthy(agent: Start) -> None:
     assert lines[0].split() == ["role", "state", "engine", "epoch", "lag", "freeze", "standby", "links"]
     assert lines[1].startswith("robot1 (here)")
     assert " ".join(lines[2].split()) == "└─ /lab/robot1/mapper primary running ptrace 3 98 ms 0.91 ms (max 1.40) robot2"
-    assert lines[3].split()[:2] == ["robot2", "live"]
+    assert lines[3].split()[:3] == ["robot2", "witness", "live"]
     assert "promise: If robot1 dies now, robot2 goes on." in lines
 
 
@@ -101,6 +101,17 @@ def test_a_program_that_has_stopped_committing_is_told_apart_in_words(agent: Sta
     assert ran.returncode == 0, "it runs, and its standby has what it committed"
     row = " ".join(ran.stdout.splitlines()[2].split())
     assert row == "└─ /lab/robot1/mapper primary running, last commit 14 s ago cooperative 3 14.3 s never robot2"
+
+
+def test_a_component_for_which_something_else_holds_has_a_promise_of_its_own(agent: Start) -> None:
+    told = {"promise": "If robot1 is lost, robot2 keeps it.", "promise_differs": True}
+    usual = COMPONENT | {"name": "/lab/robot1/other", "promise": "as ever", "promise_differs": False}
+    ran = failover("status", socket=agent(answering(STATUS | {"components": [COMPONENT | told, usual]})).path)
+    lines = [line for line in ran.stdout.splitlines() if line.startswith("promise")]
+    assert lines == [
+        "promise: If robot1 dies now, robot2 goes on.",
+        "promise for /lab/robot1/mapper: If robot1 is lost, robot2 keeps it.",
+    ]
 
 
 def test_an_ended_component_needs_no_standby(agent: Start) -> None:
