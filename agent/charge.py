@@ -405,6 +405,8 @@ class Charge:
 
     async def _capture(self, act: acts.Capture) -> None:
         component = self._present()
+        if act.hold:
+            self._is_thaw_owed = False  # a lease that comes meanwhile lets nothing run that is to be handed over
         captured = await component.capture(
             base=act.base, generation=act.generation, sequence=act.sequence, epoch=act.epoch, hold=act.hold
         )

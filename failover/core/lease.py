@@ -13,8 +13,8 @@ from failover.core.types import State
 TELL_SHARE = 4
 """The guard is told of a new lease when it is longer by this part of a lease: not for every beat. Less is not worth a thaw."""
 
-ACTING = frozenset({State.PRIMARY, State.STARTING, State.RECOVERING, State.TAKING_OVER})
-"""It runs here, or is about to: a restore may take longer than a lease."""
+ACTING = frozenset({State.PRIMARY, State.STARTING, State.RECOVERING, State.TAKING_OVER, State.HANDING_OVER})
+"""It runs here, or is about to: a restore may take longer than a lease, and so may the last snapshot of a handover."""
 
 RACE_SHARE = 16
 """What the guard knows counts as over this part of a lease early: a longer one could reach it too late."""
@@ -35,7 +35,7 @@ def watch(component: Component, turn: Turn) -> None:
         component.due_ns = turn.now_ns
         turn.order(acts.Thaw(component.name, component.epoch, component.lease_ns))
         turn.say(component, f"{turn.me} lets it run: it may act")
-    elif component.state in ACTING:
+    elif component.state in ACTING and not _has_given_way(component):
         _tell(component, turn)
 
 
@@ -76,6 +76,11 @@ def on_lease(component: Component, turn: Turn) -> bool:
 def _granted_ns(component: Component, turn: Turn, robot: str) -> int:
     peer = turn.team.peers.get(robot)
     return turn.team.lease_ns(robot) if peer is not None and grants(component, peer, turn.me) else 0
+
+
+def _has_given_way(component: Component) -> bool:
+    """Whether another robot may claim the component: this copy, which is held still, needs no lease any more."""
+    return component.handing is not None and component.handing.yielded
 
 
 def _may_thaw(component: Component, turn: Turn) -> bool:

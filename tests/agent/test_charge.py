@@ -31,6 +31,7 @@ class Told:
         self.runs = False
         self.refused = 0
         self.pid = 1
+        self.engine = "ptrace"
 
     async def lease(self, until_ns: int) -> None:
         self.lease_ns = until_ns
@@ -40,6 +41,9 @@ class Told:
 
     async def freeze(self) -> None:
         self.runs = False
+
+    async def capture(self, **_: object) -> None:
+        raise GuardError("it stands still by now, and nothing more is asked here")
 
     async def thaw(self) -> None:
         if self.lease_ns <= self.now_ns:
@@ -102,6 +106,16 @@ def test_a_thaw_that_waited_does_not_undo_a_later_freeze(tmp_path: Path) -> None
         charge.order(acts.Freeze(NAME, 3))
 
     assert not carried_out(orders, tmp_path).runs
+
+
+def test_a_lease_lets_nothing_run_whose_last_snapshot_before_a_handover_was_ordered(tmp_path: Path) -> None:
+    def orders(charge: Charge, guard: Told) -> None:
+        guard.now_ns = LATE_NS + 1
+        charge.order(acts.Thaw(NAME, 3, LATE_NS))
+        charge.order(acts.Capture(NAME, 3, False, 1, 1, hold=True))
+
+    guard = carried_out(orders, tmp_path)
+    assert (guard.runs, guard.lease_ns, guard.refused) == (False, NEWER_NS, 1)
 
 
 def test_a_takeover_that_what_waited_cannot_carry_out_starts_the_program_anew(

@@ -9,6 +9,7 @@ A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment. ``expect`` 
     100  run robot1                        an operator starts the component there
     500  cut robot1 robot2                 nothing passes, both ways;  one-way A B: from A to B;  mend: all cuts end
     600  stall robot1 300                  its loop gets no processor for 300 ms
+    600  slow robot1 40                    its disk and its captures take so many times as long
     700  exit robot1 0                     its program ends with this wait status (11: crash)
     800  handover robot1                   an operator moves it to the standby
     850  new-disk robot1                   its checkpoints are gone; what it has decided is not
@@ -87,6 +88,8 @@ class Story:
                 world.program_ends(robot, COMPONENT, int(arguments[1]))
             case "stall":
                 world.stall(robot, int(arguments[1]) * MS)
+            case "slow":
+                world.robots[robot].slow = float(arguments[1])
             case "cut":
                 world.network.cuts |= {(robot, arguments[1]), (arguments[1], robot)}
             case "one-way":

@@ -516,6 +516,9 @@ class World:
             if program is None or program.exit_status is not None:
                 self._feed(robot, CaptureFailed(name, act.epoch, "the program is gone"))
                 return
+            if not self.unfrozen(robot, name):
+                self._feed(robot, CaptureFailed(name, act.epoch, "its guard holds it still"))
+                return
             known = robot.keeper.get(name)
             may_be_unchanged = self.unchanged and known is not None and not act.base and not act.hold
             if known is not None and may_be_unchanged and self.random.random() < self.unchanged:

@@ -9,7 +9,7 @@ from failover.core import acts
 from failover.core.component import Component
 from failover.core.consent import STATES
 from failover.core.election import placing
-from failover.core.events import Captured, Received, Run, Started, Tick
+from failover.core.events import Captured, Handover, Received, Run, Started, Tick
 from failover.core.messages import FREE, Beat, Echo, Entry
 from failover.core.node import Node
 from failover.core.types import MS, Ballot, ComponentSpec, Config, Held, Launch, Record, Rule, Rules, State, WhenAlone
@@ -176,6 +176,33 @@ def test_a_primary_that_nobody_hears_stands_still() -> None:
     talk = running()
     talk.tick(ROBOT.lease_ms)
     assert talk.orders(acts.Freeze)
+
+
+def leases(talk: Talk) -> list[int]:
+    return [act.until_ns for act in talk.orders(acts.SetLease) if isinstance(act, acts.SetLease)]
+
+
+def test_a_primary_that_hands_over_renews_its_lease_until_it_has_given_way() -> None:
+    talk = running()
+    (first,) = talk.orders(acts.Ship)
+    assert isinstance(first, acts.Ship)
+    talk.hear("robot2", entry(State.STANDBY, 1, "robot1", first.position, "robot2"))
+    talk.readies.append(talk.node.step(Handover(2, NAME, "robot2"), talk.now_ns))
+    for _ in range(10):
+        talk.tick(20)
+        talk.hear("robot2", entry(State.STANDBY, 1, "robot1", first.position, "robot2"))
+    assert leases(talk)[-1] > talk.now_ns + ROBOT.lease_ns // 2
+    final = [act for act in talk.orders(acts.Capture) if isinstance(act, acts.Capture)][-1]
+    position = Position(final.generation, final.sequence, b"d")
+    talk.readies.append(talk.node.step(Captured(NAME, 1, position, first.position), talk.now_ns))
+    talk.hear("robot2", entry(State.STANDBY, 1, "robot1", position, "robot2"))
+    talk.tick(20)
+    assert final.hold and talk.said()[-1].yields_to == "robot2"
+    given = leases(talk)
+    for _ in range(10):
+        talk.tick(20)
+        talk.hear("robot2", entry(State.STANDBY, 1, "robot1", position, "robot2"))
+    assert leases(talk) == given
 
 
 def test_two_copies_that_stand_still_unelected_are_told_apart_by_what_was_acknowledged() -> None:
