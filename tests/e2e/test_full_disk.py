@@ -71,7 +71,8 @@ def test_a_full_standby_is_named_with_the_age_of_what_it_holds_and_mends_itself(
     for robot in pair:
         robots.until_status(robot, 0)
     robots.until(lambda: len(robots.numbers(first)) > before, "the program to have run on")
-    assert robots.numbers(first) == list(range(len(robots.numbers(first))))
+    counted = robots.numbers(first)
+    assert counted == list(range(len(counted)))
 
 
 def test_a_full_standby_takes_over_from_what_it_holds(pair: Pair) -> None:
