@@ -72,6 +72,14 @@ class Ballot:
         self._write(msgspec.structs.replace(self._record, boot=self._record.boot + 1))
         return self._record
 
+    def outlive(self, boot: int) -> None:
+        """Count lives from this one on: the team remembers it, and this file does not. The next `open` is the one after it.
+
+        Raises:
+            BallotError: it could not be written; the old record stands.
+        """
+        self._write(msgspec.structs.replace(self._record, boot=boot))
+
     def keep(self, core: bytes) -> None:
         """Make the core's record durable. Returns when it would survive a power cut.
 

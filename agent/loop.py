@@ -102,9 +102,13 @@ class Heart:
         self._newest_beat: dict[str, tuple[int, int]] = {}
         self._lost: Counter[str] = Counter()
         self._notes: tuple[str, ...] = ()
+        self._remembered = 0
 
-    def run(self) -> None:
+    def run(self) -> int:
         """Beat until SIGTERM or SIGINT. Components live on.
+
+        Returns:
+            0; or the life of this robot that the team remembers and its ballot does not: another one above it must begin.
 
         Raises:
             AgentError: the lanes cannot be started at all.
@@ -118,7 +122,10 @@ class Heart:
             if watchdog_ns and now_ns - fed_ns >= watchdog_ns and self._node is not None:
                 self._notifier.alive()
                 fed_ns = now_ns
+        if not self._remembered:
+            self._notifier.stopping()
         self._end()
+        return self._remembered
 
     def _begin(self) -> None:
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -189,10 +196,22 @@ class Heart:
             opened = self._hearing.open(frame)
             if isinstance(opened, Beat):
                 self._count(opened)
+                self._mind_earlier_lives(opened)
                 self._copies.heard(opened, link)
                 self._step(Received(opened, link, self._copies.take(opened.sender)))
             elif not self._copies.admit(opened, link, clock.now_ns()):
                 self._refused[str(opened.reason)] += 1
+
+    def _mind_earlier_lives(self, beat: Beat) -> None:
+        """A peer that remembers a later life of ours believes none of our beats: begin one above that."""
+        life = self._node.outlived_by(beat) if self._node is not None else 0
+        if life:
+            log.warning(
+                "%s remembers life %d of %s, and %s counts %d: its state directory is new, or an old copy, and what it voted and kept "
+                "since is lost; it begins again as life %d",
+                beat.sender, life, self._me, ballot_file.FILE_NAME, self._ballot.record.boot, life + 1
+            )  # fmt: skip
+            self._remembered, self._ending = life, True
 
     def _count(self, beat: Beat) -> None:
         """Note how long the peer was silent before this beat, and how many were lost in between."""
@@ -301,19 +320,19 @@ class Heart:
         return Told(question.number, now_ns, status, beats=counts, troubles=troubles)
 
     def _end(self) -> None:
-        self._notifier.stopping()
         self._lanes.send(Farewell())
         self._lanes.flush()
         self._persister.close(PERSIST_PATIENCE_S)
         self._scribe.close(PERSIST_PATIENCE_S)
         self._lanes.wait()
         self._beats.close()
+        self._poll.close()
         signal.set_wakeup_fd(-1)
         log.info("robot %s ends; its components live on", self._me)
 
 
 def beat(settings: Settings, notifier: Notifier) -> None:
-    """Live one life: from the ballot to the farewell.
+    """Live one life, from the ballot to the farewell; and another, if the team remembers a later one than the ballot.
 
     Raises:
         AgentError: what is needed to begin cannot be had.
@@ -327,7 +346,9 @@ def beat(settings: Settings, notifier: Notifier) -> None:
         ) from error
     ballot = ballot_file.Ballot(directory, settings.config.robot)
     ballot.open()
-    Heart(settings, ballot, notifier).run()
+    while remembered := Heart(settings, ballot, notifier).run():
+        ballot.outlive(remembered)
+        ballot.open()
 
 
 __all__ = ["Ballot", "Heart", "beat"]

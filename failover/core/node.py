@@ -68,6 +68,9 @@ LATE_NS = 5 * MS
 REST_NS = MS
 """Between two deadlines: what waits for somebody else is looked at again, but not without a pause."""
 
+LIVES_MAX = 1 << 40
+"""A peer that speaks of so many lives of this robot is not believed."""
+
 FAILBACK_PAUSE = 10
 """Of ``retry_ms``: how long a component stays before it goes back to the robot that is preferred, and between two tries."""
 
@@ -126,6 +129,15 @@ class Node:
         send = self._speak(turn)
         self._asked_ns = self._deadline_ns()
         return Ready(self._persist(), send, tuple(turn.acts), tuple(turn.said))
+
+    def outlived_by(self, beat: Beat) -> int:
+        """A life of this robot that the sender has heard and that is not an earlier one of ours; 0 for none.
+
+        Our ballot was lost, or is an old copy: whoever remembers that life believes none of our beats before a later one.
+        """
+        ours = (self._boot, self._speaker.counter)
+        lives = (echo.boot for echo in beat.echoes if echo.robot == self._config.robot and (echo.boot, abs(echo.counter)) > ours)
+        return next((life for life in lives if life < LIVES_MAX), 0)
 
     def next_deadline_ns(self) -> int:
         """The instant at which a Tick is due."""

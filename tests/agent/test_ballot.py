@@ -22,6 +22,13 @@ def test_what_was_kept_is_there_in_the_next_life_which_counts_one_more(tmp_path:
     assert second.record.core == b"epoch 7"
 
 
+def test_a_robot_that_the_team_remembers_better_counts_on_from_there(tmp_path: Path) -> None:
+    ballot = Ballot(tmp_path, "robot1")
+    ballot.open()
+    ballot.outlive(41)
+    assert ballot.open().boot == 42 and Ballot(tmp_path, "robot1").open().boot == 43
+
+
 @pytest.mark.parametrize("size_left", [0, 1, 20, -1])
 def test_a_ballot_that_was_cut_is_not_trusted(tmp_path: Path, size_left: int) -> None:
     ballot = Ballot(tmp_path, "robot1")

@@ -158,13 +158,18 @@ class RobotMachine:
 
         Frozen first, so that no one of them can notice that another has gone: to the outside it is silent from one instant on.
         """
+        count = self.freeze()
+        self.end()
+        return count
+
+    def freeze(self) -> int:
+        """Stop every process of the robot; returns how many there are."""
         frozen: set[int] = set()
         while fresh := set(self.processes()) - frozen:  # until no new one appears
             for pid in fresh:
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGSTOP)
             frozen |= fresh
-        self.end()
         return len(frozen)
 
     def end(self) -> None:

@@ -216,3 +216,21 @@ def test_every_state_can_be_reached_and_every_cause_is_used() -> None:
 def test_a_command_about_an_unknown_component_is_answered() -> None:
     (answer,) = Node(ALONE, 1, Ballot(), 0).step(Release(4, "/lab/z"), 0).act
     assert isinstance(answer, acts.Answer) and not answer.ok and "failover status" in answer.sentence
+
+
+@pytest.mark.parametrize(
+    ("echo", "remembered"),
+    [
+        (Echo("robot1", 3, 7), 0),
+        (Echo("robot1", 4, 0), 0),
+        (Echo("robot1", 4, 1_000), 4),
+        (Echo("robot1", 4, -1_000), 4),
+        (Echo("robot1", 9, 7), 9),
+        (Echo("robot3", 9, 7), 0),
+        (Echo("robot1", 1 << 60, 7), 0),
+    ],
+)
+def test_a_robot_finds_out_that_others_remember_a_life_that_its_ballot_does_not(echo: Echo, remembered: int) -> None:
+    node = Node(PAIR, 4, Ballot(), 0)
+    node.step(Tick(), 0)
+    assert node.outlived_by(Beat("robot2", 1, 1, 0, 0, 0, (echo,), ())) == remembered

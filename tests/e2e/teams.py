@@ -1,0 +1,86 @@
+"""A team of any members for a test: robots, servers and witnesses on this machine's loopback, with PIDs of their own where possible."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from failover.cli import keys
+from failover.cli.demo.robots import RobotMachine, Stage, free_ports, means
+from failover.client import team
+from failover.client.team import Robot, Role, Team
+from tests.e2e import robots
+
+TWO_AND_A_SERVER: Mapping[str, Role] = {"robot1": "robot", "robot2": "robot", "hall": "server"}
+
+
+class TeamStage(Stage):
+    """The members and the place where they stand; each can be cut off from its power and switched on again."""
+
+    def __init__(self, directory: Path, roles: Mapping[str, Role], settings: str = "") -> None:
+        super().__init__(directory, replace(means(), own_network=False), settings)
+        self._roles = roles
+        self.members: dict[str, RobotMachine] = {}
+
+    def start(self) -> None:
+        """Write keys and configuration, start all agents, wait until they answer and hear each other."""
+        self._write_team()
+        for name in self._roles:
+            self.switch_on(name)
+        robots.until(lambda: all(hears_all(member) for member in self.members.values()), "the team to hear each other")
+
+    def switch_on(self, name: str, *, empty: bool = False) -> RobotMachine:
+        """Start a member, with its disk as it was left or ``empty``; returns when its agent answers."""
+        if empty:
+            shutil.rmtree(self.directory / name / "state")
+        shutil.rmtree(self.directory / name / "run", ignore_errors=True)  # it does not outlive a reboot
+        member = self.members[name] = self.start_robot(name)
+        self.robots.append(member)
+        member.switch_on()
+        member.control().close()
+        return member
+
+    def cut_power(self, *names: str) -> None:
+        """Freeze these members and all that runs there, then kill them: neither sees the other one go."""
+        for name in names:
+            self.members[name].freeze()
+        for name in names:
+            self.members[name].end()
+
+    def _write_team(self) -> None:
+        ports = free_ports(2 * len(self._roles))
+        members = Team("demo")
+        for index, (name, role) in enumerate(self._roles.items()):
+            public, secret = keys.new_pair()
+            directory = self.directory / name / "team"
+            directory.mkdir(parents=True)
+            team.write_secret_key(directory, name, secret)
+            beats, bulk = (f"127.0.0.1:{port}" for port in ports[2 * index : 2 * index + 2])
+            members = team.enrol(members, name, Robot((beats,), bulk, role, public))
+        for name in self._roles:
+            team.write(self.directory / name / "team", members)
+
+
+def hears_all(member: RobotMachine) -> bool:
+    """Whether it hears everybody, is heard by everybody, and can send snapshots."""
+    peers = member.status()["peers"]
+    return all(peer["state"] == "live" and peer["hears_us"] and peer["lane"] == "connected" for peer in peers)
+
+
+@contextmanager
+def acting(directory: Path, roles: Mapping[str, Role] = TWO_AND_A_SERVER, settings: str = "") -> Iterator[TeamStage]:
+    """A team of these members, beating and connected."""
+    with TeamStage(directory / "stage", roles, settings) as stage:
+        stage.directory.mkdir()
+        try:
+            stage.start()
+            yield stage
+            for member in stage.members.values():
+                assert not robots.mistake(member), f"a mistake in the agent of {member.name}:\n{robots.mistake(member)}"
+        finally:
+            for member in stage.members.values():  # shown by pytest where a test fails
+                lines = member.log.read_text(errors="replace").splitlines() if member.log.exists() else []
+                print(f"--- {member.name} said:", *lines[-robots.LOG_LINES :], sep="\n")
