@@ -59,6 +59,7 @@ class Surroundings:
     Attributes:
         tell: passes an event to the core.
         silence_ns: how long the robot that the component is taken over from has been silent, as far as known; for the outage.
+        settled: returns once no snapshot of a component is being stored any more.
         here: what this robot's operator wants for a component.
         hooks: runs his commands.
     """
@@ -68,6 +69,7 @@ class Surroundings:
     records: Records
     tell: Callable[[Event], None]
     silence_ns: Callable[[str], Coroutine[Any, Any, int]]
+    settled: Callable[[str], Coroutine[Any, Any, None]]
     here: Callable[[str], ComponentConfig]
     hooks: Hooks = field(default_factory=Hooks)
 
@@ -252,6 +254,7 @@ class Charge:
         adopted = self.component is not None
         self.around.records.note(self.name, act.epoch)
         if self.component is None:
+            await self.around.settled(self.name)
             if not act.spec.launch.pid:
                 await self._hook("before_start", act.spec, self._occasion(act.epoch, hooks.STARTED))
             self.component = await self._begun(act.spec.launch, act.epoch)
@@ -285,6 +288,7 @@ class Charge:
         began_ns, laps = clock.now_ns(), clock.Laps()
         silent_ns = await self.around.silence_ns(self.name)
         await self._stop()
+        await self.around.settled(self.name)
         laps.lap("asking and clearing away")
         descriptors = await asyncio.to_thread(self.around.store.open_chain, self.name, act.position)
         laps.lap(f"opening {len(descriptors)} snapshots")

@@ -80,6 +80,14 @@ class Deposit:
         keeps_state = snapshot.engine == COOPERATIVE
         self._tell(Stored(offer.component, offer.epoch, snapshot.position, peer, offer.spec, keeps_state))
 
+    async def settled(self, component: str) -> None:
+        """Return once no snapshot of it is being stored: from then on a guard writes its output here.
+
+        The core has ordered that nobody's are taken any more; what waits for its turn is refused.
+        """
+        async with self._turns.setdefault(component, asyncio.Lock()):
+            pass
+
     def mend_logs(self, running: Collection[str]) -> None:
         """Bring each stream as far as the newest checkpoint says: an earlier life, or a power cut, may have come in between.
 

@@ -138,8 +138,9 @@ class Lanes:
         store = await self._open_store()
         records = Records(self._runtime / "running")
         hooks, here = Hooks(self._starter), self.settings.component
-        self._around = Surroundings(self.places, store, records, self.tell, self._silence_ns, here, hooks)
         self._deposit = Deposit(store, self.places, self.tell, self._stored)
+        settled = self._deposit.settled
+        self._around = Surroundings(self.places, store, records, self.tell, self._silence_ns, settled, here, hooks)
         self._dispatch = Dispatch(store, self._shipper, self.tell, self._links.hindrance)
         self._receiver = Receiver(self._lane, self._store_path, self._deposit)
         found = await self._find_guards(records)

@@ -92,6 +92,7 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     component.ordered = False
     component.crashed, component.reason = 0, ""
     component.lease_ns = component.told_ns = 0
+    admit(component, turn, "")
     open_line(component, turn)
     start = "its newest checkpoint" if plan else "the beginning"
     turn.say(component, f"{turn.me} claims epoch {component.epoch}, to run it from {start}: {why}")
@@ -350,7 +351,7 @@ def _heard_later_epoch(component: Component, turn: Turn, sender: str, entry: Ent
 
 
 def admit(component: Component, turn: Turn, sender: str, epoch: int | None = None) -> None:
-    """Take snapshots from this robot, of the present epoch (or of that one), and from nobody else."""
+    """Take snapshots from this robot, of the present epoch (or of that one), and from nobody else; "": from nobody at all."""
     wanted = (sender, component.epoch if epoch is None else epoch)
     if component.admitted != wanted and turn.config.keeps(turn.me):
         component.admitted = wanted

@@ -57,9 +57,8 @@ def carried_out(orders: Callable[[Charge, Told], Any], directory: Path) -> Told:
     guard = Told()
 
     async def run() -> None:
-        around = Surroundings(
-            cast(Any, None), cast(Any, None), Records(directory), lambda _: None, cast(Any, None), cast(Any, None)
-        )
+        none = cast(Any, None)
+        around = Surroundings(none, none, Records(directory), lambda _: None, none, none, none)
         charge = Charge(NAME, around, cast(Component, guard), epoch=3)
         orders(charge, guard)
         charge.begin()
@@ -141,7 +140,7 @@ def test_a_takeover_that_what_waited_cannot_carry_out_starts_the_program_anew(
     monkeypatch.setattr(Standby, "take", lambda _: waiting)
 
     async def run() -> None:
-        charge = Charge(NAME, Surroundings(nothing, nothing, Records(tmp_path), lambda _: None, nothing, nothing))
+        charge = Charge(NAME, Surroundings(nothing, nothing, Records(tmp_path), lambda _: None, nothing, nothing, nothing))
         assert await charge._resumed(acts.Restore(NAME, 3, Position(1, 1, b"d"), None), [], 7, Laps()) == (anew, 7)
         assert tried == [waiting, None]
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import pytest
 
 from checkpoint.model import Position
 from failover.core import acts, ballot
 from failover.core.component import TABLE, Cause
+from failover.core.consent import STATES
 from failover.core.events import (
     Captured,
     CaptureFailed,
@@ -16,6 +19,7 @@ from failover.core.events import (
     Release,
     Run,
     Started,
+    Stored,
     Tick,
     Unchanged,
 )
@@ -26,6 +30,7 @@ from failover.core.types import MS, Ballot, ComponentSpec, Config, Held, Launch,
 from failover.errors import RulesError
 
 SPEC = ComponentSpec("/lab/x", launch=Launch(("x",)))
+A = TypeVar("A", bound=acts.Act)
 ALONE = Config("robot1", grace_ms=300)
 PAIR = Config("robot1", ("robot2",), grace_ms=300)
 
@@ -36,7 +41,7 @@ def running(node: Node, spec: ComponentSpec = SPEC) -> acts.Ready:
     return node.step(Started(spec.name, 1), 1 * MS)
 
 
-def only(ready: acts.Ready, kind: type[acts.Act]) -> list[acts.Act]:
+def only(ready: acts.Ready, kind: type[A]) -> list[A]:
     return [act for act in ready.act if isinstance(act, kind)]
 
 
@@ -185,6 +190,19 @@ def test_a_restarted_robot_does_not_start_anew_what_it_gave_away() -> None:
     node = Node(PAIR, 2, Ballot((record,)), 0, (Held("/lab/x", (Position(192, 5, b"d"),)),))
     ready = node.step(Tick(), 100 * MS)
     assert not only(ready, acts.Restore) and not only(ready, acts.Start)
+
+
+def test_who_takes_a_component_over_takes_no_more_snapshots_of_it() -> None:
+    """A robot that stood still in the middle of sending one goes on with that when it wakes up."""
+    node, position = Node(PAIR, 1, Ballot(), 0), Position(65, 1, b"d")
+    entry = Entry(SPEC.name, STATES.index(State.PRIMARY), 1, "robot2", standby="robot1")
+    heard = node.step(Received(Beat("robot2", 1, 1, 1, 0, 1, (Echo("robot1", 1, 1),), (entry,)), "wire"), 10 * MS)
+    assert [(act.sender, act.epoch) for act in only(heard, acts.Admit)] == [("robot2", 1)]
+    node.step(Stored(SPEC.name, 1, position, "robot2", SPEC), 20 * MS)
+    ordered = [act for at in range(30, 2_000, 10) for act in node.step(Tick(), at * MS).act]
+    kinds = [type(act) for act in ordered if isinstance(act, acts.Admit | acts.Restore)]
+    assert kinds == [acts.Admit, acts.Restore]
+    assert acts.Admit(SPEC.name, 2, "") in ordered
 
 
 def test_an_entry_from_before_the_last_change_is_not_acted_on() -> None:
