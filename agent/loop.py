@@ -61,6 +61,11 @@ LANES_TRIES: Final = 5
 
 STARTED: Final = "protecting this robot and its neighbours"
 
+OUTLIVED: Final = (
+    "%s remembers life %d of %s, and %s counts %d: its state directory is new, or an old copy. What it voted and kept since is "
+    "lost; it begins again as life %d"
+)
+
 log = logging.getLogger("failover.heart")
 
 
@@ -206,11 +211,8 @@ class Heart:
         """A peer that remembers a later life of ours believes none of our beats: begin one above that."""
         life = self._node.outlived_by(beat) if self._node is not None else 0
         if life:
-            log.warning(
-                "%s remembers life %d of %s, and %s counts %d: its state directory is new, or an old copy, and what it voted and kept "
-                "since is lost; it begins again as life %d",
-                beat.sender, life, self._me, ballot_file.FILE_NAME, self._ballot.record.boot, life + 1
-            )  # fmt: skip
+            told = (beat.sender, life, self._me, ballot_file.FILE_NAME, self._ballot.record.boot, life + 1)
+            log.warning(OUTLIVED, *told)
             self._remembered, self._ending = life, True
 
     def _count(self, beat: Beat) -> None:

@@ -1,4 +1,4 @@
-"""A team of any members for a test: robots, servers and witnesses on this machine's loopback, with PIDs of their own where possible."""
+"""A team of any members for a test: robots, servers and witnesses on this machine's loopback, each with PIDs of its own."""
 
 from __future__ import annotations
 
