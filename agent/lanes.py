@@ -317,8 +317,8 @@ class Lanes:
         log.info("%s to %s: %s%s", lane, peer, state, f": {reason}" if reason else "")
         had_words = self._ways.carried_words(way, peer, state)
         if state is LinkState.CONNECTED:
-            key, config = self._ways.beat_key(peer), self.settings.config
-            self._ways.answer(way, peer, Hello(VERSION, self.settings.team.team, config.robot, self._life.boot, key))
+            key = self._ways.beat_key(peer)
+            self._greet(way, peer, key)
             self._say(SpeakKey(peer, key))
             return
         if way == BULK:
@@ -376,7 +376,7 @@ class Lanes:
             reason = f"{peer} belongs to team {hello.team!r}, this robot to {self.settings.team.team!r}"
         elif len(hello.beat_key) < KEY_SIZE_MIN:
             reason = f"{peer} sent a beat key of {len(hello.beat_key)} bytes; install the same release on both"
-        if way == BULK:
+        if way == BULK and not hello.again:
             self._receiver.lost(peer)  # a new connection: what was half here stays half
         if reason:
             self._incompatible[peer] = reason
@@ -385,6 +385,13 @@ class Lanes:
             return
         self._incompatible.pop(peer, None)
         self._say(HearKey(peer, hello.beat_key))
+        if self._ways.is_new_key(way, peer, hello.beat_key) and self._ways.present_key(peer):
+            # Whoever lost its power ended no connection: ours to it seems to stand, and is refused at the first word.
+            self._greet(way, peer, self._ways.present_key(peer), again=True)
+
+    def _greet(self, way: int, peer: str, key: bytes, *, again: bool = False) -> None:
+        config = self.settings.config
+        self._ways.answer(way, peer, Hello(VERSION, self.settings.team.team, config.robot, self._life.boot, key, again))
 
     def _stored(self, component: str, snapshot: Snapshot, size: int) -> None:
         self.charge(component).figures.stored(snapshot.position, size, snapshot.engine)

@@ -46,6 +46,7 @@ class Ways:
         self.troubles: list[str] = []
         self._connected: set[tuple[int, str]] = set()
         self._beat_keys: dict[str, bytes] = {}
+        self._their_keys: dict[tuple[int, str], bytes] = {}
         self._lanes: list[BulkLane] = []
         name = settings.config.robot
         bulks = {peer: robot.bulk for peer, robot in settings.peers.items()}
@@ -109,11 +110,21 @@ class Ways:
         return f"the bulk lane is {link.state}" + (f", {link.reason}" if link.reason else "")
 
     def beat_key(self, peer: str) -> bytes:
-        """The key that our beats to a peer are sealed with: a fresh one with the first connection, told again on any further."""
+        """The key for our beats to a peer on a new connection: a fresh one with the first, told again on any further."""
         connected = sum(_is_connected(lane, peer) for lane in self._lanes)
         if connected <= 1 or peer not in self._beat_keys:
             self._beat_keys[peer] = secrets.token_bytes(BEAT_KEY_SIZE)
         return self._beat_keys[peer]
+
+    def present_key(self, peer: str) -> bytes:
+        """The key that our beats to a peer are sealed with; empty before the first connection."""
+        return self._beat_keys.get(peer, b"")
+
+    def is_new_key(self, way: int, peer: str, key: bytes) -> bool:
+        """Whether a peer greets with another key than it did last on this way: then it has begun anew, and knows none of ours."""
+        known = self._their_keys.get((way, peer))
+        self._their_keys[way, peer] = key
+        return known != key
 
 
 def further_links(settings: Settings) -> list[tuple[str, dict[str, str]]]:

@@ -117,6 +117,7 @@ class Hello(msgspec.Struct, frozen=True, tag="hello"):
     Attributes:
         boot: start count of the sender's agent.
         beat_key: random bytes of this life; the sender's beats to this receiver are sealed with it from now on.
+        again: on a connection that stands, because the receiver has begun anew; what is under way on it goes on.
     """
 
     version: int
@@ -124,6 +125,7 @@ class Hello(msgspec.Struct, frozen=True, tag="hello"):
     robot: str
     boot: int
     beat_key: bytes = b""
+    again: bool = False
 
 
 class Goodbye(msgspec.Struct, frozen=True, tag="goodbye"):
