@@ -380,7 +380,22 @@ ELECTIVE_MUTANTS: tuple[Mutant, ...] = (
 """Mistakes that lives of voting teams catch."""
 
 
-NEAR: dict[str, int] = {"no_margin": 99, "anybody_may_have_it": 89, "nobody_needs_the_right": 76}
+NEAR: dict[str, int] = {
+    "nobody_needs_the_right": 62,
+    "no_base_for_the_lost": 12,
+    "double_voting": 22,
+    "no_margin": 99,
+    "disloyal_voter": 19,
+    "anybody_may_have_it": 32,
+    "named_in_advance": 132,
+    "best_lease_counts": 19,
+    "lease_from_strangers": 52,
+    "votes_with_a_copy": 22,
+    "claims_for_ever": 22,
+    "proud_primary": 11,
+    "generous_lease": 11,
+    "runs_the_finished": 52,
+}
 """The first seed that catches a mistake, where that is a late one: it is tried first."""
 
 
