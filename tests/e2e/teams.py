@@ -33,14 +33,17 @@ class TeamStage(Stage):
         robots.until(lambda: all(hears_all(member) for member in self.members.values()), "the team to hear each other")
 
     def switch_on(self, name: str, *, empty: bool = False) -> RobotMachine:
-        """Start a member, with its disk as it was left or ``empty``; returns when its agent answers."""
+        """Start a member, with its disk as it was left or ``empty``; returns when its agent answers.
+
+        An empty one must find somebody who remembers it: it answers in the life that it begins then.
+        """
         if empty:
             shutil.rmtree(self.directory / name / "state")
         shutil.rmtree(self.directory / name / "run", ignore_errors=True)  # it does not outlive a reboot
         member = self.members[name] = self.start_robot(name)
         self.robots.append(member)
         member.switch_on()
-        member.control().close()
+        robots.until(lambda: lives(member) > int(empty), f"{name} to answer")
         return member
 
     def cut_power(self, *names: str) -> None:
@@ -62,6 +65,14 @@ class TeamStage(Stage):
             members = team.enrol(members, name, Robot((beats,), bulk, role, public))
         for name in self._roles:
             team.write(self.directory / name / "team", members)
+
+
+def lives(member: RobotMachine) -> int:
+    """In which life its agent is; 0 while it does not answer."""
+    try:
+        return int(member.status()["life"])
+    except robots.NO_ANSWER:
+        return 0
 
 
 def hears_all(member: RobotMachine) -> bool:
