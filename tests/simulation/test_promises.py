@@ -8,7 +8,7 @@ from failover.core import acts
 from failover.core.events import Handover, Promote
 from failover.core.types import MS, ComponentSpec, Launch, OnLoss, Rules, State, WhenAlone
 from tests.simulation.invariants import Invariants, seen_at, state_at
-from tests.simulation.world import World, elective, pair
+from tests.simulation.world import Watcher, World, elective, pair
 
 PART = "/team/part"
 SETTLED_NS = 2_000 * MS
@@ -61,17 +61,22 @@ def team(
     configs = elective(robots, specs, servers, witnesses) if votes else pair(specs)
     invariants = Invariants(safe={PART} if votes or alone is WhenAlone.FREEZE else set(), votes=votes)
     seen: list[str] = []
-
-    def watch(world: World, robot: str, what: object) -> None:
-        if isinstance(what, acts.KeepAside):
-            seen.append(robot)
-
-    world = World(1, configs, (invariants, watch))
+    world = World(1, configs, (invariants, kept_aside_at(seen)))
     for name in world.robots:
         world.power_on(name)
     world.run(SETTLED_NS)
     assert world.acting(PART) == ["robot1"] and seen_at(world, "robot1", PART).standby == "robot2"
     return Team(world, invariants, seen)
+
+
+def kept_aside_at(robots: list[str]) -> Watcher:
+    """Notes every robot that keeps a copy's state aside."""
+
+    def watch(_: World, robot: str, what: object) -> None:
+        if isinstance(what, acts.KeepAside):
+            robots.append(robot)
+
+    return watch
 
 
 # rule = "pair"
@@ -99,6 +104,34 @@ def test_when_they_meet_again_the_higher_epoch_goes_on_and_the_losers_state_is_k
     two.world.network.cuts.clear()
     assert two.after(300) == ["robot2"]
     assert two.aside == ["robot1"] and state_at(two.world, "robot1", PART) is State.STANDBY
+
+
+def test_of_two_that_claimed_the_same_epoch_the_lesser_name_goes_on_and_the_others_state_is_kept_aside() -> None:
+    specs = (ComponentSpec(PART, launch=Launch(("part",))),)
+    aside: list[str] = []
+    world = World(1, pair(specs), (kept_aside_at(aside),))
+    world.network.cuts = {("robot1", "robot2"), ("robot2", "robot1")}
+    for name in ("robot2", "robot1"):
+        world.power_on(name)
+        world.run(world.now_ns + 300 * MS)
+    world.run(SETTLED_NS)
+    assert world.acting(PART) == ["robot1", "robot2"]
+    assert seen_at(world, "robot1", PART).epoch == seen_at(world, "robot2", PART).epoch == 1
+    world.network.cuts.clear()
+    world.run(world.now_ns + 300 * MS)
+    assert world.acting(PART) == ["robot1"] and aside == ["robot2"]
+
+
+def test_the_team_of_two_says_its_rule_and_its_promise_in_one_sentence_each() -> None:
+    two = team()
+    node = two.world.robots["robot1"].node
+    assert node is not None
+    status = node.status(two.world.local(two.world.robots["robot1"]))
+    assert status.rule == "pair" and status.promise.count(".") == 1 and status.promise.endswith(".")
+    promises = [one.promise for one in status.components]
+    assert promises == [
+        "If robot1 is silent for 170 ms, robot2 runs it; it may run twice if both live on and cannot hear each other."
+    ]
 
 
 def test_except_where_when_alone_is_freeze_there_it_stands_still_here_first() -> None:
@@ -198,44 +231,6 @@ def test_a_server_holds_what_was_acknowledged_besides_the_standby() -> None:
     three.after(500)
     held = {name: robot.store[PART][-1].sequence for name, robot in three.world.robots.items()}
     assert held["robot1"] - held["server1"] <= 2 and held["robot1"] - held["robot2"] <= 1
-
-
-def test_two_robots_that_protect_each_other_are_cut_in_turn_and_both_components_live_on() -> None:
-    names = ("/team/a", "/team/b")
-    specs = tuple(
-        ComponentSpec(name, launch=Launch(("part",)), rules=Rules(prefer=f"robot{number + 1}"))
-        for number, name in enumerate(names)
-    )
-    world = World(1, elective(2, specs, servers=1), (Invariants(safe=set(names), votes=True),))
-    for name in world.robots:
-        world.power_on(name)
-    world.run(4_000 * MS)
-    assert [world.acting(name) for name in names] == [["robot1"], ["robot2"]]
-    for lost, other in (("robot1", "robot2"), ("robot2", "robot1")):
-        world.power_off(lost)
-        world.run(world.now_ns + 1_000 * MS)
-        assert [world.acting(name) for name in names] == [[other], [other]]
-        world.power_on(lost)
-        world.run(world.now_ns + 4_000 * MS)
-        assert [world.acting(name) for name in names] == [["robot1"], ["robot2"]]
-
-
-def test_both_are_dead_one_is_back_with_a_new_disk_and_the_server_returns_both_components() -> None:
-    names = ("/team/a", "/team/b")
-    specs = tuple(ComponentSpec(name, launch=Launch(("part",))) for name in names)
-    world = World(1, elective(2, specs, servers=1, patience_ms=1_000))
-    for name in world.robots:
-        world.power_on(name)
-    world.run(SETTLED_NS)
-    values = {name: world.values[world.robots["server1"].store[name][-1]] for name in names}
-    world.power_off("robot2")
-    world.power_off("robot1")
-    world.new_disk("robot2", ballot=True)
-    world.run(world.now_ns + 500 * MS)
-    world.power_on("robot2")
-    world.run(world.now_ns + 3_000 * MS)
-    assert [world.acting(name) for name in names] == [["robot2"], ["robot2"]]
-    assert all(world.robots["robot2"].programs[name].value >= values[name] for name in names)
 
 
 def test_a_handover_at_a_robot_with_an_older_checkpoint_is_refused_and_a_promotion_is_obeyed() -> None:

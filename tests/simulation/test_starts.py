@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import permutations
 from random import Random
 
 import pytest
 
 from failover.core.names import weight
-from failover.core.types import MS, ComponentSpec, Config, Launch, Rule
-from tests.simulation.invariants import Invariants
+from failover.core.types import MS, ComponentSpec, Config, Launch, Rule, State
+from tests.simulation.invariants import Invariants, seen_at, state_at
 from tests.simulation.world import World, pair
 
 SPEC = ComponentSpec("/team/part", launch=Launch(("part",)))
@@ -17,7 +18,8 @@ STARTS = 1_000
 BLOCK = 250
 DECIDED_NS = 1_500 * MS
 
-STEMS = ("robot", "Robot", "Робот", "робот", "机器人", "ロボット", "ρομπότ", "r2-unit-", "ROBOT")
+STEMS = ("robot", "Robot", "Робот", "робот", "Rоbоt", "робот-r", "机器人", "ロボット", "ρομπότ", "r2-unit-", "ROBOT")
+"""Also of two alphabets in one name: the fifth has two Cyrillic letters."""
 DIGITS = ("0123456789", "٠١٢٣٤٥٦٧٨٩", "０１２３４５６７８９")
 
 
@@ -64,6 +66,25 @@ def test_robot2_runs_it_and_not_robot10(rule: Rule) -> None:
     names = ("robot10", "robot2") if rule is Rule.PAIR else ("robot10", "robot2", "robot33")
     configs = [replace(config, rule=rule) for config in pair((SPEC,), names)]
     assert started(1, configs).acting(SPEC.name) == ["robot2"]
+
+
+@pytest.mark.parametrize("order", [*permutations(("robot1", "robot2", "robot3"))], ids="-".join)
+@pytest.mark.parametrize("rule", list(Rule))
+def test_in_any_order_of_arrival_the_first_that_may_act_stays_and_the_late_comers_protect_it(
+    rule: Rule, order: tuple[str, ...]
+) -> None:
+    world = World(1, [replace(config, rule=rule) for config in pair((SPEC,), tuple(sorted(order)))])
+    first = order[0] if rule is Rule.PAIR else min(order[:2])
+    for name in order:
+        world.power_on(name)
+        world.run(world.now_ns + 2_000 * MS)
+        enough = rule is Rule.PAIR or name != order[0]
+        assert world.acting(SPEC.name) == ([first] if enough else [])
+    standby = seen_at(world, first, SPEC.name).standby
+    assert {one: state_at(world, one, SPEC.name) for one in order if one != first} == dict.fromkeys(
+        sorted({*order} - {first}), State.STANDBY
+    )
+    assert standby in {*order} - {first}
 
 
 @pytest.mark.parametrize("rule", list(Rule))
