@@ -1,0 +1,117 @@
+"""A program dies at a robot that lives: resumed where it stood, then from one checkpoint before, then left with its reason."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import pytest
+
+from checkpoint.model import Position
+from failover.core import acts
+from failover.core.types import MS, ComponentSpec, Launch, OnCrash, Rule, Rules, State
+from tests.simulation.invariants import seen_at, state_at
+from tests.simulation.world import World, elective, pair
+
+PART = "/team/part"
+CRASH = 11
+
+
+@dataclass(slots=True)
+class Fate:
+    """A world whose ``/team/part`` runs at robot1, protected by robot2. ``resumed``: from which positions, at which robots."""
+
+    world: World
+    resumed: list[tuple[str, Position]] = field(default_factory=list)
+
+    def crash(self) -> None:
+        self.world.program_ends("robot1", PART, CRASH)
+        self.after(300)
+
+    def after(self, ms: int) -> None:
+        self.world.run(self.world.now_ns + ms * MS)
+
+    def kept(self, robot: str) -> list[Position]:
+        return self.world.robots[robot].store[PART]
+
+    def positions(self) -> list[Position]:
+        """What robot1 can go on from, oldest first."""
+        return list(reversed(seen_at(self.world, "robot1", PART).positions))
+
+    def notes(self) -> str:
+        return "; ".join(seen_at(self.world, "robot1", PART).notes)
+
+
+def team(rule: Rule, rules: Rules) -> Fate:
+    specs = (ComponentSpec(PART, launch=Launch(("part",)), rules=rules),)
+    resumed: list[tuple[str, Position]] = []
+
+    def watch(_: World, robot: str, what: object) -> None:
+        if isinstance(what, acts.Restore):
+            resumed.append((robot, what.position))
+
+    world = World(1, elective(2, specs, witnesses=1) if rule is Rule.MAJORITY else pair(specs), (watch,))
+    for name in world.robots:
+        world.power_on(name)
+    world.run(2_000 * MS)
+    assert world.acting(PART) == ["robot1"]
+    return Fate(world, resumed)
+
+
+@pytest.mark.parametrize("rule", list(Rule))
+def test_a_crash_is_resumed_where_it_stood_then_from_one_checkpoint_before_then_not_again(rule: Rule) -> None:
+    fate = team(rule, Rules(crash_limit=2))
+    for nth in (1, 2, 3):
+        before = fate.positions()
+        fate.crash()
+        robot, position = fate.resumed[-1]
+        assert (robot, position) == ("robot1", before[-1 if nth <= 2 else -2])
+        assert fate.world.acting(PART) == ["robot1"]
+    fate.crash()
+    assert len(fate.resumed) == 3 and fate.world.acting(PART) == []
+    assert "4 crashes in 60 s; look at its logs" in fate.notes()
+    fate.after(5_000)
+    states = {name: state_at(fate.world, name, PART) for name in fate.world.robots}
+    assert {*states.values()} == {State.FAILED} and fate.world.acting(PART) == []
+
+
+@pytest.mark.parametrize("rule", list(Rule))
+def test_a_program_that_fails_for_good_loses_no_checkpoint(rule: Rule) -> None:
+    fate = team(rule, Rules(crash_limit=1))
+    for _ in range(3):
+        fate.crash()
+    assert state_at(fate.world, "robot1", PART) is State.FAILED
+    fate.after(5_000)
+    positions = fate.positions()
+    assert len(positions) > 1 and {*positions} <= {*fate.kept("robot1")} and fate.kept("robot2")
+
+
+@pytest.mark.parametrize("rule", list(Rule))
+def test_crashes_outside_the_window_are_forgiven(rule: Rule) -> None:
+    fate = team(rule, Rules(crash_limit=1, crash_window_ms=1_000))
+    for _ in range(6):
+        fate.crash()
+        fate.after(1_200)
+        assert fate.world.acting(PART) == ["robot1"]
+
+
+@pytest.mark.parametrize("rule", list(Rule))
+def test_on_crash_leave_leaves_it_and_says_so(rule: Rule) -> None:
+    fate = team(rule, Rules(on_crash=OnCrash.LEAVE))
+    fate.crash()
+    assert fate.world.acting(PART) == [] and not fate.resumed
+    assert "it died by signal 11; on_crash = leave" in fate.notes()
+
+
+@pytest.mark.parametrize("rule", list(Rule))
+def test_a_crash_loop_does_not_wander_from_robot_to_robot_for_ever(rule: Rule) -> None:
+    """Its robot dies in the middle of the loop: the next one counts its own crashes, and stops as well."""
+    fate = team(rule, Rules(crash_limit=1))
+    fate.crash()
+    fate.crash()
+    fate.world.power_off("robot1")
+    fate.after(500)
+    assert fate.world.acting(PART) == ["robot2"]
+    for _ in range(3):
+        fate.world.program_ends("robot2", PART, CRASH)
+        fate.after(300)
+    assert state_at(fate.world, "robot2", PART) is State.FAILED and len(fate.resumed) <= 2 * 3
