@@ -29,7 +29,7 @@ from checkpoint.engines.cooperative import age_ns as commit_age_ns
 from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Credentials
-from checkpoint.task_channel import HANDED_OVER, RESTARTED, TAKEN_OVER, Origin
+from checkpoint.task_channel import Origin
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +174,7 @@ async def begin_again(
     outage_ns: int,
     owner: int,
     epoch: int,
-    is_planned: bool = False,
+    why: str,
     waiting: Component | None = None,
 ) -> Component:
     """Prepare a program that keeps its state to go on from a chain of the cooperative engine; `resume` lets it.
@@ -182,7 +182,7 @@ async def begin_again(
     Whatever fails, and whoever dies before `resume`: nothing of it is left.
 
     Args:
-        is_planned: nothing was lost: somebody ordered it here.
+        why: one of `checkpoint.task_channel.REASONS`.
         waiting: the program, started to wait (`start_to_wait`); None: `resume` starts it.
 
     Raises:
@@ -199,7 +199,6 @@ async def begin_again(
     except (CheckpointError, GuardError, KeeperLostError):
         await component.undo()
         raise
-    why = why_here(outline.machine.robot, places, is_planned=is_planned)
     age_ns = outage_ns + commit_age_ns(outline)
     origin = Origin(outline.machine.robot, filled.position.generation, why, age_ns)
     totals = total_of(outline.output)
@@ -230,11 +229,6 @@ def _check_owner(name: str, program: Program, owner: int) -> None:
     if owner not in (ROOT, inherited):
         reason = f"it is to run as uid {inherited}, which is not its owner, uid {owner}; start it as that user"
         raise MismatchError(f"cannot restore {name}: {reason}", (reason,))
-
-
-def why_here(source: str, places: Places, *, is_planned: bool) -> str:
-    """Why a component goes on at this robot whose checkpoint was made at ``source``."""
-    return RESTARTED if source == places.robot else HANDED_OVER if is_planned else TAKEN_OVER
 
 
 async def reconnect(socket_path: Path, places: Places) -> Component:

@@ -37,7 +37,6 @@ from checkpoint.errors import CheckpointError, NothingCommittedError, RestoreErr
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Position
 from checkpoint.store import Store
-from checkpoint.task_channel import TAKEN_OVER
 from failover.core import acts, events
 from failover.core.acts import Act
 from failover.core.events import Event
@@ -294,7 +293,7 @@ class Charge:
         laps.lap(f"opening {len(descriptors)} snapshots")
         try:
             outage_ns, read_ns = clock.age_ns(descriptors[-1]), clock.now_ns()
-            occasion = await self._prepared(act, descriptors[-1], outage_ns, is_lost=silent_ns > 0)
+            occasion = await self._prepared(act, descriptors[-1], outage_ns)
             laps.lap("preparing")
             component, age_ns = await self._resumed(act, descriptors, outage_ns, laps)
         finally:
@@ -318,11 +317,8 @@ class Charge:
     def _occasion(self, epoch: int, why: str, source: str = "", age_ns: int = 0) -> Occasion:
         return Occasion(self.name, self.around.places.robot, epoch, why, source, age_ns)
 
-    async def _prepared(self, act: acts.Restore, newest: int, age_ns: int, *, is_lost: bool) -> Occasion | None:
+    async def _prepared(self, act: acts.Restore, newest: int, age_ns: int) -> Occasion | None:
         """Run what this robot's operator wants before it goes on here; why it does, where anybody is to be told.
-
-        Args:
-            is_lost: another robot ran it and fell silent, perhaps before it made a checkpoint of its own.
 
         Raises:
             AgentError: as `_hook`.
@@ -331,8 +327,7 @@ class Charge:
         if not (here.before_start or here.on_resume or (act.spec is not None and act.spec.launch.on_resume)):
             return None
         source = (await asyncio.to_thread(format.read_outline, newest)).machine.robot
-        why = births.why_here(source, self.around.places, is_planned=act.is_planned)
-        occasion = self._occasion(act.epoch, TAKEN_OVER if is_lost and not act.is_planned else why, source, age_ns)
+        occasion = self._occasion(act.epoch, act.why, source, age_ns)
         await self._hook("before_start", act.spec, occasion)
         return occasion
 
@@ -403,7 +398,7 @@ class Charge:
             outage_ns=outage_ns,
             owner=spec.owner,
             epoch=act.epoch,
-            is_planned=act.is_planned,
+            why=act.why,
             waiting=waiting,
         )
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from checkpoint.model import Position
 from failover.core.messages import Beat
 from failover.core.story import Decision
-from failover.core.types import Ballot, ComponentSpec
+from failover.core.types import Ballot, ComponentSpec, Resumption
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Restore:
 
     Attributes:
         lease_until_ns: given to the guard before the program runs; 0 = no lease.
-        is_planned: another robot has handed it over; nothing was lost.
+        why: what the program is told.
     """
 
     component: str
@@ -44,7 +44,7 @@ class Restore:
     position: Position
     spec: ComponentSpec | None
     lease_until_ns: int = 0
-    is_planned: bool = False
+    why: Resumption = Resumption.RESTARTED
 
 
 @dataclass(frozen=True, slots=True)

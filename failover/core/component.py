@@ -18,6 +18,7 @@ from failover.core.types import (
     Config,
     OnLoss,
     Record,
+    Resumption,
     Rules,
     State,
     Waiting,
@@ -117,7 +118,8 @@ class Component:
     """What one robot knows of one component. The first block survives a restart (``types.Record`` explains it).
 
     Attributes:
-        plan: while claiming: the position to restore, None to start afresh; ``is_planned``: it was handed over.
+        plan: while claiming: the position to restore, None to start afresh; ``resumption``: why the next process
+            goes on from a checkpoint.
         alone_right: while claiming: may go on without the others' consent once they are dead.
         claim_counter: beat of ours that first carried the present epoch.
         generation, sequence: of the next snapshot; ``parent``: newest position that the keeper may count from.
@@ -155,7 +157,7 @@ class Component:
     held: list[Position] = field(default_factory=list)
     autostart: bool = False
     plan: Position | None = None
-    is_planned: bool = False
+    resumption: Resumption = Resumption.RESTARTED
     alone_right: bool = False
     claim_counter: int = 0
     request: int = 0

@@ -17,7 +17,7 @@ from failover.core.component import LOST_MAX, Cause, Component, Turn
 from failover.core.consent import grants, state_of
 from failover.core.messages import HOLDS, UNPROTECTED, Entry
 from failover.core.names import Weight, weight
-from failover.core.types import ENDED, HOLDING, MS, PEERS_MAX, State
+from failover.core.types import ENDED, HOLDING, MS, PEERS_MAX, Resumption, State
 
 ACTS_FULLY = 2
 _ACTS = {State.CLAIMING: 0, State.FROZEN: 1}
@@ -79,9 +79,10 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     component.claimed = not component.alone_right
     component.move(Cause.CLAIM)
     component.epoch = max(component.epoch, component.seen) + 1
+    component.resumption = _resumption(component, turn, is_planned=is_planned)
     component.primary = turn.me
     component.entrusted, component.trusted, component.standby = (), False, ""
-    component.plan, component.is_planned = plan, is_planned
+    component.plan = plan
     component.claim_counter = turn.next_counter
     component.until_ns = turn.now_ns + turn.config.loyalty_ns
     component.unprotected, component.needs_base = False, False
@@ -96,6 +97,13 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     open_line(component, turn)
     start = "its newest checkpoint" if plan else "the beginning"
     turn.say(component, f"{turn.me} claims epoch {component.epoch}, to run it from {start}: {why}")
+
+
+def _resumption(component: Component, turn: Turn, *, is_planned: bool) -> Resumption:
+    """What has become of the copy before ours; it was our own, unless another robot is known to have run it last."""
+    if is_planned:
+        return Resumption.HANDED_OVER
+    return component.resumption if component.primary in ("", turn.me) else Resumption.TAKEN_OVER
 
 
 def advance(component: Component, turn: Turn) -> None:
@@ -117,7 +125,7 @@ def begin(component: Component, turn: Turn) -> None:
         turn.order(acts.Start(component.name, component.epoch, component.spec, lease_ns))
     else:
         component.move(Cause.RESTORE)
-        turn.order(acts.Restore(component.name, component.epoch, component.plan, component.spec, lease_ns, component.is_planned))
+        turn.order(acts.Restore(component.name, component.epoch, component.plan, component.spec, lease_ns, component.resumption))
     component.lease_ns = component.told_ns = lease_ns
 
 

@@ -123,7 +123,8 @@ def _recover(component: Component, turn: Turn, status: int) -> None:
     restart_line(component, turn)
     component.until_ns = turn.now_ns + turn.config.restore_ms * MS
     component.lease_ns = component.told_ns = lease.first_ns(component, turn)
-    turn.order(acts.Restore(component.name, component.epoch, position, component.spec, component.lease_ns))
+    why = component.resumption
+    turn.order(acts.Restore(component.name, component.epoch, position, component.spec, component.lease_ns, why))
     turn.say(component, f"{turn.me} saw it crash, {count} in the window, and resumes it from {position.sequence}")
 
 

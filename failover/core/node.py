@@ -54,7 +54,7 @@ from failover.core.events import (
 from failover.core.membership import Membership
 from failover.core.messages import Beat, Entry
 from failover.core.speaker import Speaker, entry_of
-from failover.core.types import COMPONENTS_MAX, ENDED, MS, Ballot, Config, Found, Held, State, StatusView
+from failover.core.types import COMPONENTS_MAX, ENDED, MS, Ballot, Config, Found, Held, Resumption, State, StatusView
 from failover.core.watch import Watch
 
 NS_PER_S = 1_000 * MS
@@ -346,6 +346,7 @@ def _runs(component: Component, turn: Turn, event: Started | Restored) -> None:
         component.resumed_ns, component.resumed_age_ns = turn.now_ns - event.age_ns, event.age_ns
         how += f", {event.age_ns / NS_PER_S:.1f} s old,"
     component.move(Cause.RUNS)
+    component.resumption = Resumption.RESTARTED  # of what comes next, if that is here
     component.tries = 0
     component.due_ns = turn.now_ns
     component.retry_ns = turn.now_ns + FAILBACK_PAUSE * turn.config.retry_ms * MS

@@ -69,6 +69,17 @@ class State(enum.StrEnum):
     RELEASED = "released"
 
 
+class Resumption(enum.StrEnum):
+    """Why a program goes on from a checkpoint, in the words that it is told (``checkpoint/TASK.md``).
+
+    It is told what became of the copy before it, not where the checkpoint was made: that may have been here all the same.
+    """
+
+    RESTARTED = "restarted"
+    TAKEN_OVER = "taken over"
+    HANDED_OVER = "handed over"
+
+
 HOLDING = frozenset(
     {
         State.CLAIMING,

@@ -24,6 +24,7 @@ from agent.places import Places, guard_sockets
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CaptureError, MismatchError, NothingCommittedError
 from checkpoint.linux import procfs
+from checkpoint.task_channel import TAKEN_OVER
 from tests.agent.guards import PATIENCE_S
 from tests.agent.test_component import Captures, live, output, piece_of, until
 
@@ -100,7 +101,7 @@ async def started(places: Places, script: str) -> Component:
 
 
 async def again(places: Places, captures: Captures, script: str) -> Component:
-    return await births.begin_again(NAME, program(script), captures.chain, places, outage_ns=5, owner=0, epoch=4)
+    return await births.begin_again(NAME, program(script), captures.chain, places, outage_ns=5, owner=0, epoch=4, why=TAKEN_OVER)
 
 
 async def held(component: Component) -> Captured:
@@ -324,7 +325,7 @@ def test_a_program_that_is_not_here_is_refused_and_leaves_nothing(tmp_path: Path
     async def story(places: Places) -> None:
         captures = await left_behind(places)
         missing = replace(program(STEPS), argv=(b"/nowhere/mapper",))
-        second = await births.begin_again(NAME, missing, captures.chain, places, outage_ns=0, owner=0, epoch=4)
+        second = await births.begin_again(NAME, missing, captures.chain, places, outage_ns=0, owner=0, epoch=4, why=TAKEN_OVER)
         with pytest.raises(GuardError, match="cannot start /nowhere/mapper: No such file or directory"):
             await second.resume()
         await until(lambda: not guard_sockets(places), "the guard to end")
@@ -337,7 +338,9 @@ def test_a_chain_is_not_started_as_somebody_who_does_not_own_it(tmp_path: Path) 
     async def story(places: Places) -> None:
         captures = await left_behind(places)
         with pytest.raises(MismatchError, match="not its owner, uid 12345"):
-            await births.begin_again(NAME, program(STEPS), captures.chain, places, outage_ns=0, owner=12345, epoch=4)
+            await births.begin_again(
+                NAME, program(STEPS), captures.chain, places, outage_ns=0, owner=12345, epoch=4, why=TAKEN_OVER
+            )
         captures.close()
 
     live(tmp_path, story)

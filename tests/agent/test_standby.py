@@ -21,6 +21,7 @@ from agent.places import Places, guard_sockets
 from agent.standby import Standby
 from agent.ward import Ward
 from checkpoint.linux.vessel import Born
+from checkpoint.task_channel import TAKEN_OVER
 from tests.agent.guards import PATIENCE_S, lives
 from tests.agent.test_component import Captures, live, output, piece_of, until
 from tests.agent.test_cooperative_component import BEGIN, NAME, STEPS, gone_afterwards, next_of, program, started
@@ -68,7 +69,7 @@ async def left_by(places: Places, script: str) -> tuple[Captures, int]:
 async def prepared(places: Places, captures: Captures, waiting: Component) -> Component:
     elsewhere = replace(places, robot="robot2")
     return await births.begin_again(
-        NAME, program(STEPS), captures.chain, elsewhere, outage_ns=5, owner=0, epoch=4, waiting=waiting
+        NAME, program(STEPS), captures.chain, elsewhere, outage_ns=5, owner=0, epoch=4, why=TAKEN_OVER, waiting=waiting
     )
 
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from checkpoint import task_channel
 from checkpoint.errors import TaskPacketError
 from checkpoint.task_channel import REASONS, Begin, FromGuard, Hello, Keeps, Origin, Packet, Refused, Safe
+from failover.core.types import Resumption
 
 DOCUMENT = (Path(task_channel.__file__).parent / "TASK.md").read_text()
 BEGIN = Begin("/lab/heater", 3, (100, 101))
@@ -64,6 +65,7 @@ def test_every_field_means_what_the_document_says() -> None:
     told = re.search(r"why it goes on from a state: 0 it does not, it begins; (.*) \|", DOCUMENT)
     assert told is not None
     assert told[1] == "; ".join(f"{number} {why}" for number, why in enumerate(REASONS, 1))
+    assert tuple(Resumption) == REASONS
 
 
 def test_the_example_in_the_document_is_what_we_send() -> None:
