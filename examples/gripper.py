@@ -9,6 +9,8 @@ sender runs; the gateway refuses older ones, so the gripper closes once.
 
 from __future__ import annotations
 
+import contextlib
+import os
 import socket
 import sys
 import threading
@@ -33,19 +35,24 @@ def serve(place: str, state: str) -> None:
 
 
 def hear(controller: socket.socket, gateway: failover.Gateway) -> None:
-    """One controller: a line ``EPOCH STEP`` a command, answered each."""
-    with controller, controller.makefile("rw") as lines:
+    """One controller, until it goes away: a line ``EPOCH STEP`` a command, answered each."""
+    with contextlib.suppress(ConnectionError), controller, controller.makefile("rw") as lines:
         for line in lines:
             epoch, step = (int(word) for word in line.split())
             try:
                 with gateway.passing(epoch):
-                    print(epoch, step, "obeyed", flush=True)  # here it would move
+                    tell(f"{epoch} {step} obeyed")  # here it would move
                 answer = "obeyed"
             except failover.StaleEpochError as stale:
                 answer = f"refused: {stale}"
-                print(epoch, step, answer, flush=True)
+                tell(f"{epoch} {step} {answer}")
             lines.write(answer + "\n")
             lines.flush()
+
+
+def tell(line: str) -> None:
+    """Several controllers are heard at once: each line is one write."""
+    os.write(sys.stdout.fileno(), f"{line}\n".encode())
 
 
 def drive(place: str) -> None:

@@ -41,8 +41,7 @@ def gripper(directory: Path) -> Iterator[Path]:
 
 def commands(said: Path) -> list[Command]:
     """Epoch and step of each, and whether it was obeyed."""
-    lines = said.read_text().splitlines()
-    words = [line.split(maxsplit=2) for line in lines if line.count(" ") >= 2]
+    words = [line.split(maxsplit=2) for line in said.read_text().splitlines()]
     return [(int(epoch), int(step), answer.partition(":")[0]) for epoch, step, answer in words]
 
 
