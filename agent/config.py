@@ -5,7 +5,7 @@ Every key and its default stand, commented, in ``systemd/agent.toml``; a test ke
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal
@@ -13,6 +13,7 @@ from typing import Final, Literal
 from agent.errors import ConfigError
 from failover.client import strict_toml
 from failover.client import team as team_directory
+from failover.client.quantities import size_bytes, span_ms
 from failover.client.team import Robot, Team
 from failover.core.names import check_component
 from failover.core.types import BEAT_MS_MAX, BEATS_IN_LEASE_MIN, PERIOD_MS_MAX
@@ -20,6 +21,9 @@ from failover.errors import FailoverError, NameFormatError
 
 PATIENCE_S_MAX: Final = 86_400
 """A day. Whoever would wait longer may as well promote."""
+
+KEEP_MAX: Final = 10_000
+"""Files of one component; each is asked for its age when the agent starts."""
 
 HOOK_S_MAX: Final = 50
 """The rules give a restore a minute."""
@@ -81,6 +85,9 @@ class Config:
         realtime: ask for SCHED_FIFO and locked memory.
         link_mbit_s: cap on snapshot traffic; 0 for none.
         snapshots_over: wired: they never leave over a wireless link; any: over whichever has the bulk address.
+        keep_checkpoints: older ones of each component that are kept for people, besides those that the team needs.
+        keep_for: spread over this span; older ones go.
+        keep_size: of the whole store; beyond it the oldest of those go. "": as much as there is.
         wireless: interfaces that count as wireless though the kernel cannot know: an Ethernet port that leads to a radio.
     """
 
@@ -100,6 +107,9 @@ class Config:
     link_mbit_s: int = 0
     snapshots_over: Literal["wired", "any"] = "wired"
     wireless: list[str] = field(default_factory=list)
+    keep_checkpoints: int = 0
+    keep_for: str = "7d"
+    keep_size: str = ""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     components: dict[str, ComponentConfig] = field(default_factory=dict)
 
@@ -123,8 +133,20 @@ class Config:
             )
         if not 1 <= self.patience_s <= PATIENCE_S_MAX:
             raise ValueError(f"patience_s is {self.patience_s}; it must be at least 1 and at most {PATIENCE_S_MAX}")
+        if not 0 <= self.keep_checkpoints <= KEEP_MAX:
+            raise ValueError(f"keep_checkpoints is {self.keep_checkpoints}; at most {KEEP_MAX}, and 0 keeps none")
+        _check_quantity("keep_for", span_ms, self.keep_for)
+        if self.keep_size:
+            _check_quantity("keep_size", size_bytes, self.keep_size)
         if self.link_mbit_s < 0:
             raise ValueError(f"link_mbit_s is {self.link_mbit_s}; 0 means no cap")
+
+
+def _check_quantity(key: str, read: Callable[[str], int], text: str) -> None:
+    try:
+        read(text)
+    except ValueError as error:
+        raise ValueError(f"{key}: {error}") from error
 
 
 @dataclass(frozen=True, slots=True)

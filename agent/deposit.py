@@ -12,7 +12,7 @@ from agent.streams import OutputLogs
 from checkpoint import format
 from checkpoint.channel import close_all
 from checkpoint.engine import COOPERATIVE
-from checkpoint.errors import ChainError, CheckpointError, FormatError
+from checkpoint.errors import ChainError, CheckpointError, FormatError, StoreError
 from checkpoint.model import Snapshot
 from checkpoint.store import Store
 from failover.core.acts import Admit
@@ -61,6 +61,17 @@ class Deposit:
             raise Refusal(f"this robot does not take snapshots of {offer.component} from {peer}")
         if offer.epoch < admitted.epoch:
             raise Refusal(f"epoch {offer.epoch} of {offer.component} is over; {admitted.epoch} has begun")
+
+    async def make_room(self, size: int) -> None:
+        """Have room for a snapshot of so many bytes, if what is kept for people can give it."""
+        try:
+            await asyncio.to_thread(self._store.make_room, size)
+        except StoreError as error:
+            log.warning("%s", error)
+
+    def not_taken(self, peer: str, offer: Offer, why: str) -> None:
+        """The disk did not take what was admitted: the core hears of it, and status tells."""
+        self._tell(StoreFailed(offer.component, offer.epoch, peer, why, needs_base=False))
 
     async def take(self, peer: str, offer: Offer, descriptor: int) -> None:
         """Verify, store durably, extend the output streams; then the core hears of it. One at a time for each component."""

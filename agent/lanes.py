@@ -35,6 +35,7 @@ from agent.links import Facts, Links
 from agent.nursery import Nursery
 from agent.places import Places, guard_sockets
 from agent.records import Records
+from agent.rules import retention
 from agent.shipping import Receiver, Shipper
 from agent.transport import Keys, LinkState, public_key_of
 from agent.units import starter
@@ -170,7 +171,7 @@ class Lanes:
         """Have the store to ourselves; an earlier life of the agent that still ends is waited for."""
         for _ in range(STORE_TRIES):
             try:
-                return await asyncio.to_thread(open_store, self._store_path)
+                return await asyncio.to_thread(open_store, self._store_path, None, retention(self.settings.config))
             except StoreError as error:
                 trouble: StoreError = error
                 await asyncio.sleep(STORE_PAUSE_S)
@@ -415,7 +416,9 @@ class Lanes:
             *self._links.notes(),
             *self._around.store.notices[-NOTICES_SHOWN:],
         ]
-        return team_view(self.settings, self._life, told, self.charges, self._lane.links, notices, self._links.shown())
+        return team_view(
+            self.settings, self._life, told, self.charges, self._lane.links, notices, self._links.shown(), self._around.store
+        )
 
 
 UNFIT_KEY: Final = (

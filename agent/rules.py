@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from agent.config import ComponentConfig, Config, Settings
+from checkpoint.history import Retention
+from failover.client.quantities import size_bytes, span_ms
 from failover.core import types
 from failover.core.types import Launch, OnCrash, OnLoss, OnUnsupported, Rule, Rules, WhenAlone
 
@@ -26,6 +28,12 @@ def node_config(settings: Settings) -> types.Config:
         witnesses=_members(settings, "witness"),
         patience_ms=config.patience_s * 1_000,
     )
+
+
+def retention(config: Config) -> Retention:
+    """What the store keeps for people."""
+    size_max = size_bytes(config.keep_size) if config.keep_size else 0
+    return Retention(config.keep_checkpoints, span_ms(config.keep_for) // 1_000, size_max)
 
 
 def _rule(settings: Settings) -> Rule:

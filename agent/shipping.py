@@ -167,6 +167,12 @@ class Desk(Protocol):
     async def take(self, peer: str, offer: Offer, descriptor: int) -> None:
         """All bytes are in the file and their digest is right. The descriptor is closed afterwards."""
 
+    async def make_room(self, size: int) -> None:
+        """So many bytes are about to be written."""
+
+    def not_taken(self, peer: str, offer: Offer, why: str) -> None:
+        """They could not be written."""
+
 
 @dataclass(slots=True)
 class _Incoming:
@@ -237,6 +243,7 @@ class Receiver:
         """Fill an unnamed file, so that whatever happens nothing half is left, and hand it over."""
         offer = transfer.offer
         try:
+            await self._desk.make_room(offer.size)
             descriptor = os.open(self._directory, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
             try:
                 await self._fill(peer, transfer, descriptor)
@@ -249,6 +256,7 @@ class Receiver:
             why = f"cannot write it there: {error.strerror}"
             log.warning("gave up snapshot %d of %s from %s: %s", offer.position.sequence, offer.component, peer, why)
             self._lane.say(peer, Refuse(offer.transfer, why))
+            self._desk.not_taken(peer, offer, why)
         except LaneError as error:
             log.warning("gave up snapshot %d of %s: %s", offer.position.sequence, offer.component, error)
             self._lane.say(peer, Refuse(offer.transfer, str(error)))

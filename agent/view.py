@@ -15,6 +15,7 @@ from agent.figures import Commits, Figures
 from agent.pump import HOLD_LIMIT
 from agent.transport import Link, LinkState
 from checkpoint.engine import COOPERATIVE, PTRACE
+from checkpoint.store import Kept, Store
 from failover.core.types import COMMITTED, IMMEDIATE, ComponentView, PeerView, Protection, State
 
 NANOSECONDS_A_MILLISECOND: Final = 1_000_000
@@ -56,6 +57,7 @@ def team_view(
     links: Mapping[str, Link],
     notices: list[str],
     interfaces: list[dict[str, object]],
+    store: Store,
 ) -> dict[str, Any]:
     """The whole picture."""
     view = told.status
@@ -77,7 +79,9 @@ def team_view(
         "notes": notes,
         "links": interfaces,
         "peers": [_peer(peer, links.get(peer.robot), told, settings) for peer in (view.peers if view else ())],
-        "components": [_component(one, charges.get(one.name), settings) for one in (view.components if view else ())],
+        "components": [
+            _component(one, charges.get(one.name), settings, store.kept(one.name)) for one in (view.components if view else ())
+        ],
         "beats": {
             "sent": beats.sent,
             "heard": beats.heard,
@@ -124,7 +128,7 @@ def _waiting_output(view: ComponentView, waiting: int) -> tuple[str, ...]:
     )
 
 
-def _component(view: ComponentView, charge: Charge | None, settings: Settings) -> dict[str, Any]:
+def _component(view: ComponentView, charge: Charge | None, settings: Settings, kept: Kept | None) -> dict[str, Any]:
     figures = charge.figures if charge is not None else None
     running = charge.component if charge is not None else None
     newest = view.positions[0] if view.positions else None
@@ -161,6 +165,8 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings) -
         "crashes": figures.crashes if figures else 0,
         "outage_ms": figures.outage_ms if figures else None,
         "exit_status": view.status if view.state is State.FINISHED else None,
+        "kept": _kept(kept),
+        "unstored": view.unstored,
         "promise": view.promise,
         "promise_differs": view.differs,
         "home": view.home,
@@ -171,6 +177,15 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings) -
         "reasons": list(figures.reasons) if figures else [],
         "notes": [*view.notes, *_own_notes(view, figures), *_waiting_output(view, waiting)],
     }
+
+
+def _kept(kept: Kept | None) -> dict[str, Any] | None:
+    """What this robot's store has of it."""
+    if kept is None:
+        return None
+    now_s = clock.wall_ns(clock.now_ns()) / 1e9
+    ages = {"newest_age_s": max(now_s - kept.newest_s, 0.0), "oldest_age_s": max(now_s - kept.oldest_s, 0.0)}
+    return {"checkpoints": kept.positions, "older": kept.olds, "size": kept.size, **ages}
 
 
 def _commits(view: ComponentView, figures: Figures | None) -> dict[str, Any]:

@@ -30,7 +30,7 @@ class Entry:
     """One snapshot file.
 
     Attributes:
-        size: bytes of the file.
+        size: bytes of the file; ``stored_s``: when it came, in seconds since 1970.
     """
 
     path: Path
@@ -38,6 +38,7 @@ class Entry:
     parent: Position | None
     epoch: int
     size: int
+    stored_s: float = 0.0
 
     @property
     def order(self) -> tuple[int, int, int]:

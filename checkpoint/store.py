@@ -14,6 +14,7 @@ from __future__ import annotations
 import logging
 import os
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ from pathlib import Path
 from checkpoint import chain, format
 from checkpoint.disk import Disk, lock_exclusively
 from checkpoint.errors import ChainError, FormatError, StoreError
+from checkpoint.history import History, Retention
 from checkpoint.model import OutputPiece, Position, Snapshot
 from checkpoint.pages import PageTable
 from checkpoint.shelf import BASE_SUFFIX, DELTA_SUFFIX, FOLDER_PREFIX, Entry, Shelf, file_name, folder_name, order_of_name
@@ -49,6 +51,8 @@ CHEAP_DELTA_COUNT = 12
 FOLD_DELTA_PART = 0.5
 """…and one whose deltas together take more than this part of its base: otherwise the store would grow without end."""
 
+NOTHING_OLD = Retention()
+
 FOLDED_OUTPUT_SIZE = 1 << 20
 """Bytes of output of each stream that a folded base keeps; the whole is in the component's logs."""
 
@@ -61,15 +65,32 @@ class _Proved:
     table: PageTable
 
 
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What the store has of one component, for people.
+
+    Attributes:
+        positions: that the rules may go back to; ``olds``: whole checkpoints besides, kept for people.
+        size: bytes of all files; ``newest_s``, ``oldest_s``: when the first and the last of them came, in seconds since 1970.
+    """
+
+    positions: int
+    olds: int
+    size: int
+    newest_s: float
+    oldest_s: float
+
+
 class Store:
     """The snapshots on one machine. Methods may be called from any thread; one process at a time.
 
     Made by ``open_store``. Every method raises StoreError when the disk fails; what the store already held is intact.
     """
 
-    def __init__(self, root: Path, disk: Disk, lock: int) -> None:
+    def __init__(self, root: Path, disk: Disk, lock: int, retention: Retention) -> None:
         self._root = root
         self._files = WholeFiles(disk)
+        self._history = History(root, self._files, retention)
         self._lock_descriptor = lock
         self._lock = threading.RLock()
         self._changing: dict[str, threading.RLock] = {}
@@ -157,7 +178,22 @@ class Store:
             self._set_out_of_use(component, entries[-1], str(error))
             return None
 
+    def kept(self, component: str) -> Kept | None:
+        """What is here of a component; None if nothing is."""
+        with self._lock:
+            shelf = self._shelf(component)
+        olds = self._history.of(folder_name(component))
+        times = [*(entry.stored_s for entry in shelf.entries), *(old.stored_s for old in olds)]
+        if not times:
+            return None
+        size = sum(entry.size for entry in shelf.entries) + sum(old.size for old in olds)
+        return Kept(len(shelf.positions()), len(olds), size, max(times), min(times))
+
     # Keeping
+
+    def make_room(self, size: int) -> None:
+        """See that the disk has room for a snapshot of so many bytes, if what is kept for people can give it."""
+        self._history.make_room(size)
 
     def put(self, source: int, *, prove: bool = True) -> Snapshot:
         """Keep a snapshot; when this returns it survives a power cut.
@@ -244,16 +280,20 @@ class Store:
     def prune(self, component: str, oldest: Position) -> None:
         """Forget what is not needed to restore ``oldest`` or a later position; fold its chain where that has grown long.
 
-        An ``oldest`` that is not held forgets nothing.
+        Whole checkpoints among it are kept for people as the retention says. An ``oldest`` that is not held forgets nothing.
         """
         if self._fold_is_due(component, oldest):
             self.fold(component, oldest)
         with self._change_of(component):
             shelf = self._shelf(component)
-            self._remove(component, shelf.unneeded_for(oldest))
+            self._remove(component, shelf.unneeded_for(oldest), self._history.take)
             floor = shelf.order_of(oldest)
             if floor is not None:
                 self._remove_damaged(component, lambda path: (order_of_name(path.name) or floor) < floor)
+        self._history.thin(folder_name(component), time.time())
+        with self._lock:
+            needed = sum(entry.size for shelf in self._shelves.values() for entry in shelf.entries)
+        self._history.shrink(needed)
 
     def keep_newest(self, component: str, positions: int) -> None:
         """Forget all but the newest positions; as ``prune``."""
@@ -320,6 +360,7 @@ class Store:
         with self._change_of(component), self._lock:
             self._remove(component, self._shelf(component).entries)
             self._remove_damaged(component, lambda _: True)
+            self._history.forget(folder_name(component))
             self._shelves.pop(component, None)
             self._proved.pop(component, None)
 
@@ -329,12 +370,18 @@ class Store:
 
     # The disk
 
-    def _remove(self, component: str, entries: tuple[Entry, ...]) -> None:
-        """Remove files, the youngest first: what is left at any instant is whole chains."""
+    def _remove(self, component: str, entries: tuple[Entry, ...], taken: Callable[[Path], bool] = lambda _: False) -> None:
+        """Remove files, the youngest first: what is left at any instant is whole chains.
+
+        Args:
+            taken: whether somebody else has taken a whole checkpoint's file to keep it.
+        """
         with disk_trouble(f"remove snapshots of {component}"):
             for entry in sorted(entries, key=lambda entry: entry.order, reverse=True):
                 with self._lock:
                     self._shelves[component] = self._shelf(component).without((entry,))
+                if entry.parent is None and taken(entry.path):
+                    continue
                 self._files.remove(entry.path)  # who opens a chain has opened it, or does not know this file any more
 
     def _remove_damaged(self, component: str, is_old: Callable[[Path], bool]) -> None:
@@ -367,6 +414,7 @@ class Store:
             for folder in sorted(self._root.iterdir()):
                 if folder.is_dir():
                     self._read_folder(folder)
+            self._history.read()
 
     def _read_folder(self, folder: Path) -> None:
         for path in sorted(folder.iterdir()):
@@ -386,12 +434,16 @@ class Store:
         if (path.parent.name, path.name) != (folder_name(header.component), file_name(header)):
             self._notice(f"{path} holds {place(header.position)} of {header.component}, which is not its name; it is not used")
             return
-        entry = Entry(path, header.position, header.parent, header.epoch, path.stat().st_size)
+        stored = path.stat()
+        entry = Entry(path, header.position, header.parent, header.epoch, stored.st_size, stored.st_mtime)
         self._shelves[header.component] = self._shelf(header.component).with_entry(entry)
 
 
-def open_store(root: Path, disk: Disk | None = None) -> Store:
+def open_store(root: Path, disk: Disk | None = None, retention: Retention = NOTHING_OLD) -> Store:
     """Open a store, or make an empty one; removes leftovers and verifies what is there.
+
+    Args:
+        retention: what is kept for people besides what is needed; nothing.
 
     Raises:
         StoreError: another process has it open, or the folder cannot be used.
@@ -407,7 +459,7 @@ def open_store(root: Path, disk: Disk | None = None) -> Store:
         raise StoreError(f"cannot open the store {root}: {error.strerror}; it must be a folder that we may write") from error
     if lock is None:
         raise StoreError(f"cannot open the store {root}: another process has it open; one agent uses one store")
-    store = Store(root, disk, lock)
+    store = Store(root, disk, lock, retention)
     try:
         store.read_folders()
     except StoreError:
@@ -417,7 +469,7 @@ def open_store(root: Path, disk: Disk | None = None) -> Store:
 
 
 def _entry_of(path: Path, snapshot: Snapshot, size: int) -> Entry:
-    return Entry(path, snapshot.position, snapshot.parent, snapshot.epoch, size)
+    return Entry(path, snapshot.position, snapshot.parent, snapshot.epoch, size, time.time())
 
 
 def _newest_output(output: tuple[OutputPiece, ...]) -> tuple[OutputPiece, ...]:

@@ -75,6 +75,15 @@ class WholeFiles:
                 self._disk.make_folder(folder)
                 self._disk.sync_folder(folder.parent)
 
+    def move(self, path: Path, final: Path) -> None:
+        """Give a whole file another name, two folders deep in the store at most. Raises OSError."""
+        self._ensure_folder(final.parent.parent)
+        self._ensure_folder(final.parent)
+        with self._lock:
+            self._disk.rename(path, final)
+        self._disk.sync_folder(final.parent)
+        self._disk.sync_folder(path.parent)
+
     def remove(self, path: Path) -> None:
         """Remove a file; one that is gone already is fine. Raises OSError."""
         self._disk.remove(path)

@@ -14,6 +14,7 @@ from textwrap import dedent
 from typing import Any, Final
 
 from failover import __version__
+from failover.client.quantities import span_ms
 
 EXIT_STATUSES: Final = "Exit status: 0 healthy, 1 failed or degraded, 2 usage, 3 no agent."
 
@@ -110,15 +111,12 @@ NUMBER_MAX: Final = (1 << 31) - 1
 """What a PID can be at most."""
 
 
-UNITS_MS: Final = {"ms": 1, "s": 1_000, "min": 60_000, "h": 3_600_000, "d": 86_400_000}
-
-
 def ago(text: str) -> int:
     """A span of time such as 90s or 10min, in milliseconds."""
-    number, unit = text.rstrip("abcdefghijklmnopqrstuvwxyz"), text.lstrip("0123456789")
-    if not number.isdecimal() or len(number) > len(str(NUMBER_MAX)) or unit not in UNITS_MS or not int(number):
-        raise argparse.ArgumentTypeError(f"{text[:40]!r} is no span of time; write 90s, 10min, 2h or 3d")
-    return int(number) * UNITS_MS[unit]
+    try:
+        return span_ms(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def positive(text: str) -> int:

@@ -171,6 +171,32 @@ def promises(status: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(found)
 
 
+def kept(status: Mapping[str, Any]) -> tuple[str, ...]:
+    """What a server keeps, for whom, how much, how old."""
+    if status.get("role") != "server":
+        return ()
+    return tuple(_kept_line(component) for component in status["components"] if component.get("kept"))
+
+
+def _kept_line(component: Mapping[str, Any]) -> str:
+    found = component["kept"]
+    older = f" and {found['older']} older" if found["older"] else ""
+    ages = f"{milliseconds(found['newest_age_s'] * 1_000)} to {span(found['oldest_age_s'])} old"
+    whose = component.get("primary") or "whoever can run it"
+    return f"kept for {whose}: {component['name']}, {found['checkpoints']} checkpoints{older}, {size(found['size'])}, {ages}"
+
+
+def span(seconds: float) -> str:
+    """98 ms, 4.2 s, 7 min, 5 h, 3 d."""
+    if seconds < HOURS_FROM_S:
+        return milliseconds(seconds * 1_000)
+    return f"{seconds / 3_600:.0f} h" if seconds < DAYS_FROM_S else f"{seconds / 86_400:.0f} d"
+
+
+HOURS_FROM_S: Final = 2 * 3_600
+DAYS_FROM_S: Final = 2 * 86_400
+
+
 def remarks(status: Mapping[str, Any]) -> tuple[str, ...]:
     """What stands below the tree: reasons, promises that do not hold, and notes, each a sentence said once."""
     found: list[str] = []
@@ -216,5 +242,9 @@ def is_healthy(status: Mapping[str, Any]) -> bool:
     no peer dead."""
     living = [sight(component) for component in status["components"] if component.get("state") not in OVER_STATES]
     unwell = any(one.get("state") in BAD_STATES or not one.get("standby") or is_unprotected(one) for one in living)
-    unwell |= any(seen.get("cold") for one in status["components"] for seen in (one, *(one.get("elsewhere") or {}).values()))
+    unwell |= any(
+        seen.get("cold") or seen.get("unstored")
+        for one in status["components"]
+        for seen in (one, *(one.get("elsewhere") or {}).values())
+    )
     return not unwell and all(peer["state"] != "dead" for peer in status["peers"])

@@ -86,6 +86,7 @@ def plain_tree(status: dict[str, Any]) -> str:
     """The team as aligned text."""
     lines = [plain_table(picture.COLUMNS, [row.cells for row in picture.rows(status)])]
     lines += picture.promises(status)
+    lines += picture.kept(status)
     if status.get("fencing"):
         lines.append(f"fencing: {status['fencing']}")
     return "\n".join([*lines, *(f"note: {line}" for line in picture.remarks(status))])
@@ -172,6 +173,7 @@ def _rich_tree(status: dict[str, Any]) -> Any:
     else:
         parts = [_rich_table(picture.COLUMNS, lines, f"team {status.get('team') or ''}".strip())]
     parts += [Text(spoken(line), style="bold") for line in picture.promises(status)]
+    parts += [Text(spoken(line)) for line in picture.kept(status)]
     if status.get("fencing"):
         parts.append(Text(spoken(f"fencing: {status['fencing']}"), style="dim"))
     return Group(*parts, *(Text(spoken(line), style="yellow") for line in picture.remarks(status)))

@@ -62,13 +62,16 @@ peers: [{name, role, state, last_heard_ms, hears_us, load, beats_lost, links, la
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
     freeze_us_max, snapshot_size, dirty_bytes, snapshots, restores, crashes, outage_ms, exit_status, promise,
-    promise_differs, owner, reasons,
+    promise_differs, kept, unstored, owner, reasons,
     output, output_waiting, notes, elsewhere, warm, cold}]
     output: immediate | committed (--output); output_waiting: bytes that wait until another robot holds them
     warm: its program waits at its standby, started in advance; None where nothing could: it is restored from its memory
     cold: why it does not wait at this robot, where it should and something went wrong; "" otherwise
     owner: uid of the user who may give orders about it and read its output, besides root
     promise: what holds for it; promise_differs: from the team's, by what was chosen for it, or because a server stands by
+    kept: {checkpoints, older, size, newest_age_s, oldest_age_s} of this robot's store: positions to which the team may go back,
+        whole ones besides that are kept for people, bytes of all; None where it has nothing
+    unstored: why the last snapshot that came to this robot was not stored there; "" otherwise
     role: primary | standby | none; protection: none | protected | degraded | stopped
     state: starting | running | frozen | held | restoring | ended | degraded | failed | released
     lag_ms: age of what the standby holds: since its capture began, or, where a program keeps its state, since its commit

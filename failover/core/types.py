@@ -407,6 +407,7 @@ class ComponentView:
         warm: its program waits at its standby, started already: only one that keeps its state itself can.
         cold: why it does not wait here, where it should and something went wrong.
         differs: its promise is another than the team's.
+        unstored: why the last snapshot that came here was not stored.
     """
 
     name: str
@@ -429,6 +430,7 @@ class ComponentView:
     warm: bool = False
     cold: str = ""
     differs: bool = False
+    unstored: str = ""
 
 
 @dataclass(frozen=True, slots=True)

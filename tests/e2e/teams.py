@@ -85,7 +85,7 @@ def hears_all(member: RobotMachine) -> bool:
 def acting(directory: Path, roles: Mapping[str, Role] = TWO_AND_A_SERVER, settings: str = "") -> Iterator[TeamStage]:
     """A team of these members, beating and connected."""
     with TeamStage(directory / "stage", roles, settings) as stage:
-        stage.directory.mkdir()
+        stage.directory.mkdir(exist_ok=True)  # a test may have put a disk of its own there
         try:
             stage.start()
             yield stage

@@ -114,6 +114,19 @@ def test_a_component_for_which_something_else_holds_has_a_promise_of_its_own(age
     ]
 
 
+def test_a_server_shows_what_it_keeps_for_whom_how_much_and_how_old(agent: Start) -> None:
+    found = {"checkpoints": 8, "older": 3, "size": 1_200_000, "newest_age_s": 0.2, "oldest_age_s": 18_000.0}
+    told = STATUS | {"role": "server", "components": [COMPONENT | {"role": "standby", "kept": found}]}
+    ran = failover("status", socket=agent(answering(told)).path)
+    assert "kept for robot1: /lab/robot1/mapper, 8 checkpoints and 3 older, 1.2 MB, 200 ms to 5 h old" in ran.stdout.splitlines()
+
+
+def test_a_server_that_cannot_store_what_comes_is_not_healthy(agent: Start) -> None:
+    told = STATUS | {"components": [COMPONENT | {"unstored": "No space left on device", "notes": ["a snapshot was not stored"]}]}
+    ran = failover("status", socket=agent(answering(told)).path)
+    assert ran.returncode == 1 and "a snapshot was not stored" in ran.stdout
+
+
 def test_an_ended_component_needs_no_standby(agent: Start) -> None:
     ended = COMPONENT | {"state": "ended", "standby": None, "exit_status": 0x300}
     ran = failover("status", socket=agent(answering(STATUS | {"components": [ended]})).path)
