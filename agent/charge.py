@@ -11,66 +11,31 @@ import contextlib
 import logging
 import os
 import signal
-from collections.abc import Callable, Coroutine
+from collections.abc import Coroutine
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-import msgspec
-
-from agent import births, clock, hooks, lost
-from agent.births import Program
-from agent.component import Captured, Component
-from agent.config import ComponentConfig
+from agent import births, clock, comeback
+from agent.component import Component
 from agent.errors import AgentError, GuardError, KeeperLostError
 from agent.figures import Commits, Figures, shortened
-from agent.guard_messages import Task
-from agent.hooks import Hook, Hooks, Kind, Occasion
 from agent.mistake import end_lanes_on_mistake
-from agent.places import Places
-from agent.records import Records
+from agent.occasions import Occasions
 from agent.rules import started_here
+from agent.snapshots import Snapshots
 from agent.standby import Standby
-from checkpoint import format
-from checkpoint.channel import Unchanged, close_all, content_of
-from checkpoint.engine import AUTO, COOPERATIVE
-from checkpoint.errors import CheckpointError, NothingCommittedError, RestoreError, UnsupportedError
-from checkpoint.linux.inheritance import Inheritance
-from checkpoint.model import Position
-from checkpoint.store import Store
+from agent.surroundings import TROUBLE, Surroundings, program_of
+from checkpoint.channel import close_all
+from checkpoint.engine import COOPERATIVE
+from checkpoint.errors import CheckpointError, NothingCommittedError, UnsupportedError
 from failover.core import acts, events
 from failover.core.acts import Act
-from failover.core.events import Event
-from failover.core.types import COMMITTED, ComponentSpec, Launch
+from failover.core.types import Launch
 
 KILLED: Final = 9
 """The wait status of a program whose guard was lost: as of one that was killed."""
 
-TROUBLE: Final = (CheckpointError, AgentError, OSError)
-"""What can go wrong with a program, its processes or a disk, and is told; anything else is our mistake and ends the lanes."""
-
 log = logging.getLogger("failover.component")
-
-
-@dataclass(slots=True)
-class Surroundings:
-    """What every charge works with.
-
-    Attributes:
-        tell: passes an event to the core.
-        silence_ns: how long the robot that the component is taken over from has been silent, as far as known; for the outage.
-        settled: returns once no snapshot of a component is being stored any more.
-        here: what this robot's operator wants for a component.
-        hooks: runs his commands.
-    """
-
-    places: Places
-    store: Store
-    records: Records
-    tell: Callable[[Event], None]
-    silence_ns: Callable[[str], Coroutine[Any, Any, int]]
-    settled: Callable[[str], Coroutine[Any, Any, None]]
-    here: Callable[[str], ComponentConfig]
-    hooks: Hooks = field(default_factory=Hooks)
 
 
 @dataclass(slots=True)
@@ -92,6 +57,8 @@ class Charge:
     started: asyncio.Event = field(default_factory=asyncio.Event)
     ended: asyncio.Future[acts.ReportExit] | None = None
     standby: Standby = field(init=False)
+    _snapshots: Snapshots = field(init=False)
+    _occasions: Occasions = field(init=False)
     _queue: asyncio.Queue[Act] = field(default_factory=asyncio.Queue)
     _tasks: set[asyncio.Task[None]] = field(default_factory=set)
     _stopping: bool = False
@@ -106,6 +73,8 @@ class Charge:
 
     def __post_init__(self) -> None:
         self.standby = Standby(self.name, self.around.places)
+        self._snapshots = Snapshots(self.name, self.around, self.figures)
+        self._occasions = Occasions(self.name, self.around, self.figures)
 
     def begin(self) -> None:
         """Start to carry acts out."""
@@ -186,7 +155,9 @@ class Charge:
             case acts.Restore():
                 await self._restore(act)
             case acts.Capture():
-                await self._capture(act)
+                if act.hold:
+                    self._is_thaw_owed = False  # a lease that comes meanwhile lets nothing run that is to be handed over
+                await self._snapshots.capture(self._present(), act)
             case acts.Acknowledge():
                 if self.component is not None:
                     await self.component.acknowledge(act.position, is_safe=act.is_safe)
@@ -204,7 +175,7 @@ class Charge:
             case acts.KeepAside():
                 await self._keep_aside(act)
             case acts.Forget() | acts.Prune() | acts.Drop():
-                await self._keep_house(act)
+                await self._snapshots.tidy(act)
             case acts.ReportExit():
                 await self._report(act)
 
@@ -255,7 +226,7 @@ class Charge:
         if self.component is None:
             await self.around.settled(self.name)
             if not act.spec.launch.pid:
-                await self._hook("before_start", act.spec, self._occasion(act.epoch, hooks.STARTED))
+                await self._occasions.before_start(act)
             self.component = await self._begun(act.spec.launch, act.epoch)
         await self.component.lease(self._lease_until_ns)
         await self._protect(refuse=act.spec.launch.pid != 0)
@@ -293,7 +264,7 @@ class Charge:
         laps.lap(f"opening {len(descriptors)} snapshots")
         try:
             outage_ns, read_ns = clock.age_ns(descriptors[-1]), clock.now_ns()
-            occasion = await self._prepared(act, descriptors[-1], outage_ns)
+            occasion = await self._occasions.before_resume(act, descriptors[-1], outage_ns)
             laps.lap("preparing")
             component, age_ns = await self._resumed(act, descriptors, outage_ns, laps)
         finally:
@@ -312,49 +283,18 @@ class Charge:
         self._notice(sentence)
         self._watch_the_end()
         if occasion is not None:
-            self._task(self._hook("on_resume", act.spec, occasion))
-
-    def _occasion(self, epoch: int, why: str, source: str = "", age_ns: int = 0) -> Occasion:
-        return Occasion(self.name, self.around.places.robot, epoch, why, source, age_ns)
-
-    async def _prepared(self, act: acts.Restore, newest: int, age_ns: int) -> Occasion | None:
-        """Run what this robot's operator wants before it goes on here; why it does, where anybody is to be told.
-
-        Raises:
-            AgentError: as `_hook`.
-        """
-        here = self.around.here(self.name)
-        if not (here.before_start or here.on_resume or (act.spec is not None and act.spec.launch.on_resume)):
-            return None
-        source = (await asyncio.to_thread(format.read_outline, newest)).machine.robot
-        occasion = self._occasion(act.epoch, act.why, source, age_ns)
-        await self._hook("before_start", act.spec, occasion)
-        return occasion
-
-    async def _hook(self, kind: Kind, spec: ComponentSpec | None, occasion: Occasion) -> None:
-        """Run this robot's own command for the occasion, else the one that came with the program.
-
-        Raises:
-            AgentError: it failed, and the program must not run here without it.
-        """
-        here = self.around.here(self.name)
-        hook = Hook(here.before_start if kind == "before_start" else here.on_resume, here.hook_s)
-        if kind == "on_resume" and not hook.command and spec is not None:
-            hook = Hook(spec.launch.on_resume, here.hook_s, program_of(spec.launch).inheritance)
-        self.figures.hook = await self.around.hooks.run(kind, hook, occasion)
-        if self.figures.hook and kind == "before_start" and here.must_prepare:
-            raise AgentError(f"{self.name} does not run here unprepared: {self.figures.hook}")
+            self._task(self._occasions.resumed(act.spec, occasion))
 
     async def _resumed(self, act: acts.Restore, chain: list[int], outage_ns: int, laps: clock.Laps) -> tuple[Component, int]:
         """The component, running, and the age of its state: what waits here for it, or, where that fails, from its beginning."""
         waiting = self.standby.take()
         if waiting is not None:
             try:
-                component = await self._brought_back(act, chain, outage_ns, laps, waiting)
+                component = await comeback.brought_back(self.around, act, chain, outage_ns, laps, waiting)
                 return await self._let_it_run(component, act.epoch, outage_ns)
             except TROUBLE as trouble:
                 log.warning("%s: what waited here cannot go on with it, it is started anew: %s", self.name, trouble)
-        component = await self._brought_back(act, chain, outage_ns, laps)
+        component = await comeback.brought_back(self.around, act, chain, outage_ns, laps)
         return await self._let_it_run(component, act.epoch, outage_ns)
 
     async def _let_it_run(self, component: Component, epoch: int, outage_ns: int) -> tuple[Component, int]:
@@ -372,66 +312,6 @@ class Charge:
         finally:
             self._coming = None
         return component, age_ns
-
-    async def _brought_back(
-        self, act: acts.Restore, chain: list[int], outage_ns: int, laps: clock.Laps, waiting: Component | None = None
-    ) -> Component:
-        """The component by the engine that took the newest snapshot."""
-        places, spec = self.around.places, act.spec
-        newest = await asyncio.to_thread(format.read_outline, chain[-1])
-        if newest.engine != COOPERATIVE:
-            if waiting is not None:
-                await waiting.undo()
-            owner = spec.owner if spec is not None else None
-            task = Task(act.epoch, engine=AUTO) if spec is not None and spec.launch.engine == AUTO else None
-            return await births.restore(
-                self.name, chain, places, outage_ns=outage_ns, owner=owner, laps=laps, task=task, epoch=act.epoch
-            )
-        if spec is None:
-            raise RestoreError(f"cannot start {self.name} again: this robot was never told its command; start it by failover run")
-        program = program_of(started_here(spec.launch, self.around.here(self.name)))
-        return await births.begin_again(
-            self.name,
-            program,
-            chain,
-            places,
-            outage_ns=outage_ns,
-            owner=spec.owner,
-            epoch=act.epoch,
-            why=act.why,
-            waiting=waiting,
-        )
-
-    async def _capture(self, act: acts.Capture) -> None:
-        component = self._present()
-        if act.hold:
-            self._is_thaw_owed = False  # a lease that comes meanwhile lets nothing run that is to be handed over
-        captured = await component.capture(
-            base=act.base, generation=act.generation, sequence=act.sequence, epoch=act.epoch, hold=act.hold
-        )
-        self.figures.reasons = ()
-        if captured.commit:
-            self.figures.commits.note(captured.commit, clock.now_ns() - captured.age_ns)
-        if isinstance(captured, Unchanged):
-            self.around.tell(events.Unchanged(self.name, act.epoch, act.sequence, captured.position))
-            return
-        try:
-            await asyncio.to_thread(self.around.store.put, captured.snapshot, prove=False)
-        finally:
-            os.close(captured.snapshot)
-        self.figures.captured(captured)
-        self.around.tell(
-            events.Captured(
-                self.name,
-                act.epoch,
-                captured.position,
-                captured.parent,
-                captured.size,
-                captured.freeze_us,
-                captured.dirty_bytes,
-                captured.age_ns,
-            )
-        )
 
     async def _thaw(self, act: acts.Thaw) -> None:
         component = self._present()
@@ -474,32 +354,9 @@ class Charge:
             self.around.records.forget(self.name)
 
     async def _keep_aside(self, act: acts.KeepAside) -> None:
-        """One last snapshot of a copy that lost, where nobody resumes from it by himself."""
         component = self._present()
-        await component.freeze(exposed=True)  # perhaps its lease has frozen it already
-        newest = self.figures.newest or Position(1, 0, b"")
-        captured = await component.capture(
-            base=True, generation=newest.generation, sequence=newest.sequence + 1, epoch=act.epoch, hold=True
-        )
-        assert isinstance(captured, Captured), "a base is always made"
-        try:
-            content = content_of(captured.snapshot)
-        finally:
-            os.close(captured.snapshot)
-        directory = self.around.places.logs.parent / "lost"
-        path = await asyncio.to_thread(lost.keep, directory, self.name, act.epoch, content)
-        log.warning("%s: the copy that lost is kept for inspection in %s: %s", self.name, path, act.reason)
+        path = await self._snapshots.keep_aside(component, act)
         self._notice(f"the copy that lost is kept for inspection in {path}; its output since is shown to nobody", component)
-
-    async def _keep_house(self, act: acts.Forget | acts.Prune | acts.Drop) -> None:
-        store = self.around.store
-        match act:
-            case acts.Forget():
-                await asyncio.to_thread(store.set_aside, self.name, act.generations)
-            case acts.Prune():
-                await asyncio.to_thread(store.prune, self.name, act.oldest)
-            case acts.Drop():
-                await asyncio.to_thread(store.drop, self.name)
 
     async def _report(self, act: acts.ReportExit) -> None:
         """The end is a record now: tell who waits, and let the guard go."""
@@ -553,17 +410,3 @@ class Charge:
         if self.component is component and not self._stopping:
             self.figures.crashes += bool(status and os.WIFSIGNALED(status))
             self.around.tell(events.Exited(self.name, self.epoch, status or 0))
-
-
-def program_of(launch: Launch) -> Program:
-    """What to start."""
-    return Program(
-        tuple(os.fsencode(argument) for argument in launch.argv),
-        tuple(os.fsencode(f"{name}={value}") for name, value in launch.environment),
-        os.fsencode(launch.directory),
-        launch.umask,
-        launch.isolate,
-        msgspec.msgpack.decode(launch.inheritance, type=Inheritance) if launch.inheritance else None,
-        launch.engine,
-        launch.output == COMMITTED,
-    )

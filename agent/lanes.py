@@ -21,7 +21,7 @@ from typing import Any, Final, Literal
 
 from agent import births, door
 from agent import config as configuration
-from agent.charge import Charge, Surroundings
+from agent.charge import Charge
 from agent.config import Settings
 from agent.control import ControlServer
 from agent.deposit import Deposit
@@ -37,6 +37,7 @@ from agent.places import Places, guard_sockets
 from agent.records import Records
 from agent.rules import retention
 from agent.shipping import Receiver, Shipper
+from agent.surroundings import Surroundings
 from agent.transport import Keys, LinkState, public_key_of
 from agent.units import starter
 from agent.verbs import Verbs

@@ -9,12 +9,14 @@ from typing import Any, cast
 
 import pytest
 
-from agent.charge import Charge, Surroundings
+from agent import comeback
+from agent.charge import Charge
 from agent.clock import Laps
 from agent.component import Component
 from agent.errors import GuardError
 from agent.records import Records
 from agent.standby import Standby
+from agent.surroundings import Surroundings
 from checkpoint.model import Position
 from failover.core import acts
 
@@ -125,7 +127,7 @@ def test_a_takeover_that_what_waited_cannot_carry_out_starts_the_program_anew(
     tried: list[Component | None] = []
 
     async def brought_back(
-        self: Charge, act: object, chain: object, outage_ns: int, laps: object, waits: Any = None
+        around: object, act: object, chain: object, outage_ns: int, laps: object, waits: Any = None
     ) -> Component:
         tried.append(waits)
         return waits or anew
@@ -135,7 +137,7 @@ def test_a_takeover_that_what_waited_cannot_carry_out_starts_the_program_anew(
             raise GuardError("the program has ended")
         return component, outage_ns
 
-    monkeypatch.setattr(Charge, "_brought_back", brought_back)
+    monkeypatch.setattr(comeback, "brought_back", brought_back)
     monkeypatch.setattr(Charge, "_let_it_run", let_it_run)
     monkeypatch.setattr(Standby, "take", lambda _: waiting)
 

@@ -1,0 +1,59 @@
+"""How a component comes back from a checkpoint: by the engine that made it, and by what waits for it where something does."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+
+from agent import births
+from agent.clock import Laps
+from agent.component import Component
+from agent.guard_messages import Task
+from agent.rules import started_here
+from agent.surroundings import Surroundings, program_of
+from checkpoint import format
+from checkpoint.engine import AUTO, COOPERATIVE
+from checkpoint.errors import RestoreError
+from failover.core import acts
+
+
+async def brought_back(
+    around: Surroundings,
+    act: acts.Restore,
+    chain: Sequence[int],
+    outage_ns: int,
+    laps: Laps,
+    waiting: Component | None = None,
+) -> Component:
+    """The component by the engine that took the newest snapshot; `Component.resume` lets it run.
+
+    Args:
+        chain: descriptors of encoded snapshots, oldest first.
+        outage_ns: how long ago the newest was taken.
+        waiting: the program, where it was started to wait.
+
+    Raises:
+        CheckpointError, AgentError: as `births.restore` and `births.begin_again`; nothing of it is left.
+    """
+    name, places, spec = act.component, around.places, act.spec
+    newest = await asyncio.to_thread(format.read_outline, chain[-1])
+    if newest.engine != COOPERATIVE:
+        if waiting is not None:
+            await waiting.undo()
+        owner = spec.owner if spec is not None else None
+        task = Task(act.epoch, engine=AUTO) if spec is not None and spec.launch.engine == AUTO else None
+        return await births.restore(name, chain, places, outage_ns=outage_ns, owner=owner, laps=laps, task=task, epoch=act.epoch)
+    if spec is None:
+        raise RestoreError(f"cannot start {name} again: this robot was never told its command; start it by failover run")
+    program = program_of(started_here(spec.launch, around.here(name)))
+    return await births.begin_again(
+        name,
+        program,
+        chain,
+        places,
+        outage_ns=outage_ns,
+        owner=spec.owner,
+        epoch=act.epoch,
+        why=act.why,
+        waiting=waiting,
+    )

@@ -1,0 +1,61 @@
+"""What every component in this robot's charge is surrounded by, and what can go wrong with it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import msgspec
+
+from agent.births import Program
+from agent.config import ComponentConfig
+from agent.errors import AgentError
+from agent.hooks import Hooks
+from agent.places import Places
+from agent.records import Records
+from checkpoint.errors import CheckpointError
+from checkpoint.linux.inheritance import Inheritance
+from checkpoint.store import Store
+from failover.core.events import Event
+from failover.core.types import COMMITTED, Launch
+
+TROUBLE: Final = (CheckpointError, AgentError, OSError)
+"""What can go wrong with a program, its processes or a disk, and is told; anything else is our mistake and ends the lanes."""
+
+
+@dataclass(slots=True)
+class Surroundings:
+    """What every charge works with.
+
+    Attributes:
+        tell: passes an event to the core.
+        silence_ns: how long the robot that the component is taken over from has been silent, as far as known; for the outage.
+        settled: returns once no snapshot of a component is being stored any more.
+        here: what this robot's operator wants for a component.
+        hooks: runs his commands.
+    """
+
+    places: Places
+    store: Store
+    records: Records
+    tell: Callable[[Event], None]
+    silence_ns: Callable[[str], Coroutine[Any, Any, int]]
+    settled: Callable[[str], Coroutine[Any, Any, None]]
+    here: Callable[[str], ComponentConfig]
+    hooks: Hooks = field(default_factory=Hooks)
+
+
+def program_of(launch: Launch) -> Program:
+    """What to start."""
+    return Program(
+        tuple(os.fsencode(argument) for argument in launch.argv),
+        tuple(os.fsencode(f"{name}={value}") for name, value in launch.environment),
+        os.fsencode(launch.directory),
+        launch.umask,
+        launch.isolate,
+        msgspec.msgpack.decode(launch.inheritance, type=Inheritance) if launch.inheritance else None,
+        launch.engine,
+        launch.output == COMMITTED,
+    )
