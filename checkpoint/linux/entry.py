@@ -95,15 +95,10 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
     tracee.cont()
     try:
         _wait_in_call(tracee.pid, "rt_sigtimedwait")
-        tracee.freeze()
-        found = arch.decode_registers(tracee.registers())
-    except CaptureError:
-        give_back(tracee, registers, mask)
-        raise
+    finally:
+        found = give_back(tracee, registers, mask, range(place, place + len(stub)).__contains__)
     code, table, inside = (ctypes.c_int64(found[name]).value for name in arch.ENTRY_REGISTERS)
     faults = _taken(tracee.pid, inside) if inside >= 0 else None
-    tracee.set_signal_mask(mask)
-    tracee.set_registers(registers)
     tracee.memory.poke(place, bytes(len(stub)))
     if code != hole or table != hole + CODE_SIZE:
         raise CaptureError(

@@ -16,6 +16,8 @@ A batch, and why a SIGKILL of the tracer at any instant leaves the program unhar
    kernel itself restarts or ends the interrupted call as signals then demand. *Killed between or before:* the wait ends and
    the batch goes on as in 2. A signal that comes just then may run its handler on top of the batch; such pages are marked
    ARMED, and a later tracer leaves them to the program as ordinary memory.
+6. *Late* (a busy machine, a tracer that was stopped): the wait ends as well, and the program makes steps of its own. Giving it
+   the registers of the first stop would make it repeat them: it keeps its own, and the look has failed.
 
 How the pages get there at first, and what is done with those of an earlier tracer: `checkpoint.linux.entry`.
 
@@ -28,6 +30,7 @@ import ctypes
 import os
 import struct
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -162,8 +165,10 @@ class BorrowedPages:
 
         Raises:
             ProcessGoneError: it was killed meanwhile.
-            CaptureError: the batch did not run in time; the program goes on.
+            CaptureError: the batch did not run in time, or we came too late to take the thread back; the program goes on.
         """
+        if self.state() == ARMED:
+            raise CaptureError(f"pid {tracee.pid} still has to return to code of an earlier look; capture it again in a moment")
         self._write(batch, arch.decode_registers(registers), mask)
         there = arch.decode_registers(registers)
         there[arch.INSTRUCTION_POINTER] = self.address
@@ -174,8 +179,8 @@ class BorrowedPages:
         try:
             self._wait_done()
         finally:
-            give_back(tracee, registers, mask)
-        self._memory.write(self._places.state, struct.pack("<Q", IDLE))
+            give_back(tracee, registers, mask, self.holds)
+            self._memory.write(self._places.state, struct.pack("<Q", IDLE))
         return self._answers(batch)
 
     def _write(self, batch: Batch, registers: arch.Registers, mask: int) -> None:
@@ -210,11 +215,25 @@ class BorrowedPages:
         return Answers(results, raw[_OUTPUTS - _RESULTS :], self.table + _OUTPUTS)
 
 
-def give_back(tracee: Tracee, registers: bytes, mask: int) -> None:
-    """Stop the thread wherever our code has it, and set it where the program stood. Mask first: see step 5."""
+def give_back(tracee: Tracee, registers: bytes, mask: int, is_ours: Callable[[int], bool]) -> arch.Registers:
+    """Stop the thread in our code, and set it where the program stood. Mask first: see step 5. Answers with what it had there.
+
+    Args:
+        is_ours: whether an instruction at this address is of our code.
+
+    Raises:
+        CaptureError: it has left our code by itself, and goes on from where it is now.
+    """
     tracee.freeze()
+    found = arch.decode_registers(tracee.registers())
+    if not is_ours(found[arch.INSTRUCTION_POINTER]):
+        raise CaptureError(
+            f"pid {tracee.pid} has run on while it was looked at: the machine left us no processor for "
+            f"{arch.ENTRY_TIMEOUT_NS // 1_000_000} ms; capture it again"
+        )
     tracee.set_signal_mask(mask)
     tracee.set_registers(registers)
+    return found
 
 
 def resumed(registers: arch.Registers) -> arch.Registers:

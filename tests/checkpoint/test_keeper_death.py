@@ -19,8 +19,12 @@ import pytest
 
 from checkpoint import channel
 from checkpoint.channel import Channel, ChannelError, Reply
+from checkpoint.engine import CaptureOrder
+from checkpoint.errors import CaptureError
+from checkpoint.linux import entry
+from checkpoint.linux.remote import BorrowedPages
 from checkpoint.linux.vessel import Birth, Born, spawn_vessel
-from tests.checkpoint.round_trip import PATIENCE_S, Program, ended, start
+from tests.checkpoint.round_trip import PATIENCE_S, Program, ended, protected, start
 
 KILLS = int(os.environ.get("FAILOVER_KILLS", "20"))
 
@@ -136,10 +140,53 @@ def test_a_keeper_killed_at_any_instant_leaves_the_program_unharmed(worker: Prog
         assert len(descriptors) <= 1, f"attempt {attempt}: left open {descriptors}"  # the file that it is writing
     with keeping() as keeper:
         a_keepers_life(keeper, worker.pid)  # and it can be protected again
+    expect_undisturbed(worker)
+
+
+def expect_undisturbed(worker: Program) -> None:
+    """Tell it to end: it has computed what it computes when nobody looks."""
     worker.tell()
     assert worker.finish() == 0
     turns = int(worker.output.split()[1])
     assert worker.output.splitlines() == ["ready", expected_end(turns)]
+
+
+def test_a_keeper_that_is_late_does_not_send_the_program_back_to_where_it_stood(
+    worker: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its code in the program waits for it, not for ever; by now the program has run on by itself."""
+    wait_in_time = BorrowedPages._wait_done
+
+    def wait_too_long(pages: BorrowedPages) -> None:
+        wait_in_time(pages)
+        assert goes_on(worker)
+
+    with protected(worker) as session:
+        snapshot = session.capture(CaptureOrder(base=True, generation=1, sequence=1))
+        session.acknowledge(snapshot.position)
+        monkeypatch.setattr(BorrowedPages, "_wait_done", wait_too_long)
+        with pytest.raises(CaptureError, match=f"pid {worker.pid} has run on while it was looked at"):
+            session.capture(CaptureOrder(base=False, generation=1, sequence=2))
+        assert goes_on(worker)
+        monkeypatch.undo()
+        session.capture(CaptureOrder(base=False, generation=1, sequence=2))
+    expect_undisturbed(worker)
+
+
+def test_a_keeper_that_is_late_with_its_first_entry_does_no_harm_either(worker: Program, monkeypatch: pytest.MonkeyPatch) -> None:
+    wait_in_time = entry._wait_in_call
+
+    def wait_too_long(pid: int, name: str) -> None:
+        wait_in_time(pid, name)
+        assert goes_on(worker)
+
+    monkeypatch.setattr(entry, "_wait_in_call", wait_too_long)
+    with pytest.raises(CaptureError, match="has run on while it was looked at"), protected(worker):
+        pass
+    monkeypatch.undo()
+    with protected(worker) as session:
+        session.capture(CaptureOrder(base=True, generation=1, sequence=1))
+    expect_undisturbed(worker)
 
 
 HOLDER = """
