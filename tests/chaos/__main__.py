@@ -20,6 +20,7 @@ from typing import Final, NoReturn
 
 from failover.errors import FailoverError
 from tests.chaos.campaign import Campaign
+from tests.chaos.faults import KINDS
 from tests.chaos.house import BEAT_MS, LEASE_MS, House, programs
 
 INSIDE: Final = "FAILOVER_CHAOS_INSIDE"
@@ -44,7 +45,7 @@ def main() -> int:
     directory.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     print(f"seed {arguments.seed}, {arguments.faults} faults; beats every {BEAT_MS} ms, leases of {LEASE_MS} ms", flush=True)
-    if not _wage(directory, arguments.seed, arguments.faults):
+    if not _wage(directory, arguments.seed, arguments.faults, arguments.kinds):
         print(f"evidence: {directory}", flush=True)
         return 1
     print(f"in {time.monotonic() - began:.0f} s", flush=True)
@@ -53,11 +54,11 @@ def main() -> int:
     return 0
 
 
-def _wage(directory: Path, seed: str, faults: int) -> bool:
+def _wage(directory: Path, seed: str, faults: int, kinds: list[str]) -> bool:
     plan = tuple(programs(directory, shutil.which("gcc") or shutil.which("cc"), _gawk()))
     with House(directory, plan) as house:
         house.start()
-        campaign = Campaign(house, random.Random(seed))
+        campaign = Campaign(house, random.Random(seed), kinds)
         try:
             campaign.wage(faults)
         except (AssertionError, FailoverError) as error:
@@ -95,6 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m tests.chaos", description=__doc__)
     parser.add_argument("--faults", type=int, default=20, help="how many")
     parser.add_argument("--seed", default=str(random.randrange(1 << 32)), help="of the dice")
+    parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS), help="of faults; all of them")
     parser.add_argument("--directory", help="where to work, and to leave the evidence; kept")
     return parser
 

@@ -13,7 +13,7 @@ from random import Random
 from typing import Any, Final
 
 from tests.chaos import actuator
-from tests.chaos.faults import KINDS, Draw, Fault
+from tests.chaos.faults import Draw, Fault
 from tests.chaos.house import AWAY, LEASE_MS, House, until
 from tests.chaos.judge import BrokenPromiseError, Judge, Pause, percentile
 from tests.chaos.reader import Reader
@@ -56,16 +56,19 @@ class Blow:
 
 @dataclass(slots=True)
 class Campaign:
-    """Deals faults to a house and judges what comes of them."""
+    """Deals faults of some kinds, each in turn, to a house and judges what comes of them."""
 
     house: House
     dice: Random
+    kinds: list[str]
     judge: Judge = field(init=False)
     blows: list[Blow] = field(default_factory=list)
     readers: list[Reader] = field(default_factory=list)
     _record: actuator.Record = field(init=False)
     _crashes: deque[tuple[float, str]] = field(default_factory=deque)
-    _kinds: list[str] = field(default_factory=list)
+    _left: list[str] = field(default_factory=list)
+    _awaited: dict[str, int] = field(default_factory=dict)
+    _told: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.judge = Judge((program.name for program in self.house.programs), PAUSE_MS)
@@ -92,12 +95,12 @@ class Campaign:
 
     def _round(self, left: int) -> None:
         """One fault or two at once, and the way back."""
-        draw = Draw(self.house, self.dice, self._running())
+        draw = self._look()
         dealt = [self._draw(draw)]
         if left > 1 and self.dice.random() < AT_ONCE:
             other = self._draw(draw)
             if set(other.hits) & set(dealt[0].hits):
-                self._kinds.append(other.kind)  # next time
+                self._left.append(other.kind)  # next time
             else:
                 dealt.append(other)
         began, ended = {}, {}
@@ -122,10 +125,10 @@ class Campaign:
     def _draw(self, draw: Draw) -> Fault:
         """The next kind in turn, so that a short campaign has one of each; none that ends a program too often."""
         while True:
-            if not self._kinds:
-                self._kinds = list(KINDS)
-                self.dice.shuffle(self._kinds)
-            fault = draw.fault(self._kinds.pop())
+            if not self._left:
+                self._left = list(self.kinds)
+                self.dice.shuffle(self._left)
+            fault = draw.fault(self._left.pop())
             names = [name for member in fault.hits for name in draw.running.get(member.name, ())]
             if not fault.crashes or self._may_crash(names):
                 return fault
@@ -160,22 +163,27 @@ class Campaign:
 
     # How it stands
 
-    def _running(self) -> dict[str, list[str]]:
-        """Which components each robot runs, by its own word."""
-        found: dict[str, list[str]] = {}
+    def _look(self) -> Draw:
+        """What faults can be aimed at: who runs what, by their own word."""
+        running: dict[str, list[str]] = {}
+        standbys: dict[str, str] = {}
         for name, picture in self.house.pictures().items():
-            found[name] = [short(one["name"]) for one in picture["components"] if one["role"] == "primary"]
-        return found
+            primaries = [one for one in picture["components"] if one["role"] == "primary"]
+            running[name] = [short(one["name"]) for one in primaries]
+            standbys |= {short(one["name"]): one["standby"] for one in primaries}
+        return Draw(self.house, self.dice, running, standbys)
 
     def _expect(self, component: str) -> None:
         """From now on, it is well when it has commanded anew."""
         self._awaited[component] = time.monotonic_ns()
 
-    _awaited: dict[str, int] = field(default_factory=dict)
-
     def _is_well(self) -> bool:
         self._hear()
-        return not self._illnesses()
+        found = self._illnesses()
+        if found and found != self._told:
+            self._write("waits", f"{time.monotonic_ns() / 1e9:.3f}  for {'; '.join(found)}")
+        self._told = found
+        return not found
 
     def _illness(self) -> str:
         return "; ".join(self._illnesses())
@@ -221,7 +229,12 @@ class Campaign:
     def _note(self, what: str) -> None:
         line = f"{time.monotonic_ns() / 1e9:.3f}  {what}"
         print(line, flush=True)
-        with (self.house.directory / "faults").open("a") as file:
+        self._write("faults", line)
+        self._write("waits", line)
+
+    def _write(self, name: str, line: str) -> None:
+        """Add to a file of the evidence: ``faults``, or ``waits``, which also has what was waited for."""
+        with (self.house.directory / name).open("a") as file:
             file.write(line + "\n")
 
     def outages(self) -> list[Pause]:

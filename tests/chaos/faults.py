@@ -5,8 +5,10 @@ Faults are drawn from dice, aimed at whoever runs a component more often than at
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -61,11 +63,13 @@ class Draw:
 
     Attributes:
         running: who runs which component now, by member's name.
+        standbys: who holds the newest checkpoint of a component, by the component's name.
     """
 
     house: House
     dice: Random
     running: Mapping[str, list[str]] = field(default_factory=dict)
+    standbys: Mapping[str, str] = field(default_factory=dict)
 
     def fault(self, kind: str) -> Fault:
         """One of this kind."""
@@ -151,6 +155,61 @@ class Draw:
 
         sentence = f"all of {member.name} hangs for {hangs_s:.2f} s, then its power is cut and comes back"
         return Fault("hung", sentence, hangs_s, (member,), begin, end)
+
+    def blackout(self) -> Fault:
+        """All members lose their power, and come back one after the other in any order."""
+        order = self.dice.sample(self.house.members, len(self.house.members))
+
+        def begin() -> None:
+            for member in order:
+                self.house.power_off(member)
+
+        def end() -> None:
+            for member in reversed(order):
+                self.house.power_on(member)
+
+        away_s = self.dice.uniform(0.2, 2)
+        return Fault("blackout", f"all lose their power for {away_s:.2f} s", away_s, tuple(order), begin, end)
+
+    def worst(self) -> Fault:
+        """A primary loses its power while its standby is cut off: nobody else may go on from less than was acknowledged."""
+        primary = self._robot()
+        names = [name for name in self.running.get(primary.name, []) if self.standbys.get(name)]
+        standby = self.house.member(self.standbys[self.dice.choice(names)]) if names else self.house.members[-1]
+        plugs = [(standby.number, link) for link in standby.links]
+        lasts_s, is_primary_first = self.dice.uniform(LEASE_S, 12 * LEASE_S), self.dice.random() < 0.5
+
+        def begin() -> None:
+            self.house.network.pull(plugs)
+            self.house.power_off(primary)
+
+        def end() -> None:
+            if is_primary_first:
+                self.house.power_on(primary)
+            self.house.network.push(plugs)
+            if not is_primary_first:
+                self.house.power_on(primary)
+
+        sentence = f"{primary.name} loses its power while its standby {standby.name} is cut off for {lasts_s:.2f} s"
+        return Fault("worst", sentence, lasts_s, (primary, standby), begin, end)
+
+    def moving(self) -> Fault:
+        """In the middle of a handover, the robot that gives, or the one that takes, loses its power."""
+        source = self._robot()
+        target = self.dice.choice([member for member in self.house.robots if member is not source])
+        name = self.dice.choice(self.running.get(source.name) or [""])
+        victim, pause_s = self.dice.choice((source, target)), self.dice.uniform(0, 1)
+
+        def begin() -> None:
+            self.house.order_handover(name, source, target)
+            time.sleep(pause_s)  # not a wait for anything: the instant of the cut
+            self.house.power_off(victim)
+
+        sentence = (
+            f"{name} is handed over from {source.name} to {target.name}; {victim.name} loses its power after {pause_s:.2f} s"
+        )
+        end = functools.partial(self.house.power_on, victim)
+        return Fault("moving", sentence, pause_s + self.dice.uniform(0.2, 6 * LEASE_S), (source, target), begin, end)
 
     def _outage(self, kind: str, member: Member, how: str, change: Callable[[Member], None]) -> Fault:
         away_s = self.dice.uniform(0.2, 8 * LEASE_S)
@@ -244,6 +303,9 @@ KINDS: Final[dict[str, Callable[[Draw], Fault]]] = {
     "full": Draw.full,
     "cable": Draw.cable,
     "burnt": Draw.burnt,
+    "worst": Draw.worst,
+    "moving": Draw.moving,
+    "blackout": Draw.blackout,
     "saturated": Draw.saturated,
 }
 

@@ -14,6 +14,7 @@ import socket
 import struct
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -25,7 +26,7 @@ from failover.cli.demo.robots import RobotMachine, agent_command, host_command, 
 from failover.client import team
 from failover.client.control import Control
 from failover.client.team import Robot, Role, Team
-from failover.errors import LostAgentError, NoAgentError
+from failover.errors import AgentRefusedError, LostAgentError, NoAgentError
 from tests.chaos import actuator
 from tests.chaos.network import Network, address_of
 
@@ -313,6 +314,12 @@ class House:
                 output="committed",
             )
 
+    def order_handover(self, component: str, source: Member, target: Member) -> None:
+        """Have a component moved; nobody waits for the answer."""
+        with contextlib.suppress(*AWAY):
+            link = source.control()
+            threading.Thread(target=_ask, args=(link, component, target.name), daemon=True).start()
+
     def pictures(self) -> dict[str, dict[str, Any]]:
         """The status of every member that answers."""
         found = {}
@@ -327,6 +334,11 @@ class House:
         peers = [peer for picture in pictures.values() for peer in picture["peers"]]
         heard = all(peer["state"] == "live" and peer["hears_us"] and peer["lane"] == "connected" for peer in peers)
         return heard and len(pictures) == len(self.members)
+
+
+def _ask(link: Control, component: str, target: str) -> None:
+    with contextlib.suppress(*AWAY, AgentRefusedError), link:
+        link.ask("handover", name=f"/house/{component}", to=target)
 
 
 def programs(directory: Path, compiler: str | None, awk: str | None) -> Iterator[Program]:
