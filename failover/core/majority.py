@@ -82,10 +82,9 @@ def won(component: Component, turn: Turn) -> bool:
 
 def may_claim(component: Component, turn: Turn, position: Position | None) -> bool:
     """The pre-vote: a majority is free, and would have this robot go on from ``position``."""
-    wanted = FREE if holds_all(component, turn, turn.me, position) else OPEN
-    if not component.free or (wanted == OPEN and not component.open):
+    if not component.free or not (component.open or holds_all(component, turn, turn.me, position)):
         return False
-    willing = 1 + sum(_would(component, peer, wanted) for peer in turn.team.living(turn.now_ns))
+    willing = 1 + sum(_would(component, turn, peer, position) for peer in turn.team.living(turn.now_ns))
     return willing >= turn.config.quorum
 
 
@@ -130,7 +129,10 @@ def _sure(component: Component) -> tuple[str, ...]:
 
 def holds_all(component: Component, turn: Turn, robot: str, position: Position | None) -> bool:
     """Whether a robot is one of those, or has at least what one of them has."""
-    sure = _sure(component)
+    return _covers(component, turn, _sure(component), robot, position)
+
+
+def _covers(component: Component, turn: Turn, sure: tuple[str, ...], robot: str, position: Position | None) -> bool:
     if not sure or robot in sure:
         return True
     theirs = (_position_at(component, turn, one) for one in sure)
@@ -165,12 +167,13 @@ def _lost(component: Component, turn: Turn, robot: str) -> bool:
     return entry.position is None and state_of(entry) not in _BOUND
 
 
-def _would(component: Component, peer: Peer, wanted: int) -> bool:
-    """Whether a peer says that it would vote; one that knows nothing of the component is bound to nobody."""
+def _would(component: Component, turn: Turn, peer: Peer, position: Position | None) -> bool:
+    """Whether a peer would vote for us, by what it has noted itself; one that does not know the component is bound to nobody."""
     entry = peer.entry(component.name)
     if entry is None:
         return peer.complete
-    return entry.flags & wanted == wanted
+    sure = tuple(robot for robot in (entry.primary, entry.standby) if robot)
+    return bool(entry.flags & OPEN) or (bool(entry.flags & FREE) and _covers(component, turn, sure, turn.me, position))
 
 
 def _gives_way(component: Component, turn: Turn, robot: str) -> bool:

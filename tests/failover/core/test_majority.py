@@ -178,6 +178,18 @@ def test_a_primary_that_nobody_hears_stands_still() -> None:
     assert talk.orders(acts.Freeze)
 
 
+def test_a_robot_claims_when_the_others_would_vote_for_it_by_what_they_have_noted() -> None:
+    """It gave its copy up to robot2's claim of epoch 3; robot2 is back with a new disk; nobody else has heard of that claim."""
+    record = Record(NAME, 3, "robot2", State.STANDBY, spec=SPEC)
+    talk = Talk(ROBOT, Ballot((record,)), (Held(NAME, (NEWEST,)),))
+    talk.tick(400)
+    for _ in range(3):
+        talk.hear("robot2", entry(State.STANDBY, 2, "robot1", None, "robot2", FREE))
+        talk.hear("witness1", entry(State.STANDBY, 2, "robot1", None, "robot2", FREE))
+        talk.tick(20)
+    assert talk.vote() == (4, "robot1")
+
+
 def leases(talk: Talk) -> list[int]:
     return [act.until_ns for act in talk.orders(acts.SetLease) if isinstance(act, acts.SetLease)]
 
