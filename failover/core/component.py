@@ -52,6 +52,7 @@ class Cause(enum.StrEnum):
 
 
 _RUNNING = (State.STARTING, State.TAKING_OVER, State.PRIMARY, State.FROZEN, State.HANDING_OVER, State.RECOVERING)
+_RUNS_HERE = (State.PRIMARY, State.FROZEN, State.HANDING_OVER, State.RECOVERING)
 _IDLE = (State.ABSENT, State.STANDBY, State.FINISHED, State.FAILED, State.RELEASED)
 
 TABLE: dict[tuple[State, Cause], State] = {
@@ -66,11 +67,11 @@ TABLE: dict[tuple[State, Cause], State] = {
     (State.FROZEN, Cause.LEASE_BACK): State.PRIMARY,
     (State.PRIMARY, Cause.HAND_OVER): State.HANDING_OVER,
     (State.HANDING_OVER, Cause.CALL_OFF): State.FROZEN,
-    **{(state, Cause.CRASH): State.RECOVERING for state in (State.PRIMARY, State.FROZEN, State.HANDING_OVER, State.RECOVERING)},
+    **{(state, Cause.CRASH): State.RECOVERING for state in _RUNS_HERE},
     (State.STARTING, Cause.CRASH): State.RECOVERING,
     (State.TAKING_OVER, Cause.CRASH): State.RECOVERING,
     **{(state, Cause.OUTBID): State.STOPPING for state in _RUNNING},
-    (State.TAKING_OVER, Cause.CANNOT): State.STOPPING,
+    **{(state, Cause.CANNOT): State.STOPPING for state in (State.TAKING_OVER, *_RUNS_HERE)},
     (State.STOPPING, Cause.CLEARED): State.STANDBY,
     **{(state, Cause.FOLLOW): State.STANDBY for state in _IDLE},
     **{(state, Cause.FINISH): State.FINISHED for state in (*_RUNNING, *_IDLE, State.CLAIMING)},

@@ -184,8 +184,9 @@ def living_entries(component: Component, turn: Turn) -> list[tuple[str, Entry]]:
 
 
 def may_start_afresh(component: Component) -> bool:
-    """Configured to run, and no checkpoint of it was ever given away."""
-    return component.autostart and component.spec is not None and not component.entrusted and not component.trusted
+    """Configured to run, and no checkpoint of it was ever given away or is here, perhaps one that cannot be used just now."""
+    is_new = not (component.entrusted or component.trusted or component.held)
+    return component.autostart and component.spec is not None and is_new
 
 
 def first_of_equals(component: Component, turn: Turn, entries: list[tuple[str, Entry]], mine: Position) -> bool:

@@ -16,7 +16,7 @@ SIGNAL_BITS = 0x7F
 """Of a wait status: the signal that ended the program, 0 for none."""
 
 TRIES_MAX = 3
-"""Takeovers that fail here before this robot leaves it alone."""
+"""Takeovers that fail here, one after the other without a checkpoint in between, before this robot leaves it alone."""
 
 PAUSES = (1, 10, 10)
 """Of ``retry_ms``, before a takeover that failed is tried again: what was in the way once may be gone at once."""
@@ -29,13 +29,26 @@ def exited(component: Component, turn: Turn, event: Exited) -> None:
     if component.state not in _WITH_PROCESS or event.epoch < component.born:
         return
     signal = event.status & SIGNAL_BITS
-    if not signal or component.ending:
+    if event.refusal and not component.ending:
+        _refused(component, turn, event)
+    elif not signal or component.ending:
         _end(component, turn, Cause.FINISH, event.status, "")
         how = f"signal {signal}" if signal else f"exit code {event.status >> 8}"
         turn.say(component, f"{turn.me} {Cause.FINISH}: {how}")
     elif component.rules.on_crash is OnCrash.LEAVE:
         _end(component, turn, Cause.FAIL, event.status, f"it died by signal {signal}; on_crash = leave")
     else:
+        crashed(component, turn, event.status)
+
+
+def _refused(component: Component, turn: Turn, event: Exited) -> None:
+    """It did not go on from its checkpoint: a failed takeover; or, where it has made checkpoints already, a crash."""
+    if component.acked is None or component.acked.generation != component.generation:
+        _end_handover(component, turn, f"{component.name} ended meanwhile")
+        component.flight, component.crashed = None, 0
+        cannot(component, turn, event.refusal)
+    else:
+        turn.say(component, event.refusal)
         crashed(component, turn, event.status)
 
 

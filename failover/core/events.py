@@ -188,11 +188,18 @@ class Warmed:
 
 @dataclass(frozen=True, slots=True)
 class Exited:
-    """The program ended by itself. ``status`` is waitpid(2)'s: low seven bits the signal (0: none), next byte the exit code."""
+    """The program ended by itself.
+
+    Attributes:
+        status: waitpid(2)'s: low seven bits the signal (0: none), next byte the exit code.
+        refusal: of a program that was started again to keep its state, and ended with an error before it kept any: a sentence. It
+            did not go on from what it was given. "" for every other end.
+    """
 
     component: str
     epoch: int
     status: int
+    refusal: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -347,7 +347,6 @@ def _runs(component: Component, turn: Turn, event: Started | Restored) -> None:
         how += f", {event.age_ns / NS_PER_S:.1f} s old,"
     component.move(Cause.RUNS)
     component.resumption = Resumption.RESTARTED  # of what comes next, if that is here
-    component.tries = 0
     component.due_ns = turn.now_ns
     component.retry_ns = turn.now_ns + FAILBACK_PAUSE * turn.config.retry_ms * MS
     turn.say(component, f"{how} at {turn.me}, epoch {component.epoch}")

@@ -199,7 +199,7 @@ def _checkpoint(component: Component, turn: Turn, position: Position, *, is_safe
     flight = component.flight
     assert flight is not None
     turn.order(acts.Acknowledge(component.name, component.epoch, position, is_safe))
-    component.undelivered = ""
+    component.undelivered, component.tries = "", 0
     component.parent = component.acked = position
     component.trail.append((position, flight.parent))
     component.acked_ns = flight.state_ns

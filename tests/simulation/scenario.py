@@ -10,6 +10,7 @@ A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment. ``expect`` 
     500  cut robot1 robot2                 nothing passes, both ways;  one-way A B: from A to B;  mend: all cuts end
     600  stall robot1 300                  its loop gets no processor for 300 ms
     600  slow robot1 40                    its disk and its captures take so many times as long
+    600  refuses robot1                    a program that is resumed there ends at once: it cannot read its state;  takes: it can
     700  exit robot1 0                     its program ends with this wait status (11: crash)
     800  handover robot1                   an operator moves it to the standby
     850  new-disk robot1                   its checkpoints are gone; what it has decided is not
@@ -88,6 +89,8 @@ class Story:
                 world.program_ends(robot, COMPONENT, int(arguments[1]))
             case "stall":
                 world.stall(robot, int(arguments[1]) * MS)
+            case "refuses" | "takes":
+                world.robots[robot].refuses = verb == "refuses"
             case "slow":
                 world.robots[robot].slow = float(arguments[1])
             case "cut":

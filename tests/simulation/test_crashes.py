@@ -115,3 +115,27 @@ def test_a_crash_loop_does_not_wander_from_robot_to_robot_for_ever(rule: Rule) -
         fate.world.program_ends("robot2", PART, CRASH)
         fate.after(300)
     assert state_at(fate.world, "robot2", PART) is State.FAILED and len(fate.resumed) <= 2 * 3
+
+
+@pytest.mark.parametrize("rule", list(Rule))
+def test_a_takeover_whose_program_refuses_its_state_has_failed_and_status_says_why(rule: Rule) -> None:
+    fate = team(rule, Rules())
+    fate.world.robots["robot2"].refuses = True
+    fate.world.power_off("robot1")
+    fate.after(10_000)
+    tries = [robot for robot, _ in fate.resumed]
+    assert tries == ["robot2"] * 3 and state_at(fate.world, "robot2", PART) is State.STANDBY
+    notes = seen_at(fate.world, "robot2", PART).notes
+    assert notes == ("robot2 cannot run it: /team/part ended with exit code 1 before it kept anything",)
+
+
+@pytest.mark.parametrize("rule", list(Rule))
+def test_a_program_that_refuses_its_state_when_it_is_resumed_in_place_goes_one_checkpoint_back(rule: Rule) -> None:
+    fate = team(rule, Rules(crash_limit=1))
+    fate.world.robots["robot1"].refuses = True
+    fate.crash()
+    fate.world.robots["robot1"].refuses = False
+    fate.after(300)
+    (_, newest), (_, older) = fate.resumed[:2]
+    assert older < newest
+    assert state_at(fate.world, "robot1", PART) in (State.PRIMARY, State.FAILED)

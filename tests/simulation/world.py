@@ -46,6 +46,10 @@ TORN = 0.5
 """Of the writes that a crash interrupts: those that got to the disk all the same."""
 
 
+REFUSES = 1 << 8
+"""The wait status of a program that cannot read its state."""
+
+
 @dataclass(frozen=True, slots=True)
 class NewDisk:
     """A robot has lost its checkpoints; ``ballot``: and its votes."""
@@ -118,6 +122,7 @@ class Robot:
     stalled_until_ns: int = 0
     slow: float = 1
     broken_store: bool = False
+    refuses: bool = False
     pending: Ballot | None = None
     told: list[Decision] = field(default_factory=list)
     writing: list[tuple[str, Position]] = field(default_factory=list)
@@ -499,6 +504,15 @@ class World:
         robot.programs[act.component] = program
         self.note(f"{robot.name}: {act.component} goes on from {act.position.generation}/{act.position.sequence}")
         self._feed(robot, Restored(act.component, act.epoch, act.position))
+        if robot.refuses:
+            self._refuse(robot, act.component, program)
+
+    def _refuse(self, robot: Robot, component: str, program: Program) -> None:
+        """The program cannot read its state here, and says so by its exit code."""
+        program.exit_status = REFUSES
+        self._feed(
+            robot, Exited(component, program.epoch, REFUSES, f"{component} ended with exit code 1 before it kept anything")
+        )
 
     def _capture(self, robot: Robot, act: acts.Capture) -> None:
         name, life, serial = act.component, robot.life, robot.serial.get(act.component, 0)
