@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from tests.chaos import actuator
 from tests.chaos.faults import Draw, Fault
-from tests.chaos.house import AWAY, LEASE_MS, House, until
+from tests.chaos.house import AWAY, LEASE_MS, LOOK_S, House, until
 from tests.chaos.judge import BrokenPromiseError, Judge, Pause, percentile
 from tests.chaos.reader import Reader
 
@@ -85,7 +85,7 @@ class Campaign:
         for reader in self.readers:
             reader.start()
         try:
-            until(self._is_well, self._illness)
+            until(self._is_well, self._illness, LOOK_S)
             while len(self.blows) < faults:
                 self._round(faults - len(self.blows))
             self._last_look()
@@ -114,7 +114,7 @@ class Campaign:
             ended[id(fault)] = time.monotonic_ns()
         for program in self.house.programs:
             self._expect(program.name)
-        until(self._is_well, self._illness)
+        until(self._is_well, self._illness, LOOK_S)
         well_ns = time.monotonic_ns()
         for fault in dealt:
             struck = tuple(name for member in fault.hits for name in draw.running.get(member.name, ()))
@@ -218,7 +218,7 @@ class Campaign:
         for reader in self.readers:
             goal = self.judge.histories[reader.component].newest
             assert goal is not None
-            until(lambda reader=reader, goal=goal: reader.newest >= goal.step, f"the output of {reader.component}")  # type: ignore[misc]
+            until(lambda reader=reader, goal=goal: reader.newest >= goal.step, f"output of {reader.component}")  # type: ignore[misc]
             self._hear()
         for component, history in self.judge.histories.items():
             if not history.stands_on(*history.acknowledged):

@@ -54,6 +54,8 @@ PATIENCE_S: Final = 90.0
 """A generous bound for whatever is waited for; the machine may be busy."""
 
 POLL_S: Final = 0.02
+LOOK_S: Final = 0.25
+"""Between two questions to everybody how things stand."""
 STEP_MS: Final = 50
 """Between two commands of a program."""
 
@@ -71,17 +73,20 @@ class StuckError(AssertionError):
     """Something that had to happen did not, within a generous bound."""
 
 
-def until(condition: Callable[[], T], what: Callable[[], str] | str, patience_s: float = PATIENCE_S) -> T:
+def until(condition: Callable[[], T], what: Callable[[], str] | str, poll_s: float = POLL_S) -> T:
     """The first true value of the condition.
+
+    Args:
+        poll_s: between two looks: longer where a look costs the members work.
 
     Raises:
         StuckError: there was none in time.
     """
-    deadline = time.monotonic() + patience_s
+    deadline = time.monotonic() + PATIENCE_S
     while not (value := condition()):
         if time.monotonic() > deadline:
-            raise StuckError(f"waited {patience_s:.0f} s in vain for {what if isinstance(what, str) else what()}")
-        time.sleep(POLL_S)
+            raise StuckError(f"waited {PATIENCE_S:.0f} s in vain for {what if isinstance(what, str) else what()}")
+        time.sleep(poll_s)
     return value
 
 
@@ -224,7 +229,7 @@ class House:
             member.disk.mkdir()
             self.new_disk(member)
             self.power_on(member)
-        until(self.is_connected, "all members to hear each other")
+        until(self.is_connected, "all members to hear each other", LOOK_S)
         for program in self.programs:
             self._run(program)
 

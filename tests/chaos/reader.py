@@ -13,7 +13,7 @@ from failover.errors import AgentRefusedError
 from tests.chaos.actuator import Safe
 from tests.chaos.house import AWAY, House, Member
 
-REST_S: Final = 0.15
+REST_S: Final = 0.3
 """Between two looks."""
 
 STDOUT: Final = 1
