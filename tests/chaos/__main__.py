@@ -30,6 +30,7 @@ NAMESPACES: Final = (
     *("unshare", "--mount", "--net", "--ipc", "--pid", "--fork", "--kill-child", "--mount-proc"),
     *("--propagation", "private"),
 )
+MISTAKE_LINES: Final = 40
 FIRST_PROCESS: Final = '"$@"; exit $?'
 """A shell as PID 1 reaps what is left to it."""
 
@@ -65,18 +66,18 @@ def _wage(directory: Path, seed: str, faults: int, kinds: list[str]) -> bool:
             print(f"seed {seed}: {type(error).__name__} at fault {len(campaign.blows) + 1}: {error}", flush=True)
             campaign.evidence()
             return False
-        finally:
-            for member in house.members:
-                _show_mistakes(member.directory / "agent.log")
+        except KeyboardInterrupt:
+            print("called off; until then:", flush=True)
         print(campaign.figures(), flush=True)
-    return True
+        return not any(_is_mistaken(member.directory / "agent.log") for member in house.members)
 
 
-def _show_mistakes(log: Path) -> None:
-    """A traceback in an agent's log is a bug, whatever came of it."""
+def _is_mistaken(log: Path) -> bool:
+    """Whether there is a traceback in an agent's log: a bug, whatever came of it. It is shown."""
     _, found, rest = log.read_text(errors="replace").partition("Traceback")
     if found:
-        print(f"a mistake in {log}:", *(found + rest).splitlines()[:40], sep="\n", flush=True)
+        print(f"a mistake in {log}:", *(found + rest).splitlines()[:MISTAKE_LINES], sep="\n", flush=True)
+    return bool(found)
 
 
 def _gawk() -> str | None:
