@@ -17,14 +17,14 @@ from typing import Any, Final
 
 from agent import births, clock, comeback
 from agent.component import Component
-from agent.errors import AgentError, GuardError, KeeperLostError
+from agent.errors import TROUBLE, AgentError, GuardError, KeeperLostError
 from agent.figures import Commits, Figures, shortened
 from agent.mistake import end_lanes_on_mistake
 from agent.occasions import Occasions
 from agent.rules import started_here
 from agent.snapshots import Snapshots
 from agent.standby import Standby
-from agent.surroundings import TROUBLE, Surroundings, program_of
+from agent.surroundings import Surroundings, program_of
 from checkpoint.channel import close_all
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CheckpointError, NothingCommittedError, UnsupportedError

@@ -15,9 +15,8 @@ from typing import Any, Final
 import msgspec
 
 from agent.caller import NOBODY
-from agent.errors import RefusedError
+from agent.errors import TROUBLE, RefusedError
 from agent.mistake import end_lanes_on_mistake
-from agent.surroundings import TROUBLE
 from checkpoint.errors import UNDECODABLE
 from failover.core.messages import CHUNK_SIZE_MAX, Bulk, Errand, ErrandDone
 from failover.errors import FailoverError

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Final
+
+from checkpoint.errors import CheckpointError
+
 
 class AgentError(Exception):
     """The daemon could not do something; the message says what, on what, why not and what to do."""
@@ -43,3 +47,7 @@ class RefusedError(AgentError):
         super().__init__(message)
         self.kind = kind
         self.reasons = reasons
+
+
+TROUBLE: Final = (CheckpointError, AgentError, OSError)
+"""What can go wrong with a program, its processes or a disk, and is told; anything else is our mistake and ends the lanes."""

@@ -55,7 +55,8 @@ class LanesProcess:
         """
         ours, theirs = pair()
         ours.setblocking(False)
-        command = [sys.executable, "-m", "agent.lanes", str(self._settings.path), str(theirs.fileno())]
+        module = "agent.witness" if self._settings.me.role == "witness" else "agent.lanes"
+        command = [sys.executable, "-m", module, str(self._settings.path), str(theirs.fileno())]
         try:
             self._child = subprocess.Popen(
                 command,

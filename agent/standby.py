@@ -12,10 +12,9 @@ from typing import Any, Final
 from agent import births, clock
 from agent.births import Program
 from agent.component import Component
-from agent.errors import AgentError, GuardError
+from agent.errors import TROUBLE, GuardError
 from agent.mistake import end_lanes_on_mistake
 from agent.places import Places
-from checkpoint.errors import CheckpointError
 
 READY_S: Final = 60.0
 """How long a program may take until it says that it keeps a state; it imports what it needs meanwhile."""
@@ -26,7 +25,6 @@ PAUSES_S: Final = (1.0, 5.0, 30.0, 120.0)
 STEADY_NS: Final = 60 * 10**9
 """One that waited so long before it ended is none that fails again and again."""
 
-TROUBLE: Final = (CheckpointError, AgentError, OSError)
 CURE: Final = "install it here, or give this robot a command of its own for it in agent.toml"
 
 log = logging.getLogger("failover.component")

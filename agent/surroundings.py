@@ -5,24 +5,19 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any
 
 import msgspec
 
 from agent.births import Program
 from agent.config import ComponentConfig
-from agent.errors import AgentError
 from agent.hooks import Hooks
 from agent.places import Places
 from agent.records import Records
-from checkpoint.errors import CheckpointError
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.store import Store
 from failover.core.events import Event
 from failover.core.types import COMMITTED, Launch
-
-TROUBLE: Final = (CheckpointError, AgentError, OSError)
-"""What can go wrong with a program, its processes or a disk, and is told; anything else is our mistake and ends the lanes."""
 
 
 @dataclass(slots=True)

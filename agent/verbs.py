@@ -19,23 +19,18 @@ from agent.arguments import (
     PromoteArguments,
     ProtectArguments,
     RunArguments,
-    StatusArguments,
     StopArguments,
-    WhyArguments,
     arguments_of,
 )
 from agent.caller import check_right, inheritance_for, owner_of
 from agent.charge import Charge
-from agent.config import Settings
 from agent.control import Conversation, Verb
-from agent.door import Told
-from agent.errands import Errands, Order
+from agent.errands import Order
 from agent.errors import RefusedError
 from agent.outflow import Outflow
 from agent.places import Places
+from agent.questions import Lines, Questions
 from agent.rules import rules_for
-from agent.telling import Telling
-from agent.view import version
 from failover.core import acts, events
 from failover.core.names import check_component, weight
 from failover.core.types import COMMITTED, ComponentSpec, Launch, State
@@ -43,9 +38,6 @@ from failover.errors import NameFormatError
 
 STANDING_POLL_S: Final = 0.01
 """Between two questions to the robot that a component moves to: what an operator reads as the move's time."""
-
-SIGHT_PATIENCE_S: Final = 0.5
-"""How long a status waits for the other robots' own."""
 
 START_PATIENCE_S: Final = 30.0
 """How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
@@ -55,65 +47,49 @@ Act = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
 """Carries an order out, for whoever may give it: its arguments → its result."""
 
 
-class Lanes(Protocol):
+class Lanes(Lines, Protocol):
     """What of `agent.lanes.Lanes` is needed here."""
 
-    settings: Settings
     places: Places
     charges: dict[str, Charge]
-    errands: Errands
 
-    async def ask(self, what: Any) -> Told: ...
-    async def command(self, make: Callable[[int], events.Command]) -> acts.Answer: ...
     def charge(self, name: str) -> Charge: ...
-    def hindrance(self, peer: str) -> str: ...
-    def picture(self, told: Told) -> dict[str, Any]: ...
 
 
-class Verbs:
+class Verbs(Questions):
     """Every verb of the control socket."""
 
     def __init__(self, lanes: Lanes) -> None:
+        super().__init__(lanes)
         self._lanes = lanes
         self._outflow = Outflow(lanes)
-        self._telling = Telling(lanes)
 
     def table(self) -> dict[str, Verb]:
         """By name, as the client says them."""
         return {
-            "ping": self.ping,
-            "status": self.status,
+            **super().table(),
             "run": self.run,
             "protect": self.protect,
             "logs": self.logs,
-            "why": self.why,
             "promote": self.promote,
             **{name: functools.partial(self._order, name) for name in self.orders()},
         }
 
     def errands(self) -> dict[str, Order]:
         """What another robot may ask of this one: the orders, and how things stand here."""
-        return {
-            **self.orders(),
-            "standing": self.standing,
-            "picture": self.picture,
-            "piece": self._outflow.piece,
-            "story": self._telling.page,
-            "promoted": functools.partial(self._permitted, self._promoted),
-        }
+        promoted = functools.partial(self._permitted, self._promoted)
+        return {**super().errands(), **self.orders(), "piece": self._outflow.piece, "promoted": promoted}
 
     def orders(self) -> dict[str, Order]:
         """Those that are carried out where the component runs, wherever they are given."""
-        return {name: functools.partial(self._permitted, act) for name, act in self._acts().items()}
-
-    def _acts(self) -> dict[str, Act]:
-        return {
+        found: dict[str, Act] = {
             "handover": self.handover,
             "failback": self.failback,
             "prefer": self.prefer,
             "release": self.release,
             "stop": self.stop,
         }
+        return {name: functools.partial(self._permitted, act) for name, act in found.items()}
 
     async def _permitted(self, order: Act, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Carry an order out here, if whoever gives it may give it."""
@@ -131,54 +107,6 @@ class Verbs:
         if primary in living:
             return await self._lanes.errands.send(primary, verb, arguments, say.caller.uid)
         return await self.orders()[verb](arguments, say.caller.uid)
-
-    async def ping(self, _say: Conversation, _arguments: dict[str, Any]) -> dict[str, Any]:
-        """Who are you?"""
-        await self._lanes.ask("status")
-        config = self._lanes.settings.config
-        team = self._lanes.settings.team.team
-        return {"robot": config.robot, "team": team, "pid": os.getppid(), "version": version(), "insecure": config.insecure}
-
-    async def status(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
-        """How does the team stand?"""
-        wanted = arguments_of(StatusArguments, "status", arguments)
-        while wanted.watch:
-            await say.update(await self._sight(wanted.team))
-            await asyncio.sleep(max(wanted.every_ms, 10) / 1_000)
-        return await self._sight(wanted.team)
-
-    async def _sight(self, team: bool) -> dict[str, Any]:
-        """This robot's picture; with ``team`` each component also as the other living robots see it."""
-        mine = self._lanes.picture(await self._lanes.ask("status"))
-        for component in mine["components"]:
-            component["elsewhere"] = {}
-        if team:
-            living = await self._reachable()
-            theirs = await asyncio.gather(*(self._asked(peer, "picture", {}) for peer in living))
-            for robot, picture in zip(living, theirs, strict=True):
-                known = {one["name"]: one for one in picture.get("components", ())}
-                for component in mine["components"]:
-                    if component["name"] in known:
-                        component["elsewhere"][robot] = known[component["name"]]
-        return mine
-
-    async def _reachable(self) -> list[str]:
-        """The robots that live and can be asked."""
-        peers = self._lanes.picture(await self._lanes.ask("status"))["peers"]
-        return [peer["name"] for peer in peers if peer["state"] == "live" and not self._lanes.hindrance(peer["name"])]
-
-    async def _asked(self, peer: str, question: str, arguments: dict[str, Any]) -> dict[str, Any]:
-        """A peer's answer; empty when it does not come soon."""
-        try:
-            return await self._lanes.errands.send(peer, question, arguments, patience_s=SIGHT_PATIENCE_S)
-        except RefusedError:
-            return {}
-
-    async def why(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
-        """What was decided, when and by whom: the stories of all robots that answer, in one."""
-        wanted = arguments_of(WhyArguments, "why", arguments)
-        name = await self._known(wanted.name) if wanted.name else ""
-        return await self._telling.whole(name, wanted.robot, wanted.age_ms_max)
 
     async def run(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """Start a program under protection; with ``wait`` pass its output on until it has ended."""
@@ -283,14 +211,6 @@ class Verbs:
                 )
             await asyncio.sleep(STANDING_POLL_S)
 
-    async def standing(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
-        """How one component stands on this robot; empty where it is unknown."""
-        return await self._view(arguments_of(NameArguments, "standing", arguments).name)
-
-    async def picture(self, _arguments: dict[str, Any], _by: int) -> dict[str, Any]:
-        """All of this robot's own sight, for another robot's status."""
-        return self._lanes.picture(await self._lanes.ask("status"))
-
     async def prefer(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """Say where a component should run."""
         wanted = arguments_of(PreferArguments, "prefer", arguments)
@@ -375,33 +295,6 @@ class Verbs:
         if not answer.ok:
             raise RefusedError(answer.sentence)
         return answer
-
-    async def _view(self, name: str) -> dict[str, Any]:
-        """The component's part of the picture; empty when it is unknown."""
-        picture = self._lanes.picture(await self._lanes.ask("status"))
-        return next((one for one in picture["components"] if one["name"] == name), {})
-
-    async def _names(self) -> dict[str, State]:
-        """Every component that this robot has heard of, and how it stands here."""
-        told = await self._lanes.ask("status")
-        return {one.name: one.state for one in told.status.components} if told.status else {}
-
-    async def _known(self, wanted: str) -> str:
-        """The component that a person means: its whole name, or an end of it that fits one alone.
-
-        Raises:
-            RefusedError: none, or more than one.
-        """
-        names = await self._names()
-        if wanted in names:
-            return wanted
-        fitting = [name for name in names if name.endswith("/" + wanted.lstrip("/"))]
-        if len(fitting) == 1:
-            return fitting[0]
-        if fitting:
-            raise RefusedError(f"{wanted!r} could be {', '.join(sorted(fitting))}; give the whole name", "UnknownComponentError")
-        known = ", ".join(sorted(name for name, state in names.items() if state is not State.RELEASED)) or "nothing"
-        raise RefusedError(f"no component is called {wanted!r}; this team protects {known}", "UnknownComponentError")
 
     async def _check_right(self, uid: int, name: str) -> None:
         """Raises RefusedError: the component is somebody else's."""

@@ -5,18 +5,20 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from importlib import metadata
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from agent import clock, fence
-from agent.charge import Charge
 from agent.config import Settings
 from agent.door import Life, Told
-from agent.figures import Commits, Figures
 from agent.pump import HOLD_LIMIT
 from agent.transport import Link, LinkState
 from checkpoint.engine import COOPERATIVE, PTRACE
-from checkpoint.store import Kept, Store
 from failover.core.types import COMMITTED, IMMEDIATE, ComponentView, PeerView, Protection, State
+
+if TYPE_CHECKING:  # a witness shows its status too, and has none of these
+    from agent.charge import Charge
+    from agent.figures import Commits, Figures
+    from checkpoint.store import Kept, Store
 
 NANOSECONDS_A_MILLISECOND: Final = 1_000_000
 
@@ -57,7 +59,7 @@ def team_view(
     links: Mapping[str, Link],
     notices: list[str],
     interfaces: list[dict[str, object]],
-    store: Store,
+    store: Store | None,
 ) -> dict[str, Any]:
     """The whole picture."""
     view = told.status
@@ -79,9 +81,7 @@ def team_view(
         "notes": notes,
         "links": interfaces,
         "peers": [_peer(peer, links.get(peer.robot), told, settings) for peer in (view.peers if view else ())],
-        "components": [
-            _component(one, charges.get(one.name), settings, store.kept(one.name)) for one in (view.components if view else ())
-        ],
+        "components": [_component(one, charges.get(one.name), settings, store) for one in (view.components if view else ())],
         "beats": {
             "sent": beats.sent,
             "heard": beats.heard,
@@ -128,7 +128,7 @@ def _waiting_output(view: ComponentView, waiting: int) -> tuple[str, ...]:
     )
 
 
-def _component(view: ComponentView, charge: Charge | None, settings: Settings, kept: Kept | None) -> dict[str, Any]:
+def _component(view: ComponentView, charge: Charge | None, settings: Settings, store: Store | None) -> dict[str, Any]:
     figures = charge.figures if charge is not None else None
     running = charge.component if charge is not None else None
     newest = view.positions[0] if view.positions else None
@@ -165,7 +165,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, k
         "crashes": figures.crashes if figures else 0,
         "outage_ms": figures.outage_ms if figures else None,
         "exit_status": view.status if view.state is State.FINISHED else None,
-        "kept": _kept(kept),
+        "kept": _kept(store.kept(view.name) if store is not None else None),
         "unstored": view.unstored,
         "promise": view.promise,
         "promise_differs": view.differs,

@@ -9,10 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from failover.cli import keys
-from failover.cli.demo.robots import RobotMachine, Stage, free_ports, means
+from failover.cli.demo.robots import RobotMachine, Stage, agent_command, free_ports, host_command, means
 from failover.client import team
 from failover.client.team import Robot, Role, Team
 from tests.e2e import robots
+
+ORDINARY_USER = ("/usr/bin/env", "unshare", "--user", "--map-user=1000", "--map-group=1000", "--")
+"""In a user namespace of its own as somebody who is not root there: no capability is left, here or there."""
 
 TWO_AND_A_SERVER: Mapping[str, Role] = {"robot1": "robot", "robot2": "robot", "hall": "server"}
 
@@ -52,6 +55,12 @@ class TeamStage(Stage):
             self.members[name].freeze()
         for name in names:
             self.members[name].end()
+
+    def command(self, name: str, config: Path) -> list[str]:
+        """The host of a member; of a witness as an ordinary user, without capabilities."""
+        if self._roles[name] == "witness":
+            return host_command(False, [*ORDINARY_USER, *agent_command(config)])
+        return super().command(name, config)
 
     def _write_team(self) -> None:
         ports = free_ports(2 * len(self._roles))

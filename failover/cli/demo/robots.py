@@ -278,13 +278,17 @@ class Stage:
             f'runtime_directory = "{directory / "run"}"\n'
             f"beat_ms = {BEAT_MS}\nlease_ms = {LEASE_MS}\n{self._settings}"
         )
-        command = host_command(self.means.own_pids, agent_command(config))
+        command = self.command(name, config)
         if self.means.own_network:
             assert shutil.which("unshare")
             command = ["unshare", "--net", "--", *command]
         with (directory / "agent.log").open("wb") as log:
             process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True)
         return RobotMachine(name, directory, process)
+
+    def command(self, _name: str, config: Path) -> list[str]:
+        """The command line of a robot's host, with its agent."""
+        return host_command(self.means.own_pids, agent_command(config))
 
     def _join(self) -> None:
         """Lay the cables between the two network namespaces."""

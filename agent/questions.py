@@ -1,0 +1,153 @@
+"""What every member answers: how things stand, and why.
+
+`agent.verbs` adds the orders. A witness answers by this alone: nothing in here needs more than the core's view of the team.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Callable
+from typing import Any, Final, Protocol
+
+from agent.arguments import NameArguments, StatusArguments, WhyArguments, arguments_of
+from agent.config import Settings
+from agent.control import Conversation, Verb
+from agent.door import Told
+from agent.errands import Errands, Order
+from agent.errors import RefusedError
+from agent.telling import Telling
+from agent.view import version
+from failover.core import acts, events
+from failover.core.types import State
+
+SIGHT_PATIENCE_S: Final = 0.5
+"""How long a status waits for the other robots' own."""
+
+WORK: Final = ("run", "protect", "logs", "handover", "failback", "prefer", "promote", "release", "stop")
+"""What takes a program, its output, or a word that others obey."""
+
+QUESTIONS: Final = ("standing", "picture", "story")
+"""What any member may ask of another one. The rest are orders, and a witness's are refused: it may be anybody's process."""
+
+
+class Lines(Protocol):
+    """What of `agent.switchboard.Switchboard` is needed here."""
+
+    settings: Settings
+    errands: Errands
+
+    async def ask(self, what: Any) -> Told: ...
+    async def command(self, make: Callable[[int], events.Command]) -> acts.Answer: ...
+    def hindrance(self, peer: str) -> str: ...
+    def picture(self, told: Told) -> dict[str, Any]: ...
+
+
+class Questions:
+    """The verbs of the control socket that every member has."""
+
+    def __init__(self, lines: Lines) -> None:
+        self._lines = lines
+        self._telling = Telling(lines)
+
+    def table(self) -> dict[str, Verb]:
+        """By name, as the client says them."""
+        return {
+            "ping": self.ping,
+            "status": self.status,
+            "why": self.why,
+            **dict.fromkeys(WORK, self._no_work),
+        }
+
+    def errands(self) -> dict[str, Order]:
+        """What another robot may ask of this one: how things stand here."""
+        return {"standing": self.standing, "picture": self.picture, "story": self._telling.page}
+
+    async def _no_work(self, _say: Conversation, _arguments: dict[str, Any]) -> dict[str, Any]:
+        me = self._lines.settings.config.robot
+        raise RefusedError(f"{me} is a witness: it votes, and neither runs nor keeps nor orders anything; ask at a robot")
+
+    async def ping(self, _say: Conversation, _arguments: dict[str, Any]) -> dict[str, Any]:
+        """Who are you?"""
+        await self._lines.ask("status")
+        config = self._lines.settings.config
+        team = self._lines.settings.team.team
+        return {"robot": config.robot, "team": team, "pid": os.getppid(), "version": version(), "insecure": config.insecure}
+
+    async def status(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """How does the team stand?"""
+        wanted = arguments_of(StatusArguments, "status", arguments)
+        while wanted.watch:
+            await say.update(await self._sight(wanted.team))
+            await asyncio.sleep(max(wanted.every_ms, 10) / 1_000)
+        return await self._sight(wanted.team)
+
+    async def _sight(self, team: bool) -> dict[str, Any]:
+        """This robot's picture; with ``team`` each component also as the other living robots see it."""
+        mine = self._lines.picture(await self._lines.ask("status"))
+        for component in mine["components"]:
+            component["elsewhere"] = {}
+        if team:
+            living = await self._reachable()
+            theirs = await asyncio.gather(*(self._asked(peer, "picture", {}) for peer in living))
+            for robot, picture in zip(living, theirs, strict=True):
+                known = {one["name"]: one for one in picture.get("components", ())}
+                for component in mine["components"]:
+                    if component["name"] in known:
+                        component["elsewhere"][robot] = known[component["name"]]
+        return mine
+
+    async def _reachable(self) -> list[str]:
+        """The robots that live and can be asked."""
+        peers = self._lines.picture(await self._lines.ask("status"))["peers"]
+        return [peer["name"] for peer in peers if peer["state"] == "live" and not self._lines.hindrance(peer["name"])]
+
+    async def _asked(self, peer: str, question: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        """A peer's answer; empty when it does not come soon."""
+        try:
+            return await self._lines.errands.send(peer, question, arguments, patience_s=SIGHT_PATIENCE_S)
+        except RefusedError:
+            return {}
+
+    async def why(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """What was decided, when and by whom: the stories of all robots that answer, in one."""
+        wanted = arguments_of(WhyArguments, "why", arguments)
+        name = await self._known(wanted.name) if wanted.name else ""
+        return await self._telling.whole(name, wanted.robot, wanted.age_ms_max)
+
+    async def standing(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
+        """How one component stands on this robot; empty where it is unknown."""
+        return await self._view(arguments_of(NameArguments, "standing", arguments).name)
+
+    async def picture(self, _arguments: dict[str, Any], _by: int) -> dict[str, Any]:
+        """All of this robot's own sight, for another robot's status."""
+        return self._lines.picture(await self._lines.ask("status"))
+
+    # --- what verbs share ---
+
+    async def _view(self, name: str) -> dict[str, Any]:
+        """The component's part of the picture; empty when it is unknown."""
+        picture = self._lines.picture(await self._lines.ask("status"))
+        return next((one for one in picture["components"] if one["name"] == name), {})
+
+    async def _names(self) -> dict[str, State]:
+        """Every component that this robot has heard of, and how it stands here."""
+        told = await self._lines.ask("status")
+        return {one.name: one.state for one in told.status.components} if told.status else {}
+
+    async def _known(self, wanted: str) -> str:
+        """The component that a person means: its whole name, or an end of it that fits one alone.
+
+        Raises:
+            RefusedError: none, or more than one.
+        """
+        names = await self._names()
+        if wanted in names:
+            return wanted
+        fitting = [name for name in names if name.endswith("/" + wanted.lstrip("/"))]
+        if len(fitting) == 1:
+            return fitting[0]
+        if fitting:
+            raise RefusedError(f"{wanted!r} could be {', '.join(sorted(fitting))}; give the whole name", "UnknownComponentError")
+        known = ", ".join(sorted(name for name, state in names.items() if state is not State.RELEASED)) or "nothing"
+        raise RefusedError(f"no component is called {wanted!r}; this team protects {known}", "UnknownComponentError")
