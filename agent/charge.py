@@ -27,7 +27,7 @@ from agent.standby import Standby
 from agent.surroundings import Surroundings, program_of
 from checkpoint.channel import close_all
 from checkpoint.engine import COOPERATIVE
-from checkpoint.errors import CheckpointError, NothingCommittedError, UnsupportedError
+from checkpoint.errors import CheckpointError, NothingCommittedError, RestoreError, UnsupportedError
 from failover.core import acts, events
 from failover.core.acts import Act
 from failover.core.types import Launch
@@ -70,6 +70,10 @@ class Charge:
     """Whether the core wants it to stand still, whatever is still in the queue."""
     _is_thaw_owed: bool = False
     """A thaw was refused, for its lease was over by then; the next lease brings it."""
+    _acts_since_ns: int = 0
+    """When the present process was let go, if it came from a checkpoint."""
+    _called_off: asyncio.Event = field(default_factory=asyncio.Event)
+    """A stop waits in the queue."""
 
     def __post_init__(self) -> None:
         self.standby = Standby(self.name, self.around.places)
@@ -90,6 +94,8 @@ class Charge:
         elif isinstance(act, acts.Cool):
             self.standby.cool()
         else:
+            if isinstance(act, acts.Stop):
+                self._called_off.set()
             self._queue.put_nowait(act)
 
     def _note_lease(self, act: Act) -> None:
@@ -168,6 +174,7 @@ class Charge:
                     self._task(self._end(self.component, act.signal))
             case acts.Stop():
                 self.standby.cool()
+                self._called_off.clear()
                 await self._stop()
                 self.around.tell(events.Stopped(self.name, act.epoch))
             case acts.LetGo():
@@ -269,12 +276,11 @@ class Charge:
             component, age_ns = await self._resumed(act, descriptors, outage_ns, laps)
         finally:
             close_all(tuple(descriptors))
-        laps.lap("letting it go")
         self.component = component
         self.figures.restores += 1
         self.figures.commits = Commits()  # of another process: its numbers begin anew
         self.figures.reasons = ()
-        self.figures.outage_ms = (silent_ns + clock.now_ns() - began_ns) / 1e6
+        self.figures.outage_ms = (silent_ns + self._acts_since_ns - began_ns) / 1e6
         since = f"the last word of the robot that ran it: silence {silent_ns / 1e6:.1f} ms, " if silent_ns else "the order: "
         sentence = f"it acts again {self.figures.outage_ms:.1f} ms after {since}{laps}"
         log.info("%s: %s", self.name, sentence)
@@ -291,27 +297,31 @@ class Charge:
         if waiting is not None:
             try:
                 component = await comeback.brought_back(self.around, act, chain, outage_ns, laps, waiting)
-                return await self._let_it_run(component, act.epoch, outage_ns)
+                return await self._let_it_run(component, act.epoch, outage_ns, laps)
             except TROUBLE as trouble:
                 log.warning("%s: what waited here cannot go on with it, it is started anew: %s", self.name, trouble)
         component = await comeback.brought_back(self.around, act, chain, outage_ns, laps)
-        return await self._let_it_run(component, act.epoch, outage_ns)
+        return await self._let_it_run(component, act.epoch, outage_ns, laps)
 
-    async def _let_it_run(self, component: Component, epoch: int, outage_ns: int) -> tuple[Component, int]:
+    async def _let_it_run(self, component: Component, epoch: int, outage_ns: int, laps: clock.Laps) -> tuple[Component, int]:
         """Give it the newest lease, and those that come while it is resumed; then it runs, or nothing of it is left."""
-        age_ns = component.prepared.age_ns if component.prepared is not None else outage_ns
+        prepared = component.prepared
         self.around.records.note(self.name, epoch)
         self._coming = component
         try:
             if self._lease_until_ns:
                 await component.lease(self._lease_until_ns)
             await component.resume()
-        except GuardError:
+            laps.lap("letting it go")
+            self._acts_since_ns = clock.now_ns()
+            if prepared is not None:
+                await comeback.accepted(component, self._called_off)
+        except (GuardError, RestoreError):
             await component.undo()
             raise
         finally:
             self._coming = None
-        return component, age_ns
+        return component, prepared.age_ns if prepared is not None else outage_ns
 
     async def _thaw(self, act: acts.Thaw) -> None:
         component = self._present()

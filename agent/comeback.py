@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Sequence
+from typing import Any, Final
 
 from agent import births
 from agent.clock import Laps
@@ -15,6 +17,12 @@ from checkpoint import format
 from checkpoint.engine import AUTO, COOPERATIVE
 from checkpoint.errors import RestoreError
 from failover.core import acts
+
+ACCEPT_S: Final = 15.0
+"""How long a program may take until its first commit says that it has taken its state; after that it counts as running."""
+
+LINE_LIMIT: Final = 300
+"""Characters of what a program said last that are told."""
 
 
 async def brought_back(
@@ -57,3 +65,44 @@ async def brought_back(
         why=act.why,
         waiting=waiting,
     )
+
+
+async def accepted(component: Component, called_off: asyncio.Event) -> None:
+    """Wait until a program that was started again has taken its state, or it is clear that it will not be heard of just now.
+
+    Whoever takes a state commits it at once. A crash is none of our business: it is told as the crash of any running program.
+
+    Args:
+        called_off: set when the component is to be stopped.
+
+    Raises:
+        RestoreError: it ended by itself before that, and says that it failed: it refused the state.
+    """
+    taken = asyncio.Event()
+    component.committed = taken.set
+    if component.keeps:
+        return
+    said = component.logs.bounds(2).committed
+    waiting = [asyncio.create_task(event.wait()) for event in (taken, called_off)]
+    awaited: list[asyncio.Future[Any]] = [component.ended, *waiting]
+    try:
+        await asyncio.wait(awaited, timeout=ACCEPT_S, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in waiting:
+            task.cancel()
+    ended = component.ended
+    status = ended.result() if ended.done() and ended.exception() is None else None
+    if status and os.WIFEXITED(status) and not component.keeps:
+        words = last_line(component, said)
+        raise RestoreError(
+            f"{component.name} did not take its state: exit status {os.WEXITSTATUS(status)} before its first commit"
+            + (f"; it said: {words}" if words else "; it said nothing")
+        )
+
+
+def last_line(component: Component, since: int) -> str:
+    """What it wrote last to its standard error, from that byte on; "" if nothing."""
+    end = component.logs.bounds(2).size
+    piece = component.logs.read(2, max(since, end - LINE_LIMIT), committed=False)
+    lines = piece.content.decode(errors="replace").splitlines()
+    return next((line.strip() for line in reversed(lines) if line.strip()), "")

@@ -132,7 +132,7 @@ def test_a_takeover_that_what_waited_cannot_carry_out_starts_the_program_anew(
         tried.append(waits)
         return waits or anew
 
-    async def let_it_run(self: Charge, component: Component, epoch: int, outage_ns: int) -> tuple[Component, int]:
+    async def let_it_run(self: Charge, component: Component, epoch: int, outage_ns: int, laps: object) -> tuple[Component, int]:
         if component is waiting:
             raise GuardError("the program has ended")
         return component, outage_ns
