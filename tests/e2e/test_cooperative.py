@@ -141,7 +141,7 @@ def test_a_program_that_stops_committing_is_seen_in_status_and_sends_nothing(
     sent = shown(first)["snapshots"]
     robots.until(lambda: shown(first)["lag_ms"] > 5_000, "its newest commit to grow old")
     told = shown(first)
-    assert told["lag_ms"] >= told["commit_age_ms"] > told["commit_usual_ms"]
+    assert min(told["lag_ms"], told["commit_age_ms"]) > told["commit_usual_ms"]  # read one after the other
     assert (told["snapshots"], told["protection"]) == (sent, "protected")
     assert robots.checkpoints(second, "count") <= sent
     drawn = robots.failover(first, "status").stdout
