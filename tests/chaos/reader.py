@@ -76,8 +76,12 @@ class Reader:
         self._offset += len(piece.content)
         *lines, self._rest = (self._rest + piece.content).split(b"\n")
         for line in lines:
-            step, seal = (int(word) for word in line.split())
-            if step != self.newest + 1:
-                self.complaint = self.complaint or f"{source} shows step {step} after {self.newest}"
-            self.newest = step
-            self.seen.append(Safe(time.monotonic_ns(), self.component, step, seal))
+            self._read_line(line, source)
+
+    def _read_line(self, line: bytes, source: str) -> None:
+        step, _, seal = line.partition(b" ")
+        if not (step.isdigit() and seal.isdigit() and int(step) == self.newest + 1):
+            self.complaint = self.complaint or f"{source} shows {line!r} after step {self.newest}"
+            return
+        self.newest = int(step)
+        self.seen.append(Safe(time.monotonic_ns(), self.component, int(step), int(seal)))
