@@ -21,7 +21,8 @@ class Invariants:
 
     Attributes:
         safe: components that must never act twice: ``when_alone`` is freeze, or primaries are elected.
-        votes: primaries are elected; ``given``: who voted for whom, of which component, in which epoch.
+        votes: primaries are elected; ``given``: who voted for whom, of which component, in which epoch; ``cast``: the same, with
+            votes that their voters have lost together with their disks: who was elected by them was elected.
         gone: positions that were on a disk that was lost.
         split: components that computed in two places at once (allowed under ``run``, after a cut).
         acknowledged: newest position that each component's primaries acknowledged while a standby held it.
@@ -32,6 +33,7 @@ class Invariants:
     votes: bool = False
     gone: set[Position] = field(default_factory=set)
     given: dict[tuple[str, str, int], str] = field(default_factory=dict)
+    cast: set[tuple[str, str, int, str]] = field(default_factory=set)
     split: set[str] = field(default_factory=set)
     epochs: dict[tuple[str, str], int] = field(default_factory=dict)
     acknowledged: dict[str, Position] = field(default_factory=dict)
@@ -106,7 +108,8 @@ class Invariants:
                 continue
             key = (robot, record.name, record.epoch)
             before = self.given.setdefault(key, record.primary)
-            for_it = sum(self.given.get((name, *key[1:])) == record.primary for name in world.robots)
+            for_it = sum((name, *key[1:], record.primary) in self.cast for name in world.robots)
+            self.cast.add((*key, record.primary))
             if before == robot and for_it > len(world.robots) // 2:
                 self.given[key] = record.primary  # its own claim was in vain: it follows the one that was elected
             elif before != record.primary:

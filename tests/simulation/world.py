@@ -86,12 +86,18 @@ class Clock:
 
 @dataclass(slots=True)
 class Program:
-    """A running copy and its guard. ``value``: how much it has computed, in true nanoseconds of running."""
+    """A running copy and its guard.
+
+    Attributes:
+        value: how much it has computed, in true nanoseconds of running.
+        frozen: by order; lapsed: because its lease ran out. A new lease lets it go on then, not after an order.
+    """
 
     epoch: int
     lease_ns: int
     value: int = 0
     frozen: bool = False
+    lapsed: bool = False
     since_ns: int = 0
     exit_status: int | None = None
 
@@ -311,7 +317,7 @@ class World:
     def unfrozen(self, robot: Robot, component: str) -> bool:
         """Whether a copy computes at this very instant."""
         program = robot.programs.get(component)
-        if program is None or program.exit_status is not None or program.frozen:
+        if program is None or program.exit_status is not None or program.frozen or program.lapsed:
             return False
         return not program.lease_ns or self.local(robot) < program.lease_ns
 
@@ -432,9 +438,10 @@ class World:
                 program.frozen = True
             case acts.Thaw():
                 robot.unheld.add(act.component)
-                program.frozen, program.lease_ns = False, act.lease_until_ns
+                program.frozen, program.lapsed, program.lease_ns = False, False, act.lease_until_ns
             case acts.SetLease():
                 program.lease_ns = act.until_ns
+                program.lapsed = program.lapsed and 0 < act.until_ns <= self.local(robot)
             case acts.End():
                 self.program_ends(robot.name, act.component, act.signal)
             case acts.LetGo():
@@ -459,14 +466,13 @@ class World:
         self.after(self._soon(20, 200) * robot.slow, lambda: done(not fails))
 
     def _settle(self, robot: Robot, program: Program) -> None:
-        """Add up what the program has computed, and let a lease that has run out freeze it for good."""
+        """Add up what the program has computed, and let a lease that has run out freeze it until the next one."""
         ran_until_ns = self.now_ns
         if program.lease_ns and self.local(robot) >= program.lease_ns:
             ran_until_ns = min(robot.clock.true(program.lease_ns), self.now_ns)
-        if not program.frozen and program.exit_status is None:
+        if not program.frozen and not program.lapsed and program.exit_status is None:
             program.value += max(ran_until_ns - program.since_ns, 0)
-        if ran_until_ns < self.now_ns:
-            program.frozen = True
+        program.lapsed = program.lapsed or ran_until_ns < self.now_ns
         program.since_ns = self.now_ns
 
     def _whole_program(self, robot: Robot, act: acts.Start | acts.Restore | acts.Stop) -> None:
