@@ -27,7 +27,7 @@ from agent.standby import Standby
 from agent.surroundings import Surroundings, program_of
 from checkpoint.channel import close_all
 from checkpoint.engine import COOPERATIVE
-from checkpoint.errors import CheckpointError, NothingCommittedError, RestoreError, UnsupportedError
+from checkpoint.errors import CheckpointError, NothingCommittedError, UnsupportedError
 from failover.core import acts, events
 from failover.core.acts import Act
 from failover.core.types import Launch
@@ -70,10 +70,6 @@ class Charge:
     """Whether the core wants it to stand still, whatever is still in the queue."""
     _is_thaw_owed: bool = False
     """A thaw was refused, for its lease was over by then; the next lease brings it."""
-    _acts_since_ns: int = 0
-    """When the present process was let go, if it came from a checkpoint."""
-    _called_off: asyncio.Event = field(default_factory=asyncio.Event)
-    """A stop waits in the queue."""
 
     def __post_init__(self) -> None:
         self.standby = Standby(self.name, self.around.places)
@@ -94,8 +90,6 @@ class Charge:
         elif isinstance(act, acts.Cool):
             self.standby.cool()
         else:
-            if isinstance(act, acts.Stop):
-                self._called_off.set()
             self._queue.put_nowait(act)
 
     def _note_lease(self, act: Act) -> None:
@@ -174,7 +168,6 @@ class Charge:
                     self._task(self._end(self.component, act.signal))
             case acts.Stop():
                 self.standby.cool()
-                self._called_off.clear()
                 await self._stop()
                 self.around.tell(events.Stopped(self.name, act.epoch))
             case acts.LetGo():
@@ -280,7 +273,7 @@ class Charge:
         self.figures.restores += 1
         self.figures.commits = Commits()  # of another process: its numbers begin anew
         self.figures.reasons = ()
-        self.figures.outage_ms = (silent_ns + self._acts_since_ns - began_ns) / 1e6
+        self.figures.outage_ms = (silent_ns + clock.now_ns() - began_ns) / 1e6
         since = f"the last word of the robot that ran it: silence {silent_ns / 1e6:.1f} ms, " if silent_ns else "the order: "
         sentence = f"it acts again {self.figures.outage_ms:.1f} ms after {since}{laps}"
         log.info("%s: %s", self.name, sentence)
@@ -313,10 +306,7 @@ class Charge:
                 await component.lease(self._lease_until_ns)
             await component.resume()
             laps.lap("letting it go")
-            self._acts_since_ns = clock.now_ns()
-            if prepared is not None:
-                await comeback.accepted(component, self._called_off)
-        except (GuardError, RestoreError):
+        except GuardError:
             await component.undo()
             raise
         finally:
@@ -419,4 +409,7 @@ class Charge:
             status = KILLED
         if self.component is component and not self._stopping:
             self.figures.crashes += bool(status and os.WIFSIGNALED(status))
-            self.around.tell(events.Exited(self.name, self.epoch, status or 0))
+            refusal = comeback.refusal(component, status or 0)
+            if refusal:
+                log.warning("%s", refusal)
+            self.around.tell(events.Exited(self.name, self.epoch, status or 0, refusal))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 from agent import births
 from agent.clock import Laps
@@ -17,9 +17,6 @@ from checkpoint import format
 from checkpoint.engine import AUTO, COOPERATIVE
 from checkpoint.errors import RestoreError
 from failover.core import acts
-
-ACCEPT_S: Final = 15.0
-"""How long a program may take until its first commit says that it has taken its state; after that it counts as running."""
 
 LINE_LIMIT: Final = 300
 """Characters of what a program said last that are told."""
@@ -67,42 +64,23 @@ async def brought_back(
     )
 
 
-async def accepted(component: Component, called_off: asyncio.Event) -> None:
-    """Wait until a program that was started again has taken its state, or it is clear that it will not be heard of just now.
+def refusal(component: Component, status: int) -> str:
+    """Why a program that was started again has not gone on from its state; "" if it has, or crashed, or ended well.
 
-    Whoever takes a state commits it at once. A crash is none of our business: it is told as the crash of any running program.
+    Whoever takes a state commits it at once (`Component.keeps`).
 
     Args:
-        called_off: set when the component is to be stopped.
-
-    Raises:
-        RestoreError: it ended by itself before that, and says that it failed: it refused the state.
+        status: its wait status.
     """
-    taken = asyncio.Event()
-    component.committed = taken.set
-    if component.keeps:
-        return
-    said = component.logs.bounds(2).committed
-    waiting = [asyncio.create_task(event.wait()) for event in (taken, called_off)]
-    awaited: list[asyncio.Future[Any]] = [component.ended, *waiting]
-    try:
-        await asyncio.wait(awaited, timeout=ACCEPT_S, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for task in waiting:
-            task.cancel()
-    ended = component.ended
-    status = ended.result() if ended.done() and ended.exception() is None else None
-    if status and os.WIFEXITED(status) and not component.keeps:
-        words = last_line(component, said)
-        raise RestoreError(
-            f"{component.name} did not take its state: exit status {os.WEXITSTATUS(status)} before its first commit"
-            + (f"; it said: {words}" if words else "; it said nothing")
-        )
+    if not component.goes_on or component.keeps or not os.WIFEXITED(status) or not os.WEXITSTATUS(status):
+        return ""
+    said = _last_line(component) or "nothing"
+    return f"{component.name} did not take its state: exit code {os.WEXITSTATUS(status)} before its first commit; it said: {said}"
 
 
-def last_line(component: Component, since: int) -> str:
-    """What it wrote last to its standard error, from that byte on; "" if nothing."""
-    end = component.logs.bounds(2).size
-    piece = component.logs.read(2, max(since, end - LINE_LIMIT), committed=False)
+def _last_line(component: Component) -> str:
+    """What it wrote last to its standard error since it was started; "" if nothing."""
+    bounds = component.logs.bounds(2)
+    piece = component.logs.read(2, max(bounds.committed, bounds.size - LINE_LIMIT), committed=False)
     lines = piece.content.decode(errors="replace").splitlines()
     return next((line.strip() for line in reversed(lines) if line.strip()), "")

@@ -109,6 +109,7 @@ class Component:
         guest: where it is somebody else's child.
         engine_wanted: as it was asked for: `AUTO`, `PTRACE` or `COOPERATIVE`.
         task_pid: of the process that keeps its state, 0 before it has said so (``connected``); keeps: it has made a commit.
+        goes_on: it was started again, or had waited, with a state that it was to go on from.
         committed: called at its first commit to each segment.
         last_words: what its guard noted at its end.
         keeper: what captures it.
@@ -133,7 +134,7 @@ class Component:
         self.engine_wanted = PTRACE
         self._impatient_at = asyncio.get_running_loop().time() + HELLO_PATIENCE_S
         self.task_pid = 0
-        self.keeps = False
+        self.keeps = self.goes_on = False
         self.committed: Callable[[], None] = lambda: None
         self.connected = asyncio.Event()
         self.last_words: tuple[str, ...] = ()
@@ -184,7 +185,7 @@ class Component:
 
     async def _begin_again(self, prepared: Prepared) -> None:
         """Have the program go on with the state that waits for it. One that waits has its lease before it can take a step."""
-        self.prepared = None
+        self.prepared, self.goes_on = None, True
         try:
             if isinstance(prepared.order, guard_messages.BeginTask):
                 await self.lease(self._lease_until_ns)

@@ -43,7 +43,7 @@ def test_a_program_that_refuses_its_state_is_a_takeover_that_failed_and_no_end(t
         robots.until_protected(first)
         other_version.touch()
         first.cut_power()
-        said = "exit status 1 before its first commit; it said: failover.errors.FitError"
+        said = "exit code 1 before its first commit; it said: failover.errors.FitError"
         robots.until(lambda: any(said in note for note in robots.component(second, "count")["notes"]), "the reason in its status")
         assert robots.component(second, "count")["exit_status"] is None
         other_version.unlink()
