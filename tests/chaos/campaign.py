@@ -239,15 +239,12 @@ class Campaign:
 
     def outages(self) -> list[Pause]:
         """Pauses of components whose robot was struck, and moves: each counted once."""
-        found = []
-        for pause in self.judge.pauses():
-            struck = any(
-                pause.component in blow.struck and pause.begin_ns < blow.well_ns and pause.end_ns > blow.begin_ns
-                for blow in self.blows
-            )
-            if struck or pause.moved:
-                found.append(pause)
-        return found
+        return [pause for pause in self.judge.pauses() if pause.moved or any(_befell(blow, pause) for blow in self.blows)]
+
+    def _outages_of(self, kind: str) -> list[float]:
+        """In milliseconds: of the components that ran where a fault of this kind struck."""
+        blows = [blow for blow in self.blows if blow.kind == kind]
+        return [pause.length_ms for pause in self.judge.pauses() if any(_befell(blow, pause) for blow in blows)]
 
     def figures(self) -> str:
         """What came of it."""
@@ -260,7 +257,8 @@ class Campaign:
             f"{commands} commands; 0 double actions, 0 acknowledged losses, 0 stuck\n"
             f"{len(outages)} outages: {_spread([one.length_ms for one in outages])} ms\n"
             f"{len(moved)} of them went on in another copy: {_spread([one.length_ms for one in moved])} ms; "
-            f"steps done again: {_spread([float(one.lost) for one in moved])}"
+            f"steps done again: {_spread([float(one.lost) for one in moved])}\n"
+            + "\n".join(f"  {kind}: {_spread(self._outages_of(kind))} ms" for kind in sorted(kinds) if self._outages_of(kind))
         )
 
     def evidence(self) -> None:
@@ -289,3 +287,8 @@ def short(name: str) -> str:
 
 def _spread(values: list[float]) -> str:
     return f"p50 {percentile(values, 0.5):.0f}, p99 {percentile(values, 0.99):.0f}, at most {max(values, default=0):.0f}"
+
+
+def _befell(blow: Blow, pause: Pause) -> bool:
+    """Whether a fault struck the robot of a component that paused then."""
+    return pause.component in blow.struck and pause.begin_ns < blow.well_ns and pause.end_ns > blow.begin_ns
