@@ -157,10 +157,10 @@ class Lanes(Switchboard):
     def hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
         """A word about a snapshot on the bulk lane."""
         match message:
-            case Offer() if hindrance := self._links.hindrance():
-                self._lane.say(peer, Refuse(message.transfer, f"snapshots wait: at {self.settings.config.robot} {hindrance}"))
             case Offer() if self.votes_only(peer):
                 self._lane.say(peer, Refuse(message.transfer, f"{peer} is a witness: it votes, and keeps no snapshots"))
+            case Offer() if hindrance := self._links.hindrance():
+                self._lane.say(peer, Refuse(message.transfer, f"snapshots wait: at {self.settings.config.robot} {hindrance}"))
             case Offer():
                 self._receiver.offered(peer, message)
             case Chunk():
