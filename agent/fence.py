@@ -21,22 +21,28 @@ GUARDED: Final = "a program whose lease is over is frozen by its guard, whatever
 
 @dataclass(frozen=True, slots=True)
 class Watchdog:
-    """A hardware watchdog that somebody feeds.
+    """A hardware watchdog that somebody feeds, as far as the kernel tells.
 
     Attributes:
         timeout_s: without a sign of life for so long it resets the machine; 0: not told.
+        is_told: False: it is there, and a kernel without CONFIG_WATCHDOG_SYSFS does not tell whether anybody feeds it. Opening
+            the device would tell, and start it.
     """
 
     identity: str
     timeout_s: int
+    is_told: bool = True
 
 
 def watchdog(directory: Path = WATCHDOGS) -> Watchdog | None:
-    """The first one that is active; None where there is none, or the kernel does not tell."""
-    for place in sorted(directory.glob("watchdog*")):
-        if _fact(place, "state") == ACTIVE:
-            timeout = _fact(place, "timeout")
-            return Watchdog(_fact(place, "identity") or place.name, int(timeout) if timeout.isdecimal() else 0)
+    """The first one that is active, else the first of which that is not known; None where there is none, or nobody feeds it."""
+    places = sorted(directory.glob("watchdog*"))
+    active = [place for place in places if _fact(place, "state") == ACTIVE]
+    untold = [place for place in places if not _fact(place, "state")]
+    for place in (*active, *untold):
+        timeout = _fact(place, "timeout")
+        seconds = int(timeout) if timeout.isdecimal() else 0
+        return Watchdog(_fact(place, "identity") or place.name, seconds, is_told=place in active)
     return None
 
 
@@ -46,6 +52,11 @@ def sentence(found: Watchdog | None) -> str:
         return (
             f"{GUARDED}; if all of this robot stood still at once and went on later, nothing here would help: no hardware "
             "watchdog is active; switch such a robot off from outside, or let actuators check the epoch (failover.Gateway)"
+        )
+    if not found.is_told:
+        return (
+            f"{GUARDED}; if all of this robot stood still at once, only its watchdog ({found.identity}) would help, and this "
+            "kernel does not tell whether anybody feeds it; systemctl show --property=RuntimeWatchdogUSec does"
         )
     after = f"after {found.timeout_s} s" if found.timeout_s else "after its timeout"
     return f"{GUARDED}; if all of this robot stood still at once, its watchdog ({found.identity}) would reset it {after}"

@@ -24,11 +24,20 @@ def test_a_watchdog_that_is_fed_is_named_with_its_timeout(tmp_path: Path) -> Non
     assert "its watchdog (iTCO_wdt) would reset it after 30 s" in fence.sentence(found)
 
 
-@pytest.mark.parametrize("facts", [{}, {"state": "inactive", "identity": "iTCO_wdt"}, {"identity": "iTCO_wdt"}])
+@pytest.mark.parametrize("facts", [{"state": "inactive"}, {"state": "inactive", "identity": "iTCO_wdt"}])
 def test_a_watchdog_that_nobody_feeds_is_none(tmp_path: Path, facts: dict[str, str]) -> None:
     found = fence.watchdog(machine(tmp_path, **facts))
     assert found is None
     assert "no hardware watchdog is active" in fence.sentence(found)
+
+
+@pytest.mark.parametrize(("facts", "name"), [({}, "watchdog0"), ({"identity": "iTCO_wdt"}, "iTCO_wdt")])
+def test_a_watchdog_of_which_the_kernel_tells_nothing_is_not_called_one_that_nobody_feeds(
+    tmp_path: Path, facts: dict[str, str], name: str
+) -> None:
+    found = fence.watchdog(machine(tmp_path, **facts))
+    assert found == Watchdog(name, 0, is_told=False)
+    assert f"({name}) would help, and this kernel does not tell whether anybody feeds it" in fence.sentence(found)
 
 
 def test_a_machine_without_watchdogs_is_told_so(tmp_path: Path) -> None:
