@@ -150,7 +150,10 @@ class Heart:
     def _start_lanes(self) -> None:
         """Start the other process; the node is born, or told what was lost, when its inventory comes."""
         self._lanes.start()
-        self._lanes_silent_ns, self._lanes_allowed_ns = 0, LANES_BIRTH_NS
+        self._lanes_silent_ns, self._lanes_allowed_ns = (
+            0,
+            LANES_BIRTH_NS << self._lanes_deaths,
+        )  # a machine so busy gets no busier
         self._poll.register(self._lanes.fileno(), select.EPOLLIN | select.EPOLLHUP)
         self._lanes.send(Life(self._ballot.record.boot, os.getpid(), self._notes))
 
