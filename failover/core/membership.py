@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 
-from failover.core.messages import Beat, Echo, Entry
+from failover.core.messages import RULES, Beat, Echo, Entry
 from failover.core.story import Sighting
 from failover.core.types import COMPONENTS_MAX, Config, PeerView, State
 
@@ -41,6 +41,7 @@ class Peer:
         heard_us_ns: when the newest beat of ours left that it has heard.
         told_ns: when we last let it act on a beat of its own.
         settled: see ``messages.Beat``.
+        at_odds: number of its rule, where that is not ours: it is known to live, and nothing else it says counts.
     """
 
     robot: str
@@ -54,6 +55,7 @@ class Peer:
     counter: int = 0
     echoed: int = 0
     settled: int = 0
+    at_odds: int = 0
     total: int = 0
     load: int = 0
     links: dict[str, int] = field(default_factory=dict)
@@ -67,10 +69,11 @@ class Peer:
     @property
     def complete(self) -> bool:
         """Every entry that it has is known and fresh: what is missing here is missing there."""
-        return self.boot > 0 and sum(known.counter >= self.settled for known in self.entries.values()) >= self.total
+        fresh = sum(known.counter >= self.settled for known in self.entries.values())
+        return self.boot > 0 and not self.at_odds and fresh >= self.total
 
-    def take(self, beat: Beat, own: tuple[str, int], link: str, now_ns: int) -> tuple[Entry, ...]:
-        """Note a beat; returns the entries that are news. ``own``: our name and boot count."""
+    def take(self, beat: Beat, own: tuple[str, int], link: str, now_ns: int, rule: int = 0) -> tuple[Entry, ...]:
+        """Note a beat; returns the entries that are news. ``own``: our name and boot count; ``rule``: ours, 0 for any."""
         if beat.boot < self.boot:
             return ()
         if beat.boot > self.boot:
@@ -79,6 +82,10 @@ class Peer:
             self.since_ns = now_ns
         self.heard_ns = max(self.heard_ns, now_ns)
         self.links[link] = now_ns
+        self.at_odds = beat.rule if 0 not in (rule, beat.rule) and beat.rule != rule else 0
+        if self.at_odds:
+            self.entries.clear()
+            return ()
         self._echoes(beat, own)
         if beat.counter > self.counter:
             self.counter, self.settled, self.total, self.load = beat.counter, beat.settled, beat.total, beat.load
@@ -114,6 +121,7 @@ class Membership:
         self._born_ns = now_ns
         self._loyalty_ns, self._grace_ns = config.loyalty_ns, config.grace_ns
         self._elects = config.by_majority
+        self._rule = RULES.index(config.rule)
         self._asked: deque[tuple[int, int]] = deque(maxlen=ASKED_MAX)
         self.peers = {robot: Peer(robot, now_ns) for robot in config.peers}
 
@@ -123,7 +131,7 @@ class Membership:
         if peer is None:
             return ()
         before = (peer.echoed, peer.heard_us)
-        news = peer.take(beat, self._own, link, now_ns)
+        news = peer.take(beat, self._own, link, now_ns, self._rule)
         if (peer.echoed, peer.heard_us) != before:
             peer.asked_ns, peer.heard_us_ns = self._left_ns(peer.echoed), self._left_ns(peer.heard_us)
         return news
@@ -183,6 +191,10 @@ class Membership:
         if not self._elects or not peer.boot:
             return False
         return now_ns - max(peer.heard_us_ns, peer.since_ns) > DEAF_LOYALTIES * self._loyalty_ns
+
+    def at_odds(self, now_ns: int) -> tuple[str, ...]:
+        """The living peers that have another rule than we."""
+        return tuple(peer.robot for peer in self.living(now_ns) if peer.at_odds)
 
     def living(self, now_ns: int) -> tuple[Peer, ...]:
         """The peers that are alive."""

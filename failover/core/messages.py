@@ -10,7 +10,7 @@ from __future__ import annotations
 import msgspec
 
 from checkpoint.model import Position
-from failover.core.types import ComponentSpec
+from failover.core.types import ComponentSpec, Rule
 
 VERSION = 1
 """Of both lanes; a peer of another version is refused by name."""
@@ -87,6 +87,7 @@ class Beat(msgspec.Struct, frozen=True, array_like=True):
         load: of the sender, 0 to 255.
         entries: those that fit; the others follow in the next beats, in turn. The changed ones go first.
         total: how many there are altogether.
+        rule: the sender's, as its number in ``RULES``; 0 does not tell.
     """
 
     sender: str
@@ -97,6 +98,11 @@ class Beat(msgspec.Struct, frozen=True, array_like=True):
     total: int = 0
     echoes: tuple[Echo, ...] = ()
     entries: tuple[Entry, ...] = ()
+    rule: int = 0
+
+
+RULES = ("", *Rule)
+"""A rule's place in here is its number in a beat."""
 
 
 # The bulk lane: connection-oriented, authenticated and encrypted by the transport; in order while a connection lives.

@@ -101,7 +101,7 @@ class Node:
         self._last_beat_ns = now_ns - URGENT_GAP_NS
         self._durable = ballot
         self._team = Membership(config, boot, now_ns)
-        self._speaker = Speaker(config.robot, boot)
+        self._speaker = Speaker(config.robot, boot, config.rule)
         self._watch = Watch()
         self._components = {record.name: Component.remembered(record) for record in ballot.records}
         self._found = {one.component: one for one in found}

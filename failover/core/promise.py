@@ -12,6 +12,12 @@ from failover.core.types import ENDED, MS, Protection
 
 def team(turn: Turn) -> str:
     """What the rule in force promises, given who is heard."""
+    at_odds = turn.team.at_odds(turn.now_ns)
+    if at_odds:
+        return (
+            f"{turn.me} decides by rule = {turn.config.rule}, {' and '.join(at_odds)} by another: nothing is started, "
+            "taken over, moved or protected between them until all have the same rule in agent.toml."
+        )
     living = [peer.robot for peer in turn.team.living(turn.now_ns)]
     if not turn.team.peers:
         return f"{turn.me} is alone in its team: a lost robot takes its programs with it."

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from failover.core.component import Component
 from failover.core.consent import STATES
-from failover.core.messages import FREE, HOLDS, NEEDS_BASE, OPEN, ORDERED, STARTS, UNPROTECTED, WARM, Beat, Echo, Entry
-from failover.core.types import HOLDING, State
+from failover.core.messages import FREE, HOLDS, NEEDS_BASE, OPEN, ORDERED, RULES, STARTS, UNPROTECTED, WARM, Beat, Echo, Entry
+from failover.core.types import HOLDING, Rule, State
 from failover.core.wire import BODY_SIZE_MAX, beat_size, entry_size
 
 LOAD_MAX = 255
@@ -48,9 +48,10 @@ def urgent(entry: Entry, before: Entry | None) -> bool:
 class Speaker:
     """Makes the beats of one life of one robot. ``counter`` is that of the last one made."""
 
-    def __init__(self, me: str, boot: int) -> None:
+    def __init__(self, me: str, boot: int, rule: Rule = Rule.PAIR) -> None:
         self._me = me
         self._boot = boot
+        self._rule = RULES.index(rule)
         self.counter = 0
         self._settled = 0
         self._said: dict[str, tuple[Entry, int]] = {}
@@ -67,7 +68,7 @@ class Speaker:
             self._settled = self.counter
         self._said = {name: said for name, said in self._said.items() if name in entries}
         order = sorted(entries, key=lambda name: (name not in changed, not self._news(entries[name]), self._last(name)))
-        empty = Beat(self._me, self._boot, self.counter, self._settled, 0, len(entries), echoes)
+        empty = Beat(self._me, self._boot, self.counter, self._settled, 0, len(entries), echoes, rule=self._rule)
         chosen = self._fitting([entries[name] for name in order], empty)
         for name in changed:
             self._said[name] = (entries[name], 0)
@@ -82,6 +83,7 @@ class Speaker:
             len(entries),
             echoes,
             chosen,
+            self._rule,
         )
 
     def _fitting(self, entries: list[Entry], empty: Beat) -> tuple[Entry, ...]:

@@ -21,6 +21,7 @@ def status(components: dict[str, Component], turn: Turn, boot: int) -> StatusVie
     peers = turn.team.views(turn.now_ns)
     bad = any(view.protection is Protection.DEGRADED or view.state is State.FAILED for view in views)
     bad = bad or any(view.cold or view.unstored for view in views)
+    bad = bad or bool(turn.team.at_odds(turn.now_ns))
     lost = any(peer.state == "dead" for peer in peers)
     return StatusView(turn.me, boot, str(turn.config.rule), promise.team(turn), not bad and not lost, peers, views)
 

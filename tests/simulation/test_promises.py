@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from failover.core import acts
 from failover.core.events import Handover, Promote
-from failover.core.types import MS, ComponentSpec, Launch, OnLoss, Rules, State, WhenAlone
+from failover.core.types import MS, ComponentSpec, Launch, OnLoss, Rule, Rules, State, WhenAlone
 from tests.simulation.invariants import Invariants, seen_at, state_at
 from tests.simulation.world import Watcher, World, elective, pair
 
@@ -250,3 +250,34 @@ def test_a_handover_at_a_robot_with_an_older_checkpoint_is_refused_and_a_promoti
     five.invariants.split.add(PART)  # an older checkpoint than the acknowledged one is what the operator asks for
     world.command("robot2", Promote(world.request(), PART))
     assert five.after(500) == ["robot2"] and seen_at(world, "robot2", PART).epoch > epoch
+
+
+# Members that do not live by the same rule
+
+
+def test_two_that_decide_by_different_rules_start_and_take_over_nothing_between_them_and_say_so() -> None:
+    specs = (ComponentSpec(PART, launch=Launch(("part",))),)
+    one, other = pair(specs)
+    world = World(1, [one, replace(other, rule=Rule.MAJORITY)])
+    two = Team(world, Invariants())
+    world.power_on("robot1")
+    assert two.after(1_000) == ["robot1"]
+    world.power_on("robot2")
+    assert two.after(2_000) == ["robot1"] and state_at(world, "robot2", PART) is State.ABSENT
+    sentence = "robot1 decides by rule = pair, robot2 by another: nothing is started, taken over, moved or protected between them"
+    assert sentence in two.says("robot1") and "robot2 decides by rule = majority, robot1 by another" in two.says("robot2")
+    assert any(sentence in one.sentence for one in world.robots["robot1"].told)
+    world.power_off("robot1")
+    assert two.after(2_000) == []
+
+
+def test_the_vote_of_a_member_that_decides_by_another_rule_does_not_count() -> None:
+    three = team(robots=3)
+    three.world.power_off("robot3")
+    three.world.robots["robot3"].config = pair(names=("robot3", "robot1", "robot2"))[0]
+    three.world.power_on("robot3")
+    assert three.after(1_000) == ["robot1"]
+    three.world.power_off("robot1")
+    assert three.after(2_000) == []
+    three.world.power_on("robot1")
+    assert three.after(2_000) in (["robot1"], ["robot2"])

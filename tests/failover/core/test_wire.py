@@ -16,7 +16,7 @@ from failover.core.wire import Reason, Receiver, Refused, seal
 KEY = bytes(range(32))
 OTHER_KEY = bytes(reversed(range(32)))
 ENTRY = Entry("/lab/robot1/mapper", 3, 7, "robot1", 449, 12, bytes(16), "robot2")
-SAMPLE = Beat("robot1", 3, 41, 40, 1, 1, (Echo("robot2", 9, 1000),), (ENTRY,))
+SAMPLE = Beat("robot1", 3, 41, 40, 1, 1, (Echo("robot2", 9, 1000),), (ENTRY,), 2)
 PROTOCOL = Path(wire.__file__).with_name("PROTOCOL.md")
 
 
