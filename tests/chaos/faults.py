@@ -98,6 +98,7 @@ class Draw:
 
         def begin() -> None:
             pids = [pid for part in parts for pid in member.parts(part)]
+            self.house.note_cgroups(member)
             send(pids, signal.SIGSTOP)  # nobody sees another one die
             send(pids, signal.SIGKILL)
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from failover.cli import keys
-from failover.cli.demo.robots import RobotMachine, agent_command, host_command, wait_for_network
+from failover.cli.demo.robots import RobotMachine, agent_command, cgroup_of, host_command, wait_for_network
 from failover.client import team
 from failover.client.control import Control
 from failover.client.team import Robot, Role, Team
@@ -192,6 +192,7 @@ class House:
         self.network = Network(2)
         self.members = [Member(number, name, role, links, directory / name) for number, (name, role, links) in enumerate(MEMBERS)]
         self._actuator: subprocess.Popen[str] | None = None
+        self._cgroups: set[Path] = set()
 
     def __enter__(self) -> House:
         return self
@@ -204,6 +205,14 @@ class House:
         if self._actuator is not None:
             self._actuator.kill()
             self._actuator.wait()
+        for place in self._cgroups:
+            with contextlib.suppress(OSError):  # its guard was quicker
+                place.rmdir()
+
+    def note_cgroups(self, member: Member) -> None:
+        """Remember those of a member whose guards are about to be killed: they are removed when all is over."""
+        pids = member.machine.processes() if member.machine is not None else ()
+        self._cgroups |= {place for pid in pids if (place := cgroup_of(pid)) is not None}
 
     @property
     def robots(self) -> list[Member]:
