@@ -130,7 +130,10 @@ class Memory:
 
     def _peek_into(self, ranges: Ranges, buffer: memoryview) -> None:
         """Read whatever the protection says, through ``/proc/PID/mem``."""
-        descriptor = os.open(f"/proc/{self.pid}/mem", os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            descriptor = os.open(f"/proc/{self.pid}/mem", os.O_RDONLY | os.O_CLOEXEC)
+        except OSError as error:
+            raise self._failure("read", 0, error.errno or 0) from error
         try:
             for address, length in ranges.tolist():
                 if os.preadv(descriptor, [buffer[:length]], address) != length:
