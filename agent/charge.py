@@ -30,7 +30,7 @@ from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CheckpointError, NothingCommittedError, UnsupportedError
 from failover.core import acts, events
 from failover.core.acts import Act
-from failover.core.types import Launch
+from failover.core.types import Launch, Resumption
 
 KILLED: Final = 9
 """The wait status of a program whose guard was lost: as of one that was killed."""
@@ -256,7 +256,7 @@ class Charge:
 
     async def _restore(self, act: acts.Restore) -> None:
         began_ns, laps = clock.now_ns(), clock.Laps()
-        silent_ns = await self.around.silence_ns(self.name)
+        silent_ns = await self.around.silence_ns(self.name) if act.why is Resumption.TAKEN_OVER else 0
         await self._stop()
         await self.around.settled(self.name)
         laps.lap("asking and clearing away")

@@ -38,17 +38,19 @@ class Deposit:
         self._tell = tell
         self._kept = kept
         self._admitted: dict[str, Admit] = {}
+        self._senders: dict[str, str] = {}
         self._turns: dict[str, asyncio.Lock] = {}
 
     def admit(self, act: Admit) -> None:
         """From now on take this component's snapshots from this sender alone."""
         self._admitted[act.component] = act
+        if act.sender:
+            self._senders[act.component] = act.sender
         self._places.nursery.expect(sum(bool(known.sender) for known in self._admitted.values()))
 
-    def sender(self, component: str) -> str:
-        """From whom its snapshots come; "" from nobody."""
-        admitted = self._admitted.get(component)
-        return admitted.sender if admitted else ""
+    def last_sender(self, component: str) -> str:
+        """From whom its snapshots come, or came until this robot claimed it; "" from nobody."""
+        return self._senders.get(component, "")
 
     def admits(self, peer: str, offer: Offer) -> None:
         """Refuse what was not asked for, before a byte of it travels.

@@ -182,8 +182,8 @@ class Lanes(Switchboard):
         self.charge(component).figures.stored(snapshot.position, size, snapshot.engine)
 
     async def _silence_ns(self, component: str) -> int:
-        """For how long the robot that sent this component's snapshots has been silent; 0 if there is none."""
-        sender = self._deposit.sender(component)
+        """For how long the robot that last sent this component's snapshots has been silent; 0 if there is none."""
+        sender = self._deposit.last_sender(component)
         if not sender:
             return 0
         told = await self.ask("status")

@@ -59,3 +59,12 @@ def test_whoever_takes_over_waits_for_the_snapshot_that_is_being_stored_and_for_
         assert deposit.stored == 1, "the second had not begun, and is refused"
 
     asyncio.run(run())
+
+
+def test_whose_snapshots_they_were_is_known_after_the_claim_that_ends_their_admission(tmp_path: Path) -> None:
+    """So that an outage is counted from the last word of that robot."""
+    deposit = Storing(tmp_path)
+    assert deposit.last_sender(NAME) == ""
+    deposit.admit(Admit(NAME, 1, "robot1"))
+    deposit.admit(Admit(NAME, 2, ""))
+    assert deposit.last_sender(NAME) == "robot1"
