@@ -96,7 +96,8 @@ def alices(machine: Machine) -> str:
 
 @pytest.mark.parametrize("user", ["alice", "root"])
 def test_a_program_inherits_what_it_would_in_the_shell_of_whoever_asked(machine: Machine, user: str) -> None:
-    portrait = "nice -n 5 taskset 1 python3 /etc/portrait.py 'of me'"
+    """But for the signals that it ignores: those of whoever runs the tests are put back to their defaults."""
+    portrait = "nice -n 5 taskset 1 env --default-signal python3 /etc/portrait.py 'of me'"
     _, expected = as_user(machine, user, f"cd /var; {ODD}; {portrait}")
     _, seen = as_user(machine, user, f"cd /var; {ODD}; {portrait.replace('python3', 'failover run -- python3')}")
     assert re.sub(OURS, "", seen, count=1) == expected
