@@ -1,0 +1,293 @@
+"""What each verb takes: one function a verb, which adds its arguments to its parser.
+
+This file and ``parser.py``, which has the verbs' names, help and examples, are all that knows argparse.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from textwrap import dedent
+from typing import Any, Final
+
+from failover.client.quantities import span_ms
+
+EXIT_STATUSES: Final = "Exit status: 0 healthy, 1 failed or degraded, 2 usage, 3 no agent."
+
+
+# --- Arguments that several verbs share ------------------------------------------------------------------------------
+
+
+def _json(room: argparse.ArgumentParser) -> None:
+    room.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+
+
+def _agent(room: argparse.ArgumentParser) -> None:
+    room.add_argument(
+        "--socket",
+        metavar="PATH",
+        help="the agent's control socket (default: $FAILOVER_SOCKET, else your own, else the system's)",
+    )
+    _json(room)
+
+
+def _name(room: argparse.ArgumentParser) -> None:
+    room.add_argument("name", metavar="NAME", help="the component's name, as failover status shows it")
+
+
+NUMBER_MAX: Final = (1 << 31) - 1
+"""What a PID can be at most."""
+
+
+def ago(text: str) -> int:
+    """A span of time such as 90s or 10min, in milliseconds."""
+    try:
+        return span_ms(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def positive(text: str) -> int:
+    """A whole number above zero, as a PID or a period is."""
+    number = int(text) if text.isdecimal() and len(text) <= len(str(NUMBER_MAX)) else 0
+    if not 0 < number <= NUMBER_MAX:
+        raise argparse.ArgumentTypeError(f"{text[:40]!r} is not a whole number above zero, or too large a one")
+    return number
+
+
+def _pid(room: argparse.ArgumentParser, optional: bool = False) -> None:
+    room.add_argument("pid", metavar="PID", type=positive, nargs="?" if optional else None, help="the process")
+
+
+# --- Under an agent --------------------------------------------------------------------------------------------------
+
+
+def run(room: argparse.ArgumentParser) -> None:
+    """Of ``failover run``."""
+    room.add_argument(
+        "--name", metavar="NAME", help="its name, a path such as /lab/robot1/mapper (default: made from the command)"
+    )
+    room.add_argument("--detach", action="store_true", help="print the name and return; see failover logs")
+    room.add_argument(
+        "--no-isolate", dest="isolate", action="store_false", help="keep it in this machine's PIDs and clocks (default: its own)"
+    )
+    room.add_argument(
+        "--engine",
+        choices=("auto", "ptrace", "cooperative"),
+        default="auto",
+        help="ptrace: captured from outside, for a program that nobody prepared; cooperative: the program says by itself what "
+        "must survive (failover.resume, failover.component), and is started again from that (default: auto, as it turns out)",
+    )
+    room.add_argument(
+        "--output",
+        choices=("immediate", "committed"),
+        default="immediate",
+        help="committed: show output once another robot holds a checkpoint that contains it, so that no takeover takes back or "
+        "repeats what was seen (default: immediate, as it is written)",
+    )
+    room.add_argument(
+        "--on-resume",
+        metavar="CMD",
+        type=shlex.split,
+        default=[],
+        help="run this, as you, on a robot where it went on; told which robot, epoch and why in FAILOVER_* variables",
+    )
+    room.add_argument("--user", metavar="USER", help="run it as this user, by name or number (only root may; default: as you)")
+    room.add_argument("command", metavar="CMD", nargs="+", help="the program and its arguments, after --")
+    _agent(room)
+
+
+def protect(room: argparse.ArgumentParser) -> None:
+    """Of ``failover protect``."""
+    _pid(room)
+    room.add_argument("--name", metavar="NAME", help="its name (default: /TEAM/ROBOT/pid-PID)")
+    _agent(room)
+
+
+def named(room: argparse.ArgumentParser) -> None:
+    """Of a verb about one component that takes no more."""
+    _name(room)
+    _agent(room)
+
+
+def stop(room: argparse.ArgumentParser) -> None:
+    """Of ``failover stop``."""
+    _name(room)
+    room.add_argument("--signal", metavar="N", type=signal_number, default=15, help="number or name (default: TERM)")
+    _agent(room)
+
+
+def logs(room: argparse.ArgumentParser) -> None:
+    """Of ``failover logs``."""
+    _name(room)
+    room.add_argument("-f", "--follow", action="store_true", help="go on until the program ends, or Ctrl-C")
+    room.add_argument("--stream", type=int, choices=(1, 2), help="standard output (1) or standard error (2) alone")
+    _agent(room)
+
+
+def status(room: argparse.ArgumentParser) -> None:
+    """Of ``failover status``."""
+    room.add_argument("-w", "--watch", action="store_true", help="show it again and again, until Ctrl-C")
+    room.add_argument("--every-ms", metavar="MS", type=positive, default=500, help="with --watch (default: 500)")
+    _agent(room)
+
+
+def why(room: argparse.ArgumentParser) -> None:
+    """Of ``failover why``."""
+    room.add_argument("name", metavar="NAME", nargs="?", help="one component alone, with what its robots noticed of each other")
+    room.add_argument("--robot", metavar="ROBOT", help="only what that robot saw and decided")
+    room.add_argument("--since", metavar="AGO", type=ago, help="only what is younger: 90s, 10min, 2h, 3d")
+    room.add_argument("-b", "--brief", action="store_true", help="one line each, without what stands behind it")
+    _agent(room)
+
+
+def handover(room: argparse.ArgumentParser) -> None:
+    """Of ``failover handover``."""
+    _name(room)
+    room.add_argument("--to", metavar="ROBOT", help="where to (default: its standby)")
+    _agent(room)
+
+
+def failback(room: argparse.ArgumentParser) -> None:
+    """Of ``failover failback``."""
+    _name(room)
+    _agent(room)
+
+
+def promote(room: argparse.ArgumentParser) -> None:
+    """Of ``failover promote``."""
+    _name(room)
+    room.add_argument("--robot", metavar="ROBOT", help="who shall run it (default: the robot with the newest checkpoint)")
+    room.add_argument("-y", "--yes", action="store_true", help="do not ask, whatever is at risk")
+    _agent(room)
+
+
+def prefer(room: argparse.ArgumentParser) -> None:
+    """Of ``failover prefer``."""
+    _name(room)
+    room.add_argument("robot", metavar="ROBOT", help="the robot that should run it whenever it can")
+    _agent(room)
+
+
+def signal_number(text: str) -> int:
+    """A signal's number, from a number or a name with or without SIG."""
+    import signal
+
+    try:
+        return signal.Signals(int(text)) if text.isdecimal() else signal.Signals["SIG" + text.upper().removeprefix("SIG")]
+    except (ValueError, KeyError):
+        raise argparse.ArgumentTypeError(f"{text!r} is no signal; give a number or a name such as TERM") from None
+
+
+# --- One shot: no agent needed ---------------------------------------------------------------------------------------
+
+
+def capture(room: argparse.ArgumentParser) -> None:
+    """Of ``failover capture``."""
+    _pid(room)
+    room.add_argument(
+        "-o",
+        "--output",
+        metavar="FILE",
+        required=True,
+        help="the snapshot's file; written whole or not at all, readable by you alone",
+    )
+    room.add_argument(
+        "--leave-running", action="store_true", help="let the program run on (default: it is ended once the snapshot is safe)"
+    )
+    room.add_argument("--force", action="store_true", help="replace FILE if it exists")
+    _json(room)
+
+
+def restore(room: argparse.ArgumentParser) -> None:
+    """Of ``failover restore``."""
+    room.add_argument("file", metavar="FILE", help="a snapshot made by failover capture")
+    room.add_argument("--wait", action="store_true", help="stay until the program ends, and pass on its exit status")
+    _json(room)
+
+
+def inspect(room: argparse.ArgumentParser) -> None:
+    """Of ``failover inspect``."""
+    room.add_argument("file", metavar="FILE", help="a snapshot's file")
+    room.add_argument("--vmas", action="store_true", help="list every mapping as well")
+    _json(room)
+
+
+def check(room: argparse.ArgumentParser) -> None:
+    """Of ``failover check``."""
+    _pid(room, optional=True)
+    _json(room)
+
+
+def team(room: argparse.ArgumentParser) -> None:
+    """Of ``failover team`` and its acts."""
+    acts = room.add_subparsers(dest="act", metavar="ACT", required=True, title="acts")
+    shared = argparse.ArgumentParser(add_help=False)
+    shared.add_argument(
+        "--directory", metavar="DIR", default="/etc/failover/team", help="the team directory (default: %(default)s)"
+    )
+    _json(shared)
+    create = _act(acts, "create", shared, "begin a team", CREATE_STORY)
+    create.add_argument("name", metavar="TEAM", help="the team's name")
+    create.set_defaults(function="failover.cli.teams:create")
+    enrol = _act(acts, "enrol", shared, "add a robot, a server or a witness and make its key", ENROL_STORY)
+    enrol.add_argument("name", metavar="ROBOT", help="the robot's name")
+    enrol.add_argument(
+        "address", metavar="HOST[:PORT]", nargs="+", help="where it hears beats: one address for each of its links (port 7420)"
+    )
+    enrol.add_argument(
+        "--bulk", metavar="HOST[:PORT]", help="where it takes snapshots, on the wired link (default: first HOST, port 7421)"
+    )
+    enrol.add_argument(
+        "--role",
+        choices=("robot", "server", "witness"),
+        help="robot: runs components; server: keeps checkpoints of all and votes; witness: votes only (default: robot)",
+    )
+    enrol.add_argument("--public-key", metavar="KEY", help="the public half of a key made on the robot itself")
+    enrol.add_argument("--replace", action="store_true", help="give a known robot new addresses and a new key")
+    enrol.set_defaults(function="failover.cli.teams:enrol")
+    show = _act(acts, "show", shared, "list the team", "Show every robot with its addresses and its public key.")
+    show.set_defaults(function="failover.cli.teams:show")
+
+
+CREATE_STORY: Final = """
+    Make the team directory with a team file that knows nobody yet. Do this once, anywhere; failover team enrol adds the robots.
+
+      failover team create lab
+    """
+
+ENROL_STORY: Final = """
+    Add a robot to the team file and make its key pair. The team file then goes to every robot, the secret key (keys/ROBOT.secret)
+    to that robot alone; remove it here afterwards. Or make the pair on the robot (failover-agent keypair), so that the secret
+    never travels, and enrol its public half. Agents read the team file when they start.
+
+      failover team enrol robot1 192.168.7.11
+      failover team enrol robot2 192.168.7.12 10.0.0.12 --bulk 192.168.7.12
+      failover team enrol hall 192.168.7.2 --role server
+      failover team enrol robot3 192.168.7.13 --public-key 'lU^njTi%j-s0Um6-=T!3XtpbYKc@&EDt>F+fX01f'
+    """
+
+
+def _act(acts: Any, name: str, shared: argparse.ArgumentParser, summary: str, story: str) -> argparse.ArgumentParser:
+    """One act of ``failover team``."""
+    room: argparse.ArgumentParser = acts.add_parser(
+        name,
+        parents=[shared],
+        help=summary,
+        description=dedent(story).strip(),
+        epilog=EXIT_STATUSES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    return room
+
+
+def demo(room: argparse.ArgumentParser) -> None:
+    """Of ``failover demo``."""
+    room.add_argument("--picture", metavar="FILE", help="write what was shown to FILE as an SVG picture too")
+    _json(room)
+
+
+def completion(room: argparse.ArgumentParser) -> None:
+    """Of ``failover completion``."""
+    room.add_argument("shell", choices=("bash", "zsh", "tcsh"), help="the shell to complete for")
