@@ -250,15 +250,16 @@ class Draw:
 
     def partition(self) -> Fault:
         """Two groups that do not hear each other, or of which only one hears the other."""
-        one = [member for member in self.house.members if self.dice.random() < 0.5]
-        other = [member for member in self.house.members if member not in one]
+        members = list(self.house.members)
+        one = self.dice.sample(members, self.dice.randrange(1, len(members)))
+        other = [member for member in members if member not in one]
         ways = set(_ways(one, other))
         half = self.dice.random() < 0.2
         if not half:
             ways |= set(_ways(other, one))
-        names = " ".join(member.name for member in one) or "nobody"
+        names = " ".join(sorted(member.name for member in one))
         how = "are heard by nobody else" if half else "are apart from the others"
-        return self._cut("partition", f"{names} {how}", tuple(self.house.members), ways)
+        return self._cut("partition", f"{names} {how}", tuple(members), ways)
 
     def saturated(self) -> Fault:
         """So little passes over a member's cables that snapshots fill them."""
