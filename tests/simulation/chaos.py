@@ -136,8 +136,7 @@ def _lose_a_disk(world: World, random: Random) -> None:
 
 def _heal(world: World) -> None:
     world.note("healing")
-    world.network.cuts.clear()
-    world.network.calm((0, 0, 1 * MS))
+    world.network.heal()
     for name, robot in world.robots.items():
         robot.slow, robot.broken_store = 1, False
         world.power_on(name)

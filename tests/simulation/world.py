@@ -136,17 +136,25 @@ class Robot:
 
 @dataclass(slots=True)
 class Network:
-    """How messages fare. ``cuts``: directed pairs that nothing passes."""
+    """How messages fare. ``cuts``: directed pairs that nothing passes; ``healed``: for good, whatever storm is still to pass."""
 
     loss: float = 0.0
     duplicate: float = 0.0
     delay_ns: int = 1 * MS
     spread_ns: int = 1 * MS
     cuts: set[tuple[str, str]] = field(default_factory=set)
+    healed: bool = False
 
     def calm(self, weather: tuple[float, float, int]) -> None:
-        """Set loss, duplication and spread."""
-        self.loss, self.duplicate, self.spread_ns = weather
+        """Set loss, duplication and spread as they were before a storm."""
+        if not self.healed:
+            self.loss, self.duplicate, self.spread_ns = weather
+
+    def heal(self) -> None:
+        """From now on everything arrives, soon."""
+        self.cuts.clear()
+        self.calm((0, 0, 1 * MS))
+        self.healed = True
 
 
 Watcher = Callable[["World", str, object], None]
