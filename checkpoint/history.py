@@ -63,7 +63,7 @@ class History:
     def read(self) -> None:
         """Find out what is there. Raises OSError."""
         for folder in sorted(self._root.iterdir()) if self._root.is_dir() else ():
-            found = (Old(path, path.stat().st_mtime, path.stat().st_size) for path in folder.iterdir())
+            found = (Old(path, stored.st_mtime, stored.st_size) for path in folder.iterdir() for stored in (path.stat(),))
             self._olds[folder.name] = tuple(sorted(found, key=lambda old: old.stored_s))
 
     def of(self, folder: str) -> tuple[Old, ...]:
