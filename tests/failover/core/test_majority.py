@@ -121,14 +121,20 @@ def test_a_witness_claims_nothing_and_takes_no_snapshots() -> None:
     assert not talk.orders(acts.Admit) and not talk.orders(acts.Start) and talk.vote() == (1, "robot1")
 
 
-def running() -> Talk:
-    """robot1 is primary by its own vote and the witness's, and holds a first snapshot that robot2 has stored."""
+def claiming() -> Talk:
+    """robot1 hears everybody, was told to run the component, and claims it."""
     talk = Talk(ROBOT)
     talk.tick(400)
     for peer in ROBOT.peers:
         talk.hear(peer)
     talk.readies.append(talk.node.step(Run(1, SPEC), talk.now_ns))
     talk.tick(5)
+    return talk
+
+
+def running() -> Talk:
+    """robot1 is primary by its own vote and the witness's, and holds a first snapshot that robot2 has stored."""
+    talk = claiming()
     talk.hear("witness1", entry(State.STANDBY, 1, "robot1"))
     assert talk.orders(acts.Start)
     talk.readies.append(talk.node.step(Started(NAME, 1), talk.now_ns))
@@ -142,12 +148,7 @@ def running() -> Talk:
 
 
 def test_a_claim_is_carried_out_once_a_majority_votes_for_it() -> None:
-    talk = Talk(ROBOT)
-    talk.tick(400)
-    for peer in ROBOT.peers:
-        talk.hear(peer)
-    talk.readies.append(talk.node.step(Run(1, SPEC), talk.now_ns))
-    talk.tick(5)
+    talk = claiming()
     assert talk.vote() == (1, "robot1") and not talk.orders(acts.Start)
     talk.hear("robot2", entry(State.STANDBY, 1, "robot1"))
     assert talk.orders(acts.Start)
