@@ -148,12 +148,6 @@ def handover(room: argparse.ArgumentParser) -> None:
     _agent(room)
 
 
-def failback(room: argparse.ArgumentParser) -> None:
-    """Of ``failover failback``."""
-    _name(room)
-    _agent(room)
-
-
 def promote(room: argparse.ArgumentParser) -> None:
     """Of ``failover promote``."""
     _name(room)

@@ -236,7 +236,7 @@ VERBS: Final = (
 
           failover failback /lab/robot1/mapper
         """,
-        arguments.failback,
+        arguments.named,
         "failover.cli.components:failback",
     ),
     Verb(
