@@ -1,4 +1,4 @@
-"""What a peer's entry says: its state, and whether it consents to our primacy."""
+"""What a peer's entry says: its state, and whether it consents to our primacy or objects to it."""
 
 from __future__ import annotations
 
@@ -21,3 +21,9 @@ def grants(component: Component, peer: Peer, me: str) -> bool:
     entry = peer.entry(component.name)
     agreed = entry is not None and (entry.epoch, entry.primary) == (component.epoch, me)
     return agreed and entry is not None and state_of(entry) is not State.STOPPING
+
+
+def objects(component: Component, peer: Peer, me: str) -> bool:
+    """Whether the peer's fresh word is that it does not follow us. A stale one is no objection: words are told in turn."""
+    known = peer.entry(component.name) is not None or peer.complete
+    return known and not grants(component, peer, me)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from checkpoint.model import Position
 from failover.core import acts, lease, majority
 from failover.core.component import Component, Flight, Turn
-from failover.core.consent import grants
+from failover.core.consent import grants, objects
 from failover.core.election import supersede
 from failover.core.events import Captured, CaptureFailed, Committed, NothingToCapture, ShipEnded, Stored, StoreFailed, Unchanged
 from failover.core.membership import Peer
@@ -37,7 +37,7 @@ def choose_standby(component: Component, turn: Turn) -> None:
 def _stays(component: Component, turn: Turn) -> bool:
     if not turn.config.by_majority:
         return turn.alive(component.standby) or component.freezes
-    if not turn.alive(component.standby) or not grants(component, turn.team.peers[component.standby], turn.me):
+    if not turn.alive(component.standby) or objects(component, turn.team.peers[component.standby], turn.me):
         return False
     return turn.config.runs(component.standby) or component.rules.standby == component.standby or not _robots(component, turn)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from checkpoint.model import Position
@@ -42,11 +44,12 @@ class Talk:
             self.readies.append(self.node.step(Tick(), at_ns))
         self.now_ns = until_ns
 
-    def hear(self, sender: str, *entries: Entry) -> acts.Ready:
+    def hear(self, sender: str, *entries: Entry, untold: int = 0) -> acts.Ready:
+        """A beat with these entries; ``untold``: how many more have changed and are told in a later one."""
         counter = self._counters[sender] = self._counters.get(sender, 0) + 1
         said = [beat for ready in self.readies for beat in ready.send]
         echoes = (Echo(said[-1].sender, 1, said[-1].counter),) if said else ()
-        beat = Beat(sender, 1, counter, counter, 0, len(entries), echoes, entries)
+        beat = Beat(sender, 1, counter, counter, 0, len(entries) + untold, echoes, entries)
         ready = self.node.step(Received(beat, "wire"), self.now_ns)
         self.readies.append(ready)
         return ready
@@ -121,21 +124,22 @@ def test_a_witness_claims_nothing_and_takes_no_snapshots() -> None:
     assert not talk.orders(acts.Admit) and not talk.orders(acts.Start) and talk.vote() == (1, "robot1")
 
 
-def claiming() -> Talk:
+def claiming(config: Config = ROBOT) -> Talk:
     """robot1 hears everybody, was told to run the component, and claims it."""
-    talk = Talk(ROBOT)
+    talk = Talk(config)
     talk.tick(400)
-    for peer in ROBOT.peers:
+    for peer in config.peers:
         talk.hear(peer)
     talk.readies.append(talk.node.step(Run(1, SPEC), talk.now_ns))
     talk.tick(5)
     return talk
 
 
-def running() -> Talk:
+def running(config: Config = ROBOT) -> Talk:
     """robot1 is primary by its own vote and the witness's, and holds a first snapshot that robot2 has stored."""
-    talk = claiming()
-    talk.hear("witness1", entry(State.STANDBY, 1, "robot1"))
+    talk = claiming(config)
+    for voter in config.peers[1:]:
+        talk.hear(voter, entry(State.STANDBY, 1, "robot1"))
     assert talk.orders(acts.Start)
     talk.readies.append(talk.node.step(Started(NAME, 1), talk.now_ns))
     talk.hear("robot2", entry(State.STANDBY, 1, "robot1"))
@@ -162,6 +166,23 @@ def test_a_checkpoint_counts_once_a_majority_has_noted_who_holds_it() -> None:
     assert not talk.orders(acts.Acknowledge)
     talk.hear("robot2", entry(State.STANDBY, 1, "robot1", ship.position, "robot2"))
     assert talk.orders(acts.Acknowledge)
+
+
+def standby_of(talk: Talk) -> str:
+    (component,) = talk.node.status(talk.now_ns).components
+    return component.standby
+
+
+def test_a_standby_stays_while_its_word_is_due_in_a_later_beat_and_is_left_when_it_objects() -> None:
+    talk = running(replace(ROBOT, peers=("robot2", "robot3", "witness1")))
+    assert standby_of(talk) == "robot3", "the first robot that consented"
+    talk.hear("robot2", entry(State.STANDBY, 1, "robot1"))
+    talk.hear("robot3", untold=1)
+    talk.tick(5)
+    assert standby_of(talk) == "robot3"
+    talk.hear("robot3", entry(State.STOPPING, 1, "robot1"))
+    talk.tick(5)
+    assert standby_of(talk) == "robot2"
 
 
 def test_a_primary_with_a_valid_lease_answers_a_later_epoch_by_one_above_it() -> None:
