@@ -35,7 +35,9 @@ PTRACE_PEEKSIGINFO: Final = 0x4209
 PTRACE_GETSIGMASK: Final = 0x420A
 PTRACE_SETSIGMASK: Final = 0x420B
 PTRACE_GET_RSEQ_CONFIGURATION: Final = 0x420F
+PTRACE_EVENT_CLONE: Final = 3
 PTRACE_EVENT_STOP: Final = 128
+PTRACE_O_TRACECLONE: Final = 0x08
 PTRACE_O_TRACEEXEC: Final = 0x10
 PTRACE_O_EXITKILL: Final = 0x100000
 PTRACE_PEEKSIGINFO_SHARED: Final = 1
@@ -258,6 +260,7 @@ def userfaultfd(number: int, flags: int) -> int:
 KCMP_FILES: Final = 2
 KCMP_FILE: Final = 0
 KCMP_VM: Final = 1
+KCMP_FS: Final = 3
 
 
 def kcmp(pid1: int, pid2: int, kind: int, index1: int = 0, index2: int = 0) -> int | None:
@@ -272,6 +275,24 @@ def kcmp(pid1: int, pid2: int, kind: int, index1: int = 0, index2: int = 0) -> i
     if result < 0 and ctypes.get_errno() in (errno.ENOSYS, errno.EPERM):
         return None
     return result
+
+
+NR_GET_ROBUST_LIST: Final[dict[str, int]] = {"x86_64": 274, "aarch64": 100}
+
+
+def robust_list(tid: int) -> tuple[int, int]:
+    """Head address and length of a thread's list of robust locks; (0, 0) where there is none.
+
+    Raises:
+        OSError: EPERM without the right to trace, ESRCH when it has ended.
+
+    Source: get_robust_list(2).
+    """
+    head, length = ctypes.c_uint64(), ctypes.c_uint64()
+    number = NR_GET_ROBUST_LIST[os.uname().machine]
+    if int(_syscall(number, ctypes.c_int(tid), ctypes.byref(head), ctypes.byref(length))) < 0:
+        raise_errno(f"get_robust_list of thread {tid}")
+    return head.value, length.value
 
 
 NR_IOPRIO_GET: Final[dict[str, int]] = {"x86_64": 252, "aarch64": 31}

@@ -50,9 +50,9 @@ def _explained(pid: int, name: str) -> Iterator[None]:
     try:
         yield
     except (FileNotFoundError, ProcessLookupError) as error:
-        if os.path.exists(f"/proc/{pid}"):
+        if os.path.exists(os.path.dirname(path)):
             raise ProbeError(f"cannot read {path}: this kernel does not offer it") from error
-        raise ProcessGoneError(f"cannot read {path}: there is no process {pid}") from error
+        raise ProcessGoneError(f"cannot read {path}: there is no such process or thread") from error
     except PermissionError as error:
         raise ProbeError(
             f"cannot read {path}: not permitted; run as the same user or with CAP_SYS_PTRACE, see systemd/failover-agent.service"
@@ -64,6 +64,16 @@ def _read_whole(descriptor: int) -> bytes:
     while piece := os.read(descriptor, READ_SIZE):
         pieces.append(piece)
     return b"".join(pieces)
+
+
+def read_line(pid: int, name: str) -> bytes:
+    """As `read_bytes`, for a file that the kernel gives in one piece."""
+    with _explained(pid, name):
+        descriptor = os.open(f"/proc/{pid}/{name}", os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            return os.read(descriptor, READ_SIZE)
+        finally:
+            os.close(descriptor)
 
 
 def read_text(pid: int, name: str) -> str:
@@ -297,8 +307,14 @@ def status(pid: int) -> Status:
 
 @dataclass(frozen=True, slots=True)
 class Stat:
-    """/proc/PID/stat, as far as we use it. Addresses are 0 where we may not see them."""
+    """/proc/PID/stat, as far as we use it. Addresses are 0 where we may not see them.
 
+    Attributes:
+        state: one letter, as `Status.state`.
+    """
+
+    name: str
+    state: str
     nice: int
     priority: int
     policy: int
@@ -316,7 +332,9 @@ class Stat:
     env_end: int
 
 
+PF_EXITING: Final = 0x00000004
 PF_KTHREAD: Final = 0x00200000
+"""Bits of `Stat.flags`. Source: linux/sched.h."""
 
 
 def parse_stat(text: str) -> Stat:
@@ -330,6 +348,8 @@ def parse_stat(text: str) -> Stat:
         return int(words[number - 3])
 
     return Stat(
+        name=text[text.index("(") + 1 : text.rindex(")")],
+        state=words[0],
         nice=field(19),
         priority=field(40),
         policy=field(41),
@@ -351,6 +371,11 @@ def parse_stat(text: str) -> Stat:
 def stat(pid: int) -> Stat:
     """Read and parse /proc/PID/stat."""
     return parse_stat(read_text(pid, "stat"))
+
+
+def thread_stat(pid: int, tid: int) -> Stat:
+    """Read and parse /proc/PID/task/TID/stat."""
+    return parse_stat(read_text(pid, f"task/{tid}/stat"))
 
 
 # Limits

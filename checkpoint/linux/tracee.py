@@ -64,15 +64,21 @@ def _is_dead(pid: int) -> bool:
 
 
 class Tracee:
-    """One thread of another process, from `seize` to `detach`."""
+    """One thread of another process, from `seize` to `detach`.
 
-    def __init__(self, pid: int) -> None:
+    Args:
+        pid: the thread's id; for the first thread of a process that of the process.
+        memory: its process's, if somebody has it already.
+    """
+
+    def __init__(self, pid: int, memory: Memory | None = None) -> None:
         self.pid = pid
-        self.memory = Memory(pid)
+        self.memory = memory or Memory(pid)
         self._registers = ctypes.create_string_buffer(REGISTERS_SIZE)
         self._xstate = ctypes.create_string_buffer(XSTATE_SIZE)
         self._iov = abi.IoVec()
         self._mask = ctypes.c_uint64()
+        self._signals: ctypes.Array[ctypes.c_char] | None = None
 
     def request(self, what: str, request: int, address: int = 0, value: int = 0) -> int:
         """Make one raw ptrace(2) request.
@@ -124,9 +130,20 @@ class Tracee:
             ProcessGoneError: it ended instead.
             CaptureError: it did not stop in time; it stops as soon as it can, call `freeze` again or `release`.
         """
-        if (stood := self._reported()) is not None and not stood.is_delivery:
+        return self.ask_to_stop() or self.await_stop(timeout_s)
+
+    def ask_to_stop(self) -> Stop | None:
+        """The first half of `freeze`: where it stands already; None when `await_stop` must follow."""
+        stood = self.reported()
+        if stood is not None and not stood.is_delivery:
             return stood
         self.interrupt()
+        if stood is not None:
+            self.cont(stood.signal)  # a signal came just after it was seized
+        return None
+
+    def await_stop(self, timeout_s: float = STOP_TIMEOUT_S) -> Stop:
+        """The second half of `freeze`."""
         while (stop := self.wait(timeout_s)).is_delivery:
             self.cont(stop.signal)
         return stop
@@ -157,8 +174,16 @@ class Tracee:
             else:
                 time.sleep(0.0001)
 
-    def _reported(self) -> Stop | None:
-        """The stop that it has reported already, if any."""
+    def is_dead(self) -> bool:
+        """Whether it has ended, reaped or not."""
+        return _is_dead(self.pid)
+
+    def reported(self) -> Stop | None:
+        """The stop that it has reported already, if any.
+
+        Raises:
+            ProcessGoneError: it has ended, or we are not its tracer any more.
+        """
         try:
             pid, status = os.waitpid(self.pid, abi.WALL | os.WNOHANG)
         except ChildProcessError as error:
@@ -199,7 +224,7 @@ class Tracee:
     def _getregset(self, what: str, kind: int, buffer: ctypes.Array[ctypes.c_char]) -> bytes:
         self._iov.base, self._iov.length = ctypes.addressof(buffer), len(buffer)
         self.request(what, abi.PTRACE_GETREGSET, kind, ctypes.addressof(self._iov))
-        return buffer.raw[: self._iov.length]
+        return ctypes.string_at(buffer, self._iov.length)
 
     def _setregset(self, what: str, kind: int, content: bytes, buffer: ctypes.Array[ctypes.c_char]) -> None:
         ctypes.memmove(buffer, content, len(content))
@@ -228,14 +253,16 @@ class Tracee:
             CaptureError: more than `PENDING_LIMIT` are queued.
         """
         found: list[bytes] = []
-        buffer = ctypes.create_string_buffer(PEEK_COUNT * abi.SIGINFO_SIZE)
+        if self._signals is None:
+            self._signals = ctypes.create_string_buffer(PEEK_COUNT * abi.SIGINFO_SIZE)
+        buffer = self._signals
         flags = abi.PTRACE_PEEKSIGINFO_SHARED if shared else 0
         while len(found) <= PENDING_LIMIT:
             order = abi.PeekSiginfo(len(found), flags, PEEK_COUNT)
             count = self.request(
                 "read pending signals of", abi.PTRACE_PEEKSIGINFO, ctypes.addressof(order), ctypes.addressof(buffer)
             )
-            raw = buffer.raw
+            raw = ctypes.string_at(buffer, count * abi.SIGINFO_SIZE)
             found += [raw[i * abi.SIGINFO_SIZE : (i + 1) * abi.SIGINFO_SIZE] for i in range(count)]
             if count < PEEK_COUNT:
                 return tuple(found)

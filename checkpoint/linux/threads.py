@@ -1,0 +1,263 @@
+"""All threads of one process, stopped and let go together.
+
+How none is missed, and none left behind (each step is a race):
+
+1. The listing of /proc/PID/task is older than the seizing: a thread that has ended meanwhile is passed over.
+2. A thread that is seized but still runs gives birth to another: the newborn stands in /proc/PID/task before its mother can
+   stop (copy_process in kernel/fork.c looks for signals before it adds it). So the threads are counted again, and listed, until
+   everybody who is counted stands still; only who runs can give birth.
+3. A thread ends between seizing and stopping: as its tracer we are told, and must take note, or its process could never end.
+4. A thread waits inside the kernel (a disk, a network file system, vfork) and does not stop: everybody else is let go, and it as
+   soon as it stops, which SIGCHLD tells us.
+5. The process is killed while it stands: each thread ends for its tracer first, as in 3.
+6. We die: the kernel lets everybody go.
+
+Source: ptrace(2), "Attaching and detaching", "Death under ptrace"; proc_pid_task(5).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
+from checkpoint.linux import abi, procfs
+from checkpoint.linux.tracee import STOP_TIMEOUT_S, Tracee
+
+GLANCE_S: Final = 0.02
+"""How long a thread may take before we look whether it waits inside the kernel."""
+PATIENCE_S: Final = 1.0
+"""How long we wait for threads that do not stop where no signal can tell us (in a thread of ours that is not the first)."""
+FIRST_LINKS: Final = 2
+"""Links of an empty /proc/PID/task: its own, and its parent's. Each thread is one more."""
+
+
+def thread_count(pid: int) -> int:
+    """How many threads a process has, those included that are about to end.
+
+    Source: proc_task_getattr() in fs/proc/base.c.
+    """
+    try:
+        return os.stat(f"/proc/{pid}/task").st_nlink - FIRST_LINKS
+    except (FileNotFoundError, ProcessLookupError) as error:
+        raise ProcessGoneError(f"there is no process {pid} any more") from error
+
+
+def thread_ids(pid: int) -> list[int]:
+    """The ids of its threads, oldest first."""
+    try:
+        return sorted(int(name) for name in os.listdir(f"/proc/{pid}/task"))
+    except (FileNotFoundError, ProcessLookupError) as error:
+        raise ProcessGoneError(f"there is no process {pid} any more") from error
+
+
+class Threads:
+    """The threads of one process; every call from the thread of ours that makes the first one.
+
+    Invariants: between `thaw` and `freeze` nobody is seized, but for threads in ``_loose``, which had not stopped.
+
+    Attributes:
+        leader: the first thread, whose id is the process's.
+    """
+
+    def __init__(self, leader: Tracee) -> None:
+        self.leader = leader
+        self._known: dict[int, Tracee] = {leader.pid: leader}
+        self._held: dict[int, Tracee] = {}
+        self._moving: set[int] = set()
+        self._loose: dict[int, Tracee] = {}
+        self._before: Any = None
+
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self.leader.pid
+
+    @property
+    def others(self) -> tuple[Tracee, ...]:
+        """Those that stand still, besides the leader, oldest first."""
+        return tuple(tracee for tid, tracee in sorted(self._held.items()) if tid != self.pid)
+
+    # Stopping
+
+    def freeze(self) -> None:
+        """Stop every thread.
+
+        Raises:
+            ProcessGoneError: the process has ended.
+            ProbeError: somebody else traces one of them, or we may not.
+            CaptureError: one did not stop in time. Nobody stands still for us after any of these.
+        """
+        self._require_none_loose()
+        try:
+            self._freeze()
+        except BaseException:
+            self.thaw()
+            raise
+        if len(self._known) > len(self._held):
+            self._known = {self.pid: self.leader, **self._held}
+
+    def _freeze(self) -> None:
+        deadline = time.perf_counter() + STOP_TIMEOUT_S
+        ended: set[int] = set()
+        self._moving.clear()
+        fresh = [self.pid] if thread_count(self.pid) == 1 else thread_ids(self.pid)
+        while fresh:
+            ended |= self._stop(fresh, deadline)
+            if thread_count(self.pid) == len(self._held):
+                return
+            fresh = [tid for tid in thread_ids(self.pid) if tid not in self._held and tid not in ended]
+            if fresh and time.perf_counter() > deadline:
+                raise CaptureError(
+                    f"pid {self.pid} did not come to stand still within {STOP_TIMEOUT_S:g} s: it starts threads all the time, "
+                    "or the machine leaves it no processor; capture it again"
+                )
+
+    def _stop(self, tids: list[int], deadline: float) -> set[int]:
+        """Stop these; those that have ended instead."""
+        ended: set[int] = set()
+        asked = [tid for tid in tids if self._unless_ended(self._seize, tid, ended)]
+        for tid in asked:
+            self._unless_ended(self._ask, tid, ended)
+        for tid in asked:
+            if tid in self._moving:
+                self._unless_ended(lambda tid: self._await(self._held[tid], deadline), tid, ended)
+        return ended
+
+    def _seize(self, tid: int) -> None:
+        tracee = self._known.get(tid)
+        if tracee is None:
+            tracee = self._known[tid] = Tracee(tid, self.leader.memory)
+        tracee.seize()
+        self._held[tid] = tracee
+
+    def _ask(self, tid: int) -> None:
+        if self._held[tid].ask_to_stop() is None:
+            self._moving.add(tid)
+
+    def _unless_ended(self, act: Callable[[int], None], tid: int, ended: set[int]) -> bool:
+        """Do something to a thread; False if it has ended. A process whose first thread has ended is another matter."""
+        try:
+            act(tid)
+        except ProcessGoneError:
+            if tid == self.pid:
+                raise
+            self._held.pop(tid, None)
+            self._moving.discard(tid)
+            ended.add(tid)
+            return False
+        return True
+
+    def _await(self, tracee: Tracee, deadline: float) -> None:
+        left_s = max(deadline - time.perf_counter(), 0.0)
+        try:
+            tracee.await_stop(min(GLANCE_S, left_s))
+        except ProcessGoneError:
+            raise
+        except CaptureError:
+            if thread_count(self.pid) > 1 and procfs.thread_stat(self.pid, tracee.pid).state == "D":
+                raise
+            tracee.await_stop(left_s)
+
+    # Letting go
+
+    def thaw(self) -> None:
+        """Let everybody go, however far `freeze` came, whoever has ended meanwhile."""
+        held, self._held = self._held, {}
+        for tid, tracee in held.items():
+            try:
+                tracee.detach()
+            except CheckpointError:
+                self._loose[tid] = tracee
+        self._settle()
+
+    def adopt(self, others: tuple[Tracee, ...]) -> None:
+        """Take over threads that are ours already and stand still, the leader among them."""
+        self._held = {tracee.pid: tracee for tracee in (self.leader, *others)}
+        self._known |= self._held
+
+    def hold(self) -> None:
+        """Leave them standing; should they be killed meanwhile, we take note, so that their parent hears of it."""
+        self._listen()
+
+    def _settle(self) -> None:
+        """Let go of those that had not stopped, or take note of their end: now, or as soon as it can be."""
+        self._tend()
+        if not self._loose:
+            self._listen_no_more()
+            return
+        if self._listen():
+            self._tend()
+            return
+        deadline = time.perf_counter() + PATIENCE_S
+        while self._loose and time.perf_counter() < deadline:
+            time.sleep(0.001)
+            self._tend()
+
+    def _tend(self) -> None:
+        self._loose = {tid: tracee for tid, tracee in self._loose.items() if not self._is_let_go(tracee)}
+
+    def _is_let_go(self, tracee: Tracee) -> bool:
+        """Try once more to let go of a thread; whether it is ours no more."""
+        if self._is_our_child(tracee) and tracee.is_dead():
+            return True  # whoever of us is its parent takes note of it
+        try:
+            stop = tracee.reported()
+        except ProcessGoneError:
+            return True
+        if stop is None:
+            return False
+        try:
+            tracee.detach(stop.signal if stop.is_delivery else 0)
+        except ProcessGoneError:
+            return False  # killed just now: its end is still to come
+        return True
+
+    def _is_our_child(self, tracee: Tracee) -> bool:
+        if tracee is not self.leader:
+            return False
+        try:
+            return procfs.status(self.pid).ppid == os.getpid()
+        except CheckpointError:
+            return False
+
+    def _require_none_loose(self) -> None:
+        if self._loose:
+            self._settle()
+        if self._loose:
+            listed = ", ".join(map(str, self._loose))
+            raise CaptureError(
+                f"thread {listed} of pid {self.pid} waits inside the kernel since the last attempt, for a device or a file "
+                "system; capture it again when that answers"
+            )
+
+    # Hearing of it
+
+    def _listen(self) -> bool:
+        """Have the kernel tell us; False where it cannot: signals go to our first thread."""
+        if threading.current_thread() is not threading.main_thread():
+            return False
+        if self._before is None:
+            self._before = signal.signal(signal.SIGCHLD, lambda *_: self._hear()) or signal.SIG_DFL
+        return True
+
+    def _listen_no_more(self) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGCHLD, self._before)
+            self._before = None
+
+    def _hear(self) -> None:
+        """One of them has stopped or ended."""
+        for tracee in self._held.values():
+            if not self._is_our_child(tracee):
+                with contextlib.suppress(ChildProcessError):
+                    os.waitid(os.P_PID, tracee.pid, os.WEXITED | os.WNOHANG | abi.WALL)
+        if self._loose:
+            self._tend()
+            if not (self._loose or self._held):
+                self._listen_no_more()
