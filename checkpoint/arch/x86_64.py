@@ -8,6 +8,7 @@ Sources: struct user_regs_struct of sys/user.h; arch/x86/entry/syscalls/syscall_
 
 from __future__ import annotations
 
+import operator
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +23,9 @@ REGISTER_NAMES: Final = (
     *("orig_rax", "rip", "cs", "eflags", "rsp", "ss", "fs_base", "gs_base", "ds", "es", "fs", "gs"),
 )
 """Order of NT_PRSTATUS: 64-bit words, little-endian."""
+_in_order: Final = operator.itemgetter(*REGISTER_NAMES)
 _REGISTERS: Final = struct.Struct(f"<{len(REGISTER_NAMES)}Q")
+REGISTERS_SIZE: Final = _REGISTERS.size
 CODE_SEGMENT_64: Final = 0x33
 """``cs`` of a 64-bit program; 0x23 is a 32-bit one."""
 
@@ -37,7 +40,10 @@ def decode_registers(content: bytes) -> Registers:
 
 def encode_registers(registers: Mapping[str, int]) -> bytes:
     """Write NT_PRSTATUS."""
-    return _REGISTERS.pack(*(registers[name] & _WORD for name in REGISTER_NAMES))
+    try:
+        return _REGISTERS.pack(*_in_order(registers))
+    except struct.error:  # a negative one
+        return _REGISTERS.pack(*(registers[name] & _WORD for name in REGISTER_NAMES))
 
 
 _WORD: Final = (1 << 64) - 1
@@ -46,6 +52,8 @@ STACK_POINTER: Final = "rsp"
 RESULT: Final = "rax"
 CALL_NUMBER: Final = "orig_rax"
 """Number of the system call that the thread stands in; -1 outside of one."""
+NO_CALL: Final = _WORD
+"""As `CALL_NUMBER`, unsigned: the thread is not in a system call, so the kernel has none to restart."""
 ARGUMENTS: Final = ("rdi", "rsi", "rdx", "r10", "r8", "r9")
 
 # System calls
@@ -58,7 +66,7 @@ SYSCALLS: Final[Mapping[str, int]] = {
     "futex": 202, "io_getevents": 208, "restart_syscall": 219, "semtimedop": 220, "timer_gettime": 224,
     "timer_getoverrun": 225, "clock_gettime": 228, "clock_nanosleep": 230, "epoll_wait": 232, "pselect6": 270,
     "ppoll": 271, "get_robust_list": 274, "epoll_pwait": 281, "userfaultfd": 323, "io_uring_enter": 426,
-    "epoll_pwait2": 441,
+    "epoll_pwait2": 441, "futex_waitv": 449,
 }  # fmt: skip
 """Numbers by name: those that we make or tell of."""
 SYSCALL_NAMES: Final[Mapping[int, str]] = {number: name for name, number in SYSCALLS.items()}

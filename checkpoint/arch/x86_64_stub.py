@@ -121,13 +121,10 @@ SYSTEM_CALLS: Final = {
 }
 """Numbers of the system calls that a restore makes inside a vessel (asm/unistd_64.h)."""
 
-_NO_CALL: Final = -1
-"""As `x86_64.CALL_NUMBER`: the thread is not in a system call, so the kernel has none to restart."""
-
 
 def with_registers(registers: bytes, **values: int) -> bytes:
     """A copy of NT_PRSTATUS with some registers changed; the thread is not in a system call any more."""
-    return x86_64.encode_registers(x86_64.decode_registers(registers) | {x86_64.CALL_NUMBER: _NO_CALL, **values})
+    return x86_64.encode_registers(x86_64.decode_registers(registers) | {x86_64.CALL_NUMBER: x86_64.NO_CALL, **values})
 
 
 ERESTARTSYS: Final = -512

@@ -52,7 +52,7 @@ class Interruption:
         self._place, self._number = place, number
         name = arch.SYSCALL_NAMES.get(number, "")
         if name not in arch.RESTART_BLOCK_USERS:
-            ended = {**registers, arch.RESULT: -errno.EINTR, arch.CALL_NUMBER: -1}
+            ended = {**registers, arch.RESULT: -errno.EINTR, arch.CALL_NUMBER: arch.NO_CALL}
             return ended, ""
         if name in arch.REMAINING_TIME:
             asked, remaining = (arch.ARGUMENTS[index] for index in arch.REMAINING_TIME[name])
@@ -86,7 +86,7 @@ def _again(registers: arch.Registers, number: int) -> tuple[arch.Registers, str]
     again = {
         **registers,
         arch.RESULT: number,
-        arch.CALL_NUMBER: -1,
+        arch.CALL_NUMBER: arch.NO_CALL,
         arch.INSTRUCTION_POINTER: registers[arch.INSTRUCTION_POINTER] - len(arch.SYSCALL),
     }
     return again, arch.SYSCALL_NAMES.get(number, str(number))

@@ -89,7 +89,7 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
     tracee.memory.poke(place, stub)
     there = arch.decode_registers(registers)
     there[arch.INSTRUCTION_POINTER] = place + arch.ENTRY_CODE_OFFSET
-    there[arch.CALL_NUMBER] = -1
+    there[arch.CALL_NUMBER] = arch.NO_CALL
     tracee.set_registers(arch.encode_registers(there))
     tracee.set_signal_mask(abi.ALL_SIGNALS)
     tracee.cont()

@@ -153,6 +153,12 @@ class Memory:
         if content:
             self.write_from(ranges_of([(address, len(content))]), bytearray(content))
 
+    def write_each(self, contents: list[tuple[int, bytes]]) -> None:
+        """Write many pieces, each at its address, all at once."""
+        if contents:
+            ranges = ranges_of([(address, len(content)) for address, content in contents])
+            self.write_from(ranges, bytearray(b"".join(content for _, content in contents)))
+
     def poke(self, address: int, content: bytes) -> None:
         """Write whatever the protection says, through ``/proc/PID/mem`` (FOLL_FORCE).
 

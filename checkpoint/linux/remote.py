@@ -1,7 +1,8 @@
 """System calls made inside a stopped tracee, by one batch of straight-line code in a few pages that we borrow there.
 
 The pages: ``CODE_SIZE`` bytes r-x, then ``TABLE_SIZE`` bytes rw-. They lie in the middle of the largest hole, are never
-given to a child (MADV_DONTFORK), belong to no snapshot, and stay between captures.
+given to a child (MADV_DONTFORK), belong to no snapshot, and stay between captures. In each of both a large *desk* comes first,
+for the batch of the first thread, then `DESK_COUNT` small ones, at which other threads answer all at the same time.
 
 A batch, and why a SIGKILL of the tracer at any instant leaves the program unharmed (each step is a test):
 
@@ -26,11 +27,12 @@ No instruction changes a flag or touches the stack. Source: signal(7), ptrace(2)
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -41,29 +43,61 @@ from checkpoint.linux import abi
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.tracee import Tracee
 
-CODE_SIZE: Final = 4 * abi.PAGE_SIZE
-TABLE_SIZE: Final = 4 * abi.PAGE_SIZE
+LARGE_DESK: Final = 4 * abi.PAGE_SIZE
+"""Bytes of the large desk's code, and of its table."""
+DESK_COUNT: Final = 32
+SMALL_DESK: Final = 512
+"""Bytes of a small desk's code, and of its table: room for four short calls."""
+CODE_SIZE: Final = LARGE_DESK + DESK_COUNT * SMALL_DESK
+TABLE_SIZE: Final = CODE_SIZE
 SIZE: Final = CODE_SIZE + TABLE_SIZE
-MAGIC: Final = b"failover borrows these pages; 1\0"
+MAGIC: Final = b"failover borrows these pages; 2\0"
 """Stands at the end of the code pages, and at the beginning of the table."""
 BATCH_TIMEOUT_S: Final = 1.0
 """How long a batch may take: its calls never wait, so only a machine that does not run the program at all exceeds this."""
 CALL_LIMIT: Final = 200
-"""Calls in one batch; ``CODE_SIZE`` holds 220 of the longest."""
+"""Calls in one batch; ``LARGE_DESK`` holds 220 of the longest."""
 
 IDLE: Final = 0
 ARMED: Final = 1
 ENDED: Final = 2
 ABANDONED: Final = 3
 
-_RESULTS: Final = 0x100
-_OUTPUTS: Final = _RESULTS + 8 * CALL_LIMIT
-_OUTPUT_ALIGNMENT: Final = 16
 _HEAD: Final = struct.Struct("<32sQQQQQQQQ")  # magic, state, done, serial, mask, timeout (2 words), empty set, resume
+_HEAD_SIZE: Final = _HEAD.size + 8 * len(arch.CLOBBERED)
+_OUTPUT_ALIGNMENT: Final = 16
+_STATE_OFFSET: Final = 32
 
 
-def _places(table: int) -> arch.TablePlaces:
-    words = table + 32
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Where the parts of a desk's table begin: head, then results, then what the calls write.
+
+    Attributes:
+        size: of the table; its code has as much room.
+        call_limit: calls in one batch.
+    """
+
+    size: int
+    call_limit: int
+
+    @property
+    def results(self) -> int:
+        """Offset of the results."""
+        return -(-_HEAD_SIZE // _OUTPUT_ALIGNMENT) * _OUTPUT_ALIGNMENT
+
+    @property
+    def outputs(self) -> int:
+        """Offset of the outputs."""
+        return self.results + -(-8 * self.call_limit // _OUTPUT_ALIGNMENT) * _OUTPUT_ALIGNMENT
+
+
+LARGE: Final = Plan(LARGE_DESK, CALL_LIMIT)
+SMALL: Final = Plan(SMALL_DESK, 4)
+
+
+def _places(table: int, plan: Plan) -> arch.TablePlaces:
+    words = table + _STATE_OFFSET
     return arch.TablePlaces(
         state=words,
         ended=ENDED,
@@ -74,7 +108,7 @@ def _places(table: int) -> arch.TablePlaces:
         empty_set=words + 48,
         resume=words + 56,
         registers=words + 64,
-        results=table + _RESULTS,
+        results=table + plan.results,
     )
 
 
@@ -82,26 +116,32 @@ class Batch:
     """System calls put in order for one run; each answers with its place in the results.
 
     Args:
-        table: address of the borrowed table: outputs of the calls go there.
+        table: address of the table of the desk at which they will be made: outputs of the calls go there.
     """
 
-    def __init__(self, table: int) -> None:
+    def __init__(self, table: int, plan: Plan = LARGE) -> None:
         self._table = table
+        self._plan = plan
         self.calls: list[Call] = []
         self.output_size = 0
 
+    @property
+    def end(self) -> int:
+        """Offset in the table after the last output."""
+        return self._plan.outputs + self.output_size
+
     def output(self, size: int) -> int:
         """Reserve room for what a call writes; answers with its address in the tracee."""
-        address = self._table + _OUTPUTS + self.output_size
+        address = self._table + self._plan.outputs + self.output_size
         self.output_size += -(-size // _OUTPUT_ALIGNMENT) * _OUTPUT_ALIGNMENT
-        if _OUTPUTS + self.output_size > TABLE_SIZE:
+        if self.end > self._plan.size:
             raise CaptureError(f"too much to ask of a process at once: {self.output_size} bytes of answers")
         return address
 
     def add(self, name: str, *arguments: int) -> int:
         """Add a call."""
-        if len(self.calls) >= CALL_LIMIT:
-            raise CaptureError(f"too much to ask of a process at once: more than {CALL_LIMIT} system calls")
+        if len(self.calls) >= self._plan.call_limit:
+            raise CaptureError(f"too much to ask of a process at once: more than {self._plan.call_limit} system calls")
         self.calls.append(Call(name, arguments))
         return len(self.calls) - 1
 
@@ -124,20 +164,89 @@ class Answers:
         return self._outputs[offset : offset + size]
 
 
+@dataclass(frozen=True, slots=True)
+class Guest:
+    """A thread that is to make the calls of a batch, and where it stands.
+
+    Attributes:
+        registers: as it was stopped with; given back untouched.
+        mask: the program's own signal mask.
+    """
+
+    tracee: Tracee
+    registers: arch.Registers
+    mask: int
+
+
+class Desk:
+    """A place in the borrowed pages at which one thread makes the calls of a batch."""
+
+    def __init__(self, memory: Memory, code: int, table: int, plan: Plan) -> None:
+        self.code = code
+        self.table = table
+        self.size = plan.size
+        self._memory = memory
+        self._plan = plan
+        self._places = _places(table, plan)
+        self._code_key: tuple[Call, ...] | None = None
+        self._serial = 0
+
+    def state(self) -> int:
+        """`IDLE`, `ARMED`, `ENDED` or `ABANDONED`, as it stands in the table."""
+        return int.from_bytes(self._memory.read(self._places.state, 8), "little")
+
+    def set_state(self, state: int) -> None:
+        """Write it."""
+        self._memory.write(self._places.state, struct.pack("<Q", state))
+
+    def armed(self, batch: Batch, registers: arch.Registers, mask: int) -> bytes:
+        """Step 1: lay the code; the head of the table, to be laid, too: what a thread needs that goes on by itself."""
+        key = tuple(batch.calls)
+        if key != self._code_key:
+            code = arch.batch_code(self.code, key, self._places)
+            assert len(code) + len(MAGIC) <= self._plan.size, "the limit of calls keeps the code within its desk"
+            self._memory.poke(self.code, code)
+            self._code_key = key
+        self._serial += 1
+        resume = resumed(registers)
+        return _HEAD.pack(
+            MAGIC, ARMED, 0, self._serial, mask, 0, arch.ENTRY_TIMEOUT_NS, 0, resume[arch.INSTRUCTION_POINTER]
+        ) + struct.pack(f"<{len(arch.CLOBBERED)}Q", *(resume[name] for name in arch.CLOBBERED))
+
+    def start(self, guest: Guest) -> None:
+        """Steps 2 to 4: have a thread make the calls."""
+        there = {**guest.registers, arch.INSTRUCTION_POINTER: self.code, arch.CALL_NUMBER: arch.NO_CALL}
+        guest.tracee.set_registers(arch.encode_registers(there))
+        guest.tracee.set_signal_mask(abi.ALL_SIGNALS)
+        guest.tracee.cont()
+
+    def is_done(self, table: bytes) -> bool:
+        """Whether the calls have been made, by the table's bytes."""
+        done = self._places.done - self.table
+        return table[done : done + 8] == struct.pack("<Q", self._serial)
+
+    def answers(self, table: bytes, batch: Batch) -> Answers:
+        """What they brought back, by the table's bytes."""
+        results = struct.unpack_from(f"<{len(batch.calls)}q", table, self._plan.results)
+        outputs = table[self._plan.outputs : self._plan.outputs + batch.output_size]
+        return Answers(results, outputs, self.table + self._plan.outputs)
+
+
 class BorrowedPages:
     """Our pages in one tracee; every method is called while it stands still, and leaves it standing still.
 
     Attributes:
         address: of the code pages; the table follows them.
+        desks: the small ones.
     """
 
     def __init__(self, memory: Memory, address: int) -> None:
         self.address = address
         self.table = address + CODE_SIZE
         self._memory = memory
-        self._places = _places(self.table)
-        self._code_key: tuple[Call, ...] | None = None
-        self._serial = 0
+        self._large = Desk(memory, address, self.table, LARGE)
+        offsets = range(LARGE_DESK, CODE_SIZE, SMALL_DESK)
+        self.desks = tuple(Desk(memory, address + offset, self.table + offset, SMALL) for offset in offsets)
 
     @property
     def end(self) -> int:
@@ -149,12 +258,15 @@ class BorrowedPages:
         return self.address <= address < self.end
 
     def state(self) -> int:
-        """`IDLE`, `ARMED`, `ENDED` or `ABANDONED`, as it stands in the table."""
-        return int.from_bytes(self._memory.read(self._places.state, 8), "little")
+        """`IDLE`, `ARMED`, `ENDED` or `ABANDONED`: of the large desk, unless a small one is still `ARMED`."""
+        state = self._large.state()
+        if state not in (ARMED, ABANDONED) and any(desk.state() == ARMED for desk in self.desks):
+            return ARMED
+        return state
 
     def abandon(self) -> None:
         """Leave the pages to the program as ordinary memory: something of its own may still lead there."""
-        self._memory.write(self._places.state, struct.pack("<Q", ABANDONED))
+        self._large.set_state(ABANDONED)
 
     def run(self, tracee: Tracee, batch: Batch, registers: bytes, mask: int) -> Answers:
         """Make the calls of a batch; afterwards the thread stands exactly as before.
@@ -167,64 +279,120 @@ class BorrowedPages:
             ProcessGoneError: it was killed meanwhile.
             CaptureError: the batch did not run in time, or we came too late to take the thread back; the program goes on.
         """
-        if self.state() == ARMED:
-            raise CaptureError(f"pid {tracee.pid} still has to return to code of an earlier look; capture it again in a moment")
-        self._write(batch, arch.decode_registers(registers), mask)
-        there = arch.decode_registers(registers)
-        there[arch.INSTRUCTION_POINTER] = self.address
-        there[arch.CALL_NUMBER] = -1
-        tracee.set_registers(arch.encode_registers(there))
-        tracee.set_signal_mask(abi.ALL_SIGNALS)
-        tracee.cont()
+        guest = Guest(tracee, arch.decode_registers(registers), mask)
+        return self._run_at([self._large], [batch], [guest])[0]
+
+    def run_each(self, batches: Sequence[Batch], guests: Sequence[Guest]) -> list[Answers]:
+        """Have each of many threads make the calls of a batch, as many at a time as there are small desks; raises as `run`.
+
+        Args:
+            batches: one for each small desk.
+        """
+        found: list[Answers] = []
+        for first in range(0, len(guests), len(self.desks)):
+            found += self._run_at(self.desks, batches, guests[first : first + len(self.desks)])
+        return found
+
+    def _run_at(self, desks: Sequence[Desk], batches: Sequence[Batch], guests: Sequence[Guest]) -> list[Answers]:
+        places = list(zip(desks, batches, guests, strict=False))
+        self._require_free([desk for desk, _, _ in places])
+        heads = [(desk.table, desk.armed(batch, guest.registers, guest.mask)) for desk, batch, guest in places]
+        self._memory.write_each(heads)
+        started: list[tuple[Desk, Guest]] = []
         try:
-            self._wait_done()
+            for desk, _, guest in places:
+                started.append((desk, guest))
+                desk.start(guest)
+            tables = _tables_when_done(self._memory, [desk for desk, _, _ in places], batches[0].end)
         finally:
-            give_back(tracee, registers, mask, self.holds)
-            self._memory.write(self._places.state, struct.pack("<Q", IDLE))
-        return self._answers(batch)
+            self._take_back(started, [desk for desk, _, _ in places[len(started) :]])
+        return [desk.answers(table, batch) for (desk, batch, _), table in zip(places, tables, strict=True)]
 
-    def _write(self, batch: Batch, registers: arch.Registers, mask: int) -> None:
-        key = tuple(batch.calls)
-        if key != self._code_key:
-            code = arch.batch_code(self.address, key, self._places)
-            assert len(code) + len(MAGIC) <= CODE_SIZE, "CALL_LIMIT keeps the code within its pages"
-            self._memory.poke(self.address, code)
-            self._code_key = key
-        self._serial += 1
-        resume = resumed(registers)
-        head = _HEAD.pack(
-            MAGIC, ARMED, 0, self._serial, mask, 0, arch.ENTRY_TIMEOUT_NS, 0, resume[arch.INSTRUCTION_POINTER]
-        ) + struct.pack(f"<{len(arch.CLOBBERED)}Q", *(resume[name] for name in arch.CLOBBERED))
-        self._memory.write(self.table, head)
-
-    def _wait_done(self) -> None:
-        deadline = time.perf_counter() + BATCH_TIMEOUT_S
-        done = struct.pack("<Q", self._serial)
-        while self._memory.read(self._places.done, 8) != done:
-            if time.perf_counter() > deadline:
+    def _require_free(self, desks: Sequence[Desk]) -> None:
+        size = desks[0].size
+        raw = self._memory.read(desks[0].table, (len(desks) - 1) * size + _HEAD_SIZE)
+        for place in range(len(desks)):
+            if raw[place * size + _STATE_OFFSET] == ARMED:
                 raise CaptureError(
-                    f"pid {self._memory.pid} did not run for {BATCH_TIMEOUT_S:g} s while it was looked at: it is frozen by its "
-                    "cgroup, or higher priorities leave it no processor; capture it again when it runs"
+                    f"pid {self._memory.pid} still has to return to code of an earlier look; capture it again in a moment"
                 )
-            os.sched_yield()
 
-    def _answers(self, batch: Batch) -> Answers:
-        count = len(batch.calls)
-        raw = self._memory.read(self._places.results, _OUTPUTS - _RESULTS + batch.output_size)
-        results = struct.unpack_from(f"<{count}q", raw)
-        return Answers(results, raw[_OUTPUTS - _RESULTS :], self.table + _OUTPUTS)
+    def _take_back(self, places: Sequence[tuple[Desk, Guest]], untouched: Sequence[Desk]) -> None:
+        """As `give_back`, for many: nobody waits for another one's stop, and one that is gone spoils nothing for the others.
+
+        Args:
+            untouched: desks that nobody came to.
+
+        Raises:
+            ProcessGoneError, CaptureError: of the first of those that could not be given back.
+        """
+        failures: list[CaptureError] = []
+        moving: list[Tracee] = []
+        for _, guest in places:
+            with _collected(failures):
+                if guest.tracee.ask_to_stop() is None:
+                    moving.append(guest.tracee)
+        given = list(untouched)
+        for desk, guest in places:
+            with _collected(failures):
+                if guest.tracee in moving:
+                    guest.tracee.await_stop()
+                set_back(guest.tracee, arch.encode_registers(guest.registers), guest.mask, self.holds)
+                given.append(desk)
+        idle = struct.pack("<Q", IDLE)
+        with _collected(failures):
+            self._memory.write_each([(desk.table + _STATE_OFFSET, idle) for desk in given])
+        if failures:
+            raise failures[0]
+
+
+@contextlib.contextmanager
+def _collected(failures: list[CaptureError]) -> Iterator[None]:
+    try:
+        yield
+    except CaptureError as failure:
+        failures.append(failure)
+
+
+def _tables_when_done(memory: Memory, desks: Sequence[Desk], end: int) -> list[bytes]:
+    """The tables of desks that lie one after the other, when all the calls have been made.
+
+    Args:
+        end: offset of the first byte in the last table that is not of interest.
+
+    Raises:
+        CaptureError: they were not, in time.
+    """
+    deadline = time.perf_counter() + BATCH_TIMEOUT_S
+    size = desks[0].size
+    while True:
+        raw = memory.read(desks[0].table, (len(desks) - 1) * size + end)
+        tables = [raw[place * size : (place + 1) * size] for place in range(len(desks))]
+        if all(desk.is_done(table) for desk, table in zip(desks, tables, strict=True)):
+            return tables
+        if time.perf_counter() > deadline:
+            raise CaptureError(
+                f"pid {memory.pid} did not run for {BATCH_TIMEOUT_S:g} s while it was looked at: it is frozen by its "
+                "cgroup, or higher priorities leave it no processor; capture it again when it runs"
+            )
+        os.sched_yield()
 
 
 def give_back(tracee: Tracee, registers: bytes, mask: int, is_ours: Callable[[int], bool]) -> arch.Registers:
-    """Stop the thread in our code, and set it where the program stood. Mask first: see step 5. Answers with what it had there.
+    """Stop the thread in our code, and set it where the program stood. Answers with what it had there; raises as `set_back`."""
+    tracee.freeze()
+    return set_back(tracee, registers, mask, is_ours)
+
+
+def set_back(tracee: Tracee, registers: bytes, mask: int, is_ours: Callable[[int], bool]) -> arch.Registers:
+    """Set a thread that stands in our code where the program stood. Mask first: see step 5. Answers with what it had there.
 
     Args:
-        is_ours: whether an instruction at this address is of our code.
+        is_ours: whether an instruction at an address is of our code.
 
     Raises:
         CaptureError: it has left our code by itself, and goes on from where it is now.
     """
-    tracee.freeze()
     found = arch.decode_registers(tracee.registers())
     if not is_ours(found[arch.INSTRUCTION_POINTER]):
         raise CaptureError(
@@ -252,5 +420,5 @@ def resumed(registers: arch.Registers) -> arch.Registers:
         **registers,
         arch.RESULT: again,
         arch.INSTRUCTION_POINTER: registers[arch.INSTRUCTION_POINTER] - len(arch.SYSCALL),
-        arch.CALL_NUMBER: -1,
+        arch.CALL_NUMBER: arch.NO_CALL,
     }

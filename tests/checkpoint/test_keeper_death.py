@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -21,8 +21,9 @@ from checkpoint import channel
 from checkpoint.channel import Channel, ChannelError, Reply
 from checkpoint.engine import CaptureOrder
 from checkpoint.errors import CaptureError
-from checkpoint.linux import entry
-from checkpoint.linux.remote import BorrowedPages
+from checkpoint.linux import entry, remote
+from checkpoint.linux.memory import Memory
+from checkpoint.linux.remote import Desk
 from checkpoint.linux.vessel import Birth, Born, spawn_vessel
 from tests.checkpoint.round_trip import PATIENCE_S, Program, ended, protected, start
 
@@ -155,16 +156,17 @@ def test_a_keeper_that_is_late_does_not_send_the_program_back_to_where_it_stood(
     worker: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its code in the program waits for it, not for ever; by now the program has run on by itself."""
-    wait_in_time = BorrowedPages._wait_done
+    wait_in_time = remote._tables_when_done
 
-    def wait_too_long(pages: BorrowedPages) -> None:
-        wait_in_time(pages)
+    def wait_too_long(memory: Memory, desks: Sequence[Desk], end: int) -> list[bytes]:
+        tables = wait_in_time(memory, desks, end)
         assert goes_on(worker)
+        return tables
 
     with protected(worker) as session:
         snapshot = session.capture(CaptureOrder(base=True, generation=1, sequence=1))
         session.acknowledge(snapshot.position)
-        monkeypatch.setattr(BorrowedPages, "_wait_done", wait_too_long)
+        monkeypatch.setattr(remote, "_tables_when_done", wait_too_long)
         with pytest.raises(CaptureError, match=f"pid {worker.pid} has run on while it was looked at"):
             session.capture(CaptureOrder(base=False, generation=1, sequence=2))
         assert goes_on(worker)
