@@ -123,6 +123,8 @@ def _check_threads(snapshot: Snapshot) -> None:
     tids = [thread.tid for thread in snapshot.threads]
     if len(set(tids)) != len(tids):
         raise FormatError("threads: two have the same id")
+    if tids and tids[0] != snapshot.process.pid:
+        raise FormatError(f"threads: the first is {tids[0]}, of process {snapshot.process.pid}")
 
 
 def _check_output(output: tuple[OutputPiece, ...]) -> None:

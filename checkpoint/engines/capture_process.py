@@ -1,19 +1,47 @@
-"""A captured process and its thread in the model's words: from what it told while it stood still, and /proc while it runs on."""
+"""A captured process and its threads in the model's words: from what it told while it stood still, and /proc while it runs on."""
 
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 from checkpoint.arch import x86_64 as arch
 from checkpoint.engines import description
 from checkpoint.engines.identities import Identities
 from checkpoint.engines.standing import Standing
+from checkpoint.engines.standing_threads import ThreadStanding
 from checkpoint.linux import abi, procfs
-from checkpoint.model import ProcessState, ThreadState
+from checkpoint.model import PosixTimer, ProcessState, ThreadState
 
 
-def thread_state(pid: int, standing: Standing) -> ThreadState:
-    """Its one thread."""
+def thread_states(pid: int, standing: Standing) -> tuple[ThreadState, ...]:
+    """Its threads, the first one first."""
+    return (_first_thread(pid, standing), *map(_other_thread, standing.others))
+
+
+def _other_thread(standing: ThreadStanding) -> ThreadState:
+    place = standing.place
+    return ThreadState(
+        tid=place.inner_tid,
+        name=standing.stat.name,
+        registers={"prstatus": arch.encode_registers(standing.settled), "xstate": standing.xstate},
+        signal_mask=place.mask,
+        pending=place.pending,
+        altstack=standing.altstack,
+        robust_list=standing.robust_list,
+        clear_tid=standing.clear_tid,
+        rseq=place.rseq,
+        policy=standing.policy,
+        priority=standing.stat.priority,
+        nice=standing.stat.nice,
+        io_priority=standing.io_priority,
+        affinity=tuple(sorted(standing.affinity)),
+        timer_slack_ns=standing.timer_slack_ns,
+        interrupted=standing.interrupted,
+    )
+
+
+def _first_thread(pid: int, standing: Standing) -> ThreadState:
     place, told, stat, status = standing.place, standing.told, standing.stat, standing.status
     return ThreadState(
         tid=status.pids[-1],
@@ -63,6 +91,13 @@ def process_state(pid: int, standing: Standing, identities: Identities) -> Proce
         signal_actions=told.actions,
         pending=standing.place.shared_pending,
         interval_timers=told.interval_timers,
-        posix_timers=told.posix_timers,
+        posix_timers=_timers(standing),
         isolated=len(status.pids) > 1,
     )
+
+
+def _timers(standing: Standing) -> tuple[PosixTimer, ...]:
+    """Those of timer_create(2), each naming the thread that it signals as the program does; /proc names it as we do."""
+    inner = {other.place.tracee.pid: other.place.inner_tid for other in standing.others}
+    inner |= {standing.status.pids[0]: standing.status.pids[-1]}
+    return tuple(replace(timer, tid=inner.get(timer.tid, timer.tid)) for timer in standing.told.posix_timers)

@@ -11,12 +11,13 @@ from typing import Final
 
 from checkpoint.arch import x86_64 as arch
 from checkpoint.engines.restart import Interruption, outside_critical_section, undisturbed
-from checkpoint.errors import CaptureError, ProcessGoneError
+from checkpoint.errors import CaptureError
 from checkpoint.linux import dirty, entry, procfs, remote
 from checkpoint.linux.digests import DigestTracker
 from checkpoint.linux.dirty import SoftDirtyTracker
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.remote import BorrowedPages
+from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.tracking import Tracker
 from checkpoint.linux.write_protection import PagemapTracker
@@ -29,7 +30,11 @@ LEAVE_PAUSE_S: Final = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Entered:
-    """What one session works with; ``notes`` are sentences for the operator."""
+    """What one session works with; ``notes`` are sentences for the operator.
+
+    Attributes:
+        interruption: of the first thread.
+    """
 
     pages: BorrowedPages
     tracker: Tracker
@@ -37,34 +42,37 @@ class Entered:
     notes: tuple[str, ...]
 
 
-def enter(tracee: Tracee) -> Entered:
+def enter(threads: Threads) -> Entered:
     """Borrow pages, choose how to track, and let go again.
 
     Raises:
         CaptureError, ProcessGoneError: it could not be entered; nothing of ours is left in it.
     """
-    interruption = Interruption(Memory(tracee.pid))
+    interruption = Interruption(Memory(threads.pid))
     deadline = time.perf_counter() + LEAVE_TIMEOUT_S
-    while (entered := _try_to_enter(tracee, interruption, last=time.perf_counter() > deadline)) is None:
+    while (entered := _try_to_enter(threads, interruption, last=time.perf_counter() > deadline)) is None:
         time.sleep(LEAVE_PAUSE_S)
-    tracker, notes = _tracker_for(tracee.pid, entered)
+    tracker, notes = _tracker_for(threads.pid, entered)
     return Entered(entered.pages, tracker, interruption, notes)
 
 
-def _try_to_enter(tracee: Tracee, interruption: Interruption, *, last: bool) -> entry.Entered | None:
-    """Enter once; None while the program still stands in the code of a tracer that died.
+def _try_to_enter(threads: Threads, interruption: Interruption, *, last: bool) -> entry.Entered | None:
+    """Enter once, by the first thread; None while the program still stands in the code of a tracer that died.
 
     Args:
         last: waiting has helped nothing: pages that somebody was in are left to the program.
     """
-    with stopped(tracee):
+    tracee = threads.leader
+    with stopped(threads):
         mask = tracee.signal_mask()
         pending = (*tracee.pending(shared=False), *tracee.pending(shared=True))
         decoded = where_it_stands(tracee, mask, pending, tracee.rseq())
         lines = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
         left = entry.leftovers(tracee.memory, lines)
-        place = decoded[arch.INSTRUCTION_POINTER]
-        stands_inside = entry.is_in_stub(place, tracee.memory, lines) or any(borrowed.holds(place) for borrowed in left)
+        places = [decoded[arch.INSTRUCTION_POINTER], *map(_instruction_pointer, threads.others)]
+        stands_inside = any(
+            entry.is_in_stub(place, tracee.memory, lines) or any(borrowed.holds(place) for borrowed in left) for place in places
+        )
         if stands_inside or (not last and any(borrowed.state() == remote.ARMED for borrowed in left)):
             if last:
                 raise CaptureError(f"pid {tracee.pid} does not leave the code of an earlier tracer; protect it again")
@@ -84,6 +92,10 @@ def _try_to_enter(tracee: Tracee, interruption: Interruption, *, last: bool) -> 
             batch.add("close", number)
         entered.pages.run(tracee, batch, registers, mask)
         return entered
+
+
+def _instruction_pointer(tracee: Tracee) -> int:
+    return arch.decode_registers(tracee.registers())[arch.INSTRUCTION_POINTER]
 
 
 def where_it_stands(tracee: Tracee, mask: int, pending: tuple[bytes, ...], rseq: Rseq | None) -> arch.Registers:
@@ -108,15 +120,13 @@ def _tracker_for(pid: int, entered: entry.Entered) -> tuple[Tracker, tuple[str, 
 
 
 @contextlib.contextmanager
-def stopped(tracee: Tracee) -> Iterator[None]:
-    """Hold it still for the body; let it go however that ends."""
-    tracee.seize()
+def stopped(threads: Threads) -> Iterator[None]:
+    """Hold all of it still for the body; let it go however that ends."""
+    threads.freeze()
     try:
-        tracee.freeze()
         yield
     finally:
-        with contextlib.suppress(ProcessGoneError):
-            tracee.detach()
+        threads.thaw()
 
 
 def _unblocked(pending: tuple[bytes, ...], mask: int) -> list[int]:

@@ -80,6 +80,11 @@ class Inquiry:
         self._switches = Questions(self.batch)
         self._slack = self.batch.add("prctl", abi.PR_GET_TIMERSLACK)
 
+    @property
+    def has_timers(self) -> bool:
+        """Whether a signal of timer_create(2) may come while the questions are asked."""
+        return bool(self._timers)
+
     def _asks_action(self, signal: int) -> int:
         return self._filled(32, lambda address: ("rt_sigaction", signal, 0, address, abi.SIGSET_SIZE))
 

@@ -3,7 +3,7 @@
 One capture::
 
     copy         what is much, while it runs (`capture_memory`)                   the program runs
-    freeze       stop it; registers, mask, pending signals                        it stands still
+    freeze       stop its threads; registers, mask, pending signals                        it stands still
     scan, copy   which pages were written since, and their bytes
     ask          a batch of system calls inside it (`standing`); descriptors; output counts
     thaw         everything as it was
@@ -16,12 +16,12 @@ nor, as long as we copy faster than the program writes, with the time since the 
 from __future__ import annotations
 
 import contextlib
+import functools
 import gc
-import os
-import signal
+import operator
 import time
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 from checkpoint import pages
 from checkpoint.chain import position_of
@@ -29,7 +29,7 @@ from checkpoint.engine import PTRACE, CaptureOrder, Streams
 from checkpoint.engines import description, entering
 from checkpoint.engines import probe as probing
 from checkpoint.engines.capture_memory import MemoryCapture, RunningCopy, Taken
-from checkpoint.engines.capture_process import process_state, thread_state
+from checkpoint.engines.capture_process import process_state, thread_states
 from checkpoint.engines.entering import Entered
 from checkpoint.engines.identities import Identities
 from checkpoint.engines.outputs import Outputs
@@ -37,6 +37,7 @@ from checkpoint.engines.standing import Onlooker, Standing
 from checkpoint.errors import ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.procfs import MapsLine, Status
+from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.tracking import NONE
 from checkpoint.model import Position, Snapshot
@@ -60,6 +61,13 @@ class Frozen:
     freeze_us: int
 
 
+def _xstate_mask(standing: Standing) -> int:
+    """Which parts of the processor's state any thread uses."""
+    return functools.reduce(
+        operator.or_, map(description.xstate_mask, (standing.xstate, *(one.xstate for one in standing.others)))
+    )
+
+
 class PtraceSession:
     """One protected process; every call from the thread that opened it. See ``checkpoint.engine.Session``.
 
@@ -69,15 +77,15 @@ class PtraceSession:
         frozen_size: bytes of pages that the last capture copied while the program stood still.
     """
 
-    def __init__(self, pid: int, component: str, tracee: Tracee, entered: Entered) -> None:
+    def __init__(self, pid: int, component: str, threads: Threads, entered: Entered) -> None:
         self.pid = pid
         self.component = component
         self.notes = entered.notes
         self.totals: Totals = (0, 0)
         self.frozen_size = 0
-        self._tracee = tracee
-        self._onlooker = Onlooker(tracee, entered)
-        self._memory = MemoryCapture(tracee.memory, entered.tracker, entered.pages)
+        self._threads = threads
+        self._onlooker = Onlooker(threads, entered)
+        self._memory = MemoryCapture(threads.leader.memory, entered.tracker, entered.pages)
         self._flags: dict[int, tuple[str, ...]] = {}
         self._flags_of: tuple[MapsLine, ...] = ()
         self._identities = Identities(pid)
@@ -86,7 +94,6 @@ class PtraceSession:
         self._totals_at: dict[Position, Totals] = {}
         self._refused = False
         self._held = False
-        self._before_hold: Any = None
         self._collects = False
         self._closed = False
 
@@ -101,8 +108,8 @@ class PtraceSession:
             if not report.supported:
                 listed = "; ".join(report.reasons)
                 raise UnsupportedError(f"cannot protect pid {pid} ({report.command}): {listed}", report.reasons)
-            tracee = Tracee(pid)
-            session = cls(pid, component, tracee, entering.enter(tracee))
+            threads = Threads(Tracee(pid))
+            session = cls(pid, component, threads, entering.enter(threads))
         except BaseException:
             if outputs:
                 outputs.close()
@@ -204,26 +211,24 @@ class PtraceSession:
         self._collects = gc.isenabled()
         gc.disable()
         began = time.perf_counter_ns()
-        self._tracee.seize()
-        self._tracee.freeze()
+        try:
+            self._threads.freeze()
+        except BaseException:
+            self._collect_again()
+            raise
         return began
 
     def _hold(self) -> None:
-        """Leave it standing; should it be killed meanwhile, its parent hears of it only after we have taken note."""
+        """Leave it standing."""
         self._held = True
-        if procfs.status(self.pid).ppid != os.getpid():  # a parent takes note by itself
-            self._before_hold = signal.signal(signal.SIGCHLD, lambda *_: self._take_note())
-
-    def _take_note(self) -> None:
-        with contextlib.suppress(ChildProcessError):
-            os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG)
+        self._threads.hold()
 
     def _thaw(self) -> None:
-        if self._before_hold is not None:
-            signal.signal(signal.SIGCHLD, self._before_hold)
-        self._held, self._before_hold = False, None
-        with contextlib.suppress(ProcessGoneError):
-            self._tracee.detach()
+        self._held = False
+        self._threads.thaw()
+        self._collect_again()
+
+    def _collect_again(self) -> None:
         if self._collects:
             gc.enable()
 
@@ -258,10 +263,10 @@ class PtraceSession:
             engine=PTRACE,
             position=Position(order.generation, order.sequence, bytes(16)),
             parent=parent,
-            machine=replace(description.this_machine(), robot=order.robot, xstate_mask=description.xstate_mask(standing.xstate)),
+            machine=replace(description.this_machine(), robot=order.robot, xstate_mask=_xstate_mask(standing)),
             clocks=standing.told.clocks,
             process=process_state(self.pid, standing, self._identities),
-            threads=(thread_state(self.pid, standing),),
+            threads=thread_states(self.pid, standing),
             vmas=self._identities.vmas(taken.lines, self._flags, taken.guards),
             epoch=order.epoch,
             freeze_us=frozen.freeze_us,

@@ -6,7 +6,9 @@
     seize, stand in a hole       the vessel is ours and dies with us; loop and tables lie where neither has a mapping
     first table                  its own mappings go, the vdso moves, everything the program had is mapped
     pages                        written from outside
-    second table                 protections, files, marks, signals, timers, rights
+    second table                 protections, files, marks, signals
+    threads                      each born with its own id, and a table of its own (`restore_threads`)
+    third table                  timers, rights
     registers                    SIGTRAP's action, the area unmapped by the vdso's own syscall instruction, then the program's own
 
 Until `Restored.resume` the program stands still and dies with its tracer (PTRACE_O_EXITKILL): an unfinished one leaves nothing.
@@ -27,18 +29,19 @@ from typing import Final
 from checkpoint import epoch_variable
 from checkpoint.arch import x86_64, x86_64_stub
 from checkpoint.engine import RestoreOptions
-from checkpoint.engines import restore_checks, restore_memory, restore_process, switches
+from checkpoint.engines import restore_checks, restore_memory, restore_process, restore_threads, switches
 from checkpoint.engines.restore_process import Vessel
 from checkpoint.errors import CheckpointError, MismatchError, RestoreError
 from checkpoint.linux import abi, call_table, procfs
 from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
+from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee
-from checkpoint.model import Credentials, Position, Snapshot, Vma
+from checkpoint.model import Credentials, Position, Snapshot, ThreadState, Vma
 from checkpoint.resources.rebuild import rebuild_all
 
 PTRACE_O_TRACESYSGOOD: Final = 1
 PTRACE_EVENT_EXEC: Final = 4
-OPTIONS: Final = abi.PTRACE_O_EXITKILL | PTRACE_O_TRACESYSGOOD | abi.PTRACE_O_TRACEEXEC
+OPTIONS: Final = abi.PTRACE_O_EXITKILL | PTRACE_O_TRACESYSGOOD | abi.PTRACE_O_TRACEEXEC | abi.PTRACE_O_TRACECLONE
 
 REFUGE_SIZE: Final = 1 << 20
 """Bytes beside the area where vdso and its data stay while their old and new places are cleared."""
@@ -49,22 +52,25 @@ class RestoredProgram:
     """A program that was brought back; see ``checkpoint.engine.Restored``.
 
     Attributes:
-        tracee: it stands still for us until `resume`, or until a session takes it over.
+        threads: all of it; they stand still for us until `resume`.
     """
 
-    tracee: Tracee
+    threads: Threads
     position: Position
     notes: tuple[str, ...]
 
     @property
     def pid(self) -> int:
         """As this process sees it."""
-        return self.tracee.pid
+        return self.threads.pid
 
     def resume(self) -> None:
-        """Let it go on, without us."""
-        self.tracee.request("let go of", abi.PTRACE_SETOPTIONS, 0, 0)
-        self.tracee.detach()
+        """Let it go on, without us: all of its threads at once. Should we die halfway, it dies, too, or all of it goes on."""
+        try:
+            for tracee in (*self.threads.others, self.threads.leader):
+                tracee.request("let go of", abi.PTRACE_SETOPTIONS, 0, 0)
+        finally:
+            self.threads.thaw()
 
 
 def restore(vessel_pid: int, state: Snapshot, options: RestoreOptions) -> RestoredProgram:
@@ -88,9 +94,21 @@ class _Restore:
         self._options = options
         self._thread = state.threads[0]
         self._tracee = Tracee(vessel_pid)
+        self._others: list[tuple[Tracee, ThreadState]] = []
         self._notes: list[str] = []
 
     def run(self) -> RestoredProgram:
+        try:
+            self._run()
+        except BaseException:
+            restore_threads.end(self._tracee, [tracee for tracee, _ in self._others])
+            raise
+        threads = Threads(self._tracee)
+        threads.adopt(tuple(tracee for tracee, _ in self._others))
+        threads.hold()
+        return RestoredProgram(threads, self._state.position, tuple(self._notes))
+
+    def _run(self) -> None:
         tracee = self._tracee
         tracee.seize(OPTIONS)
         tracee.freeze()
@@ -104,12 +122,19 @@ class _Restore:
         mappings = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
         self._build_and_run(vessel, mappings)
         self._become_program()
-        return RestoredProgram(tracee, self._state.position, tuple(self._notes))
 
     def _require_identity(self, vessel: Vessel) -> None:
-        """A program that holds robust or priority-inheriting locks has written its thread id into them: it needs that id."""
+        """A program of several threads knows their ids; so does one that holds robust or priority-inheriting locks."""
         if vessel.inner_pid == self._state.process.pid:
             return
+        if len(self._state.threads) > 1:
+            count, wanted = len(self._state.threads), self._state.process.pid
+            reason = f"it has {count} threads, and pid {wanted}, by which they know it, cannot be had"
+            raise MismatchError(
+                f"cannot restore {self._state.component} as pid {vessel.inner_pid}: {reason}; "
+                "free that pid, or run it in PIDs of its own (failover run isolates)",
+                (reason,),
+            )
         head = self._thread.robust_list[0]
         listed = content_at(self._state, head, ROBUST_HEAD.size) if head else None
         if listed is None:
@@ -130,7 +155,9 @@ class _Restore:
         kernel_pages = restore_memory.kernel_pages(mappings)
         first = self._mappings_table(CallTable(base), vessel, mappings, base + AREA_SIZE)
         second = self._state_table(CallTable(base, descriptors=set(first.descriptors)), vessel)
-        size = max(first.end, second.end) - base
+        third = self._rights_table(CallTable(base, descriptors=set(second.descriptors)), vessel)
+        tables = [self._thread_table(CallTable(base), thread, vessel) for thread in self._state.threads[1:]]
+        size = max(table.end for table in (first, second, third, *tables)) - base
         if size > AREA_SIZE:
             raise RestoreError(
                 f"cannot restore: its {len(state.vmas)} mappings need {size >> 20} MiB of calls; the limit is 64 MiB"
@@ -143,6 +170,8 @@ class _Restore:
         if self._options.epoch:
             _renew_token(tracee, state, self._options.epoch)
         self._notes += stub.run(second)
+        self._start_threads(base, tables)
+        self._notes += stub.run(third)
         self._stub = stub
         _write_oom_score(tracee.pid, state.process.oom_score_adj, self._notes)
         _write_coredump_filter(tracee.pid, state.process.coredump_filter, self._notes)
@@ -159,25 +188,50 @@ class _Restore:
         return table
 
     def _state_table(self, table: CallTable, vessel: Vessel) -> CallTable:
-        process, thread, elapsed_ns = self._state.process, self._thread, self._options.elapsed_ns
+        process, thread = self._state.process, self._thread
         restore_memory.settle(table, self._state.vmas, self._state.runs)
         self._notes += rebuild_all(table, self._state, self._options, vessel.inner_pid)
         restore_process.memory_layout(table, process, with_executable=vessel.may_choose_executable)
         restore_process.signal_actions(table, process.signal_actions)
         restore_process.thread_marks(table, thread)
         restore_process.surroundings(table, process)
+        return table
+
+    def _rights_table(self, table: CallTable, vessel: Vessel) -> CallTable:
+        """What comes after the birth of the threads, which takes a right."""
+        state, thread, elapsed_ns = self._state, self._thread, self._options.elapsed_ns
+        process = state.process
         restore_process.scheduling(table, thread, vessel)
         self._notes += restore_process.limits(table, process, vessel)
         self._notes += restore_process.rights(table, process, vessel)
-        restore_process.pending_signals(table, process, thread, vessel.inner_pid)
-        restore_process.posix_timers(table, process, thread, vessel, elapsed_ns)
+        restore_process.pending_signals(table, process, vessel.inner_pid)
+        restore_process.pending_of_thread(table, process, thread, vessel.inner_pid, vessel.inner_pid)
+        restore_process.posix_timers(table, process, state.threads, vessel, elapsed_ns)
         restore_process.interval_timers(table, process.interval_timers, elapsed_ns)
         restore_process.last_marks(table, process)
         switches.set_again(table, process.switches)
         return table
 
+    def _thread_table(self, table: CallTable, thread: ThreadState, vessel: Vessel) -> CallTable:
+        """What each thread must say for itself; its notes about rights are those of the first."""
+        process = self._state.process
+        restore_process.thread_marks(table, thread)
+        restore_process.scheduling(table, thread, vessel, f" for thread {thread.tid} ({thread.name})")
+        restore_process.rights(table, process, vessel)
+        restore_process.pending_of_thread(table, process, thread, vessel.inner_pid, thread.tid)
+        switches.set_again(table, [switch for switch in process.switches if switch[0] in switches.OF_THREADS])
+        return table
+
+    def _start_threads(self, base: int, tables: list[CallTable]) -> None:
+        """Give birth to the other threads, and have each make the calls of its table."""
+        for thread in self._state.threads[1:]:
+            born = restore_threads.spawn(self._tracee, self._start_registers, base, thread.tid)
+            self._others.append((born, thread))
+        for (tracee, _), table in zip(self._others, tables, strict=True):
+            self._notes += Stub(tracee, base).run(table)
+
     def _become_program(self) -> None:
-        """SIGTRAP's action, our area gone, then the program's own registers and mask."""
+        """SIGTRAP's action, our area gone, then the program's own registers and masks."""
         tracee, state = self._tracee, self._state
         vdso = restore_memory.kernel_pages_of(state.vmas)[-1]
         instruction = self._syscall_instruction(vdso)
@@ -186,17 +240,22 @@ class _Restore:
         arguments = (signal.SIGTRAP, self._stub.base + abi.PAGE_SIZE, 0, abi.SIGSET_SIZE)
         self._single(instruction, "rt_sigaction", *arguments)
         self._single(instruction, "munmap", self._stub.base, -(-self._area_size // abi.PAGE_SIZE) * abi.PAGE_SIZE)
-        self._restore_rseq_section()
-        tracee.set_xstate(self._thread.registers["xstate"][: self._xstate_size].ljust(self._xstate_size, b"\0"))
+        for one, thread in ((tracee, self._thread), *self._others):
+            self._take_place(one, thread)
+
+    def _take_place(self, tracee: Tracee, thread: ThreadState) -> None:
+        """Give a thread its registers and mask; it stands in a stop that it can be let go from."""
+        self._restore_rseq_section(thread)
+        tracee.set_xstate(thread.registers["xstate"][: self._xstate_size].ljust(self._xstate_size, b"\0"))
         tracee.interrupt()  # a signal that comes from now on finds the thread where the kernel decides about interrupted calls
         tracee.cont()
         tracee.wait(call_table.RUN_TIMEOUT_S)
-        tracee.set_registers(x86_64_stub.in_interrupted_call(self._thread.registers["prstatus"], self._thread.interrupted))
-        tracee.set_signal_mask(self._thread.signal_mask)
+        tracee.set_registers(x86_64_stub.in_interrupted_call(thread.registers["prstatus"], thread.interrupted))
+        tracee.set_signal_mask(thread.signal_mask)
 
-    def _restore_rseq_section(self) -> None:
+    def _restore_rseq_section(self, thread: ThreadState) -> None:
         """Point again to the critical section that the thread may stand in: registering forgot it, the kernel aborts it."""
-        rseq = self._thread.rseq
+        rseq = thread.rseq
         if rseq is None:
             return
         pointer = content_at(self._state, rseq.address + RSEQ_SECTION_OFFSET, 8)

@@ -52,8 +52,7 @@ def _of_machine(state: Snapshot) -> Iterator[str]:
     machine, here = state.machine, this_machine()
     if machine.page_size != abi.PAGE_SIZE:
         yield f"its pages are {machine.page_size} bytes, this kernel's {abi.PAGE_SIZE}: boot a kernel with the same"
-    if len(state.threads) != 1:
-        yield f"it has {len(state.threads)} threads: only single-threaded programs are supported so far"
+    yield from _of_threads(state)
     ours = kernel_pages(procfs.parse_maps(procfs.read_text(os.getpid(), "maps")))
     theirs = kernel_pages_of(state.vmas)
     if [page.size for page in ours] != [page.size for page in theirs]:
@@ -69,6 +68,15 @@ def _of_machine(state: Snapshot) -> Iterator[str]:
         yield f"its root directory is {state.process.root_directory}: programs in a chroot are not supported"
     if not os.path.isdir(state.process.working_directory):
         yield f"its working directory {state.process.working_directory} is missing: make it"
+
+
+def _of_threads(state: Snapshot) -> Iterator[str]:
+    if not state.threads or state.threads[0].tid != state.process.pid:
+        yield "its first thread is not told: capture it again"
+    for thread in state.threads:
+        registers = thread.registers
+        if len(registers.get("prstatus", b"")) != x86_64.REGISTERS_SIZE or not registers.get("xstate"):
+            yield f"the registers of its thread {thread.tid} are not those of this processor: capture it again"
 
 
 def can_install_guards() -> bool:

@@ -13,7 +13,7 @@ import os
 import signal
 import struct
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -138,22 +138,29 @@ def trap_action(actions: Iterable[SignalAction]) -> SignalAction:
     return next((action for action in actions if action.signal == _SIGTRAP), SignalAction(_SIGTRAP, 0, 0, 0, 0))
 
 
-def pending_signals(table: CallTable, process: ProcessState, thread: ThreadState, inner_pid: int) -> None:
-    """Queue what was pending: every signal is blocked in the vessel, so they wait for the program.
+def pending_signals(table: CallTable, process: ProcessState, inner_pid: int) -> None:
+    """Queue what was pending for the process: every signal is blocked in the vessel, so they wait for the program.
 
     The signal of a periodic timer is queued by the timer itself, which `posix_timers` lets expire at once.
     """
-    periodic = {timer.timer_id for timer in process.posix_timers if timer.interval_ns}
-    for siginfo in process.pending:
-        number = struct.unpack_from("<i", siginfo)[0]
-        if timer_of(siginfo) in periodic:
-            continue
+    for number, siginfo in _not_of_periodic_timers(process, process.pending):
         table.call(f"queue signal {number}", "rt_sigqueueinfo", inner_pid, number, table.place(siginfo))
-    for siginfo in thread.pending:
-        number = struct.unpack_from("<i", siginfo)[0]
-        if timer_of(siginfo) in periodic:
-            continue
-        table.call(f"queue signal {number}", "rt_tgsigqueueinfo", inner_pid, inner_pid, number, table.place(siginfo))
+
+
+def pending_of_thread(table: CallTable, process: ProcessState, thread: ThreadState, inner_pid: int, tid: int) -> None:
+    """Queue what was pending for one thread; it alone may do so.
+
+    Source: do_rt_tgsigqueueinfo() in kernel/signal.c: nobody pretends to the kernel's own signals but to himself.
+    """
+    for number, siginfo in _not_of_periodic_timers(process, thread.pending):
+        table.call(f"queue signal {number}", "rt_tgsigqueueinfo", inner_pid, tid, number, table.place(siginfo))
+
+
+def _not_of_periodic_timers(process: ProcessState, pending: Iterable[bytes]) -> Iterator[tuple[int, bytes]]:
+    periodic = {timer.timer_id for timer in process.posix_timers if timer.interval_ns}
+    for siginfo in pending:
+        if timer_of(siginfo) not in periodic:
+            yield struct.unpack_from("<i", siginfo)[0], siginfo
 
 
 def timer_of(siginfo: bytes) -> int | None:
@@ -179,19 +186,23 @@ def thread_marks(table: CallTable, thread: ThreadState) -> None:
     table.call("set the name", "prctl", abi.PR_SET_NAME, table.place(os.fsencode(thread.name) + b"\0"))
 
 
-def scheduling(table: CallTable, thread: ThreadState, vessel: Vessel) -> None:
-    """Priority, policy, processors, I/O priority, timer slack."""
-    table.attempt(f"nice {thread.nice} is not kept", "setpriority", 0, 0, thread.nice)
+def scheduling(table: CallTable, thread: ThreadState, vessel: Vessel, whose: str = "") -> None:
+    """Priority, policy, processors, I/O priority, timer slack.
+
+    Args:
+        whose: added to the notes.
+    """
+    table.attempt(f"nice {thread.nice} is not kept{whose}", "setpriority", 0, 0, thread.nice)
     if thread.policy:
         priority = table.place(struct.pack("<i", thread.priority))
-        table.attempt(f"scheduling policy {thread.policy} is not kept", "sched_setscheduler", 0, thread.policy, priority)
+        table.attempt(f"scheduling policy {thread.policy} is not kept{whose}", "sched_setscheduler", 0, thread.policy, priority)
     allowed = vessel.affinity & set(thread.affinity)
     if allowed and allowed != vessel.affinity:
         mask = sum(1 << processor for processor in allowed).to_bytes(max(allowed) // 64 * 8 + 8, "little")
-        table.attempt("the choice of processors is not kept", "sched_setaffinity", 0, len(mask), table.place(mask))
+        table.attempt(f"the choice of processors is not kept{whose}", "sched_setaffinity", 0, len(mask), table.place(mask))
     if thread.io_priority:
-        table.attempt("the I/O priority is not kept", "ioprio_set", 1, 0, thread.io_priority)
-    table.attempt("the timer slack is not kept", "prctl", abi.PR_SET_TIMERSLACK, thread.timer_slack_ns)
+        table.attempt(f"the I/O priority is not kept{whose}", "ioprio_set", 1, 0, thread.io_priority)
+    table.attempt(f"the timer slack is not kept{whose}", "prctl", abi.PR_SET_TIMERSLACK, thread.timer_slack_ns)
 
 
 # --- Timers ----------------------------------------------------------------------------------------------------------
@@ -213,7 +224,9 @@ def interval_timers(table: CallTable, timers: Iterable[IntervalTimer], elapsed_n
         table.call(f"arm interval timer {timer.which}", "setitimer", timer.which, table.place(packed), 0)
 
 
-def posix_timers(table: CallTable, process: ProcessState, thread: ThreadState, vessel: Vessel, elapsed_ns: int) -> None:
+def posix_timers(
+    table: CallTable, process: ProcessState, threads: Sequence[ThreadState], vessel: Vessel, elapsed_ns: int
+) -> None:
     """Make the timers of timer_create(2) again, with the numbers that they had, and arm them.
 
     A kernel that does not let us say the number (before Linux 6.15) counts up to it; what comes before is deleted.
@@ -227,7 +240,8 @@ def posix_timers(table: CallTable, process: ProcessState, thread: ThreadState, v
         raise RestoreError(
             f"cannot restore: it has a timer number {highest}, and this kernel counts up to it; use Linux 6.15 or later"
         )
-    overdue = {timer_of(siginfo) for siginfo in (*process.pending, *thread.pending)}
+    overdue = {timer_of(siginfo) for pending in (process.pending, *(one.pending for one in threads)) for siginfo in pending}
+    others = {one.tid for one in threads[1:]}
     if chosen_ids:
         table.call("choose timer numbers", "prctl", PR_TIMER_CREATE_RESTORE_IDS, 1)
     next_id = 0
@@ -236,7 +250,7 @@ def posix_timers(table: CallTable, process: ProcessState, thread: ThreadState, v
             _create_timer(table, PosixTimer(next_id, 1, 1, 0, 0, 0, 0, 0), inner_pid)
             table.call(f"delete timer {next_id}", "timer_delete", next_id)
             next_id += 1
-        _create_timer(table, timer, inner_pid)
+        _create_timer(table, timer, timer.tid if timer.tid in others else inner_pid)
         next_id = timer.timer_id + 1
     if chosen_ids:
         table.call("stop choosing timer numbers", "prctl", PR_TIMER_CREATE_RESTORE_IDS, 0)
@@ -252,8 +266,9 @@ def timer_numbers_can_be_chosen() -> bool:
     return bool(ctypes.CDLL(None).prctl(PR_TIMER_CREATE_RESTORE_IDS, PR_TIMER_CREATE_RESTORE_IDS_GET, 0, 0, 0) >= 0)
 
 
-def _create_timer(table: CallTable, timer: PosixTimer, inner_pid: int) -> None:
-    event = struct.pack("<Qiii", timer.value & RLIM_INFINITY, timer.signal, timer.notify, inner_pid).ljust(64, b"\0")
+def _create_timer(table: CallTable, timer: PosixTimer, tid: int) -> None:
+    """Make one timer; ``tid`` is whom it signals if it signals a thread."""
+    event = struct.pack("<Qiii", timer.value & RLIM_INFINITY, timer.signal, timer.notify, tid).ljust(64, b"\0")
     number = table.place(struct.pack("<i", timer.timer_id))
     table.call(f"create timer {timer.timer_id}", "timer_create", timer.clock, table.place(event), number)
 

@@ -11,12 +11,13 @@ from checkpoint.arch import x86_64 as arch
 from checkpoint.engines.entering import Entered, where_it_stands
 from checkpoint.engines.inquiry import Inquiry, Told, rearmed
 from checkpoint.engines.outputs import Outputs
+from checkpoint.engines.standing_threads import ThreadOnlooker, ThreadPlace, ThreadStanding
 from checkpoint.errors import CaptureError
 from checkpoint.linux import procfs
 from checkpoint.linux.procfs import Stat, Status
 from checkpoint.linux.remote import Answers
+from checkpoint.linux.threads import Threads
 from checkpoint.linux.timers import parse_timers
-from checkpoint.linux.tracee import Tracee
 from checkpoint.model import Rseq
 from checkpoint.resources import OpenFile, gather, with_contents
 from checkpoint.stream_counts import Totals
@@ -26,7 +27,7 @@ NOTHING_WRITTEN: Final[Totals] = (0, 0)
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where the thread stands.
+    """Where the first thread stands, and the others.
 
     Attributes:
         registers: that it is given back.
@@ -40,6 +41,11 @@ class Place:
     shared_pending: tuple[bytes, ...]
     rseq: Rseq | None
     status_text: bytes
+    others: tuple[ThreadPlace, ...] = ()
+
+    def every_pending(self) -> tuple[bytes, ...]:
+        """Whatever is pending anywhere."""
+        return (*self.pending, *self.shared_pending, *(siginfo for other in self.others for siginfo in other.pending))
 
 
 @dataclass(frozen=True)
@@ -47,11 +53,13 @@ class Standing:
     """Everything that was asked; nothing in it needs the process any more.
 
     Attributes:
+        others: the threads besides the first.
         waiting: signals that were pending after the process had been asked.
         totals: see `Outputs.totals`.
     """
 
     place: Place
+    others: tuple[ThreadStanding, ...]
     xstate: bytes
     settled: arch.Registers
     interrupted: str
@@ -65,8 +73,7 @@ class Standing:
     @functools.cached_property
     def told(self) -> Told:
         """What it said about itself."""
-        before = (*self.place.pending, *self.place.shared_pending)
-        return rearmed(self.inquiry.read(self.answers), before, self.waiting)
+        return rearmed(self.inquiry.read(self.answers), self.place.every_pending(), self.waiting)
 
     @functools.cached_property
     def status(self) -> Status:
@@ -82,8 +89,10 @@ class Standing:
 class Onlooker:
     """Asks one process, again and again; the questions stay the same while its signals and timers do."""
 
-    def __init__(self, tracee: Tracee, entered: Entered) -> None:
-        self._tracee = tracee
+    def __init__(self, threads: Threads, entered: Entered) -> None:
+        self._tracee = threads.leader
+        self._threads = threads
+        self._others = ThreadOnlooker(threads, entered.pages)
         self._borrowed = entered.pages
         self._interruption = entered.interruption
         self._inquiry: Inquiry | None = None
@@ -95,6 +104,7 @@ class Onlooker:
             special, _, _ = procfs.signal_sets(procfs.read_bytes(self._tracee.pid, "status"))
             self._questions(special)
             with_contents(gather(self._tracee.pid))
+        self._others.prepare()
 
     def place(self) -> Place:
         """Where it stands, before anything else is asked.
@@ -111,17 +121,22 @@ class Onlooker:
         registers = where_it_stands(tracee, mask, (*pending, *shared_pending), rseq)
         if self._borrowed.holds(registers[arch.INSTRUCTION_POINTER]):
             raise CaptureError(f"pid {tracee.pid} still stands in code of an earlier look; capture it again in a moment")
-        return Place(registers, mask, special, pending, shared_pending, rseq, status)
+        others = self._others.places(shared_pending)
+        return Place(registers, mask, special, pending, shared_pending, rseq, status, others)
 
     def ask(self, place: Place, outputs: Outputs | None) -> Standing:
         """Everything else. Its system calls are made inside the process: the memory has been taken before."""
         tracee = self._tracee
         inquiry = self._questions(place.special)
         answers = self._borrowed.run(tracee, inquiry.batch, arch.encode_registers(place.registers), place.mask)
+        others = self._others.ask(place.others)
         waiting = (*tracee.pending(shared=False), *tracee.pending(shared=True))
+        if inquiry.has_timers:
+            waiting += self._others.waiting(place.others)
         settled, interrupted = self._interruption.settled(place.registers)
         return Standing(
             place=place,
+            others=others,
             xstate=tracee.xstate(),
             settled=settled,
             interrupted=interrupted,

@@ -39,6 +39,9 @@ NAMES: Final = {
 }
 """Every switch that is kept, in the order in which they are set: the last one forbids what a restore itself does."""
 
+OF_THREADS: Final = (PR_SET_TSC, PR_MCE_KILL, PR_SET_SPECULATION_CTRL)
+"""Those that each thread has for itself. All are given what the first one has."""
+
 Switch = tuple[int, int, int]
 
 

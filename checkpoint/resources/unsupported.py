@@ -1,7 +1,7 @@
 """What cannot be kept yet: found by name, with what to do about it. Nothing here touches the process.
 
 This is the table's last row of every kind: an open file that no other kind took, a mapping that cannot be made again, a process
-that is not one thread by itself.
+that is not by itself. What threads must not be is in ``refused_threads``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from checkpoint.linux import procfs
 from checkpoint.linux.procfs import MapsLine, Status
 from checkpoint.linux.tracking import is_orphan
 from checkpoint.model import Resource
-from checkpoint.resources import OpenFile, Surroundings
+from checkpoint.resources import OpenFile, Surroundings, refused_threads
 
 KIND: Final = "unsupported"
 
@@ -181,6 +181,11 @@ def require_traceable(pid: int, status: Status) -> None:
         raise ProbeError(f"cannot protect {pid}: it is a thread of process {status.tgid}; name that one")
     if procfs.stat(pid).flags & procfs.PF_KTHREAD:
         raise ProbeError(f"cannot protect pid {pid} ({status.name}): it is a kernel thread; choose a program")
+    if status.state in "ZX" and status.threads > 1:
+        raise ProbeError(
+            f"cannot protect pid {pid} ({status.name}): its first thread has ended while {status.threads - 1} others live, which "
+            "is not kept yet: let the first one wait for them"
+        )
     if status.state in "ZX":
         raise ProbeError(f"cannot protect pid {pid} ({status.name}): it has ended and is a zombie, waiting for its parent")
     if pid == os.getpid():
@@ -193,12 +198,8 @@ def require_traceable(pid: int, status: Status) -> None:
 
 def refuse_process(pid: int, status: Status) -> Iterator[str]:
     """Why a process as a whole cannot be captured."""
-    if status.threads != 1:
-        yield (
-            f"it has {status.threads} threads, which {_ADVICE}; numerical libraries often run with one thread: "
-            "OPENBLAS_NUM_THREADS=1, OMP_NUM_THREADS=1"
-        )
-    children = procfs.read_text(pid, f"task/{pid}/children").split()
+    yield from refused_threads.refuse(pid, status)
+    children = refused_threads.children(pid)
     if children:
         yield f"it has child processes ({', '.join(children)}), which are not kept yet: protect it while it has none"
     if status.seccomp:

@@ -232,12 +232,6 @@ PLAIN = [
 CASES = [
     *PLAIN,
     refused(Case("ruby", ("ruby", "script.rb"), (("script.rb", RUBY),)), "it has two eventfds, which are not kept yet"),
-    refused(
-        Case("guile", ("guile", "--no-auto-compile", "-s", "script.scm"), (("script.scm", GUILE),)),
-        "it has threads, which are not kept yet",
-    ),
-    refused(
-        Case("octave", ("octave-cli", "-q", "--no-init-file", "--no-history", "--eval", OCTAVE)),
-        "it has a thread that waits for signals, and threads are not kept yet",
-    ),
+    Case("guile", ("guile", "--no-auto-compile", "-s", "script.scm"), (("script.scm", GUILE),)),
+    Case("octave", ("octave-cli", "-q", "--no-init-file", "--no-history", "--eval", OCTAVE)),
 ]

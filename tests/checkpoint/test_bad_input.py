@@ -13,7 +13,7 @@ import pytest
 from checkpoint import chain, format
 from checkpoint.errors import ChainError, CheckpointError, FormatError
 from checkpoint.model import Resource, Snapshot
-from tests.checkpoint.round_trip import captured_and_killed, ended, restored, start_tracee
+from tests.checkpoint.round_trip import Program, captured_and_killed, ended, restored, start, start_tracee
 from tests.conftest import children
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
@@ -54,9 +54,37 @@ def test_a_foreign_vdso_is_said_so(snapshot: Snapshot, tmp_path: Path) -> None:
     _expect_nothing_started(other, tmp_path, r"vdso.*2\.6\.18")
 
 
-def test_two_threads_are_said_to_be_too_many(snapshot: Snapshot, tmp_path: Path) -> None:
+def test_a_thread_whose_id_is_taken_is_said_so(snapshot: Snapshot, tmp_path: Path) -> None:
+    """By then the vessel has a thread already, which must not be left."""
     (thread,) = snapshot.threads
-    _expect_nothing_started(replace(snapshot, threads=(thread, replace(thread, tid=thread.tid + 1))), tmp_path, "2 threads")
+    with ended(start_tracee_beside(tmp_path)) as other:
+        threads = (thread, replace(thread, tid=free_id()), replace(thread, tid=other.pid))
+        _expect_nothing_started(replace(snapshot, threads=threads), tmp_path, f"thread {other.pid}: that id is in use")
+
+
+def start_tracee_beside(directory: Path) -> Program:
+    """Somebody who has an id."""
+    (directory / "beside").mkdir()
+    return start(["/bin/sleep", "600"], directory / "beside")
+
+
+def free_id() -> int:
+    """An id that nobody has, and that nobody is given soon."""
+    largest = int(Path("/proc/sys/kernel/pid_max").read_text())
+    return next(number for number in range(largest - 1, 1, -1) if not Path(f"/proc/{number}").exists())
+
+
+def test_a_snapshot_without_its_first_thread_is_said_so(snapshot: Snapshot, tmp_path: Path) -> None:
+    (thread,) = snapshot.threads
+    for threads in ((), (replace(thread, tid=thread.tid + 1),)):
+        _expect_nothing_started(replace(snapshot, threads=threads), tmp_path, "first thread")
+
+
+@pytest.mark.parametrize("registers", [{}, {"prstatus": bytes(8), "xstate": bytes(576)}, {"prstatus": bytes(216)}])
+def test_a_thread_without_registers_is_said_so(snapshot: Snapshot, tmp_path: Path, registers: dict[str, bytes]) -> None:
+    (thread,) = snapshot.threads
+    threads = (thread, replace(thread, tid=thread.tid + 1, registers=registers))
+    _expect_nothing_started(replace(snapshot, threads=threads), tmp_path, f"registers of its thread {thread.tid + 1}")
 
 
 def test_a_resource_of_an_unknown_kind_is_named(snapshot: Snapshot, tmp_path: Path) -> None:

@@ -129,6 +129,7 @@ BROKEN = {
     "where the runs need": lambda made: replace(made, contents=made.contents[:-1]),
     "page sum": lambda made: replace(made, page_sum=b""),
     "same id": lambda made: replace(made, threads=made.threads * 2),
+    "the first is": lambda made: replace(made, threads=(replace(made.threads[0], tid=99), *made.threads[1:])),
     "is not before": lambda made: replace(made, parent=replace(made.position, sequence=99)),
     "cannot be": lambda made: replace(made, output=(OutputPiece(3, 0, b""),)),
     "epoch": lambda made: replace(made, epoch=-1),

@@ -12,12 +12,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
 
 from checkpoint import channel
+from checkpoint.arch import x86_64
 from checkpoint.channel import Channel, ChannelError, Reply
 from checkpoint.engine import CaptureOrder
 from checkpoint.errors import CaptureError
@@ -25,7 +26,7 @@ from checkpoint.linux import entry, remote
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.remote import Desk
 from checkpoint.linux.vessel import Birth, Born, spawn_vessel
-from tests.checkpoint.round_trip import PATIENCE_S, Program, ended, protected, start
+from tests.checkpoint.round_trip import PATIENCE_S, Program, captured_at_last, ended, expect_ok, protected, start, start_tracee
 
 KILLS = int(os.environ.get("FAILOVER_KILLS", "20"))
 
@@ -189,6 +190,57 @@ def test_a_keeper_that_is_late_with_its_first_entry_does_no_harm_either(worker: 
     with protected(worker) as session:
         session.capture(CaptureOrder(base=True, generation=1, sequence=1))
     expect_undisturbed(worker)
+
+
+def calls_of(pid: int) -> set[str]:
+    """The numbers of the system calls that its threads stand in."""
+    return {(task / "syscall").read_text().split()[0] for task in Path(f"/proc/{pid}/task").iterdir()}
+
+
+@pytest.mark.compiler
+def test_a_keeper_that_is_late_sends_none_of_many_threads_back(
+    compiled: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wait_in_time, waiting = remote._tables_when_done, str(x86_64.SYSCALLS["rt_sigtimedwait"])
+
+    def wait_too_long(memory: Memory, desks: Sequence[Desk], end: int) -> list[bytes]:
+        tables = wait_in_time(memory, desks, end)
+        if len(desks) > 1:
+            tracee.wait_until(lambda: waiting not in calls_of(memory.pid), "all to go on by themselves")
+        return tables
+
+    with ended(start_tracee(compiled("threads", "-O2"), tmp_path, "many")) as tracee:
+        with protected(tracee) as session:
+            monkeypatch.setattr(remote, "_tables_when_done", wait_too_long)
+            with pytest.raises(CaptureError, match="has run on while it was looked at"):
+                session.capture(CaptureOrder(base=True, generation=1, sequence=1))
+            monkeypatch.undo()
+            captured_at_last(session, CaptureOrder(base=True, generation=1, sequence=1))
+        tracee.tell()
+        expect_ok(tracee)
+
+
+@pytest.mark.compiler
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_keeper_killed_at_any_instant_leaves_no_thread_stopped(compiled: Callable[..., Path], tmp_path: Path) -> None:
+    dice = random.Random(12)
+    with ended(start_tracee(compiled("threads", "-O2"), tmp_path, "many")) as tracee:
+        with keeping() as keeper:
+            began = time.perf_counter()
+            a_keepers_life(keeper, tracee.pid)
+            life_s = time.perf_counter() - began
+        for attempt in range(KILLS):
+            with keeping() as keeper:
+                timer = keeper.kill_after(life_s * (attempt + dice.random()) / KILLS)
+                with contextlib.suppress(ChannelError):
+                    a_keepers_life(keeper, tracee.pid)
+                timer.join()
+                keeper.process.wait()
+            for task in Path(f"/proc/{tracee.pid}/task").iterdir():
+                assert "\nTracerPid:\t0\n" in (task / "status").read_text(), f"attempt {attempt}"
+        tracee.tell()
+        expect_ok(tracee)
 
 
 HOLDER = """

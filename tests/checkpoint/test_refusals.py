@@ -21,7 +21,13 @@ pytestmark = [pytest.mark.compiler, pytest.mark.root]
 Compiled = Callable[..., Path]
 
 REFUSED = {
-    "thread": "thread",
+    "thread_files": "own open files",
+    "thread_directory": "own working directory",
+    "thread_namespace": "namespace",
+    "thread_rights": "other rights",
+    "thread_seccomp": "seccomp",
+    "child_in_the_same_memory": "child",
+    "child_of_thread": "child",
     "child": "child",
     "zombie_child": "child",
     "shared_files_child": "child",
@@ -92,6 +98,16 @@ def test_what_cannot_be_preserved_is_refused_by_name_and_not_touched(kind: str, 
         assert report.reasons == refusal.value.reasons
         if kind == "deleted_directory":
             return  # it cannot see a go file any more
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_a_program_whose_first_thread_has_ended_is_refused_by_name(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("refused", "-O2"), tmp_path, "dead_leader")) as tracee:
+        tracee.wait_until(lambda: _state(tracee.pid) == "Z", "the first thread's end")
+        for look in (ENGINE.probe, lambda pid: ENGINE.protect(pid, "/test/tracee", None)):
+            with pytest.raises(ProbeError, match="first thread has ended while 1 others live"):
+                look(tracee.pid)
         tracee.tell()
         expect_ok(tracee)
 

@@ -116,7 +116,9 @@ FILES = cases(
     "beyond_end odd_name owner_signal",
 )
 
-PRESERVED = [*MEMORY, *REGISTERS, *SIGNALS, *TIME, *PORTRAITS, *FILES]
+THREADS = [*cases("threads"), *cases("threads", "many")]
+
+PRESERVED = [*MEMORY, *REGISTERS, *SIGNALS, *TIME, *PORTRAITS, *FILES, *THREADS]
 
 NOT_YET = {
     "sigwait-timed": "a sigtimedwait with a limit ends with EINTR at any stop, and what was left of it is not known",
@@ -142,7 +144,7 @@ def test_a_restored_program_finds_everything_as_it_was(case: Case, compiled: Com
         expect_ok(tracee)
 
 
-LOOKED_AT = [*REGISTERS, *SIGNALS, *TIME, *cases("portrait", "plain")]
+LOOKED_AT = [*REGISTERS, *SIGNALS, *TIME, *cases("portrait", "plain"), *THREADS]
 
 
 @pytest.mark.parametrize("case", expected(LOOKED_AT, {"sigwait-timed": NOT_YET["sigwait-timed"]}))
@@ -190,7 +192,9 @@ def _complaint(tracee: Program) -> str:
 
 
 @pytest.mark.parametrize(
-    "case", [*cases("heap"), *cases("signal_pending"), *cases("portrait", "limits"), *cases("files", "deleted")], ids=str
+    "case",
+    [*cases("heap"), *cases("signal_pending"), *cases("portrait", "limits"), *cases("files", "deleted"), *cases("threads")],
+    ids=str,
 )
 def test_three_restores_in_a_row_lose_nothing(case: Case, compiled: Compiled, tmp_path: Path) -> None:
     tracee = start_tracee(compiled(case.program, "-O2"), tmp_path, *case.arguments)

@@ -15,29 +15,27 @@ from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 
 CHANGING = """
-import os, socket, sys, threading, time
+import os, socket, subprocess, sys, time
 flag, kind, number, held = sys.argv[1], sys.argv[2], 0, None
 
-class Thread:
+class Child:
     def __init__(self):
-        self.over = threading.Event()
-        self.thread = threading.Thread(target=self.over.wait)
-        self.thread.start()
+        self.child = subprocess.Popen(["/bin/sleep", "600"])
     def close(self):
-        self.over.set()
-        self.thread.join()
+        self.child.kill()
+        self.child.wait()
 
 while True:
     print(number, flush=True)
     number += 1
     time.sleep(0.01)
     if os.path.exists(flag) and held is None:
-        held = socket.socket() if kind == "socket" else Thread()
+        held = socket.socket() if kind == "socket" else Child()
     elif held is not None and not os.path.exists(flag):
         held.close()
         held = None
 """
-"""Counts, and holds a socket, or a second thread, for as long as a file exists."""
+"""Counts, and holds a socket, or has a child, for as long as a file exists."""
 
 STOPPING = '[components."/demo/robot1/count"]\non_unsupported = "stop_protecting"\n'
 
@@ -63,7 +61,7 @@ def start(pair: Pair, tmp_path: Path, kind: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("kind", "named"), [("socket", "is a socket"), ("thread", "it has 2 threads")])
+@pytest.mark.parametrize(("kind", "named"), [("socket", "is a socket"), ("child", "it has child processes")])
 def test_what_a_program_turned_into_is_named_and_it_recovers(pair: Pair, tmp_path: Path, kind: str, named: str) -> None:
     flag = start(pair, tmp_path, kind)
     flag.touch()

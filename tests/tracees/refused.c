@@ -45,9 +45,67 @@ static void *nap_along(void *unused) {
     return NULL;
 }
 
-static pthread_t thread;
-static void take_thread(void) {
-    if (pthread_create(&thread, NULL, nap_along, NULL)) cannot("start a thread");
+/* A thread that makes itself unlike the first one, says so, and naps along. */
+static volatile int is_unlike;
+static int (*make_unlike)(void);
+
+static void *nap_unlike(void *unused) {
+    is_unlike = make_unlike() ? -1 : 1;
+    return nap_along(unused);
+}
+
+static void take_unlike_thread(int (*make)(void)) {
+    pthread_t thread;
+    make_unlike = make;
+    if (pthread_create(&thread, NULL, nap_unlike, NULL)) cannot("start a thread");
+    while (!is_unlike) usleep(1000);
+    if (is_unlike < 0) cannot("have a thread that is unlike the first");
+}
+
+static int unshare_files(void) { return unshare(CLONE_FILES); }
+static int unshare_directory(void) { return unshare(CLONE_FS); }
+static int unshare_names(void) { return unshare(CLONE_NEWUTS); }
+static int become_other(void) { return syscall(SYS_setresuid, -1, 65534, -1); }
+static void take_thread_files(void) { take_unlike_thread(unshare_files); }
+static void take_thread_directory(void) { take_unlike_thread(unshare_directory); }
+static void take_thread_namespace(void) { take_unlike_thread(unshare_names); }
+static void take_thread_rights(void) { take_unlike_thread(become_other); }
+
+static void *end_the_process(void *unused) {
+    nap_along(unused);
+    exit(finish());
+}
+
+static void take_dead_leader(void) {
+    pthread_t thread;
+    if (pthread_create(&thread, NULL, end_the_process, NULL)) cannot("start a thread");
+    ready();
+    pthread_exit(NULL);
+}
+
+static int sleep_beside(void *unused) {
+    (void)unused;
+    while (!is_told(go)) usleep(2000);
+    _exit(0);
+}
+
+static void take_child_in_the_same_memory(void) {
+    static char stack[65536] __attribute__((aligned(16)));
+    child = clone(sleep_beside, stack + sizeof stack, CLONE_VM | SIGCHLD, NULL);
+    if (child < 0) cannot("share memory with a child");
+}
+
+static void *bear(void *unused) {
+    child = fork();
+    if (child) return nap_along(unused);
+    while (!is_told(go)) usleep(2000);
+    _exit(0);
+}
+
+static void take_child_of_thread(void) {
+    pthread_t thread;
+    if (pthread_create(&thread, NULL, bear, NULL)) cannot("start a thread");
+    while (!*(volatile pid_t *)&child) usleep(1000);
 }
 
 static void take_child(void) {
@@ -155,6 +213,17 @@ static void take_seccomp(void) {
     struct sock_fprog program = {1, allow};
     prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0);
     if (prctl(PR_SET_SECCOMP, SECCOMP_MODE_FILTER, &program)) cannot("install a filter");
+}
+
+static int install_filter(void) {
+    struct sock_filter allow[] = {BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW)};
+    struct sock_fprog program = {1, allow};
+    return prctl(PR_SET_SECCOMP, SECCOMP_MODE_FILTER, &program);
+}
+
+static void take_thread_seccomp(void) {
+    prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0);
+    take_unlike_thread(install_filter);
 }
 
 static void take_huge_pages(void) {
@@ -278,7 +347,14 @@ static const struct kind {
     const char *name;
     void (*take)(void);
 } kinds[] = {{"nothing", NULL},
-             {"thread", take_thread},
+             {"thread_files", take_thread_files},
+             {"thread_directory", take_thread_directory},
+             {"thread_namespace", take_thread_namespace},
+             {"thread_rights", take_thread_rights},
+             {"thread_seccomp", take_thread_seccomp},
+             {"dead_leader", take_dead_leader},
+             {"child_in_the_same_memory", take_child_in_the_same_memory},
+             {"child_of_thread", take_child_of_thread},
              {"child", take_child},
              {"zombie_child", take_zombie_child},
              {"shared_files_child", take_shared_files_child},

@@ -1,0 +1,93 @@
+"""The threads of a program besides its first: born inside the vessel, each with the id that the others know it by.
+
+They are traced from their birth (PTRACE_O_TRACECLONE), so none runs before it is what it was. All share what the threads of a
+process share; each says for itself what is its own, by a table of calls like the first one's.
+
+Source: clone(2) (clone3, set_tid), ptrace(2).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import os
+import signal
+import struct
+from collections.abc import Iterable
+from typing import Final
+
+from checkpoint.arch import x86_64, x86_64_stub
+from checkpoint.errors import CheckpointError, ProcessGoneError, RestoreError
+from checkpoint.linux import abi, call_table
+from checkpoint.linux.tracee import Tracee
+
+CLONE_VM: Final = 0x100
+CLONE_FS: Final = 0x200
+CLONE_FILES: Final = 0x400
+CLONE_SIGHAND: Final = 0x800
+CLONE_THREAD: Final = 0x10000
+CLONE_SYSVSEM: Final = 0x40000
+FLAGS: Final = CLONE_VM | CLONE_FS | CLONE_FILES | CLONE_SIGHAND | CLONE_THREAD | CLONE_SYSVSEM
+"""What pthread_create(3) shares; what it sets (thread-local storage, addresses for its id) comes with registers and table."""
+
+_ARGUMENTS: Final = struct.Struct("<10Q")
+"""struct clone_args of linux/sched.h, as far as set_tid_size: the ids wanted are a list of their own."""
+
+
+def spawn(leader: Tracee, registers: bytes, base: int, tid: int) -> Tracee:
+    """Have the first thread give birth to one with the id ``tid``; it stands still at its first instruction.
+
+    Args:
+        registers: any of the leader's, to begin with.
+        base: of the area that holds the loop, whose syscall instruction is used; the leader stands still in it.
+
+    Raises:
+        RestoreError: that id cannot be had.
+    """
+    place = base + abi.PAGE_SIZE
+    wanted = place + _ARGUMENTS.size
+    leader.memory.write(place, _ARGUMENTS.pack(FLAGS, 0, 0, 0, 0, 0, 0, 0, wanted, 1) + struct.pack("<i", tid))
+    instruction = base + x86_64_stub.CALL_LOOP.index(x86_64.SYSCALL)
+    call = x86_64_stub.SYSTEM_CALLS["clone3"], (place, _ARGUMENTS.size)
+    leader.set_registers(x86_64_stub.at_call(registers, instruction, *call))
+    born = 0
+    for _ in ("entry", "birth or exit"):
+        leader.request("step", abi.PTRACE_SYSCALL)
+        if leader.wait(call_table.RUN_TIMEOUT_S).event == abi.PTRACE_EVENT_CLONE:
+            born = _born(leader)
+            leader.request("step", abi.PTRACE_SYSCALL)
+            leader.wait(call_table.RUN_TIMEOUT_S)
+    if not born:
+        raise RestoreError(f"cannot restore its thread {tid}: {_reason(-x86_64_stub.call_result(leader.registers()))}")
+    thread = Tracee(born, leader.memory)
+    thread.wait(call_table.RUN_TIMEOUT_S)
+    return thread
+
+
+def _born(leader: Tracee) -> int:
+    """The id, as we see it, of the thread that the leader tells of."""
+    message = ctypes.c_ulong()
+    leader.request("ask for the newborn of", abi.PTRACE_GETEVENTMSG, 0, ctypes.addressof(message))
+    return message.value
+
+
+def _reason(number: int) -> str:
+    if number == errno.EEXIST:
+        return "that id is in use; free it, or run the program in PIDs of its own (failover run isolates)"
+    if number == errno.EPERM:
+        return "choosing an id needs CAP_CHECKPOINT_RESTORE; give it to the agent, or allow user namespaces"
+    return os.strerror(number)
+
+
+def end(leader: Tracee, others: Iterable[Tracee]) -> None:
+    """Kill a vessel that will be no program: its threads end for their tracer, or its parent could not reap it."""
+    others = tuple(others)
+    if not others:
+        return
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(leader.pid, signal.SIGKILL)
+    for thread in others:
+        with contextlib.suppress(ProcessGoneError, CheckpointError):
+            while True:
+                thread.wait(call_table.RUN_TIMEOUT_S)

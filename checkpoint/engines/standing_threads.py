@@ -1,0 +1,224 @@
+"""What the threads besides the first one are asked while all stand still.
+
+Most of it the kernel tells us; three things only the thread itself can be asked, by a batch of its own: they all answer at the
+same time, at the small desks of the borrowed pages. What cannot change in a thread's life is looked up before the freeze.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import struct
+from dataclasses import dataclass
+
+from checkpoint.arch import x86_64 as arch
+from checkpoint.engines import description
+from checkpoint.engines.entering import where_it_stands
+from checkpoint.engines.restart import Interruption
+from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, UnsupportedError
+from checkpoint.linux import abi, procfs
+from checkpoint.linux.procfs import Stat
+from checkpoint.linux.remote import SMALL, Answers, Batch, BorrowedPages, Desk, Guest
+from checkpoint.linux.threads import Threads, thread_ids
+from checkpoint.linux.tracee import Tracee
+from checkpoint.model import Rseq
+
+Life = tuple[int, int]
+"""A thread for all its life: its id as we see it, and when it began."""
+
+
+@dataclass(frozen=True, slots=True)
+class ThreadPlace:
+    """Where a thread stands.
+
+    Attributes:
+        registers: that it is given back.
+        inner_tid: its id as it sees it itself.
+    """
+
+    tracee: Tracee
+    life: Life
+    inner_tid: int
+    stat_text: bytes
+    registers: arch.Registers
+    mask: int
+    pending: tuple[bytes, ...]
+    rseq: Rseq | None
+
+
+@dataclass(frozen=True)
+class ThreadStanding:
+    """Everything that a thread was asked; nothing in it needs the process any more.
+
+    Attributes:
+        settled: registers that a snapshot goes on with.
+        interrupted: see ``checkpoint.model.ThreadState``.
+    """
+
+    place: ThreadPlace
+    xstate: bytes
+    settled: arch.Registers
+    interrupted: str
+    robust_list: tuple[int, int]
+    policy: int
+    affinity: tuple[int, ...]
+    io_priority: int
+    questions: ThreadQuestions
+    answers: Answers
+
+    @functools.cached_property
+    def stat(self) -> Stat:
+        """Its /proc/PID/task/TID/stat."""
+        return procfs.parse_stat(os.fsdecode(self.place.stat_text))
+
+    @functools.cached_property
+    def altstack(self) -> tuple[int, int, int]:
+        """(address, flags, size) of sigaltstack(2)."""
+        return self.questions.altstack_in(self.answers)
+
+    @property
+    def clear_tid(self) -> int:
+        """The address given to set_tid_address(2)."""
+        return self.questions.clear_tid_in(self.answers)
+
+    @property
+    def timer_slack_ns(self) -> int:
+        """Of prctl(2), PR_GET_TIMERSLACK."""
+        return self.questions.timer_slack_in(self.answers)
+
+
+class ThreadQuestions:
+    """The calls that one thread makes at one desk."""
+
+    def __init__(self, desk: Desk) -> None:
+        self.batch = Batch(desk.table, SMALL)
+        self._altstack = self.batch.output(24)
+        self.batch.add("sigaltstack", 0, self._altstack)
+        self._clear_tid = self.batch.output(8)
+        self._told_clear_tid = self.batch.add("prctl", abi.PR_GET_TID_ADDRESS, self._clear_tid)
+        self._slack = self.batch.add("prctl", abi.PR_GET_TIMERSLACK)
+
+    def altstack_in(self, answers: Answers) -> tuple[int, int, int]:
+        """(address, flags, size)."""
+        address, flags, size = struct.unpack("<Qi4xQ", answers.at(self._altstack, 24))
+        return address, flags, size
+
+    def clear_tid_in(self, answers: Answers) -> int:
+        """The address that the kernel clears when the thread ends: whoever joins it waits there.
+
+        Raises:
+            UnsupportedError: this kernel does not tell.
+        """
+        if answers.results[self._told_clear_tid] < 0:
+            reason = (
+                "it has several threads, and this kernel does not tell where their end is noted: boot one with "
+                "CONFIG_CHECKPOINT_RESTORE"
+            )
+            raise UnsupportedError(f"cannot capture: {reason}", (reason,))
+        return int.from_bytes(answers.at(self._clear_tid, 8), "little")
+
+    def timer_slack_in(self, answers: Answers) -> int:
+        """In nanoseconds."""
+        return max(answers.results[self._slack], 0)
+
+
+def _start_time(stat_text: bytes) -> int:
+    """When a thread began, of its unparsed stat: the 22nd field, counted from the name's end, which is the second."""
+    return int(stat_text[stat_text.rindex(b")") + 2 :].split(b" ", 20)[19])
+
+
+class ThreadOnlooker:
+    """Asks the threads of one process besides the first, again and again."""
+
+    def __init__(self, threads: Threads, borrowed: BorrowedPages) -> None:
+        self._threads = threads
+        self._borrowed = borrowed
+        self._questions = [ThreadQuestions(desk) for desk in borrowed.desks]
+        self._inner_tids: dict[Life, int] = {}
+        self._interruptions: dict[int, Interruption] = {}
+
+    def prepare(self) -> None:
+        """Look up, while the program runs, what does not change."""
+        for tid in thread_ids(self._threads.pid):
+            if tid != self._threads.pid:
+                try:
+                    self._inner_tid((tid, _start_time(self._stat_text(tid))))
+                except (ProcessGoneError, ProbeError):
+                    continue  # it has ended
+
+    def _stat_text(self, tid: int) -> bytes:
+        return procfs.read_line(self._threads.pid, f"task/{tid}/stat")
+
+    def _inner_tid(self, life: Life) -> int:
+        """Its id as it sees it itself.
+
+        Raises:
+            UnsupportedError: it cannot be asked anything.
+        """
+        tid = life[0]
+        if life not in self._inner_tids:
+            status = procfs.parse_status(procfs.read_text(self._threads.pid, f"task/{tid}/status"))
+            if status.seccomp:
+                reason = f"its thread {tid} runs under a seccomp filter, which forbids what a capture asks of it"
+                raise UnsupportedError(f"cannot capture pid {self._threads.pid}: {reason}", (reason,))
+            self._inner_tids[life] = status.pids[-1]
+        return self._inner_tids[life]
+
+    def places(self, shared_pending: tuple[bytes, ...]) -> tuple[ThreadPlace, ...]:
+        """Where they stand.
+
+        Raises:
+            CaptureError: one has not left the code of an earlier look yet.
+        """
+        found = tuple(self._place(tracee, shared_pending) for tracee in self._threads.others)
+        if len(self._inner_tids) > len(found):
+            lives = {place.life for place in found}
+            self._inner_tids = {life: tid for life, tid in self._inner_tids.items() if life in lives}
+            self._interruptions = {
+                tid: kept for tid, kept in self._interruptions.items() if any(tid == life[0] for life in lives)
+            }
+        return found
+
+    def _place(self, tracee: Tracee, shared_pending: tuple[bytes, ...]) -> ThreadPlace:
+        stat_text = self._stat_text(tracee.pid)
+        pending = tracee.pending(shared=False)
+        mask, rseq = tracee.signal_mask(), tracee.rseq()
+        registers = where_it_stands(tracee, mask, (*pending, *shared_pending), rseq)
+        if self._borrowed.holds(registers[arch.INSTRUCTION_POINTER]):
+            raise CaptureError(f"thread {tracee.pid} still stands in code of an earlier look; capture it again in a moment")
+        life = tracee.pid, _start_time(stat_text)
+        return ThreadPlace(tracee, life, self._inner_tid(life), stat_text, registers, mask, pending, rseq)
+
+    def ask(self, places: tuple[ThreadPlace, ...]) -> tuple[ThreadStanding, ...]:
+        """Everything else."""
+        if not places:
+            return ()
+        guests = [Guest(place.tracee, place.registers, place.mask) for place in places]
+        answers = self._borrowed.run_each([questions.batch for questions in self._questions], guests)
+        count = len(self._questions)
+        return tuple(
+            self._standing(place, self._questions[index % count], answer)
+            for index, (place, answer) in enumerate(zip(places, answers, strict=True))
+        )
+
+    def _standing(self, place: ThreadPlace, questions: ThreadQuestions, answers: Answers) -> ThreadStanding:
+        tid = place.tracee.pid
+        interruption = self._interruptions.setdefault(tid, Interruption(place.tracee.memory))
+        settled, interrupted = interruption.settled(place.registers)
+        return ThreadStanding(
+            place=place,
+            xstate=place.tracee.xstate(),
+            settled=settled,
+            interrupted=interrupted,
+            robust_list=abi.robust_list(tid),
+            policy=description.policy(tid),
+            affinity=tuple(os.sched_getaffinity(tid)),
+            io_priority=abi.io_priority(tid),
+            questions=questions,
+            answers=answers,
+        )
+
+    @staticmethod
+    def waiting(places: tuple[ThreadPlace, ...]) -> tuple[bytes, ...]:
+        """The signals that are pending for them now."""
+        return tuple(siginfo for place in places for siginfo in place.tracee.pending(shared=False))

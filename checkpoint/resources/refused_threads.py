@@ -1,0 +1,124 @@
+"""Threads that cannot be kept: those that do not share what the threads of a program share. Nothing here touches them.
+
+A thread comes back with the rights, the files and the namespaces of the first one, so it must have them now.
+
+Source: pthreads(7), credentials(7), unshare(2), kcmp(2).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from checkpoint.errors import ProbeError, ProcessGoneError
+from checkpoint.linux import abi, procfs
+from checkpoint.linux.procfs import Status
+from checkpoint.linux.threads import thread_ids
+from checkpoint.linux.timers import parse_timers
+
+THREAD_LIMIT: Final = 4096
+"""Threads of one program: the state of each takes 3 to 12 KB, of 32 MiB."""
+
+CLOCK_THREAD_CPUTIME: Final = 3
+_RIGHTS: Final = ("TracerPid:", "Uid:", "Gid:", "Groups:", "Cap", "NoNewPrivs:", "Seccomp:")
+"""Beginnings of the lines that tell them, and who traces a thread."""
+_NAMESPACES: Final = ("net", "ipc", "uts", "cgroup", "mnt", "user", "pid_for_children", "time_for_children")
+_SHARED: Final = ((abi.KCMP_FILES, "open files"), (abi.KCMP_FS, "working directory and root"))
+
+
+def refuse(pid: int, status: Status) -> Iterator[str]:
+    """Why the threads of a process cannot be captured.
+
+    Args:
+        status: of the first one.
+    """
+    parent = status.ppid
+    if parent > 1 and abi.kcmp(pid, parent, abi.KCMP_VM) == 0:
+        yield f"it shares its memory with its parent {parent}, a process of its own (vfork, CLONE_VM), which is not kept yet"
+    if status.threads == 1:
+        return
+    if status.threads > THREAD_LIMIT:
+        yield f"it has {status.threads} threads; the limit is {THREAD_LIMIT}: let it start fewer"
+        return
+    if status.state in "ZX":
+        yield f"its first thread has ended while {status.threads - 1} others live, which is not kept yet: let it wait for them"
+        return
+    first = _Shared.of(pid, pid)
+    for tid in thread_ids(pid):
+        if tid != pid:
+            try:
+                yield from _refuse_thread(pid, first, tid)
+            except (ProcessGoneError, ProbeError, FileNotFoundError):
+                continue  # this one has ended
+    if any(timer.clock == CLOCK_THREAD_CPUTIME for timer in parse_timers(procfs.read_text(pid, "timers"))):
+        yield "it has a timer that counts the processor time of one of its threads, and nobody tells which: use another clock"
+
+
+@dataclass(frozen=True, slots=True)
+class _Shared:
+    """What all threads of a program must have alike.
+
+    Attributes:
+        rights: lines of /proc/PID/task/TID/status.
+    """
+
+    rights: tuple[str, ...]
+    namespaces: tuple[str, ...]
+    personality: bytes
+
+    @classmethod
+    def of(cls, pid: int, tid: int) -> _Shared:
+        status = procfs.read_text(pid, f"task/{tid}/status")
+        return cls(
+            rights=tuple(line for line in status.splitlines() if line.startswith(_RIGHTS)),
+            namespaces=tuple(_namespace(pid, tid, kind) for kind in _NAMESPACES),
+            personality=procfs.read_line(pid, f"task/{tid}/personality"),
+        )
+
+
+def _namespace(pid: int, tid: int, kind: str) -> str:
+    try:
+        return os.readlink(f"/proc/{pid}/task/{tid}/ns/{kind}")
+    except OSError:
+        return ""  # a kernel without this kind, or it has ended
+
+
+def _refuse_thread(pid: int, first: _Shared, tid: int) -> tuple[str, ...]:
+    """What is wrong with one thread; nothing is with one that is about to end, which shares less and less."""
+    shared = _Shared.of(pid, tid)
+    own = [what for kind, what in _SHARED if abi.kcmp(pid, tid, kind)]
+    if shared == first and not own:
+        return ()
+    reasons = tuple(_unlike(pid, tid, shared, first, own))
+    return reasons if not procfs.thread_stat(pid, tid).flags & procfs.PF_EXITING else ()
+
+
+def _unlike(pid: int, tid: int, shared: _Shared, first: _Shared, own: list[str]) -> Iterator[str]:
+    status = procfs.parse_status(procfs.read_text(pid, f"task/{tid}/status"))
+    named = f"its thread {tid} ({status.name})"
+    if status.tracer not in (0, os.getpid()):
+        yield f"{named} is traced by pid {status.tracer}: end that debugger"
+    elif status.seccomp:
+        yield f"{named} runs under a seccomp filter, which forbids what a capture asks of it: run it without the filter"
+    elif shared.rights != first.rights:
+        yield f"{named} has other rights (user, groups or capabilities) than the first, which is not kept yet"
+    for what in own:
+        yield f"{named} has its own {what} (unshare), which is not kept yet"
+    pairs = zip(_NAMESPACES, shared.namespaces, first.namespaces, strict=True)
+    if differing := [kind for kind, here, there in pairs if here != there]:
+        yield f"{named} lives in a namespace of its own ({', '.join(differing)}), which is not kept yet"
+    if shared.personality != first.personality:
+        yield f"{named} has an execution domain of its own (personality), which is not kept yet"
+
+
+def children(pid: int) -> list[str]:
+    """The child processes of all its threads."""
+    found: list[str] = []
+    for tid in thread_ids(pid):
+        try:
+            found += procfs.read_text(pid, f"task/{tid}/children").split()
+        except (ProcessGoneError, ProbeError):
+            continue  # it has ended; its children are those of another one now
+    return found

@@ -1,0 +1,279 @@
+"""Programs of several threads: none is missed when it is frozen, and none is ever left stopped, whatever goes wrong."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from checkpoint.engine import CaptureOrder, RestoreOptions, Session
+from checkpoint.errors import CaptureError, MismatchError, ProcessGoneError, UnsupportedError
+from checkpoint.linux.vessel import Birth, discard, spawn_vessel
+from checkpoint.model import Snapshot
+from tests.checkpoint.round_trip import (
+    ENGINE,
+    Program,
+    captured,
+    captured_and_killed,
+    captured_at_last,
+    ended,
+    expect_ok,
+    protected,
+    restored,
+    start,
+    start_tracee,
+    transported,
+)
+
+pytestmark = [pytest.mark.compiler, pytest.mark.root]
+
+Compiled = Callable[..., Path]
+
+RACES = int(os.environ.get("FAILOVER_TEST_RACES", "100"))
+"""Captures that race with the birth and the end of threads; ten thousand take some minutes."""
+SIGCHLD = signal.SIGCHLD
+
+
+def states(pid: int) -> str:
+    """One letter for each thread that is there."""
+    found = ""
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        try:
+            found += (task / "stat").read_text().rpartition(")")[2].split()[0]
+        except (FileNotFoundError, ProcessLookupError):
+            continue  # it has ended
+    return found
+
+
+def tracers(pid: int) -> set[str]:
+    """Who traces any of its threads."""
+    found = set()
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        try:
+            found |= {line.split()[1] for line in (task / "status").read_text().splitlines() if line.startswith("TracerPid")}
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+    return found
+
+
+def open_descriptors() -> list[str]:
+    """Ours."""
+    return sorted(os.listdir("/proc/self/fd"))
+
+
+def test_captures_that_race_with_births_and_ends_lose_nothing(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("births", "-O2"), tmp_path)) as tracee:
+        before = open_descriptors()
+        with protected(tracee) as session:
+            counts = set()
+            for sequence in range(1, RACES + 1):
+                snapshot = captured_at_last(session, CaptureOrder(sequence=sequence))
+                session.acknowledge(snapshot.position)
+                counts.add(len(snapshot.threads))
+                assert len({thread.tid for thread in snapshot.threads}) == len(snapshot.threads)
+            whole = transported(captured_at_last(session, CaptureOrder(base=True, sequence=RACES + 1)))
+        assert open_descriptors() == before
+        assert len(counts) > 1, f"only ever saw {counts} threads: nobody was born meanwhile"
+        assert tracers(tracee.pid) == {"0"}
+        assert "t" not in states(tracee.pid)
+        tracee.tell()
+        expect_ok(tracee)
+    (tmp_path / "go").unlink()
+    with ended(restored(whole, tmp_path)) as tracee:
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_many_restores_of_a_program_that_gives_birth_to_threads(compiled: Compiled, tmp_path: Path) -> None:
+    tracee = start_tracee(compiled("births", "-O2"), tmp_path)
+    for _ in range(10):
+        with ended(tracee):
+            snapshot = captured_and_killed(tracee)
+        tracee = restored(snapshot, tmp_path)
+    with ended(tracee):
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_a_thread_that_does_not_stop_is_let_go_later_and_nobody_else_waits_for_it(compiled: Compiled, tmp_path: Path) -> None:
+    handler = signal.getsignal(SIGCHLD)
+    with ended(start_tracee(compiled("vforks", "-O2"), tmp_path)) as tracee, protected(tracee) as session:
+        session.capture(CaptureOrder(sequence=1))
+        (tmp_path / "in").touch()
+        tracee.wait_until(lambda: "D" in states(tracee.pid), "a thread inside the kernel")
+        for sequence in (2, 3):
+            with pytest.raises((CaptureError, UnsupportedError)):
+                session.capture(CaptureOrder(sequence=sequence))
+            assert "t" not in states(tracee.pid)
+        (tmp_path / "leave").touch()
+        tracee.wait_for_line("came out")
+        tracee.wait_until(lambda: tracers(tracee.pid) == {"0"}, "nobody to trace it")
+        assert signal.getsignal(SIGCHLD) == handler
+        session.capture(CaptureOrder(sequence=4))
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_a_program_killed_while_it_is_held_ends_for_its_parent(compiled: Compiled, tmp_path: Path) -> None:
+    handler = signal.getsignal(SIGCHLD)
+    with ended(start_tracee(compiled("threads", "-O2"), tmp_path)) as tracee:
+        with protected(tracee) as session:
+            session.capture(CaptureOrder(hold=True))
+            assert set(states(tracee.pid)) == {"t"}
+            os.kill(tracee.pid, signal.SIGKILL)
+            tracee.wait_until(lambda: tracee.poll() is not None, "its end")
+        assert tracee.status == -signal.SIGKILL
+    assert signal.getsignal(SIGCHLD) == handler
+
+
+def capture_for_ever(session: Session) -> None:
+    """One after the other."""
+    for sequence in itertools.count(1):
+        session.capture(CaptureOrder(sequence=sequence))
+
+
+def test_a_program_that_ends_while_it_is_captured_ends(compiled: Compiled, tmp_path: Path) -> None:
+    for attempt in range(10):
+        directory = tmp_path / str(attempt)
+        directory.mkdir()
+        with ended(start_tracee(compiled("births", "-O2"), directory)) as tracee:
+            with protected(tracee) as session:
+                tracee.tell()
+                with pytest.raises(ProcessGoneError):
+                    capture_for_ever(session)
+            expect_ok(tracee)
+
+
+def test_a_stopped_program_of_many_threads_is_still_stopped_after_a_capture(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("threads", "-O2"), tmp_path)) as tracee:
+        os.kill(tracee.pid, signal.SIGSTOP)
+        tracee.wait_until(lambda: set(states(tracee.pid)) == {"T"}, "all stopped")
+        for _ in range(3):
+            captured(tracee)
+        deadline = time.monotonic() + 0.1
+        while time.monotonic() < deadline:
+            assert set(states(tracee.pid)) == {"T"}
+        tracee.tell()
+        os.kill(tracee.pid, signal.SIGCONT)
+        expect_ok(tracee)
+
+
+def test_an_unfinished_restore_that_is_given_up_leaves_nothing(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("threads", "-O2"), tmp_path)) as tracee:
+        snapshot = captured_and_killed(tracee)
+    born = spawn_vessel(Birth(inner_pid=snapshot.process.pid))
+    ENGINE.restore(born.pid, snapshot, RestoreOptions())
+    assert set(states(born.pid)) == {"t"}
+    assert len(states(born.pid)) == len(snapshot.threads)
+    discard(born)
+    assert not Path(f"/proc/{born.pid}").exists()
+
+
+def test_without_its_pid_a_program_of_many_threads_is_refused(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("threads", "-O2"), tmp_path)) as tracee:
+        snapshot = captured_and_killed(tracee)
+    with pytest.raises(MismatchError, match="it has 7 threads, and pid"):
+        restored(snapshot, tmp_path, keep_pid=False)
+
+
+QUEUES = """
+import queue, threading, time
+first, second, third = queue.Queue(8), queue.Queue(8), queue.Queue(8)
+def feed():
+    for number in range(1500):
+        first.put(number)
+        time.sleep(0.001)
+    first.put(None)
+def pipe(source, target, change):
+    while (number := source.get()) is not None:
+        target.put(change(number))
+    target.put(None)
+threads = [threading.Thread(target=feed), threading.Thread(target=pipe, args=(first, second, lambda n: n * n % 9973)),
+           threading.Thread(target=pipe, args=(second, third, lambda n: n ^ 1234))]
+for thread in threads:
+    thread.start()
+total = 0
+while (number := third.get()) is not None:
+    total = (total * 31 + number) % 1000003
+    print(number, total, flush=True)
+for thread in threads:
+    thread.join()
+print("end", total, flush=True)
+"""
+
+
+def whole_output(argv: list[str], directory: Path) -> str:
+    """What a program writes undisturbed."""
+    directory.mkdir()
+    with ended(start(argv, directory)) as program:
+        assert program.finish() == 0
+    return program.output
+
+
+def three_lives(argv: list[str], directory: Path, expected: str) -> Snapshot:
+    """What it writes with three deaths is the same; its last snapshot."""
+    directory.mkdir()
+    program = start(argv, directory)
+    size = 0
+    for round_number in (1, 2, 3):
+        with ended(program):
+            program.wait_for_output(max(size, len(expected) * round_number // 7))
+            size = (directory / "out").stat().st_size
+            snapshot = captured_and_killed(program)
+        program = restored(snapshot, directory)
+    with ended(program):
+        assert program.finish() == 0, program.complaints
+    assert program.output == expected
+    return snapshot
+
+
+def test_cpython_with_four_threads_and_queues_computes_the_same(tmp_path: Path) -> None:
+    argv = [sys.executable, "-c", QUEUES]
+    snapshot = three_lives(argv, tmp_path / "disturbed", whole_output(argv, tmp_path / "undisturbed"))
+    assert len(snapshot.threads) == 4
+
+
+POOL = """
+import numpy as np
+matrix = np.random.default_rng(7).integers(0, 9, (256, 256)).astype(float)
+power = np.eye(256)
+for number in range(400):
+    power = np.round(power @ matrix) % 9973
+    print(number, int(power.sum()), flush=True)
+"""
+
+
+def test_numpy_with_its_thread_pool_computes_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "4")
+    argv = [sys.executable, "-c", POOL]
+    snapshot = three_lives(argv, tmp_path / "disturbed", whole_output(argv, tmp_path / "undisturbed"))
+    if len(snapshot.threads) == 1:
+        pytest.skip("this numpy has no thread pool")
+
+
+def test_a_program_in_pids_of_its_own_keeps_its_thread_ids(compiled: Compiled, tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)
+    tracee = start([compiled("threads", "-O2"), "go"], tmp_path, isolate=True)
+    with ended(tracee):
+        tracee.wait_for_line("ready")
+        snapshot = captured_and_killed(tracee)
+    if not snapshot.process.isolated:
+        pytest.skip("this machine gives a program no PIDs of its own")
+    assert snapshot.threads[0].tid == snapshot.process.pid
+    assert all(thread.tid < 50 for thread in snapshot.threads), "ids as the program sees them"
+    born = spawn_vessel(Birth(inner_pid=snapshot.process.pid, isolate=True, stdio=_streams(tmp_path)))
+    ENGINE.restore(born.pid, snapshot, RestoreOptions()).resume()
+    with ended(Program(born, tmp_path)) as tracee:
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def _streams(directory: Path) -> tuple[int, int, int]:
+    output = os.open(directory / "out", os.O_WRONLY | os.O_APPEND)
+    return os.open("/dev/null", os.O_RDONLY), output, output

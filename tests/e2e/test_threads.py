@@ -1,0 +1,51 @@
+"""A program of several threads at one robot, whose power fails: all of its threads go on at the other one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.e2e import robots
+
+pytestmark = pytest.mark.root
+
+
+COUNTING = """
+import queue, threading, time
+there, back = queue.Queue(2), queue.Queue(2)
+counted = {"first": 0, "second": 0, "third": 0}
+def pass_on():
+    while True:
+        counted["second"] += 1
+        back.put(there.get())
+def beside():
+    while True:
+        counted["third"] += 1
+        time.sleep(0.005)
+def feed():
+    number = 0
+    while True:
+        there.put(number)
+        number += 1
+        counted["first"] += 1
+        time.sleep(0.01)
+for act in (pass_on, beside, feed):
+    threading.Thread(target=act, daemon=True).start()
+while True:
+    print(back.get(), flush=True)
+"""
+"""Counts by handing each number from thread to thread."""
+
+
+def test_all_threads_of_a_program_go_on_at_the_other_robot(tmp_path: Path) -> None:
+    with robots.two_robots(tmp_path, "") as (first, second):
+        robots.run(first, "count", "/usr/bin/python3", "-S", "-c", COUNTING)
+        robots.until_protected(first)
+        robots.until(lambda: len(robots.numbers(first)) > 50, "some numbers")
+        first.cut_power()
+        robots.until(lambda: robots.component(second, "count").get("role") == "primary", "robot2 to take over")
+        before = len(robots.numbers(second))
+        robots.until(lambda: len(robots.numbers(second)) > before + 50, "it to go on")
+        counted = robots.numbers(second)
+        assert counted == list(range(len(counted))), "each number once, in order"
