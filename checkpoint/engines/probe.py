@@ -10,7 +10,7 @@ from checkpoint.engine import NOTED, REFUSED, Finding, Report, Streams
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import dirty, procfs
 from checkpoint.linux.procfs import Status
-from checkpoint.resources import Surroundings, gather, look, pipes_of, unsupported
+from checkpoint.resources import Surroundings, glance, look, pipes_of, unsupported
 
 COMMAND_LENGTH: Final = 200
 """Characters of a command line that a report shows."""
@@ -40,7 +40,7 @@ def _probe(pid: int, surroundings: Surroundings) -> Report:
     findings = (
         *_process_findings(pid, status),
         *_memory_findings(pid),
-        *look(gather(pid), surroundings).findings,
+        *look(glance(pid), surroundings).findings,
     )
     return Report(pid, _command(pid, status), status.resident_size, dirty.best_tracking(), findings)
 

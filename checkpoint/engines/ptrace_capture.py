@@ -42,7 +42,7 @@ from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.tracking import NONE
 from checkpoint.model import Position, Snapshot
 from checkpoint.pages import PageTable
-from checkpoint.resources import Surroundings, gather, look, unsupported
+from checkpoint.resources import Surroundings, glance, look, unsupported
 from checkpoint.stream_counts import Totals
 
 NS_PER_US: Final = 1000
@@ -169,7 +169,7 @@ class PtraceSession:
     def _look_from_outside(self) -> None:
         """What was refused once is looked at without stopping it: a program that has an epoll for a week is left in peace."""
         with contextlib.suppress(ProcessGoneError, ProbeError):
-            held = look(gather(self.pid), self._outputs.surroundings if self._outputs else Surroundings())
+            held = look(glance(self.pid), self._outputs.surroundings if self._outputs else Surroundings())
             self._refuse((*held.reasons, *unsupported.refuse_process(self.pid, procfs.status(self.pid))))
 
     def _refuse(self, reasons: tuple[str, ...]) -> None:

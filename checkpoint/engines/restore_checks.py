@@ -21,6 +21,7 @@ from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux import abi, procfs
 from checkpoint.model import FileIdentity, Resource, Snapshot
 from checkpoint.resources import rebuild, writers
+from checkpoint.resources.rebuilding import number_of
 
 _FAR: str = "bring it here from the machine that ran the program"
 
@@ -153,12 +154,12 @@ def _of_open_file(held: Resource, path: str, same_boot: bool) -> Iterator[str]:
     except OSError as error:
         yield f"{path}, open as {held.name}, cannot be used ({error.strerror}): {_FAR}"
         return
-    if stat.S_IFMT(about.st_mode) != stat.S_IFMT(rebuild.number_of(held.facts["mode"])):
+    if stat.S_IFMT(about.st_mode) != stat.S_IFMT(number_of(held.facts["mode"])):
         yield f"{path}, open as {held.name}, is of another type here (a directory, a device …); {_FAR}"
         return
-    if not stat.S_ISREG(about.st_mode) or rebuild.number_of(held.facts["flags"]) & rebuild.O_PATH:
+    if not stat.S_ISREG(about.st_mode) or number_of(held.facts["flags"]) & rebuild.O_PATH:
         return
-    facts, size = held.facts, rebuild.number_of(held.facts["size"])
+    facts, size = held.facts, number_of(held.facts["size"])
     named, shared = f"{path}, open as {held.name},", "accept it as shared if its content does not matter"
     grows, digest = rebuild.grows_at_its_end(held), facts.get("digest", b"")
     same_file = same_boot and (about.st_dev, about.st_ino) == (facts["device"], facts["inode"])

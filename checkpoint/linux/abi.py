@@ -261,17 +261,32 @@ KCMP_FILES: Final = 2
 KCMP_FILE: Final = 0
 KCMP_VM: Final = 1
 KCMP_FS: Final = 3
+KCMP_EPOLL_TFD: Final = 7
+
+
+class EpollSlot(ctypes.Structure):
+    """struct kcmp_epoll_slot of linux/kcmp.h: the ``skipped`` + 1st thing that an epoll instance knows under a number."""
+
+    _fields_ = (("epoll", ctypes.c_uint32), ("number", ctypes.c_uint32), ("skipped", ctypes.c_uint32))
+
+
+_kcmp_number: Final = NR_KCMP.get(os.uname().machine)
+_held_syscall: Final = ctypes.PyDLL(None, use_errno=True).syscall
+"""As `_syscall`, but other threads of the interpreter wait: for short calls, thousands of them while a program stands still."""
+_held_syscall.argtypes = (ctypes.c_long,) * 6
+_held_syscall.restype = ctypes.c_long
 
 
 def kcmp(pid1: int, pid2: int, kind: int, index1: int = 0, index2: int = 0) -> int | None:
     """Whether two processes share something: 0 the same, 1 or 2 ordered, 3 unordered; None where the kernel cannot tell.
 
+    Negative when there is no such process or descriptor.
+
     Source: kcmp(2).
     """
-    number = NR_KCMP.get(os.uname().machine)
-    if number is None:
+    if _kcmp_number is None:
         return None
-    result = int(_syscall(number, *map(ctypes.c_long, (pid1, pid2, kind, index1, index2))))
+    result = int(_held_syscall(_kcmp_number, pid1, pid2, kind, index1, index2))
     if result < 0 and ctypes.get_errno() in (errno.ENOSYS, errno.EPERM):
         return None
     return result

@@ -76,11 +76,23 @@ class CallTable:
 
     def open(self, path: str, flags: int, mode: int = 0) -> int:
         """Add the opening of a file: the descriptor that it will have."""
+        return self.obtain(f"open {path}", "openat", _AT_FDCWD, self.place_path(path), flags, mode)
+
+    def obtain(self, what: str, name: str, *arguments: int) -> int:
+        """Add a call that makes a descriptor: the number that it will have."""
         number = self.lowest_descriptor()
-        arguments = (_AT_FDCWD, self.place_path(path), flags, mode)
-        self.call(f"open {path}", "openat", *arguments, least=number, most=number)
+        self.call(what, name, *arguments, least=number, most=number)
         self.descriptors.add(number)
         return number
+
+    def obtain_pair(self, what: str, name: str, *arguments: int) -> tuple[int, int]:
+        """Add a call that makes two descriptors, whatever it writes about them."""
+        pair = []
+        for _ in range(2):
+            pair.append(self.lowest_descriptor())
+            self.descriptors.add(pair[-1])
+        self.call(what, name, *arguments)
+        return pair[0], pair[1]
 
     def close(self, descriptor: int) -> None:
         """Add the closing of a descriptor."""

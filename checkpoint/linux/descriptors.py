@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Final
 
 from checkpoint.errors import ProbeError, ProcessGoneError
-from checkpoint.linux.procfs import parse_fields, read_bytes
+from checkpoint.linux import abi
+from checkpoint.linux.procfs import READ_SIZE, parse_fields
+
+_HEAD: Final = re.compile(rb"pos:\s*(\d+)\nflags:\s*(\d+)\n")
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +24,7 @@ class Descriptor:
         target: where /proc/PID/fd/N leads, in the kernel's words: a path, "pipe:[123]", "anon_inode:[eventpoll]" …
         offset, flags: of fdinfo; flags hold O_CLOEXEC too.
         mode, device, rdev, inode, size, mtime_ns: of fstat(2).
-        fields: everything that fdinfo says.
+        told: everything that fdinfo says, unread.
     """
 
     number: int
@@ -32,17 +38,29 @@ class Descriptor:
     size: int
     mtime_ns: int
     links: int
-    fields: Mapping[str, str]
+    told: bytes
 
     @property
     def name(self) -> str:
         """What reports call it."""
         return f"fd {self.number}"
 
+    @property
+    def fields(self) -> Mapping[str, str]:
+        """What fdinfo says, the first of several lines of one key."""
+        return parse_fields(self.text)
+
+    @property
+    def text(self) -> str:
+        """What fdinfo says."""
+        return os.fsdecode(self.told)
+
 
 def descriptors(pid: int) -> tuple[Descriptor, ...]:
     """Every open descriptor, in order of number."""
-    return tuple(found for number in _numbers(pid) if (found := descriptor(pid, number)) is not None)
+    numbers = _numbers(pid)
+    with _opened(pid, "fd") as links, _opened(pid, "fdinfo") as texts:
+        return tuple(found for number in numbers if (found := _descriptor(number, links, texts)) is not None)
 
 
 def descriptors_to(pid: int, target: str) -> tuple[Descriptor, ...]:
@@ -72,18 +90,42 @@ def _numbers(pid: int) -> list[int]:
 
 def descriptor(pid: int, number: int) -> Descriptor | None:
     """One open descriptor; None when it was closed meanwhile."""
-    path = f"/proc/{pid}/fd/{number}"
+    with _opened(pid, "fd") as links, _opened(pid, "fdinfo") as texts:
+        return _descriptor(number, links, texts)
+
+
+@contextlib.contextmanager
+def _opened(pid: int, name: str) -> Iterator[int]:
+    """A directory of /proc/PID, for the body: its files are reached faster than by their whole paths."""
     try:
-        target = os.readlink(path)
-        about = os.stat(path)
-        fields = parse_fields(os.fsdecode(read_bytes(pid, f"fdinfo/{number}")))
-    except (FileNotFoundError, ProbeError):
+        directory = os.open(f"/proc/{pid}/{name}", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except (FileNotFoundError, ProcessLookupError) as error:
+        raise ProcessGoneError(f"cannot list descriptors: there is no process {pid}") from error
+    except PermissionError as error:
+        raise ProbeError(
+            f"cannot list descriptors of pid {pid}: not permitted; run as the same user or with CAP_SYS_PTRACE"
+        ) from error
+    try:
+        yield directory
+    finally:
+        os.close(directory)
+
+
+def _descriptor(number: int, links: int, texts: int) -> Descriptor | None:
+    """One descriptor, by the directories fd and fdinfo of its process."""
+    name = str(number)
+    try:
+        target = os.readlink(name, dir_fd=links)
+        about = os.stat(name, dir_fd=links)
+        told = _read(name, texts)
+    except (FileNotFoundError, ProcessLookupError):
         return None
+    head = _HEAD.match(told)
     return Descriptor(
         number=number,
         target=target,
-        offset=int(fields.get("pos", "0")),
-        flags=int(fields.get("flags", "0"), 8),
+        offset=int(head[1]) if head else 0,
+        flags=int(head[2], 8) if head else 0,
         mode=about.st_mode,
         device=about.st_dev,
         rdev=about.st_rdev,
@@ -91,5 +133,35 @@ def descriptor(pid: int, number: int) -> Descriptor | None:
         size=about.st_size,
         mtime_ns=about.st_mtime_ns,
         links=about.st_nlink,
-        fields=fields,
+        told=told,
     )
+
+
+def _read(name: str, directory: int) -> bytes:
+    """A file that the kernel writes whole into a buffer that is large enough."""
+    descriptor = os.open(name, os.O_RDONLY | os.O_CLOEXEC, dir_fd=directory)
+    try:
+        told = os.read(descriptor, READ_SIZE)
+        while len(told) % READ_SIZE == 0 and (more := os.read(descriptor, READ_SIZE)):
+            told += more
+        return told
+    finally:
+        os.close(descriptor)
+
+
+@contextlib.contextmanager
+def copy_of(pid: int, number: int) -> Iterator[int]:
+    """A descriptor of ours for the same open file, for the body.
+
+    Raises:
+        OSError: it was closed meanwhile, it is opened with O_PATH, or we may not.
+    """
+    pidfd = os.pidfd_open(pid)
+    try:
+        descriptor = abi.pidfd_getfd(pidfd, number)
+    finally:
+        os.close(pidfd)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)

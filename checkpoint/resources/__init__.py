@@ -6,12 +6,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 from checkpoint.engine import KEPT, REFUSED, Finding
+from checkpoint.errors import CaptureError
 from checkpoint.linux import abi, entry
 from checkpoint.linux.descriptors import Descriptor, descriptors
 from checkpoint.model import Fact, Resource
@@ -28,6 +30,7 @@ class OpenFile:
             not needed.
         capacity: of a pipe, in bytes.
         both_ends: of a pipe: the process itself has another descriptor for its other end.
+        observed: facts that only the process standing still could tell, as its kind's ``observe`` found them.
     """
 
     pid: int
@@ -35,6 +38,7 @@ class OpenFile:
     content: bytes | None = None
     capacity: int = 0
     both_ends: bool = False
+    observed: Mapping[str, Fact] = field(default_factory=dict)
 
     @property
     def first(self) -> Descriptor:
@@ -86,17 +90,18 @@ def pipes_of(outputs: Sequence[int]) -> dict[str, int]:
 def gather(pid: int) -> tuple[OpenFile, ...]:
     """Read every descriptor, and which of them share an open file. For an exact picture the process stands still."""
     groups: list[list[Descriptor]] = []
-    alike: dict[tuple[int, int, int, int], list[list[Descriptor]]] = {}
+    alike: dict[tuple[int | bytes, ...], list[list[Descriptor]]] = {}
     for one in descriptors(pid):
         if entry.is_left_open(one):  # ours, and closed when it is entered
             continue
-        candidates = alike.setdefault((one.device, one.inode, one.offset, one.flags & ~os.O_CLOEXEC), [])
-        shared = next((group for group in candidates if _is_shared(pid, group[0], one)), None)
-        if shared is not None:
-            shared.append(one)
+        identity = (one.device, one.inode, one.offset, one.flags & ~os.O_CLOEXEC, _own_number(one))
+        candidates = alike.setdefault(identity, [])
+        place, is_known = _place_among(pid, candidates, one)
+        if is_known:
+            candidates[place].append(one)
         else:
-            candidates.append([one])
-            groups.append(candidates[-1])
+            groups.append([one])
+            candidates.insert(place, groups[-1])
     ends = {(group[0].target, group[0].flags & os.O_ACCMODE) for group in groups}
     other = {os.O_RDONLY: os.O_WRONLY, os.O_WRONLY: os.O_RDONLY}
     return tuple(
@@ -105,18 +110,39 @@ def gather(pid: int) -> tuple[OpenFile, ...]:
     )
 
 
-def _is_shared(pid: int, left: Descriptor, right: Descriptor) -> bool:
-    """Whether both stand for one open file description. Source: kcmp(2), KCMP_FILE."""
-    return abi.kcmp(pid, pid, abi.KCMP_FILE, left.number, right.number) == 0
+def _own_number(one: Descriptor) -> bytes:
+    """What tells an eventfd from all others; b"" for other kinds, and on kernels before 4.20. Source: fs/eventfd.c."""
+    return one.told.partition(b"eventfd-id:")[2].partition(b"\n")[0]
+
+
+def _place_among(pid: int, ordered: Sequence[Sequence[Descriptor]], one: Descriptor) -> tuple[int, bool]:
+    """Where a descriptor belongs among open files in the kernel's own order, and whether it is one of them.
+
+    The order makes it few questions: a program may have thousands of timerfds, which are all alike. Source: kcmp(2), KCMP_FILE.
+    """
+    low, high = 0, len(ordered)
+    while low < high:
+        middle = (low + high) // 2
+        order = abi.kcmp(pid, pid, abi.KCMP_FILE, one.number, ordered[middle][0].number)
+        if order == 0:
+            return middle, True
+        low, high = (low, middle) if order == 1 else (middle + 1, high)
+    return low, False
 
 
 def with_contents(opened: Sequence[OpenFile]) -> tuple[OpenFile, ...]:
-    """Add the content of every deleted file and of every pipe that is kept; the process stands still."""
-    from checkpoint.resources import files, pipes
+    """Add the content of every deleted file and of every pipe that is kept, and what else must be asked while it stands still.
+
+    Raises:
+        CaptureError: one of them cannot be looked into.
+    """
+    from checkpoint.resources import files, kinds, pipes
 
     found = []
     for held in opened:
-        if files.must_carry(held):
+        if observe := kinds.OBSERVED.get(held.first.target):
+            held = replace(held, observed=observe(held, opened))
+        elif files.must_carry(held):
             held = replace(held, content=files.content_of(held))
         elif pipes.is_pipe(held.first) and held.both_ends:
             capacity, content = pipes.look_into(held)
@@ -125,13 +151,27 @@ def with_contents(opened: Sequence[OpenFile]) -> tuple[OpenFile, ...]:
     return tuple(found)
 
 
+def glance(pid: int) -> tuple[OpenFile, ...]:
+    """Read every descriptor of a process that runs on: enough to tell what is refused."""
+    from checkpoint.resources import kinds
+
+    opened = gather(pid)
+    found = []
+    for held in opened:
+        if observe := kinds.OBSERVED.get(held.first.target):
+            with contextlib.suppress(CaptureError):  # closed meanwhile
+                held = replace(held, observed=observe(held, opened))
+        found.append(held)
+    return tuple(found)
+
+
 def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
     """Sort open files into the kinds: what comes back, and what does not."""
-    from checkpoint.resources import devices, files, pipes, signalling, streams, unsupported
+    from checkpoint.resources import kinds, signalling
 
     resources, findings = [], []
     for held in opened:
-        for kind in (streams, devices, files, pipes, unsupported):
+        for kind in kinds.ASKED:
             if reason := kind.refuse(held, surroundings) or signalling.refuse(held):
                 findings.append(Finding(kind.KIND, held.name, REFUSED, reason))
                 break

@@ -67,7 +67,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     if not (stat.S_ISREG(first.mode) or stat.S_ISDIR(first.mode)) or not first.target.startswith("/"):
         return None
     what = f"{held.name} is {first.target}"
-    if "lock" in first.fields:
+    if b"\nlock:" in first.told:
         return f"{what} with a file lock or lease, which is not kept: protect the program while it holds none"
     if first.target.startswith(MEMORY_FILE):
         return f"{what}: a memory file without a name is not kept; let the program use a file in /dev/shm"

@@ -188,11 +188,7 @@ def rebuild(table: CallTable, ends: Sequence[Resource], first: int) -> dict[tupl
 
 
 def _make(table: CallTable, target: int) -> tuple[int, int]:
-    reader = table.lowest_descriptor()
-    table.descriptors.add(reader)
-    writer = table.lowest_descriptor()
-    table.descriptors.add(writer)
-    table.call("make a pipe", "pipe2", table.place(bytes(8)), os.O_CLOEXEC)
+    reader, writer = table.obtain_pair("make a pipe", "pipe2", table.place(bytes(8)), os.O_CLOEXEC)
     for number, place in ((reader, target), (writer, target + 1)):
         table.duplicate(number, place, os.O_CLOEXEC)
         table.close(number)

@@ -1,10 +1,10 @@
 """Every descriptor of a snapshot, put back inside a vessel under its own number.
 
-Resources of the kinds "files", "devices" and "streams" each stand for one *open file description*: descriptors made by dup share
-one, with its offset and flags, and share one again. Facts that all have: ``descriptors``, a list of [number, 1 if close-on-exec].
+Every resource stands for one *open file description*: descriptors made by dup share one, with its offset and flags, and share one
+again. Facts that all have: ``descriptors``, a list of [number, 1 if close-on-exec].
 
 Order: the vessel's own 0, 1 and 2 move out of the way; then every number in ascending order, so that whatever is opened gets a
-number that is still wanted or free; then what had moved is closed.
+number that is still wanted or free; then what had moved is closed; then what refers to other descriptors is told of them.
 
 Sources: open(2), dup(2), fdinfo of proc_pid_fdinfo(5).
 """
@@ -14,6 +14,7 @@ from __future__ import annotations
 import fcntl
 import os
 import stat
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,7 +22,8 @@ from checkpoint.engine import RestoreOptions
 from checkpoint.errors import RestoreError
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource, Snapshot
-from checkpoint.resources import pipes, signalling
+from checkpoint.resources import devices, epolls, eventfds, files, pipes, signalfds, signalling, streams, timerfds
+from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 REOPENED_FLAGS: Final = (
     os.O_ACCMODE | os.O_APPEND | os.O_NONBLOCK | os.O_DSYNC | os.O_SYNC | os.O_DIRECT | os.O_NOATIME | os.O_DIRECTORY
@@ -30,7 +32,14 @@ REOPENED_FLAGS: Final = (
 
 O_PATH: Final = 0o10000000
 STREAMS: Final = (0, 1, 2)
-KINDS: Final = ("files", "devices", "streams", pipes.KIND)
+MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
+    eventfds.KIND: eventfds.rebuild,
+    timerfds.KIND: timerfds.rebuild,
+    signalfds.KIND: signalfds.rebuild,
+    epolls.KIND: epolls.rebuild,
+}
+"""Kinds that are made anew: each adds its calls and answers with a descriptor."""
+KINDS: Final = (files.KIND, devices.KIND, streams.KIND, pipes.KIND, *MADE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,17 +70,27 @@ def rebuild_all(table: CallTable, state: Snapshot, options: RestoreOptions, inne
         return ()
     moved = _move_streams_away(table, wanted[-1].number + 1)
     piped = pipes.rebuild(table, [held for held in state.resources if held.kind == pipes.KIND], moved[-1] + 1)
+    rebuilding = Rebuilding(options, state.clocks, inner_pid)
     holders: dict[int, int] = {}  # which number already stands for an open file description
     for one in wanted:
         if id(one.resource) in holders:
             _duplicate(table, holders[id(one.resource)], one)
         else:
-            _obtain(table, one, moved, piped, options)
+            _obtain(table, one, moved, piped, rebuilding)
             holders[id(one.resource)] = one.number
             signalling.rebuild(table, one.number, one.resource, inner_pid)
     for number in (*moved, *piped.values()):
         table.close(number)
+    _settle(table, wanted, holders)
     return ()
+
+
+def _settle(table: CallTable, wanted: list[Wanted], holders: Mapping[int, int]) -> None:
+    """What refers to other descriptors: all of them are there now."""
+    marked = frozenset(one.number for one in wanted if one.close_on_exec)
+    for one in wanted:
+        if one.resource.kind == epolls.KIND and holders[id(one.resource)] == one.number:
+            epolls.settle(table, one.resource, one.number, marked, spare=wanted[-1].number + 1)
 
 
 def descriptors_of(state: Snapshot) -> list[Wanted]:
@@ -98,7 +117,7 @@ def _move_streams_away(table: CallTable, first: int) -> tuple[int, ...]:
 
 
 def _obtain(
-    table: CallTable, one: Wanted, moved: tuple[int, ...], piped: dict[tuple[int, int], int], options: RestoreOptions
+    table: CallTable, one: Wanted, moved: tuple[int, ...], piped: dict[tuple[int, int], int], rebuilding: Rebuilding
 ) -> None:
     """The first descriptor of an open file description."""
     facts = one.resource.facts
@@ -110,7 +129,10 @@ def _obtain(
         if number_of(facts.get("flags", 0)) & os.O_NONBLOCK:
             table.attempt(f"{one.resource.name} waits where it did not", "fcntl", one.number, fcntl.F_SETFL, os.O_NONBLOCK)
         return
-    opened = _open_deleted(table, one.resource) if facts.get("deleted") else _open(table, one.resource, options)
+    if one.resource.kind in MADE:
+        opened = MADE[one.resource.kind](table, one.resource, rebuilding)
+    else:
+        opened = _open_deleted(table, one.resource) if facts.get("deleted") else _open(table, one.resource, rebuilding.options)
     if opened != one.number:
         table.duplicate(opened, one.number, os.O_CLOEXEC if one.close_on_exec else 0)
         table.close(opened)
@@ -181,14 +203,3 @@ def has_grown(held: Resource) -> bool:
     """Whether a regular file is longer here than the program knows: what it wrote after the snapshot is to be cut off."""
     about = os.stat(str(held.facts["path"]))
     return stat.S_ISREG(about.st_mode) and grows_at_its_end(held) and about.st_size > number_of(held.facts["size"])
-
-
-def number_of(fact: Fact) -> int:
-    """A fact that is an integer.
-
-    Raises:
-        RestoreError: it is not.
-    """
-    if not isinstance(fact, int):
-        raise RestoreError(f"cannot restore: a resource says {fact!r} where a number belongs")
-    return fact

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import os
 import struct
-from collections.abc import Iterator
 from typing import Final
 
-from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
+from checkpoint.linux.descriptors import copy_of
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile
 
@@ -55,22 +53,8 @@ def _asked(held: OpenFile) -> tuple[int, int, int] | None:
     """(signal, kind of owner, owner) if anything was set, asked through a copy of the descriptor; None where there is none."""
     if held.first.flags & O_PATH:
         return None
-    with contextlib.suppress(OSError), _copy(held) as descriptor:
+    with contextlib.suppress(OSError), copy_of(held.pid, held.first.number) as descriptor:
         signal = fcntl.fcntl(descriptor, fcntl.F_GETSIG)
         kind, owner = _OWNER.unpack(fcntl.fcntl(descriptor, F_GETOWN_EX, bytes(_OWNER.size)))
         return (signal, kind, owner) if signal or owner else None
     return None
-
-
-@contextlib.contextmanager
-def _copy(held: OpenFile) -> Iterator[int]:
-    """The same open file, as a descriptor of ours."""
-    pidfd = os.pidfd_open(held.pid)
-    try:
-        descriptor = abi.pidfd_getfd(pidfd, held.first.number)
-    finally:
-        os.close(pidfd)
-    try:
-        yield descriptor
-    finally:
-        os.close(descriptor)

@@ -27,10 +27,6 @@ _ADVICE: Final = (
 )
 
 ANONYMOUS_INODES: Final[Mapping[str, str]] = {
-    "eventpoll": "an epoll instance",
-    "eventfd": "an eventfd",
-    "timerfd": "a timerfd",
-    "signalfd": "a signalfd",
     "inotify": "an inotify instance",
     "fanotify": "a fanotify group",
     "io_uring": "an io_uring",

@@ -5,11 +5,6 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 
-import pytest
-from _pytest.mark import ParameterSet
-
-from checkpoint.errors import UnsupportedError
-
 
 @dataclass(frozen=True)
 class Case:
@@ -198,11 +193,6 @@ DC = "[la 1 + dsa lb * 7 + 1000000007 % dsb p la 120000 >x] sx 0sa 12345sb lx x"
 NUMBERS = "".join(f"{index * 7919 % 100003}\n" for index in range(30000))
 
 
-def refused(case: Case, reason: str) -> ParameterSet:
-    """A program that is not supported yet: that it is refused is known."""
-    return pytest.param(case, marks=pytest.mark.xfail(reason=f"refused: {reason}", strict=True, raises=UnsupportedError))
-
-
 PLAIN = [
     Case("bc", ("bc", "-ql", "script.bc"), (("script.bc", BC),)),
     Case("cpython", (sys.executable, "script.py"), (("script.py", PYTHON),)),
@@ -231,7 +221,7 @@ PLAIN = [
 
 CASES = [
     *PLAIN,
-    refused(Case("ruby", ("ruby", "script.rb"), (("script.rb", RUBY),)), "it has two eventfds, which are not kept yet"),
+    Case("ruby", ("ruby", "script.rb"), (("script.rb", RUBY),)),
     Case("guile", ("guile", "--no-auto-compile", "-s", "script.scm"), (("script.scm", GUILE),)),
     Case("octave", ("octave-cli", "-q", "--no-init-file", "--no-history", "--eval", OCTAVE)),
 ]

@@ -37,10 +37,6 @@ REFUSED = {
     "tcp_socket": "socket",
     "udp_socket": "socket",
     "netlink_socket": "socket",
-    "epoll": "epoll",
-    "eventfd": "eventfd",
-    "timerfd": "timerfd",
-    "signalfd": "signalfd",
     "inotify": "inotify",
     "fanotify": "fanotify",
     "io_uring": "io_uring",
@@ -242,7 +238,7 @@ wait_for("go")
 """
 
 
-WAITS_IN_EPOLL = """
+WAITS_WITH_A_PIDFD = """
 import ctypes, os, select, sys
 libc, events = ctypes.CDLL(None, use_errno=True), ctypes.create_string_buffer(64)
 def step(name):
@@ -250,24 +246,25 @@ def step(name):
     while not os.path.exists(os.path.join(sys.argv[1], "after " + name)):
         libc.usleep(2000)
 step("ready")
-epoll = select.epoll()
+epoll, pidfd = select.epoll(), os.pidfd_open(os.getpid())
 print("waits", flush=True)
 while not os.path.exists(os.path.join(sys.argv[1], "after waits")):
     if libc.epoll_wait(epoll.fileno(), events, 1, 100) < 0:
         print("interrupted", flush=True)
 epoll.close()
+os.close(pidfd)
 step("closed")
 """
 
 
 def test_a_program_that_was_refused_is_not_stopped_again_while_it_would_be_refused(tmp_path: Path) -> None:
-    with ended(start([sys.executable, "-c", WAITS_IN_EPOLL, tmp_path], tmp_path)) as program, protected(program) as session:
+    with ended(start([sys.executable, "-c", WAITS_WITH_A_PIDFD, tmp_path], tmp_path)) as program, protected(program) as session:
         program.wait_for_line("ready")
         session.capture(CaptureOrder(sequence=1))
         (tmp_path / "after ready").touch()
         program.wait_for_line("waits")
         for sequence in range(2, 30):
-            with pytest.raises(UnsupportedError, match="epoll"):
+            with pytest.raises(UnsupportedError, match="pidfd"):
                 session.capture(CaptureOrder(sequence=sequence))
         (tmp_path / "after waits").touch()
         program.wait_for_line("closed")

@@ -15,8 +15,6 @@
 #include <netinet/in.h>
 #include <pthread.h>
 #include <pty.h>
-#include <sys/epoll.h>
-#include <sys/eventfd.h>
 #include <sys/fanotify.h>
 #include <sys/file.h>
 #include <sys/inotify.h>
@@ -25,9 +23,7 @@
 #include <sys/prctl.h>
 #include <sys/ptrace.h>
 #include <sys/shm.h>
-#include <sys/signalfd.h>
 #include <sys/socket.h>
-#include <sys/timerfd.h>
 #include <sys/un.h>
 
 static const char *go;
@@ -154,16 +150,6 @@ static void take_tcp_socket(void) {
 
 static void take_udp_socket(void) { keep(socket(AF_INET6, SOCK_DGRAM, 0), "a socket"); }
 static void take_netlink_socket(void) { keep(socket(AF_NETLINK, SOCK_RAW, 0), "a socket"); }
-static void take_epoll(void) { keep(epoll_create1(0), "epoll"); }
-static void take_eventfd(void) { keep(eventfd(3, 0), "an eventfd"); }
-static void take_timerfd(void) { keep(timerfd_create(CLOCK_MONOTONIC, 0), "a timerfd"); }
-
-static void take_signalfd(void) {
-    sigset_t set;
-    sigemptyset(&set);
-    sigaddset(&set, SIGHUP);
-    keep(signalfd(-1, &set, 0), "a signalfd");
-}
 
 static void take_inotify(void) {
     keep(inotify_init(), "inotify");
@@ -365,10 +351,6 @@ static const struct kind {
              {"tcp_socket", take_tcp_socket},
              {"udp_socket", take_udp_socket},
              {"netlink_socket", take_netlink_socket},
-             {"epoll", take_epoll},
-             {"eventfd", take_eventfd},
-             {"timerfd", take_timerfd},
-             {"signalfd", take_signalfd},
              {"inotify", take_inotify},
              {"fanotify", take_fanotify},
              {"io_uring", take_io_uring},

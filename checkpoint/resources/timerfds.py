@@ -1,0 +1,139 @@
+"""Timers of timerfd_create(2): armed again with what was left, the outage counted, and with the expirations not read yet.
+
+A periodic one goes on in its own rhythm, and counts the expirations that it missed. One that was set to an hour of the day
+(TFD_TIMER_ABSTIME of the realtime clock) keeps that hour.
+
+Facts: ``descriptors``; ``flags`` of fcntl(2); ``clock``; ``settings``: flags of timerfd_settime(2); ``value_ns``: until its next
+expiration, 0 if disarmed; ``interval_ns``; ``ticks``: expirations that were not read yet; ``asked_ns``: when all this was so,
+by the realtime clock: a moment after the snapshot's clocks were read.
+
+Source: timerfd_show() in fs/timerfd.c; TFD_IOC_SET_TICKS in timerfd_create(2).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import struct
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from checkpoint.errors import CaptureError
+from checkpoint.linux import abi
+from checkpoint.linux.call_table import CallTable
+from checkpoint.linux.descriptors import copy_of, descriptor
+from checkpoint.model import Fact, Resource
+from checkpoint.resources import OpenFile, Surroundings, elsewhere
+from checkpoint.resources.rebuilding import Rebuilding, number_of
+
+KIND: Final = "timerfds"
+TARGET: Final = "anon_inode:[timerfd]"
+
+TFD_TIMER_ABSTIME: Final = 1
+TFD_TIMER_CANCEL_ON_SET: Final = 2
+TFD_IOC_SET_TICKS: Final = 0x40085400
+REALTIME_CLOCKS: Final = (time.CLOCK_REALTIME, 8)
+"""CLOCK_REALTIME and CLOCK_REALTIME_ALARM."""
+
+_TICKS: Final = re.compile(rb"ticks: (\d+)\n")
+_TOLD: Final = re.compile(rb"clockid: (\d+)\nticks: (\d+)\nsettime flags: (\d+)\n")
+_TIMES: Final = struct.Struct("<4q")
+_NS_PER_S: Final = 1_000_000_000
+SOONEST_WITH_TICKS_NS: Final = 200_000
+"""A timer with unread expirations is not armed for less: the next one would come before they have been set."""
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
+    """Its clock, how it was set, what is left and what was not read.
+
+    Asking winds a periodic timer up that went off and was not read, so that its unread expirations can be told: `timerfd_gettime`
+    changes nothing else.
+
+    Raises:
+        CaptureError: it cannot be asked.
+    """
+    times = ctypes.create_string_buffer(_TIMES.size)
+    try:
+        with copy_of(held.pid, held.first.number) as timer:
+            if _libc.timerfd_gettime(timer, times):
+                abi.raise_errno("timerfd_gettime")
+            asked_ns = time.time_ns()
+    except OSError as error:
+        raise CaptureError(f"cannot ask the timerfd {held.name} of pid {held.pid}: {error.strerror}; try again") from error
+    interval_s, interval_ns, value_s, value_ns = _TIMES.unpack(times.raw)
+    told = _TOLD.search(held.first.told)
+    assert told is not None, "every kernel with fdinfo tells of timers so"
+    ticks = int(told[2])
+    if ticks and (interval_s or interval_ns):
+        again = descriptor(held.pid, held.first.number)
+        counted = _TICKS.search(again.told) if again else None
+        ticks = int(counted[1]) if counted else ticks
+    return {
+        "clock": int(told[1]),
+        "settings": int(told[3], 8),
+        "value_ns": value_s * _NS_PER_S + value_ns,
+        "interval_ns": interval_s * _NS_PER_S + interval_ns,
+        "ticks": ticks,
+        "asked_ns": asked_ns,
+    }
+
+
+def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
+    """The timer as it was observed."""
+    if held.first.target != TARGET:
+        return None
+    return Resource(KIND, held.name, {"descriptors": held.numbers, "flags": held.first.flags & ~os.O_CLOEXEC, **held.observed})
+
+
+def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
+    """Why a timerfd cannot be kept."""
+    return elsewhere.refuse(held, "a timerfd") if held.first.target == TARGET else None
+
+
+@dataclass(frozen=True, slots=True)
+class Left:
+    """What is left of a timer when some time has gone by."""
+
+    value_ns: int
+    ticks: int
+
+
+def left_after(value_ns: int, interval_ns: int, ticks: int, elapsed_ns: int) -> Left:
+    """What is left: the expirations of a periodic timer are counted, a single one goes off as soon as it is armed."""
+    if not value_ns:
+        return Left(0, ticks)
+    if value_ns > elapsed_ns:
+        return Left(value_ns - elapsed_ns, ticks)
+    if not interval_ns:
+        return Left(1, 0)
+    missed, into = divmod(elapsed_ns - value_ns, interval_ns)
+    return Left(interval_ns - into, ticks + 1 + missed)
+
+
+def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
+    """Make it again and arm it."""
+    facts = {
+        name: number_of(held.facts[name])
+        for name in ("clock", "settings", "value_ns", "interval_ns", "ticks", "flags", "asked_ns")
+    }
+    made = table.obtain(f"make the timerfd of {held.name}", "timerfd_create", facts["clock"], facts["flags"] & os.O_NONBLOCK)
+    since_ns = rebuilding.clocks.realtime_ns + rebuilding.elapsed_ns - facts["asked_ns"]
+    left = left_after(facts["value_ns"], facts["interval_ns"], facts["ticks"], since_ns)
+    value_ns, settings = left.value_ns, 0
+    if value_ns and left.ticks:
+        value_ns = max(value_ns, SOONEST_WITH_TICKS_NS)
+    if value_ns > 1 and facts["settings"] & TFD_TIMER_ABSTIME and facts["clock"] in REALTIME_CLOCKS:
+        value_ns += facts["asked_ns"] + since_ns
+        settings = facts["settings"] & (TFD_TIMER_ABSTIME | TFD_TIMER_CANCEL_ON_SET)
+    if value_ns:
+        times = _TIMES.pack(*divmod(facts["interval_ns"], _NS_PER_S), *divmod(value_ns, _NS_PER_S))
+        table.call(f"arm the timerfd of {held.name}", "timerfd_settime", made, settings, table.place(times), 0)
+    if left.ticks:
+        lost = f"{left.ticks} expirations of {held.name} that were not read are lost"
+        table.attempt(lost, "ioctl", made, TFD_IOC_SET_TICKS, table.place(left.ticks.to_bytes(8, "little")))
+    return made

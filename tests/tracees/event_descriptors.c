@@ -1,0 +1,314 @@
+/* Descriptors that only wake: eventfd, timerfd, signalfd and epoll; the case is named by the second argument. */
+#include "tracee.h"
+
+#include <poll.h>
+#include <sys/epoll.h>
+#include <sys/eventfd.h>
+#include <sys/signalfd.h>
+#include <sys/timerfd.h>
+
+static const char *go;
+
+static void wait_here(void) {
+    ready();
+    wait_for_go(go);
+}
+
+static uint64_t take(int file) {
+    uint64_t value = 0;
+    errno = 0;
+    return read(file, &value, 8) == 8 ? value : 0;
+}
+
+static int is_ready(int file) { return poll(&(struct pollfd){file, POLLIN, 0}, 1, 0) == 1; }
+
+static void put(int file, uint64_t value) {
+    if (write(file, &value, 8) != 8) differs("cannot write to fd %d: %s", file, strerror(errno));
+}
+
+/* eventfd */
+
+static void eventfd_counter(void) {
+    int counter = eventfd(5, EFD_NONBLOCK), empty = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK), twin = dup(counter);
+    put(counter, 37);
+    wait_here();
+    EXPECT(!is_ready(empty), "the empty one has something");
+    EXPECT_EQUAL("count", take(twin), 42);
+    EXPECT(take(counter) == 0 && errno == EAGAIN, "the twin counts on its own");
+    EXPECT_EQUAL("flags", fcntl(empty, F_GETFL) & O_NONBLOCK, O_NONBLOCK);
+    EXPECT_EQUAL("mark", fcntl(empty, F_GETFD), FD_CLOEXEC);
+    EXPECT_EQUAL("mark", fcntl(counter, F_GETFD), 0);
+}
+
+static void eventfd_semaphore(void) {
+    int semaphore = eventfd(3, EFD_SEMAPHORE | EFD_NONBLOCK);
+    wait_here();
+    for (int round = 0; round < 3; round++) EXPECT_EQUAL("one at a time", take(semaphore), 1);
+    EXPECT(take(semaphore) == 0 && errno == EAGAIN, "more than three");
+}
+
+static void eventfd_full(void) {
+    int counter = eventfd(0, EFD_NONBLOCK);
+    put(counter, 0xfffffffffffffffdULL);
+    wait_here();
+    put(counter, 1);
+    uint64_t one = 1;
+    EXPECT(write(counter, &one, 8) == -1 && errno == EAGAIN, "it was full");
+    EXPECT(take(counter) == 0xfffffffffffffffeULL, "the count differs");
+}
+
+static void eventfd_many(void) {
+    int files[400];
+    for (int index = 0; index < 400; index++)
+        if ((files[index] = eventfd(index, EFD_NONBLOCK)) < 0) cannot("make eventfd %d", index);
+    wait_here();
+    for (int index = 0; index < 400; index++) EXPECT_EQUAL("count", take(files[index]), index);
+}
+
+/* timerfd */
+
+static void timer_relative(void) {
+    int timer = timerfd_create(CLOCK_MONOTONIC, TFD_NONBLOCK | TFD_CLOEXEC);
+    struct itimerspec left, time = {.it_value = {40, 0}};
+    timerfd_settime(timer, 0, &time, NULL);
+    int64_t start = now_ns(CLOCK_MONOTONIC);
+    wait_here();
+    int64_t passed_ms = (now_ns(CLOCK_MONOTONIC) - start) / 1000000;
+    timerfd_gettime(timer, &left);
+    long left_ms = left.it_value.tv_sec * 1000 + left.it_value.tv_nsec / 1000000;
+    EXPECT(left_ms <= 40000 && left_ms >= 40000 - passed_ms - 200, "%ld ms left after %lld", left_ms, (long long)passed_ms);
+    EXPECT(take(timer) == 0 && errno == EAGAIN, "it went off");
+    EXPECT_EQUAL("mark", fcntl(timer, F_GETFD), FD_CLOEXEC);
+}
+
+static void timer_absolute(clockid_t clock) {
+    int timer = timerfd_create(clock, 0);
+    int64_t end = now_ns(clock) + 2 * SECOND;
+    struct itimerspec time = {.it_value = {end / SECOND, end % SECOND}};
+    timerfd_settime(timer, TFD_TIMER_ABSTIME | (clock == CLOCK_REALTIME ? TFD_TIMER_CANCEL_ON_SET : 0), &time, NULL);
+    wait_here();
+    EXPECT_EQUAL("expirations", take(timer), 1);
+    int64_t late = now_ns(clock) - end;
+    EXPECT(late >= -20000000, "it went off %lld us early", (long long)-late / 1000);
+}
+
+static void timer_absolute_monotonic(void) { timer_absolute(CLOCK_MONOTONIC); }
+static void timer_absolute_realtime(void) { timer_absolute(CLOCK_REALTIME); }
+static void timer_absolute_boottime(void) { timer_absolute(CLOCK_BOOTTIME); }
+
+/* Every expiration is counted, those before the capture too; those of the outage may be or not, as its clock goes on. */
+static void timer_periodic(void) {
+    int timer = timerfd_create(CLOCK_MONOTONIC, 0);
+    struct itimerspec left, time = {.it_value = {0, 30000000}, .it_interval = {0, 20000000}};
+    timerfd_settime(timer, 0, &time, NULL);
+    int64_t start = now_ns(CLOCK_MONOTONIC);
+    nanosleep(&(struct timespec){0, 100000000}, NULL);
+    wait_here();
+    int64_t passed_ms = (now_ns(CLOCK_MONOTONIC) - start) / 1000000;
+    int64_t count = take(timer), wanted = (passed_ms - 30) / 20 + 1;
+    EXPECT(count >= 4 && count <= wanted + 1, "%lld expirations in %lld ms", (long long)count,
+           (long long)passed_ms);
+    timerfd_gettime(timer, &left);
+    EXPECT_EQUAL("interval", left.it_interval.tv_nsec, 20000000);
+    EXPECT(take(timer) >= 1, "it does not go on");
+}
+
+static void timer_unread(void) {
+    int timer = timerfd_create(CLOCK_MONOTONIC, TFD_NONBLOCK);
+    struct itimerspec left, time = {.it_value = {0, 1000000}};
+    timerfd_settime(timer, 0, &time, NULL);
+    poll(&(struct pollfd){timer, POLLIN, 0}, 1, -1);
+    wait_here();
+    timerfd_gettime(timer, &left);
+    EXPECT(left.it_value.tv_sec == 0 && left.it_value.tv_nsec == 0, "a timer that went off is armed");
+    EXPECT_EQUAL("expirations", take(timer), 1);
+    EXPECT(take(timer) == 0 && errno == EAGAIN, "it went off again");
+}
+
+static void timer_disarmed(void) {
+    int timer = timerfd_create(CLOCK_REALTIME, TFD_NONBLOCK);
+    wait_here();
+    EXPECT(take(timer) == 0 && errno == EAGAIN, "it went off");
+    struct itimerspec time = {.it_value = {0, 1}};
+    timerfd_settime(timer, 0, &time, NULL);
+    poll(&(struct pollfd){timer, POLLIN, 0}, 1, 10000);
+    EXPECT_EQUAL("expirations", take(timer), 1);
+}
+
+/* signalfd */
+
+static void signalfd_waiting(void) {
+    sigset_t set;
+    sigemptyset(&set), sigaddset(&set, SIGUSR2), sigaddset(&set, SIGRTMIN + 3);
+    sigprocmask(SIG_BLOCK, &set, NULL);
+    int signals = signalfd(-1, &set, SFD_NONBLOCK | SFD_CLOEXEC);
+    if (signals < 0) cannot("make a signalfd");
+    sigqueue(getpid(), SIGRTMIN + 3, (union sigval){.sival_int = 17});
+    sigqueue(getpid(), SIGRTMIN + 3, (union sigval){.sival_int = 18});
+    wait_here();
+    struct signalfd_siginfo about;
+    for (int value = 17; value < 19; value++) {
+        EXPECT(read(signals, &about, sizeof about) == sizeof about, "no signal waits");
+        EXPECT_EQUAL("signal", about.ssi_signo, SIGRTMIN + 3);
+        EXPECT_EQUAL("value", about.ssi_int, value);
+    }
+    EXPECT(read(signals, &about, sizeof about) == -1 && errno == EAGAIN, "more signals wait");
+    kill(getpid(), SIGHUP > 0 ? SIGUSR2 : 0);
+    EXPECT(read(signals, &about, sizeof about) == sizeof about && about.ssi_signo == SIGUSR2, "it does not hear SIGUSR2");
+}
+
+/* epoll */
+
+static void watch(int epoll, int file, uint32_t events, uint64_t word) {
+    struct epoll_event event = {.events = events, .data.u64 = word};
+    if (epoll_ctl(epoll, EPOLL_CTL_ADD, file, &event)) cannot("watch fd %d", file);
+}
+
+static void expect_event(int epoll, uint32_t events, uint64_t word) {
+    struct epoll_event event = {0};
+    int count = epoll_wait(epoll, &event, 1, 5000);
+    EXPECT(count == 1 && event.events == events && event.data.u64 == word, "%d events: %x of %llx, not %x of %llx", count,
+           event.events, (unsigned long long)event.data.u64, events, (unsigned long long)word);
+}
+
+static void expect_silence(int epoll) {
+    struct epoll_event event;
+    EXPECT_EQUAL("events", epoll_wait(epoll, &event, 1, 0), 0);
+}
+
+static void epoll_simple(void) {
+    int epoll = epoll_create1(EPOLL_CLOEXEC), counter = eventfd(0, EFD_NONBLOCK), ends[2];
+    if (pipe(ends)) cannot("make a pipe");
+    watch(epoll, counter, EPOLLIN, 0xfedcba9876543210ULL);
+    watch(epoll, ends[0], EPOLLIN | EPOLLRDHUP, 7);
+    wait_here();
+    expect_silence(epoll);
+    put(counter, 1);
+    expect_event(epoll, EPOLLIN, 0xfedcba9876543210ULL);
+    take(counter);
+    expect_silence(epoll);
+    put(ends[1], 1);
+    expect_event(epoll, EPOLLIN, 7);
+    EXPECT(epoll_ctl(epoll, EPOLL_CTL_DEL, ends[0], NULL) == 0, "cannot take one out: %s", strerror(errno));
+    expect_silence(epoll);
+    EXPECT_EQUAL("mark", fcntl(epoll, F_GETFD), FD_CLOEXEC);
+}
+
+static void epoll_ready(void) {
+    int epoll = epoll_create1(0), twin = dup(epoll), counter = eventfd(1, 0);
+    watch(epoll, counter, EPOLLIN, 1);
+    wait_here();
+    expect_event(twin, EPOLLIN, 1);
+    expect_event(epoll, EPOLLIN, 1);
+}
+
+static void epoll_nested(void) {
+    int outer = epoll_create1(0), middle = epoll_create1(0), inner = epoll_create1(0), counter = eventfd(0, EFD_NONBLOCK);
+    watch(outer, middle, EPOLLIN, 1), watch(middle, inner, EPOLLIN, 2), watch(inner, counter, EPOLLIN, 3);
+    wait_here();
+    expect_silence(outer);
+    put(counter, 1);
+    expect_event(outer, EPOLLIN, 1), expect_event(middle, EPOLLIN, 2), expect_event(inner, EPOLLIN, 3);
+}
+
+static void epoll_once(void) {
+    int epoll = epoll_create1(0), used = eventfd(1, 0), fresh = eventfd(0, 0);
+    watch(epoll, used, EPOLLIN | EPOLLONESHOT, 1);
+    expect_event(epoll, EPOLLIN, 1);
+    watch(epoll, fresh, EPOLLIN | EPOLLONESHOT, 2);
+    wait_here();
+    expect_silence(epoll);
+    put(fresh, 1);
+    expect_event(epoll, EPOLLIN, 2);
+    expect_silence(epoll);
+    struct epoll_event event = {.events = EPOLLIN | EPOLLONESHOT, .data.u64 = 3};
+    EXPECT(epoll_ctl(epoll, EPOLL_CTL_MOD, used, &event) == 0, "cannot arm it again: %s", strerror(errno));
+    expect_event(epoll, EPOLLIN, 3);
+}
+
+static void epoll_edge(void) {
+    int epoll = epoll_create1(0), counter = eventfd(0, EFD_NONBLOCK);
+    watch(epoll, counter, EPOLLIN | EPOLLET, 9);
+    wait_here();
+    put(counter, 1);
+    expect_event(epoll, EPOLLIN, 9);
+    expect_silence(epoll);
+    put(counter, 1);
+    expect_event(epoll, EPOLLIN, 9);
+}
+
+static void epoll_exclusive(void) {
+    int epoll = epoll_create1(0), counter = eventfd(0, EFD_NONBLOCK);
+    watch(epoll, counter, EPOLLIN | EPOLLEXCLUSIVE, 11);
+    wait_here();
+    put(counter, 1);
+    expect_event(epoll, EPOLLIN, 11);
+    struct epoll_event event = {.events = EPOLLIN};
+    EXPECT(epoll_ctl(epoll, EPOLL_CTL_MOD, counter, &event) == -1 && errno == EINVAL, "it is not exclusive any more");
+}
+
+/* What was registered under a number that is closed by now, or leads to something else. */
+static void epoll_renumbered(void) {
+    int epoll = epoll_create1(0), first = eventfd(0, 0), second = eventfd(0, 0);
+    watch(epoll, first, EPOLLIN, 1), watch(epoll, second, EPOLLIN, 2);
+    int far = dup2(first, 300), near = dup2(second, 301);
+    close(first), close(second);
+    int new_first = eventfd(0, EFD_CLOEXEC);
+    if (new_first != first) cannot("get the number again");
+    watch(epoll, new_first, EPOLLIN, 3);
+    wait_here();
+    EXPECT_EQUAL("mark", fcntl(new_first, F_GETFD), FD_CLOEXEC);
+    EXPECT(fcntl(second, F_GETFD) == -1, "a closed descriptor is open");
+    expect_silence(epoll);
+    put(far, 1), expect_event(epoll, EPOLLIN, 1), take(far);
+    put(near, 1), expect_event(epoll, EPOLLIN, 2), take(near);
+    put(new_first, 1), expect_event(epoll, EPOLLIN, 3);
+}
+
+/* It sleeps in epoll_wait when it is captured, for ever, and is woken by a timer. */
+static void epoll_waiting(void) {
+    int epoll = epoll_create1(0), timer = timerfd_create(CLOCK_MONOTONIC, 0);
+    struct itimerspec time = {.it_value = {0, 5000000}, .it_interval = {0, 5000000}};
+    struct epoll_event event;
+    watch(epoll, timer, EPOLLIN, 5);
+    timerfd_settime(timer, 0, &time, NULL);
+    ready();
+    while (!is_told(go)) {
+        int count = epoll_wait(epoll, &event, 1, -1);
+        EXPECT(count == 1 && event.data.u64 == 5, "epoll_wait: %d (%s)", count, strerror(errno));
+        EXPECT(take(timer) >= 1, "nothing to read");
+    }
+}
+
+int main(int count, char **arguments) {
+    static const struct {
+        const char *name;
+        void (*act)(void);
+    } cases[] = {{"eventfd_counter", eventfd_counter},
+                 {"eventfd_semaphore", eventfd_semaphore},
+                 {"eventfd_full", eventfd_full},
+                 {"eventfd_many", eventfd_many},
+                 {"timer_relative", timer_relative},
+                 {"timer_absolute_monotonic", timer_absolute_monotonic},
+                 {"timer_absolute_realtime", timer_absolute_realtime},
+                 {"timer_absolute_boottime", timer_absolute_boottime},
+                 {"timer_periodic", timer_periodic},
+                 {"timer_unread", timer_unread},
+                 {"timer_disarmed", timer_disarmed},
+                 {"signalfd_waiting", signalfd_waiting},
+                 {"epoll_simple", epoll_simple},
+                 {"epoll_ready", epoll_ready},
+                 {"epoll_nested", epoll_nested},
+                 {"epoll_once", epoll_once},
+                 {"epoll_edge", epoll_edge},
+                 {"epoll_exclusive", epoll_exclusive},
+                 {"epoll_renumbered", epoll_renumbered},
+                 {"epoll_waiting", epoll_waiting}};
+    go = arguments[1];
+    for (size_t index = 0; index < sizeof cases / sizeof *cases; index++)
+        if (count > 2 && !strcmp(arguments[2], cases[index].name)) {
+            cases[index].act();
+            return finish();
+        }
+    cannot("find the case");
+}
