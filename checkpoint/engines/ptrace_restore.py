@@ -37,7 +37,7 @@ from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee
 from checkpoint.model import Credentials, Position, Snapshot, ThreadState, Vma
-from checkpoint.resources.rebuild import rebuild_all
+from checkpoint.resources.rebuild import rebuild_all, rebuild_last
 
 PTRACE_O_TRACESYSGOOD: Final = 1
 PTRACE_EVENT_EXEC: Final = 4
@@ -209,6 +209,7 @@ class _Restore:
         restore_process.posix_timers(table, process, state.threads, vessel, elapsed_ns)
         restore_process.interval_timers(table, process.interval_timers, elapsed_ns)
         restore_process.last_marks(table, process)
+        rebuild_last(table, self._state)
         switches.set_again(table, process.switches)
         return table
 

@@ -141,6 +141,8 @@ def _of_descriptors(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
             yield f"{held.name} is of kind {held.kind!r}, which this version does not know: use the version that captured it"
         elif held.kind == "files" and not held.facts.get("deleted") and path not in options.accept_changed:
             yield from _of_open_file(held, path, state.machine.boot_id == this_machine().boot_id)
+        elif held.kind in rebuild.NEEDED:
+            yield from rebuild.NEEDED[held.kind](held)
 
 
 def _of_open_file(held: Resource, path: str, same_boot: bool) -> Iterator[str]:
@@ -150,7 +152,7 @@ def _of_open_file(held: Resource, path: str, same_boot: bool) -> Iterator[str]:
         same_boot: it may be the very same file, and its times can be compared.
     """
     try:
-        about = os.stat(path)
+        about = os.stat(path, follow_symlinks=not number_of(held.facts["flags"]) & rebuild.O_PATH)
     except OSError as error:
         yield f"{path}, open as {held.name}, cannot be used ({error.strerror}): {_FAR}"
         return

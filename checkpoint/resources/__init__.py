@@ -140,7 +140,7 @@ def with_contents(opened: Sequence[OpenFile]) -> tuple[OpenFile, ...]:
 
     found = []
     for held in opened:
-        if observe := kinds.OBSERVED.get(held.first.target):
+        if observe := kinds.observer_of(held.first):
             held = replace(held, observed=observe(held, opened))
         elif files.must_carry(held):
             held = replace(held, content=files.content_of(held))
@@ -158,7 +158,7 @@ def glance(pid: int) -> tuple[OpenFile, ...]:
     opened = gather(pid)
     found = []
     for held in opened:
-        if observe := kinds.OBSERVED.get(held.first.target):
+        if observe := kinds.observer_of(held.first):
             with contextlib.suppress(CaptureError):  # closed meanwhile
                 held = replace(held, observed=observe(held, opened))
         found.append(held)

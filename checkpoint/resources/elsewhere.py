@@ -38,6 +38,11 @@ def holder_of(held: OpenFile) -> int | None:
     return None
 
 
+def opener_of(held: OpenFile) -> int | None:
+    """Another process that has a file of the same name open; what was opened in the last second may be missed."""
+    return next((other for other, _ in _holders(held.pid, _second()).get(held.first.target, ())), None)
+
+
 def refuse(held: OpenFile, what: str) -> str | None:
     """Why something that is ``what`` cannot be kept: somebody else has it, too."""
     if (other := holder_of(held)) is None:
@@ -47,14 +52,18 @@ def refuse(held: OpenFile, what: str) -> str | None:
 
 @lru_cache(maxsize=PRIVATE_KNOWN)
 def _require_private(pid: int, number: int, target: str) -> None:
-    for other, its_number in _holders(pid, time.monotonic_ns() // 1_000_000_000).get(target, ()):
+    for other, its_number in _holders(pid, _second()).get(target, ()):
         if abi.kcmp(pid, other, abi.KCMP_FILE, number, its_number) == 0:
             raise _HeldElsewhereError(other)
 
 
+def _second() -> int:
+    return time.monotonic_ns() // 1_000_000_000
+
+
 @lru_cache(maxsize=1)
 def _holders(pid: int, second: int) -> Mapping[str, list[tuple[int, int]]]:
-    """What all other processes have open that has no path: (process, number) by the kernel's name for it.
+    """What all other processes have open: (process, number) by the kernel's name for it.
 
     Args:
         second: of our clock; all that is asked within one second looks once.
@@ -63,8 +72,7 @@ def _holders(pid: int, second: int) -> Mapping[str, list[tuple[int, int]]]:
     for other in os.listdir("/proc"):
         if other.isdigit() and int(other) not in (pid, os.getpid()):
             for number, target in _descriptors(other):
-                if not target.startswith("/"):
-                    found.setdefault(target, []).append((int(other), number))
+                found.setdefault(target, []).append((int(other), number))
     return found
 
 

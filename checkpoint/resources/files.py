@@ -1,4 +1,4 @@
-"""Regular files and directories: opened again at the same offset; what was only read must be the same file.
+"""Regular files, directories and paths (O_PATH): opened again at the same offset; what was only read must be the same file.
 
 Facts: ``descriptors``; ``path``; ``flags`` of open(2); ``offset`` and ``size`` in bytes, ``mode``, ``device``, ``inode`` and
 ``mtime_ns`` at the capture; ``digest``: blake3 of the content of a file that is open for reading only, b"" where it is longer
@@ -41,7 +41,7 @@ MEMORY_FILE: Final = "/memfd:"
 def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
     """What must be known to open it again."""
     first = held.first
-    if not (stat.S_ISREG(first.mode) or stat.S_ISDIR(first.mode)) or not first.target.startswith("/"):
+    if not is_file(first):
         return None
     facts: dict[str, Fact] = {
         "descriptors": held.numbers,
@@ -64,7 +64,7 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
 def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     """Why a file cannot be opened again."""
     first = held.first
-    if not (stat.S_ISREG(first.mode) or stat.S_ISDIR(first.mode)) or not first.target.startswith("/"):
+    if not is_file(first):
         return None
     what = f"{held.name} is {first.target}"
     if b"\nlock:" in first.told:
@@ -80,10 +80,16 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     return _refuse_deleted(held) if is_deleted(first) else None
 
 
+def is_file(one: Descriptor) -> bool:
+    """Whether it is a regular file, a directory, or only the path of something (O_PATH)."""
+    is_kind = stat.S_ISREG(one.mode) or stat.S_ISDIR(one.mode) or one.flags & O_PATH
+    return bool(is_kind) and one.target.startswith("/")
+
+
 def _refuse_deleted(held: OpenFile) -> str | None:
     first, what = held.first, f"{held.name} is {held.first.target}"
-    if stat.S_ISDIR(first.mode):
-        return f"{what}: a deleted directory cannot be opened again; let the program close it"
+    if not stat.S_ISREG(first.mode):
+        return f"{what}: a deleted directory, device or the like cannot be opened again; let the program close it"
     if first.links:
         return f"{what}, but it still has another name, which is not known: let the program open it under that name"
     if first.size > CONTENT_LIMIT:
@@ -105,7 +111,7 @@ def must_carry(held: OpenFile) -> bool:
 def _is_found(held: OpenFile) -> bool:
     """Whether its path leads to it, as the process sees paths."""
     try:
-        about = os.stat(f"/proc/{held.pid}/root{held.first.target}")
+        about = os.stat(f"/proc/{held.pid}/root{held.first.target}", follow_symlinks=not held.first.flags & O_PATH)
     except OSError:
         return False
     return (about.st_dev, about.st_ino) == (held.first.device, held.first.inode)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, Protocol
 
+from checkpoint.linux.descriptors import Descriptor
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import (
     OpenFile,
@@ -12,13 +13,18 @@ from checkpoint.resources import (
     devices,
     epolls,
     eventfds,
+    fifos,
     files,
     pipes,
     signalfds,
     streams,
     timerfds,
     unsupported,
+    watches,
 )
+
+Observer = Callable[[OpenFile, Sequence[OpenFile]], Mapping[str, Fact]]
+"""Given one open file, and all."""
 
 
 class Kind(Protocol):
@@ -33,11 +39,29 @@ class Kind(Protocol):
         """Why it cannot be kept."""
 
 
-ASKED: Final[tuple[Kind, ...]] = (streams, devices, files, pipes, eventfds, timerfds, signalfds, epolls, unsupported)
+ASKED: Final[tuple[Kind, ...]] = (
+    streams,
+    files,
+    devices,
+    pipes,
+    fifos,
+    eventfds,
+    timerfds,
+    signalfds,
+    epolls,
+    watches,
+    unsupported,
+)
 """The last one refuses whatever no other took."""
 
-OBSERVED: Final[Mapping[str, Callable[[OpenFile, Sequence[OpenFile]], Mapping[str, Fact]]]] = {
+_OBSERVED: Final[Mapping[str, Observer]] = {
     timerfds.TARGET: timerfds.observe,
     epolls.TARGET: epolls.observe,
+    watches.TARGET: watches.observe,
 }
-"""By the kernel's name for it: what only a process that stands still can tell. Given one open file, and all."""
+"""By the kernel's name for an open file."""
+
+
+def observer_of(one: Descriptor) -> Observer | None:
+    """What asks an open file for what only a process that stands still can tell."""
+    return fifos.observe if fifos.is_fifo(one) else _OBSERVED.get(one.target)

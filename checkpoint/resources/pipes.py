@@ -117,14 +117,19 @@ def look_into(held: OpenFile) -> tuple[int, bytes]:
         pipe = os.open(path, (os.O_RDONLY if reads else os.O_WRONLY) | os.O_NONBLOCK | os.O_CLOEXEC)
         try:
             capacity = fcntl.fcntl(pipe, F_GETPIPE_SZ)
-            return capacity, _copy_of(pipe, capacity) if reads else b""
+            return capacity, copy_of_content(pipe, capacity) if reads else b""
         finally:
             os.close(pipe)
     except OSError as error:
         raise CaptureError(f"cannot look into the pipe {path}: {error.strerror}; capture it again") from error
 
 
-def _copy_of(pipe: int, capacity: int) -> bytes:
+def copy_of_content(pipe: int, capacity: int) -> bytes:
+    """What is in a pipe, by its reading end; it stays there.
+
+    Raises:
+        OSError: somebody reads it meanwhile.
+    """
     waiting = array.array("i", [0])
     fcntl.ioctl(pipe, termios.FIONREAD, waiting)
     if not waiting[0]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import fcntl
 import os
 import stat
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -22,7 +22,19 @@ from checkpoint.engine import RestoreOptions
 from checkpoint.errors import RestoreError
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource, Snapshot
-from checkpoint.resources import devices, epolls, eventfds, files, pipes, signalfds, signalling, streams, timerfds
+from checkpoint.resources import (
+    devices,
+    epolls,
+    eventfds,
+    fifos,
+    files,
+    pipes,
+    signalfds,
+    signalling,
+    streams,
+    timerfds,
+    watches,
+)
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 REOPENED_FLAGS: Final = (
@@ -37,8 +49,15 @@ MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
     timerfds.KIND: timerfds.rebuild,
     signalfds.KIND: signalfds.rebuild,
     epolls.KIND: epolls.rebuild,
+    watches.KIND: watches.rebuild,
+    fifos.KIND: fifos.rebuild,
 }
 """Kinds that are made anew: each adds its calls and answers with a descriptor."""
+NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
+    fifos.KIND: fifos.mismatches,
+    watches.KIND: watches.mismatches,
+}
+"""Kinds that need something of this machine: why it does not have that, one sentence each."""
 KINDS: Final = (files.KIND, devices.KIND, streams.KIND, pipes.KIND, *MADE)
 
 
@@ -91,6 +110,13 @@ def _settle(table: CallTable, wanted: list[Wanted], holders: Mapping[int, int]) 
     for one in wanted:
         if one.resource.kind == epolls.KIND and holders[id(one.resource)] == one.number:
             epolls.settle(table, one.resource, one.number, marked, spare=wanted[-1].number + 1)
+
+
+def rebuild_last(table: CallTable, state: Snapshot) -> None:
+    """Add the calls that must come after everything else of a restore: what is watched would tell of it."""
+    for held in state.resources:
+        if held.kind == watches.KIND:
+            watches.settle(table, held, number_of(_pairs(held.facts["descriptors"])[0][0]))
 
 
 def descriptors_of(state: Snapshot) -> list[Wanted]:
@@ -147,7 +173,7 @@ def _duplicate(table: CallTable, holder: int, one: Wanted) -> None:
 def _open(table: CallTable, held: Resource, options: RestoreOptions) -> int:
     facts = held.facts
     path, flags = str(facts["path"]), number_of(facts["flags"])
-    descriptor = table.open(path, flags & (REOPENED_FLAGS | O_PATH))
+    descriptor = table.open(path, flags & (O_PATH | os.O_NOFOLLOW | os.O_DIRECTORY if flags & O_PATH else REOPENED_FLAGS))
     if held.kind == "files" and not flags & O_PATH:
         if path not in options.accept_changed and has_grown(held):
             size = number_of(facts["size"])

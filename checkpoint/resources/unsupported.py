@@ -27,7 +27,6 @@ _ADVICE: Final = (
 )
 
 ANONYMOUS_INODES: Final[Mapping[str, str]] = {
-    "inotify": "an inotify instance",
     "fanotify": "a fanotify group",
     "io_uring": "an io_uring",
     "userfaultfd": "a userfaultfd",

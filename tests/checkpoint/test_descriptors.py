@@ -5,12 +5,15 @@ One tracee for a family of kinds, one case for each thing that could be lost: se
 
 from __future__ import annotations
 
+import os
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from tests.checkpoint.round_trip import captured, captured_and_killed, ended, expect_ok, restored, start_tracee
+from checkpoint.errors import UnsupportedError
+from tests.checkpoint.round_trip import ENGINE, captured, captured_and_killed, ended, expect_ok, restored, start_tracee
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
@@ -25,6 +28,7 @@ CASES = {
         "timer_disarmed signalfd_waiting "
         "epoll_simple epoll_ready epoll_nested epoll_once epoll_edge epoll_exclusive epoll_renumbered epoll_waiting"
     ),
+    "path_descriptors": "inotify_directories inotify_gaps fifo_both fifo_reader path_only",
 }
 
 
@@ -42,3 +46,28 @@ def test_what_a_program_has_open_is_as_it_was_after_three_restores(
         captured(tracee)
         tracee.tell()
         expect_ok(tracee)
+
+
+def test_a_named_pipe_is_made_where_it_is_missing(compiled: Compiled, tmp_path: Path) -> None:
+    tracee = start_tracee(compiled("path_descriptors", "-O2"), tmp_path, "fifo_gone")
+    with ended(tracee):
+        snapshot = captured_and_killed(tracee)
+    (tmp_path / "pipe").unlink()
+    with ended(restored(snapshot, tmp_path)) as tracee:
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_a_named_pipe_that_somebody_else_has_open_is_refused(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("path_descriptors", "-O2"), tmp_path, "fifo_reader")) as tracee:
+        with open(tmp_path / "pipe", "wb"), subprocess.Popen(["cat", tmp_path / "pipe"]) as cat:
+            try:
+                tracee.wait_until(lambda: str(tmp_path / "pipe") in _targets(cat.pid), "the other reader")
+                with pytest.raises(UnsupportedError, match=f"pid {cat.pid}"):
+                    ENGINE.protect(tracee.pid, "/test/fifo", None)
+            finally:
+                cat.kill()
+
+
+def _targets(pid: int) -> list[str]:
+    return [os.readlink(one) for one in Path(f"/proc/{pid}/fd").iterdir()]

@@ -17,7 +17,6 @@
 #include <pty.h>
 #include <sys/fanotify.h>
 #include <sys/file.h>
-#include <sys/inotify.h>
 #include <sys/ioctl.h>
 #include <sys/pidfd.h>
 #include <sys/prctl.h>
@@ -131,11 +130,6 @@ static void take_pipe(void) {
     keep(ends[1], "a pipe");
 }
 
-static void take_fifo(void) {
-    mkfifo("fifo", 0600);
-    keep(open("fifo", O_RDWR), "a fifo");
-}
-
 static void take_unix_socket(void) {
     int ends[2];
     if (socketpair(AF_UNIX, SOCK_STREAM, 0, ends)) cannot("make sockets");
@@ -150,11 +144,6 @@ static void take_tcp_socket(void) {
 
 static void take_udp_socket(void) { keep(socket(AF_INET6, SOCK_DGRAM, 0), "a socket"); }
 static void take_netlink_socket(void) { keep(socket(AF_NETLINK, SOCK_RAW, 0), "a socket"); }
-
-static void take_inotify(void) {
-    keep(inotify_init(), "inotify");
-    inotify_add_watch(opened, ".", IN_CREATE);
-}
 
 static void take_fanotify(void) { keep(fanotify_init(FAN_CLASS_NOTIF, O_RDONLY), "fanotify"); }
 
@@ -346,12 +335,10 @@ static const struct kind {
              {"shared_files_child", take_shared_files_child},
              {"traced_child", take_traced_child},
              {"pipe", take_pipe},
-             {"fifo", take_fifo},
              {"unix_socket", take_unix_socket},
              {"tcp_socket", take_tcp_socket},
              {"udp_socket", take_udp_socket},
              {"netlink_socket", take_netlink_socket},
-             {"inotify", take_inotify},
              {"fanotify", take_fanotify},
              {"io_uring", take_io_uring},
              {"io_uring_mapped", take_io_uring_mapped},

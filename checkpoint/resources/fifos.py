@@ -1,0 +1,144 @@
+"""Named pipes that nobody else has open: opened again by name, with what is in them; made where they are missing.
+
+Facts: ``descriptors``; ``path``; ``flags`` of open(2); ``mode``; ``device`` and ``inode`` at the capture; ``capacity`` in bytes;
+``content``: the bytes in it, with one descriptor of each named pipe, b"" with the others.
+
+Source: fifo(7), tee(2).
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import stat
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
+
+from checkpoint.errors import CaptureError
+from checkpoint.linux.call_table import CallTable
+from checkpoint.linux.descriptors import Descriptor, copy_of
+from checkpoint.model import Fact, Resource
+from checkpoint.resources import OpenFile, Surroundings, elsewhere, pipes
+from checkpoint.resources.rebuilding import Rebuilding, number_of
+
+KIND: Final = "fifos"
+O_PATH: Final = 0o10000000
+_AT_FDCWD: Final = -100
+
+
+def is_fifo(one: Descriptor) -> bool:
+    """Whether a descriptor is an open named pipe."""
+    return stat.S_ISFIFO(one.mode) and one.target.startswith("/") and not one.flags & O_PATH
+
+
+def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
+    """Its capacity, and what is in it if this is the one that tells; it stays there.
+
+    Raises:
+        CaptureError: it cannot be looked into.
+    """
+    try:
+        with copy_of(held.pid, held.first.number) as descriptor:
+            capacity = fcntl.fcntl(descriptor, pipes.F_GETPIPE_SZ)
+            content = _content(held, descriptor, capacity) if _tells(held, opened) else b""
+    except OSError as error:
+        raise CaptureError(f"cannot look into the named pipe {held.first.target}: {error.strerror}; try again") from error
+    return {"capacity": capacity, "content": content}
+
+
+def _tells(held: OpenFile, opened: Sequence[OpenFile]) -> bool:
+    """Whether this open file is the first of its named pipe that can be read, or the first of all if none can."""
+    same = [one for one in opened if (one.first.device, one.first.inode) == (held.first.device, held.first.inode)]
+    return held is next((one for one in same if _reads(one.first)), same[0])
+
+
+def _reads(one: Descriptor) -> bool:
+    return one.flags & os.O_ACCMODE != os.O_WRONLY
+
+
+def _content(held: OpenFile, descriptor: int, capacity: int) -> bytes:
+    if _reads(held.first):
+        return pipes.copy_of_content(descriptor, capacity)
+    reader = os.open(f"/proc/{held.pid}/fd/{held.first.number}", os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        return pipes.copy_of_content(reader, capacity)
+    finally:
+        os.close(reader)
+
+
+def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
+    """One open named pipe."""
+    first = held.first
+    if not is_fifo(first):
+        return None
+    facts: dict[str, Fact] = {
+        "descriptors": held.numbers,
+        "path": first.target,
+        "flags": first.flags & ~os.O_CLOEXEC,
+        "mode": first.mode,
+        "device": first.device,
+        "inode": first.inode,
+        **held.observed,
+    }
+    return Resource(KIND, held.name, facts)
+
+
+def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
+    """Why a named pipe cannot be kept."""
+    first = held.first
+    if not is_fifo(first):
+        return None
+    what = f"{held.name} is the named pipe {first.target}"
+    if not _leads_there(held):
+        return f"{what}, whose name is gone: let the program open it by a name that stays"
+    if other := elsewhere.opener_of(held):
+        return f"{what}, which pid {other} has open too: protect the program when that has closed it"
+    return None
+
+
+def _leads_there(held: OpenFile) -> bool:
+    try:
+        about = os.stat(f"/proc/{held.pid}/root{held.first.target}")
+    except OSError:
+        return False
+    return (about.st_dev, about.st_ino) == (held.first.device, held.first.inode)
+
+
+def mismatches(held: Resource) -> Iterator[str]:
+    """Why it could not be opened here: something else has its name, or there is no place for it."""
+    path = str(held.facts["path"])
+    if os.path.lexists(path):
+        if not stat.S_ISFIFO(os.stat(path).st_mode):
+            yield f"{path}, open as {held.name}, is no named pipe here: remove it"
+    elif not os.path.isdir(os.path.dirname(path)):
+        yield f"the directory of the named pipe {path}, open as {held.name}, is missing here: make it"
+
+
+def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
+    """Open it as it was, without waiting for somebody at its other end, and fill it."""
+    path, flags, content = str(held.facts["path"]), number_of(held.facts["flags"]), held.facts["content"]
+    if not os.path.lexists(path):
+        _make(table, path, number_of(held.facts["mode"]))
+    assert isinstance(content, bytes)
+    if not content and flags & os.O_ACCMODE == os.O_RDONLY:
+        # Whoever reads and has never seen a writer waits; opened beside a writer of ours it would be told that he hung up.
+        made = table.open(path, flags | os.O_NONBLOCK)
+        if not flags & os.O_NONBLOCK:
+            table.call(f"set the flags of {held.name}", "fcntl", made, fcntl.F_SETFL, 0)
+        return made
+    both = table.open(path, os.O_RDWR)
+    made = table.open(path, flags)
+    capacity = number_of(held.facts["capacity"])
+    if capacity != pipes.DEFAULT_CAPACITY:
+        table.call(f"size the named pipe {path}", "fcntl", made, pipes.F_SETPIPE_SZ, capacity, least=capacity)
+    if content:
+        size = len(content)
+        table.call(f"fill the named pipe {path}", "write", both, table.place(content), size, least=size, most=size)
+    table.close(both)
+    return made
+
+
+def _make(table: CallTable, path: str, mode: int) -> None:
+    place = table.place_path(path)
+    table.attempt("", "mknodat", _AT_FDCWD, place, stat.S_IFIFO | mode & 0o7777, 0)  # two descriptors of it make it once
+    table.attempt("", "fchmodat", _AT_FDCWD, place, mode & 0o7777)
