@@ -64,6 +64,7 @@ Needs no stack. Each call is ten little-endian words: number, six arguments, res
 CALL: Final = struct.Struct("<7Q3q")
 
 SYSTEM_CALLS: Final = {
+    "accept4": 288,
     "arch_prctl": 158,
     "bind": 49,
     "capset": 126,

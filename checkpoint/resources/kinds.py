@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, Protocol
 
+from checkpoint.errors import CaptureError
 from checkpoint.linux.descriptors import Descriptor
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import (
@@ -15,10 +17,13 @@ from checkpoint.resources import (
     eventfds,
     fifos,
     files,
+    internet_sockets,
     pipes,
     signalfds,
+    sockets,
     streams,
     timerfds,
+    unix_sockets,
     unsupported,
     watches,
 )
@@ -50,6 +55,8 @@ ASKED: Final[tuple[Kind, ...]] = (
     signalfds,
     epolls,
     watches,
+    unix_sockets,
+    internet_sockets,
     unsupported,
 )
 """The last one refuses whatever no other took."""
@@ -64,4 +71,23 @@ _OBSERVED: Final[Mapping[str, Observer]] = {
 
 def observer_of(one: Descriptor) -> Observer | None:
     """What asks an open file for what only a process that stands still can tell."""
+    if sockets.is_socket(one):
+        return _observe_socket
     return fifos.observe if fifos.is_fifo(one) else _OBSERVED.get(one.target)
+
+
+def _observe_socket(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
+    """A socket of a family that is kept; nothing of another.
+
+    Raises:
+        CaptureError: it cannot be looked into.
+    """
+    try:
+        with sockets.looked_into(held.pid, held.first.number) as looked:
+            if looked.family == socket.AF_UNIX:
+                return unix_sockets.observe(held, looked, opened)
+            if looked.family in internet_sockets.FAMILIES and looked.proto in internet_sockets.PROTOCOLS:
+                return internet_sockets.observe(held, looked)
+    except OSError as error:
+        raise CaptureError(f"cannot look into the socket {held.name} of pid {held.pid}: {error.strerror}; try again") from error
+    return {}

@@ -28,11 +28,13 @@ from checkpoint.resources import (
     eventfds,
     fifos,
     files,
+    internet_sockets,
     pipes,
     signalfds,
     signalling,
     streams,
     timerfds,
+    unix_sockets,
     watches,
 )
 from checkpoint.resources.rebuilding import Rebuilding, number_of
@@ -56,9 +58,12 @@ MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
 NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
     fifos.KIND: fifos.mismatches,
     watches.KIND: watches.mismatches,
+    unix_sockets.KIND: unix_sockets.mismatches,
+    internet_sockets.KIND: internet_sockets.mismatches,
 }
 """Kinds that need something of this machine: why it does not have that, one sentence each."""
-KINDS: Final = (files.KIND, devices.KIND, streams.KIND, pipes.KIND, *MADE)
+SOCKETS: Final = (unix_sockets.KIND, internet_sockets.KIND)
+KINDS: Final = (files.KIND, devices.KIND, streams.KIND, pipes.KIND, *MADE, *SOCKETS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,19 +94,31 @@ def rebuild_all(table: CallTable, state: Snapshot, options: RestoreOptions, inne
         return ()
     moved = _move_streams_away(table, wanted[-1].number + 1)
     piped = pipes.rebuild(table, [held for held in state.resources if held.kind == pipes.KIND], moved[-1] + 1)
+    connected = _prepare_sockets(table, state, moved[-1] + 1 + len(piped))
     rebuilding = Rebuilding(options, state.clocks, inner_pid)
     holders: dict[int, int] = {}  # which number already stands for an open file description
     for one in wanted:
         if id(one.resource) in holders:
             _duplicate(table, holders[id(one.resource)], one)
         else:
-            _obtain(table, one, moved, piped, rebuilding)
+            _obtain(table, one, moved, piped, connected, rebuilding)
             holders[id(one.resource)] = one.number
             signalling.rebuild(table, one.number, one.resource, inner_pid)
-    for number in (*moved, *piped.values()):
+    for number in (*moved, *piped.values(), *connected.values()):
         table.close(number)
     _settle(table, wanted, holders)
     return ()
+
+
+def _prepare_sockets(table: CallTable, state: Snapshot, first: int) -> dict[int, int]:
+    """Make all sockets at numbers from ``first`` on, in the working directory: names may be relative to it."""
+    of_unix = [held for held in state.resources if held.kind == unix_sockets.KIND]
+    of_internet = [held for held in state.resources if held.kind == internet_sockets.KIND]
+    if of_unix:
+        directory = state.process.working_directory
+        table.call(f"enter the working directory {directory}", "chdir", table.place_path(directory))
+    made = unix_sockets.prepare(table, of_unix, first)
+    return made | internet_sockets.prepare(table, of_internet, first + len(made) + 1)
 
 
 def _settle(table: CallTable, wanted: list[Wanted], holders: Mapping[int, int]) -> None:
@@ -143,12 +160,20 @@ def _move_streams_away(table: CallTable, first: int) -> tuple[int, ...]:
 
 
 def _obtain(
-    table: CallTable, one: Wanted, moved: tuple[int, ...], piped: dict[tuple[int, int], int], rebuilding: Rebuilding
+    table: CallTable,
+    one: Wanted,
+    moved: tuple[int, ...],
+    piped: dict[tuple[int, int], int],
+    connected: Mapping[int, int],
+    rebuilding: Rebuilding,
 ) -> None:
     """The first descriptor of an open file description."""
     facts = one.resource.facts
     if one.resource.kind == pipes.KIND:
         _duplicate(table, piped[number_of(facts["pipe"]), number_of(facts["end"])], one)
+        return
+    if one.resource.kind in SOCKETS:
+        _duplicate(table, connected[number_of(facts["socket"])], one)
         return
     if one.resource.kind == "streams":
         table.duplicate(moved[number_of(facts["stream"])], one.number, os.O_CLOEXEC if one.close_on_exec else 0)

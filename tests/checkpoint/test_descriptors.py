@@ -6,14 +6,16 @@ One tracee for a family of kinds, one case for each thing that could be lost: se
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from checkpoint.errors import UnsupportedError
-from tests.checkpoint.round_trip import ENGINE, captured, captured_and_killed, ended, expect_ok, restored, start_tracee
+from checkpoint.errors import CheckpointError, UnsupportedError
+from tests.checkpoint.round_trip import ENGINE, captured, captured_and_killed, ended, expect_ok, restored, start, start_tracee
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
@@ -29,6 +31,11 @@ CASES = {
         "epoll_simple epoll_ready epoll_nested epoll_once epoll_edge epoll_exclusive epoll_renumbered epoll_waiting"
     ),
     "path_descriptors": "inotify_directories inotify_gaps fifo_both fifo_reader path_only",
+    "sockets": (
+        "pair_stream pair_datagram pair_packets pair_much pair_options pair_half_closed pair_orphan listener_path "
+        "listener_abstract unix_with_itself unix_datagrams unix_fresh tcp_listener_4 tcp_listener_6 tcp_fresh udp_queue "
+        "udp_options udp_group"
+    ),
 }
 
 
@@ -71,3 +78,31 @@ def test_a_named_pipe_that_somebody_else_has_open_is_refused(compiled: Compiled,
 
 def _targets(pid: int) -> list[str]:
     return [os.readlink(one) for one in Path(f"/proc/{pid}/fd").iterdir()]
+
+
+def test_a_unix_socket_that_leads_to_another_process_is_refused(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(tmp_path / "ours"))
+        listener.listen()
+        connects = "import socket, sys, time; s = socket.socket(socket.AF_UNIX); s.connect('ours'); print('ready', flush=True)\n"
+        with ended(start([sys.executable, "-c", connects + "time.sleep(600)"], tmp_path)) as program:
+            program.wait_for_line("ready")
+            with pytest.raises(UnsupportedError, match="another process"):
+                ENGINE.protect(program.pid, "/test/waiting", None)
+            accepted, _ = listener.accept()
+            with accepted, pytest.raises(UnsupportedError, match="another process"):
+                ENGINE.protect(program.pid, "/test/connected", None)
+
+
+def test_a_listener_whose_name_another_process_has_taken_is_refused_by_name(compiled: Compiled, tmp_path: Path) -> None:
+    tracee = start_tracee(compiled("sockets", "-O2"), tmp_path, "listener_path")
+    with ended(tracee):
+        snapshot = captured_and_killed(tracee)
+    (tmp_path / "listens.sock").unlink()
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(tmp_path / "listens.sock"))
+        listener.listen()
+        names = [held.facts.get("name") for held in snapshot.resources]
+        assert b"listens.sock\0" in names or b"listens.sock" in names
+        with pytest.raises(CheckpointError, match=r"listens\.sock"):
+            restored(snapshot, tmp_path)

@@ -30,12 +30,12 @@ while True:
     number += 1
     time.sleep(0.01)
     if os.path.exists(flag) and held is None:
-        held = socket.socket() if kind == "socket" else Child()
+        held = socket.socket(socket.AF_NETLINK, socket.SOCK_RAW) if kind == "socket" else Child()
     elif held is not None and not os.path.exists(flag):
         held.close()
         held = None
 """
-"""Counts, and holds a socket, or has a child, for as long as a file exists."""
+"""Counts, and holds a socket of a family that is not kept, or has a child, for as long as a file exists."""
 
 STOPPING = '[components."/demo/robot1/count"]\non_unsupported = "stop_protecting"\n'
 

@@ -130,19 +130,37 @@ static void take_pipe(void) {
     keep(ends[1], "a pipe");
 }
 
-static void take_unix_socket(void) {
-    int ends[2];
-    if (socketpair(AF_UNIX, SOCK_STREAM, 0, ends)) cannot("make sockets");
-    keep(ends[0], "a socket");
-}
-
-static void take_tcp_socket(void) {
-    keep(socket(AF_INET, SOCK_STREAM, 0), "a socket");
+static void take_tcp_connection(void) {
     struct sockaddr_in address = {.sin_family = AF_INET, .sin_addr = {htonl(INADDR_LOOPBACK)}};
-    if (bind(opened, (struct sockaddr *)&address, sizeof address) || listen(opened, 1)) cannot("listen");
+    socklen_t size = sizeof address;
+    int listens = socket(AF_INET, SOCK_STREAM, 0);
+    if (bind(listens, (struct sockaddr *)&address, size) || listen(listens, 1)) cannot("listen");
+    getsockname(listens, (struct sockaddr *)&address, &size);
+    keep(socket(AF_INET, SOCK_STREAM, 0), "a socket");
+    if (connect(opened, (struct sockaddr *)&address, size)) cannot("connect");
+    accept(listens, NULL, NULL);
 }
 
-static void take_udp_socket(void) { keep(socket(AF_INET6, SOCK_DGRAM, 0), "a socket"); }
+static void take_unix_rights(void) {
+    int ends[2];
+    char byte = 0, room[CMSG_SPACE(sizeof(int))] = {0};
+    if (socketpair(AF_UNIX, SOCK_STREAM, 0, ends)) cannot("make sockets");
+    struct iovec content = {&byte, 1};
+    struct msghdr message = {.msg_iov = &content, .msg_iovlen = 1, .msg_control = room, .msg_controllen = sizeof room};
+    struct cmsghdr *rights = CMSG_FIRSTHDR(&message);
+    rights->cmsg_level = SOL_SOCKET, rights->cmsg_type = SCM_RIGHTS, rights->cmsg_len = CMSG_LEN(sizeof(int));
+    memcpy(CMSG_DATA(rights), &ends[0], sizeof(int));
+    if (sendmsg(ends[0], &message, 0) != 1) cannot("send a descriptor");
+    keep(ends[1], "a socket");
+}
+
+static void take_unix_waiting(void) {
+    struct sockaddr_un address = {.sun_family = AF_UNIX, .sun_path = "waiting.sock"};
+    keep(socket(AF_UNIX, SOCK_STREAM, 0), "a socket");
+    if (bind(opened, (struct sockaddr *)&address, sizeof address) || listen(opened, 1)) cannot("listen");
+    if (connect(socket(AF_UNIX, SOCK_STREAM, 0), (struct sockaddr *)&address, sizeof address)) cannot("connect");
+}
+
 static void take_netlink_socket(void) { keep(socket(AF_NETLINK, SOCK_RAW, 0), "a socket"); }
 
 static void take_fanotify(void) { keep(fanotify_init(FAN_CLASS_NOTIF, O_RDONLY), "fanotify"); }
@@ -335,9 +353,9 @@ static const struct kind {
              {"shared_files_child", take_shared_files_child},
              {"traced_child", take_traced_child},
              {"pipe", take_pipe},
-             {"unix_socket", take_unix_socket},
-             {"tcp_socket", take_tcp_socket},
-             {"udp_socket", take_udp_socket},
+             {"unix_rights", take_unix_rights},
+             {"tcp_connection", take_tcp_connection},
+             {"unix_waiting", take_unix_waiting},
              {"netlink_socket", take_netlink_socket},
              {"fanotify", take_fanotify},
              {"io_uring", take_io_uring},

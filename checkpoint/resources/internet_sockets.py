@@ -1,0 +1,300 @@
+"""Sockets of TCP and UDP: listeners, sockets for datagrams with their groups, and those that are not connected yet.
+
+A socket is bound to the same address again. Datagrams that wait come back where their sender's address is this machine's own;
+others are lost, as the network may lose them. A TCP connection is refused: it has another end, which knows its numbers.
+
+Facts besides those of every socket: ``state`` of tcp(7), `CLOSED` for UDP; ``address`` and ``peer``: [host, port] or [host, port,
+flow, scope], empty if there is none; ``backlog``; ``waiting``: connections not accepted yet; ``sources``: addresses from which
+what is in the queue came; ``groups``: a list of [interface, group, filter as MCAST_MSFILTER takes it].
+
+Source: tcp(7), udp(7), ip(7); linux/in.h for group_filter.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import socket
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
+
+from checkpoint.linux import procfs
+from checkpoint.linux.call_table import CallTable
+from checkpoint.model import Fact, Resource
+from checkpoint.resources import OpenFile, Surroundings, elsewhere, sockets
+from checkpoint.resources.rebuilding import number_of
+
+KIND: Final = "internet_sockets"
+FAMILIES: Final = (socket.AF_INET, socket.AF_INET6)
+PROTOCOLS: Final = (socket.IPPROTO_TCP, socket.IPPROTO_UDP)
+
+ESTABLISHED: Final = 1
+CLOSED: Final = 7
+LISTENING: Final = 10
+_TCP_INFO: Final = struct.Struct("<B7x4I2I")
+MCAST_JOIN_GROUP: Final = 42
+MCAST_MSFILTER: Final = 48
+IP_FREEBIND: Final = 15
+EXCLUDE: Final = 0
+_FILTER: Final = struct.Struct("<I4x128sII")
+"""struct group_filter without its sources: interface, group, mode, number of sources."""
+SOURCES_MAX: Final = 64
+ADDRESS_SIZE: Final = 128
+"""Bytes of struct sockaddr_storage."""
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def observe(held: OpenFile, looked: socket.socket) -> dict[str, Fact]:
+    """Its state, its addresses and what waits in it.
+
+    Raises:
+        OSError: it cannot be looked into.
+    """
+    facts = sockets.common_facts(held.first, looked)
+    state, waiting, backlog = CLOSED, 0, 0
+    if looked.proto == socket.IPPROTO_TCP:
+        state, *_, waiting, backlog = _TCP_INFO.unpack(looked.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size))
+    is_datagram = looked.proto == socket.IPPROTO_UDP
+    messages, sources = sockets.datagrams_of(looked) if is_datagram else ((), ())
+    return facts | {
+        "state": state,
+        "address": _bound(looked.getsockname()),
+        "peer": _peer(looked),
+        "backlog": backlog if state == LISTENING else 0,
+        "waiting": waiting if state == LISTENING else 0,
+        "queue": list(messages),
+        "sources": [list(source) for source in sources],
+        "groups": list(_groups(held.pid, looked)) if is_datagram else [],
+    }
+
+
+def _bound(address: Sequence[Fact]) -> list[Fact]:
+    """An address that the socket was bound to; empty if it was not."""
+    return list(address) if address[1] else []
+
+
+def _in_words(address: Sequence[Fact]) -> str:
+    return f"{address[0]!s} port {address[1]!s}"
+
+
+def _peer(looked: socket.socket) -> list[Fact]:
+    try:
+        return list(looked.getpeername())
+    except OSError:
+        return []
+
+
+def _groups(pid: int, looked: socket.socket) -> Iterator[list[Fact]]:
+    """The multicast groups that a socket has joined: every group of this machine is asked for."""
+    level = socket.IPPROTO_IP if looked.family == socket.AF_INET else socket.IPPROTO_IPV6
+    for interface, group in _machine_groups(pid, looked.family):
+        packed = bytearray(
+            _FILTER.pack(interface, sockaddr([group, 0, 0, 0]), 0, SOURCES_MAX) + bytes(ADDRESS_SIZE * SOURCES_MAX)
+        )
+        size = ctypes.c_uint32(len(packed))
+        buffer = (ctypes.c_char * len(packed)).from_buffer(packed)
+        if _libc.getsockopt(looked.fileno(), level, MCAST_MSFILTER, buffer, ctypes.byref(size)) == 0:
+            count = _FILTER.unpack_from(packed)[3]
+            with contextlib.suppress(OSError):  # the interface has just gone
+                yield [socket.if_indextoname(interface), group, bytes(packed[: _FILTER.size + ADDRESS_SIZE * count])]
+
+
+def _machine_groups(pid: int, family: int) -> Iterator[tuple[int, str]]:
+    """(interface, group) of all groups that anybody on this machine has joined. Source: proc_pid_net(5)."""
+    if family == socket.AF_INET6:
+        for line in procfs.read_text(pid, "net/igmp6").splitlines():
+            words = line.split()
+            yield int(words[0]), socket.inet_ntop(socket.AF_INET6, bytes.fromhex(words[2]))
+        return
+    interface = 0
+    for line in procfs.read_text(pid, "net/igmp").splitlines()[1:]:
+        words = line.split()
+        if not line.startswith("\t"):
+            interface = int(words[0])
+        else:
+            yield interface, socket.inet_ntoa(bytes.fromhex(words[0])[::-1])
+
+
+def sockaddr(address: Sequence[Fact]) -> bytes:
+    """An address as bind(2) takes it, 128 bytes."""
+    host, port = str(address[0]), number_of(address[1])
+    if ":" not in host:
+        return struct.pack("<H", socket.AF_INET) + (struct.pack(">H", port) + socket.inet_aton(host)).ljust(126, b"\0")
+    scope = number_of(address[3]) if len(address) > 3 else 0
+    flow = number_of(address[2]) if len(address) > 2 else 0
+    packed = struct.pack(">HI", port, flow) + socket.inet_pton(socket.AF_INET6, host.partition("%")[0])
+    return struct.pack("<H", socket.AF_INET6) + (packed + struct.pack("<I", scope)).ljust(126, b"\0")
+
+
+def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
+    """The socket as it was observed."""
+    if not _is_mine(held):
+        return None
+    facts: dict[str, Fact] = {"descriptors": held.numbers, "flags": held.first.flags & ~os.O_CLOEXEC, **held.observed}
+    return Resource(KIND, held.name, facts)
+
+
+def _is_mine(held: OpenFile) -> bool:
+    seen = held.observed
+    return seen.get("family") in FAMILIES and seen.get("protocol") in PROTOCOLS
+
+
+def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
+    """Why a socket of TCP or UDP cannot be kept."""
+    if not _is_mine(held):
+        return None
+    seen = held.observed
+    name = {socket.IPPROTO_TCP: "a TCP socket", socket.IPPROTO_UDP: "a UDP socket"}[number_of(seen["protocol"])]
+    if seen["state"] == LISTENING and seen["waiting"]:
+        return f"{held.name} is {name} where a connection waits to be accepted: it is kept as soon as the program has accepted it"
+    if seen["state"] not in (CLOSED, LISTENING):
+        peer = seen["peer"]
+        assert isinstance(peer, list)
+        other = f" with {_in_words(peer)}" if peer else ""
+        return (
+            f"{held.name} is a TCP connection{other}, which is not kept yet: protect the program while it has none, or let it "
+            "keep its state itself (docs/decorator.md)"
+        )
+    return elsewhere.refuse(held, name)
+
+
+def mismatches(held: Resource) -> Iterator[str]:
+    """Why its address could not be had here."""
+    address = held.facts["address"]
+    assert isinstance(address, list)
+    if address and not _has_option(held, socket.IPPROTO_IP, IP_FREEBIND) and not is_ours(address):
+        yield (
+            f"{held.name} is bound to {_in_words(address)}, and this machine does not have that address: give it to one of its "
+            "interfaces, or let the program bind to all (0.0.0.0 or ::)"
+        )
+    for interface, group, _ in _joined(held):
+        if interface not in (name for _, name in socket.if_nameindex()):
+            yield f"{held.name} has joined the group {group} at interface {interface}, which is missing here: rename or add it"
+
+
+def _has_option(held: Resource, level: int, number: int) -> bool:
+    options = held.facts["options"]
+    assert isinstance(options, list)
+    return any(isinstance(one, list) and one[:2] == [level, number] for one in options)
+
+
+def is_ours(address: Sequence[Fact]) -> bool:
+    """Whether a socket can be bound to the address on this machine, at some port."""
+    family = socket.AF_INET6 if ":" in str(address[0]) else socket.AF_INET
+    if family == socket.AF_INET and socket.inet_aton(str(address[0]))[0] in range(224, 240):
+        return True
+    with socket.socket(family, socket.SOCK_DGRAM) as tried:
+        try:
+            tried.bind((str(address[0]), 0, *address[2:]))
+        except OSError:
+            return False
+    return True
+
+
+def _joined(held: Resource) -> Iterator[tuple[str, str, bytes]]:
+    groups = held.facts["groups"]
+    assert isinstance(groups, list)
+    for one in groups:
+        assert isinstance(one, list) and isinstance(one[2], bytes)
+        yield str(one[0]), str(one[1]), one[2]
+
+
+# --- Restore -----------------------------------------------------------------------------------------------------------
+
+
+def prepare(table: CallTable, held: Sequence[Resource], first: int) -> dict[int, int]:
+    """Make all of them at numbers from ``first`` on: the descriptor of each, by the socket's number in the snapshot."""
+    made: dict[int, int] = {}
+    for one in held:
+        opened = sockets.make(table, one)
+        place = first + len(made)
+        made[number_of(one.facts["socket"])] = place
+        table.duplicate(opened, place, os.O_CLOEXEC)
+        table.close(opened)
+    for one in held:
+        _place(table, one, made[number_of(one.facts["socket"])])
+    for one in held:
+        _send_again(table, one, held, made)
+    for one in held:
+        number, peer = made[number_of(one.facts["socket"])], one.facts["peer"]
+        assert isinstance(peer, list)
+        if peer:
+            what = f"{one.name} is not connected to {_in_words(peer)}, where no way leads from here"
+            table.attempt(what, "connect", number, table.place(sockaddr(peer)), _size(peer))
+        sockets.set_flags(table, one, number)
+    return made
+
+
+def _size(address: Sequence[Fact]) -> int:
+    return 28 if ":" in str(address[0]) else 16
+
+
+def _place(table: CallTable, one: Resource, made: int) -> None:
+    """Bind it, let it listen, join its groups."""
+    address = one.facts["address"]
+    assert isinstance(address, list)
+    if address:
+        what = f"bind {one.name} to {_in_words(address)}"
+        table.call(what, "bind", made, table.place(sockaddr(address)), _size(address))
+    if number_of(one.facts["state"]) == LISTENING:
+        table.call(f"listen at {one.name}", "listen", made, number_of(one.facts["backlog"]))
+    for interface, group, packed in _joined(one):
+        index = socket.if_nametoindex(interface)
+        level = socket.IPPROTO_IPV6 if ":" in group else socket.IPPROTO_IP
+        request = struct.pack("<I4x", index) + sockaddr([group, 0, 0, 0])
+        what = f"let {one.name} join the group {group} at {interface}"
+        table.call(what, "setsockopt", made, level, MCAST_JOIN_GROUP, table.place(request), len(request))
+        _, _, mode, count = _FILTER.unpack_from(packed)
+        if mode != EXCLUDE or count:
+            request = struct.pack("<I", index) + packed[4:]
+            table.call(what, "setsockopt", made, level, MCAST_MSFILTER, table.place(request), len(request))
+
+
+def _send_again(table: CallTable, one: Resource, held: Sequence[Resource], made: Mapping[int, int]) -> None:
+    """Send the datagrams that waited, each from the address that it came from, if that is this machine's."""
+    messages, sources, address = one.facts["queue"], one.facts["sources"], one.facts["address"]
+    assert isinstance(messages, list) and isinstance(sources, list) and isinstance(address, list)
+    if not address:
+        return
+    target = _reachable(address)
+    ours = {
+        tuple(bound): made[number_of(each.facts["socket"])]
+        for each in held
+        if isinstance(bound := each.facts["address"], list) and bound
+    }
+    for message, source in zip(messages, sources, strict=True):
+        assert isinstance(message, bytes) and isinstance(source, list)
+        sender = ours.get(tuple(source))
+        if sender is None and not _is_free(source):
+            continue
+        lent = sender if sender is not None else _sender(table, one, source)
+        arguments = (lent, table.place(message), len(message), socket.MSG_DONTWAIT, table.place(sockaddr(target)), _size(target))
+        table.attempt(f"a datagram that waited in {one.name} is lost", "sendto", *arguments)
+        if sender is None:
+            table.close(lent)
+
+
+def _reachable(address: list[Fact]) -> list[Fact]:
+    """Where to send to what is bound to an address: itself, if that is all of this machine's."""
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(str(address[0]), address[0])
+    return [host, *address[1:]]
+
+
+def _is_free(source: Sequence[Fact]) -> bool:
+    family = socket.AF_INET6 if ":" in str(source[0]) else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as tried:
+        try:
+            tried.bind(tuple(source))
+        except (OSError, OverflowError):
+            return False
+    return True
+
+
+def _sender(table: CallTable, one: Resource, source: list[Fact]) -> int:
+    family = socket.AF_INET6 if ":" in str(source[0]) else socket.AF_INET
+    made = table.obtain(f"make a sender for {one.name}", "socket", family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC, 0)
+    table.call(f"bind a sender for {one.name}", "bind", made, table.place(sockaddr(source)), _size(source))
+    return made

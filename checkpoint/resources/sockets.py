@@ -1,0 +1,255 @@
+"""What all sockets have in common: their family and kind, options, and what waits in them to be read.
+
+Facts of every socket: ``descriptors``; ``flags`` of fcntl(2); ``socket``: its inode number, by which others refer to it;
+``family``, ``type`` and ``protocol`` of socket(2); ``options``: a list of [level, number, value] of those that are not as in a
+fresh socket; ``queue``: what waits to be read, a list of messages, of a stream the pieces in which it was found.
+
+A datagram of no bytes that waits is lost by the second capture after it came: it cannot be looked at twice.
+
+Source: socket(7), ip(7), ipv6(7), tcp(7), udp(7).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import socket
+import stat
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+from checkpoint.linux.call_table import CallTable
+from checkpoint.linux.descriptors import Descriptor, copy_of
+from checkpoint.model import Fact, Resource
+from checkpoint.resources.rebuilding import number_of
+
+QUEUE_LIMIT: Final = 4 << 20
+"""Bytes that wait in one socket and are carried."""
+MESSAGES_MAX: Final = 65536
+PIECE_SIZE: Final = 1 << 18
+"""Bytes that are looked at in one go: more than any datagram has."""
+RIGHTS_SPACE: Final = socket.CMSG_SPACE(253 * 4)
+"""Room for as many descriptors as one message may carry (SCM_MAX_FD)."""
+OPTION_SIZE: Final = 64
+"""Bytes of the longest option that is kept."""
+
+SO_PEEK_OFF: Final = 42
+_GENERAL: Final = (2, 5, 6, 9, 10, 11, 12, 13, 15, 16, 18, 20, 21, 25, 29, 34, 35, 36, 37, 40, SO_PEEK_OFF, 46, 60, 69)
+"""SO_REUSEADDR, DONTROUTE, BROADCAST, KEEPALIVE, OOBINLINE, NO_CHECK, PRIORITY, LINGER, REUSEPORT, PASSCRED, RCVLOWAT, RCVTIMEO,
+SNDTIMEO, BINDTODEVICE, TIMESTAMP, PASSSEC, TIMESTAMPNS, MARK, TIMESTAMPING, RXQ_OVFL, PEEK_OFF, BUSY_POLL, ZEROCOPY,
+PREFER_BUSY_POLL."""
+_BUFFERS: Final = {socket.SO_SNDBUF: 1, socket.SO_RCVBUF: 2}
+"""Which bit of SO_BUF_LOCK says that the program has set it; else the kernel chooses. It doubles what it is told."""
+SO_BUF_LOCK: Final = 72
+_FORCED: Final = {socket.SO_SNDBUF: 32, socket.SO_RCVBUF: 33}
+"""SO_SNDBUFFORCE and SO_RCVBUFFORCE."""
+_IP: Final = (1, 2, 8, 10, 11, 12, 13, 15, 19, 20, 21, 32, 33, 34, 49, 50)
+"""IP_TOS, TTL, PKTINFO, MTU_DISCOVER, RECVERR, RECVTTL, RECVTOS, FREEBIND, TRANSPARENT, ORIGDSTADDR, MINTTL, MULTICAST_IF,
+MULTICAST_TTL, MULTICAST_LOOP, MULTICAST_ALL, UNICAST_IF."""
+_IPV6: Final = (16, 17, 18, 19, 23, 25, 26, 29, 49, 51, 66, 67, 70, 78)
+"""IPV6_UNICAST_HOPS, MULTICAST_IF, MULTICAST_HOPS, MULTICAST_LOOP, MTU_DISCOVER, RECVERR, V6ONLY, MULTICAST_ALL, RECVPKTINFO,
+RECVHOPLIMIT, RECVTCLASS, TCLASS, AUTOFLOWLABEL, FREEBIND."""
+_TCP: Final = (1, 3, 4, 5, 6, 7, 8, 9, 10, 13, 18, 23, 25, 37)
+"""TCP_NODELAY, CORK, KEEPIDLE, KEEPINTVL, KEEPCNT, SYNCNT, LINGER2, DEFER_ACCEPT, WINDOW_CLAMP, CONGESTION, USER_TIMEOUT,
+FASTOPEN, NOTSENT_LOWAT, TX_DELAY."""
+_UDP: Final = (1, 101, 102, 103, 104)
+"""UDP_CORK, NO_CHECK6_TX, NO_CHECK6_RX, SEGMENT, GRO."""
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """What socket(2) was told."""
+
+    family: int
+    type: int
+    protocol: int
+
+
+@dataclass(frozen=True, slots=True)
+class Queue:
+    """What waits to be read.
+
+    Attributes:
+        rights: descriptors are on their way in one of the messages.
+        too_long: more than `QUEUE_LIMIT` bytes.
+    """
+
+    messages: tuple[bytes, ...]
+    sources: tuple[bytes, ...]
+    rights: bool
+    too_long: bool
+
+
+def is_socket(one: Descriptor) -> bool:
+    """Whether a descriptor is a socket."""
+    return stat.S_ISSOCK(one.mode) and one.target.startswith("socket:")
+
+
+@contextlib.contextmanager
+def looked_into(pid: int, number: int) -> Iterator[socket.socket]:
+    """A socket of another process, for the body; what is set on it is set there, too.
+
+    Raises:
+        OSError: it was closed meanwhile.
+    """
+    with copy_of(pid, number) as descriptor:
+        copied = socket.socket(fileno=os.dup(descriptor))
+        try:
+            yield copied
+        finally:
+            copied.close()
+
+
+def common_facts(one: Descriptor, looked: socket.socket) -> dict[str, Fact]:
+    """Family, kind and options."""
+    form = Form(looked.family, looked.type, looked.proto)
+    return {
+        "socket": one.inode,
+        "family": int(form.family),
+        "type": int(form.type),
+        "protocol": form.protocol,
+        "options": list(_options(looked, form)),
+    }
+
+
+def _options(looked: socket.socket, form: Form) -> Iterator[list[Fact]]:
+    fresh = _fresh_options(form)
+    locks = int.from_bytes(_option(looked, socket.SOL_SOCKET, SO_BUF_LOCK) or b"\3", "little")
+    for (level, number), usual in fresh.items():
+        value = _option(looked, level, number)
+        if value != usual and _is_chosen(level, number, locks):
+            yield [level, number, value]
+
+
+def _is_chosen(level: int, number: int, locks: int) -> bool:
+    return level != socket.SOL_SOCKET or number not in _BUFFERS or bool(locks & _BUFFERS[number])
+
+
+@lru_cache(maxsize=32)
+def _fresh_options(form: Form) -> Mapping[tuple[int, int], bytes]:
+    """Options of a socket that was just made, as far as it has them."""
+    levels = [(socket.SOL_SOCKET, (*_GENERAL, *_BUFFERS))]
+    if form.family in (socket.AF_INET, socket.AF_INET6):
+        levels.append((socket.IPPROTO_IP, _IP))
+        levels.append((form.protocol, {socket.IPPROTO_TCP: _TCP, socket.IPPROTO_UDP: _UDP}.get(form.protocol, ())))
+    if form.family == socket.AF_INET6:
+        levels.append((socket.IPPROTO_IPV6, _IPV6))
+    try:
+        fresh = socket.socket(form.family, form.type, form.protocol)
+    except OSError:
+        return {}
+    with fresh:
+        found = {(level, number): _option(fresh, level, number) for level, numbers in levels for number in numbers}
+    return {place: value for place, value in found.items() if value is not None}
+
+
+def _option(looked: socket.socket, level: int, number: int) -> bytes | None:
+    try:
+        return looked.getsockopt(level, number, OPTION_SIZE)
+    except OSError:
+        return None
+
+
+def queue_of(looked: socket.socket) -> Queue:
+    """What waits to be read; it stays there.
+
+    Raises:
+        OSError: this socket cannot be looked into.
+    """
+    before = looked.getsockopt(socket.SOL_SOCKET, SO_PEEK_OFF)
+    looked.setsockopt(socket.SOL_SOCKET, SO_PEEK_OFF, 0)
+    try:
+        return _peeked(looked)
+    finally:
+        looked.setsockopt(socket.SOL_SOCKET, SO_PEEK_OFF, before)
+
+
+def _peeked(looked: socket.socket) -> Queue:
+    messages: list[bytes] = []
+    sources: list[bytes] = []
+    size, rights = 0, False
+    is_datagram = looked.type == socket.SOCK_DGRAM
+    while size <= QUEUE_LIMIT and len(messages) < MESSAGES_MAX:
+        try:
+            content, ancillary, _, source = looked.recvmsg(PIECE_SIZE, RIGHTS_SPACE, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            break
+        for level, kind, carried in ancillary:
+            if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
+                rights = True
+                for (number,) in struct.iter_unpack("<i", carried[: len(carried) // 4 * 4]):
+                    os.close(number)
+        if not content and not is_datagram:  # its peer has shut it down
+            break
+        messages.append(content)
+        sources.append(source if isinstance(source, bytes) else os.fsencode(source) if isinstance(source, str) else b"")
+        size += len(content)
+    return Queue(tuple(messages), tuple(sources), rights, size > QUEUE_LIMIT)
+
+
+def datagrams_of(looked: socket.socket) -> tuple[tuple[bytes, ...], tuple[tuple[Fact, ...], ...]]:
+    """Datagrams of UDP that wait to be read, and where each came from; they stay there."""
+    before = looked.getsockopt(socket.SOL_SOCKET, SO_PEEK_OFF)
+    looked.setsockopt(socket.SOL_SOCKET, SO_PEEK_OFF, 0)
+    messages: list[bytes] = []
+    sources = []
+    try:
+        while len(messages) < MESSAGES_MAX:
+            content, source = looked.recvfrom(PIECE_SIZE, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+            messages.append(content)
+            sources.append(tuple(source))
+    except (BlockingIOError, ConnectionError):
+        pass
+    finally:
+        looked.setsockopt(socket.SOL_SOCKET, SO_PEEK_OFF, before)
+    return tuple(messages), tuple(sources)
+
+
+# --- Restore -----------------------------------------------------------------------------------------------------------
+
+
+def make(table: CallTable, held: Resource) -> int:
+    """A fresh socket of the same kind, with its options."""
+    form = [number_of(held.facts[name]) for name in ("family", "type", "protocol")]
+    made = table.obtain(f"make the socket of {held.name}", "socket", form[0], form[1] | socket.SOCK_CLOEXEC, form[2])
+    set_options(table, held, made)
+    return made
+
+
+def set_options(table: CallTable, held: Resource, made: int) -> None:
+    """Set the options that are not as in a fresh socket. One that cannot be set here becomes a note."""
+    options = held.facts["options"]
+    assert isinstance(options, list)
+    for one in options:
+        assert isinstance(one, list) and isinstance(one[2], bytes)
+        level, number, value = number_of(one[0]), number_of(one[1]), one[2]
+        if level == socket.SOL_SOCKET and number in _BUFFERS:
+            value = (int.from_bytes(value, "little") // 2).to_bytes(4, "little")
+            table.attempt("", "setsockopt", made, level, number, table.place(value), len(value))
+            number = _FORCED[number]
+            lost = ""
+        else:
+            lost = f"option {number} of level {level} of {held.name} is not kept"
+        table.attempt(lost, "setsockopt", made, level, number, table.place(value), len(value))
+
+
+def fill(table: CallTable, held: Resource, sender: int) -> None:
+    """Send what waited, through a socket whose messages arrive there."""
+    messages = held.facts["queue"]
+    assert isinstance(messages, list)
+    for message in messages:
+        assert isinstance(message, bytes)
+        size, what = len(message), f"fill {held.name} with what waited in it"
+        arguments = (sender, table.place(message), size, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL, 0, 0)
+        table.call(what, "sendto", *arguments, least=size, most=size)
+
+
+def set_flags(table: CallTable, held: Resource, made: int) -> None:
+    """Whether it waits."""
+    flags = number_of(held.facts["flags"]) & (os.O_NONBLOCK | os.O_ASYNC)
+    if flags:
+        table.call(f"set the flags of {held.name}", "fcntl", made, fcntl.F_SETFL, flags)
