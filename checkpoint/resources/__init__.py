@@ -167,16 +167,16 @@ def glance(pid: int) -> tuple[OpenFile, ...]:
 
 def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
     """Sort open files into the kinds: what comes back, and what does not."""
-    from checkpoint.resources import kinds, signalling
+    from checkpoint.resources import kinds, locks, signalling
 
     resources, findings = [], []
     for held in opened:
         for kind in kinds.ASKED:
-            if reason := kind.refuse(held, surroundings) or signalling.refuse(held):
+            if reason := kind.refuse(held, surroundings) or signalling.refuse(held) or locks.refuse(held):
                 findings.append(Finding(kind.KIND, held.name, REFUSED, reason))
                 break
             if resource := kind.describe(held, surroundings):
-                resources.append(replace(resource, facts={**resource.facts, **signalling.describe(held)}))
+                resources.append(replace(resource, facts={**resource.facts, **signalling.describe(held), **locks.describe(held)}))
                 findings.append(Finding(kind.KIND, held.name, KEPT, f"{held.name} is {held.first.target}"))
                 break
     return Held(tuple(resources), tuple(findings))

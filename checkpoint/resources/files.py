@@ -34,7 +34,6 @@ DIGESTS_KEPT: Final = 1024
 CHUNK: Final = 1 << 20
 
 O_PATH: Final = 0o10000000
-KERNEL_DIRECTORIES: Final = ("/proc", "/sys")
 MEMORY_FILE: Final = "/memfd:"
 
 
@@ -67,12 +66,8 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     if not is_file(first):
         return None
     what = f"{held.name} is {first.target}"
-    if b"\nlock:" in first.told:
-        return f"{what} with a file lock or lease, which is not kept: protect the program while it holds none"
     if first.target.startswith(MEMORY_FILE):
         return f"{what}: a memory file without a name is not kept; let the program use a file in /dev/shm"
-    if any(f"{first.target}/".startswith(f"{place}/") for place in KERNEL_DIRECTORIES):
-        return f"{what}, a view of this machine's kernel: let the program close it after reading"
     if first.target.startswith("/secretmem"):
         return f"{what}: secret memory cannot be read, that is its purpose; run the program without it"
     if not (_was_found(held) if is_deleted(first) else _is_found(held) or _has_just_lost_its_name(held)):

@@ -18,6 +18,7 @@ from checkpoint.resources import (
     fifos,
     files,
     internet_sockets,
+    kernel_files,
     pipes,
     signalfds,
     sockets,
@@ -46,6 +47,7 @@ class Kind(Protocol):
 
 ASKED: Final[tuple[Kind, ...]] = (
     streams,
+    kernel_files,
     files,
     devices,
     pipes,

@@ -29,6 +29,8 @@ from checkpoint.resources import (
     fifos,
     files,
     internet_sockets,
+    kernel_files,
+    locks,
     pipes,
     signalfds,
     signalling,
@@ -53,12 +55,14 @@ MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
     epolls.KIND: epolls.rebuild,
     watches.KIND: watches.rebuild,
     fifos.KIND: fifos.rebuild,
+    kernel_files.KIND: kernel_files.rebuild,
 }
 """Kinds that are made anew: each adds its calls and answers with a descriptor."""
 NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
     fifos.KIND: fifos.mismatches,
     watches.KIND: watches.mismatches,
     unix_sockets.KIND: unix_sockets.mismatches,
+    kernel_files.KIND: kernel_files.mismatches,
     internet_sockets.KIND: internet_sockets.mismatches,
 }
 """Kinds that need something of this machine: why it does not have that, one sentence each."""
@@ -130,10 +134,12 @@ def _settle(table: CallTable, wanted: list[Wanted], holders: Mapping[int, int]) 
 
 
 def rebuild_last(table: CallTable, state: Snapshot) -> None:
-    """Add the calls that must come after everything else of a restore: what is watched would tell of it."""
+    """Add the calls that must come after everything else of a restore: watches would tell of it, locks would be lost."""
     for held in state.resources:
+        first = number_of(_pairs(held.facts["descriptors"])[0][0])
+        locks.settle(table, held, first)
         if held.kind == watches.KIND:
-            watches.settle(table, held, number_of(_pairs(held.facts["descriptors"])[0][0]))
+            watches.settle(table, held, first)
 
 
 def descriptors_of(state: Snapshot) -> list[Wanted]:

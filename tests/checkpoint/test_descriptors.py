@@ -5,6 +5,7 @@ One tracee for a family of kinds, one case for each thing that could be lost: se
 
 from __future__ import annotations
 
+import fcntl
 import os
 import socket
 import subprocess
@@ -30,7 +31,7 @@ CASES = {
         "timer_disarmed signalfd_waiting "
         "epoll_simple epoll_ready epoll_nested epoll_once epoll_edge epoll_exclusive epoll_renumbered epoll_waiting"
     ),
-    "path_descriptors": "inotify_directories inotify_gaps fifo_both fifo_reader path_only",
+    "path_descriptors": "inotify_directories inotify_gaps fifo_both fifo_reader path_only kernel_files file_locks",
     "sockets": (
         "pair_stream pair_datagram pair_packets pair_much pair_options pair_half_closed pair_orphan listener_path "
         "listener_abstract unix_with_itself unix_datagrams unix_fresh tcp_listener_4 tcp_listener_6 tcp_fresh udp_queue "
@@ -74,6 +75,16 @@ def test_a_named_pipe_that_somebody_else_has_open_is_refused(compiled: Compiled,
                     ENGINE.protect(tracee.pid, "/test/fifo", None)
             finally:
                 cat.kill()
+
+
+def test_a_lock_that_somebody_else_has_taken_meanwhile_stops_the_restore(compiled: Compiled, tmp_path: Path) -> None:
+    tracee = start_tracee(compiled("path_descriptors", "-O2"), tmp_path, "file_locks")
+    with ended(tracee):
+        snapshot = captured_and_killed(tracee)
+    with open(tmp_path / "whole", "rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        with pytest.raises(CheckpointError, match=f"lock.*{tmp_path}/whole"):
+            restored(snapshot, tmp_path)
 
 
 def _targets(pid: int) -> list[str]:

@@ -2,6 +2,7 @@
 #include "tracee.h"
 
 #include <poll.h>
+#include <sys/file.h>
 #include <sys/inotify.h>
 
 static const char *go;
@@ -119,12 +120,65 @@ static void path_only(void) {
     EXPECT(openat(some, "..", O_PATH) >= 0, "it is no directory");
 }
 
+/* Files of the kernel: read on from where it stood, of itself and of the machine. */
+static void kernel_files(void) {
+    int status = open("/proc/self/status", O_RDONLY), own = open("/proc/self", O_RDONLY | O_DIRECTORY);
+    int memory = open("/proc/meminfo", O_RDONLY | O_CLOEXEC), cpus = open("/sys/devices/system/cpu/possible", O_RDONLY);
+    char before[40] = "", found[40] = "", wanted[40];
+    if (cpus < 0 || pread(cpus, before, 39, 0) < 1) cannot("read a file of /sys");
+    if (read(status, found, 6) != 6 || read(memory, found, 5) != 5) cannot("read");
+    wait_here();
+    EXPECT(read(memory, found, 5) == 5 && !memcmp(found, "tal: ", 5), "meminfo goes on with '%s'", found);
+    lseek(status, 0, SEEK_SET);
+    static char text[4096];
+    EXPECT(read(status, text, sizeof text - 1) > 100, "status cannot be read");
+    snprintf(wanted, sizeof wanted, "\nPid:\t%d\n", getpid());
+    EXPECT(strstr(text, wanted) != NULL, "status is another process's");
+    EXPECT(faccessat(own, "maps", F_OK, 0) == 0, "the directory is another one");
+    memset(found, 0, sizeof found);
+    EXPECT(pread(cpus, found, 39, 0) > 0 && !strcmp(found, before), "processors: '%s'", found);
+    EXPECT_EQUAL("mark", fcntl(memory, F_GETFD), FD_CLOEXEC);
+}
+
+/* Whether somebody else could take a lock: asked from a child. */
+static int is_locked(const char *name, int kind, struct flock asked) {
+    pid_t child = fork();
+    if (child == 0) {
+        int file = open(name, O_RDWR);
+        if (kind == 0) _exit(flock(file, LOCK_EX | LOCK_NB) != 0);
+        _exit(fcntl(file, F_SETLK, &asked) != 0);
+    }
+    int status;
+    waitpid(child, &status, 0);
+    return WEXITSTATUS(status);
+}
+
+static void file_locks(void) {
+    struct flock part = {.l_type = F_WRLCK, .l_start = 100, .l_len = 10}, rest = {.l_type = F_RDLCK, .l_start = 200};
+    struct flock all = {.l_type = F_WRLCK}, free_part = {.l_type = F_WRLCK, .l_start = 110, .l_len = 90};
+    touch("whole"), touch("parts"), touch("open");
+    int whole = open("whole", O_RDWR), parts = open("parts", O_RDWR), description = open("open", O_RDWR | O_CLOEXEC);
+    chmod("whole", 0600), chmod("parts", 0600);
+    if (flock(whole, LOCK_EX) || fcntl(parts, F_SETLK, &part) || fcntl(parts, F_SETLK, &rest)) cannot("lock");
+    if (fcntl(description, F_OFD_SETLK, &part)) cannot("lock an open file");
+    wait_here();
+    EXPECT(is_locked("whole", 0, all), "flock is gone");
+    EXPECT(is_locked("parts", 1, part), "the lock of a part is gone");
+    EXPECT(is_locked("parts", 1, rest) == 0, "the shared lock is exclusive");
+    rest.l_type = F_WRLCK;
+    EXPECT(is_locked("parts", 1, rest), "the lock to the end is gone");
+    EXPECT(is_locked("parts", 1, free_part) == 0, "more is locked than was");
+    EXPECT(is_locked("open", 1, part), "the lock of an open file is gone");
+    flock(whole, LOCK_UN);
+    EXPECT(is_locked("whole", 0, all) == 0, "flock cannot be given back");
+}
+
 int main(int count, char **arguments) {
     static const struct {
         const char *name;
         void (*act)(void);
     } cases[] = {{"inotify_directories", inotify_directories}, {"inotify_gaps", inotify_gaps}, {"fifo_both", fifo_both},
-                 {"fifo_reader", fifo_reader}, {"fifo_gone", fifo_gone}, {"path_only", path_only}};
+                 {"fifo_reader", fifo_reader}, {"fifo_gone", fifo_gone}, {"path_only", path_only}, {"kernel_files", kernel_files}, {"file_locks", file_locks}};
     go = arguments[1];
     for (size_t index = 0; index < sizeof cases / sizeof *cases; index++)
         if (count > 2 && !strcmp(arguments[2], cases[index].name)) {

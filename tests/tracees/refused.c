@@ -225,21 +225,6 @@ static void take_huge_pages(void) {
     place[0] = 1;
 }
 
-static void take_lock(void) {
-    keep(open("locked", O_RDWR | O_CREAT, 0600), "a file");
-    if (flock(opened, LOCK_EX)) cannot("lock");
-}
-
-static void take_record_lock(void) {
-    keep(open("locked", O_RDWR | O_CREAT, 0600), "a file");
-    if (fcntl(opened, F_SETLK, &(struct flock){.l_type = F_WRLCK, .l_len = 10})) cannot("lock");
-}
-
-static void take_description_lock(void) {
-    keep(open("locked", O_RDWR | O_CREAT, 0600), "a file");
-    if (fcntl(opened, F_OFD_SETLK, &(struct flock){.l_type = F_RDLCK, .l_len = 10})) cannot("lock");
-}
-
 static void take_lease(void) {
     keep(open("leased", O_RDONLY | O_CREAT, 0600), "a file");
     if (fcntl(opened, F_SETLEASE, F_RDLCK)) cannot("take a lease");
@@ -281,8 +266,8 @@ static void take_perf_event(void) {
 
 static void take_pidfd(void) { keep(pidfd_open(getpid(), 0), "a pidfd"); }
 static void take_namespace(void) { keep(open("/proc/self/ns/net", O_RDONLY), "a namespace"); }
-static void take_proc_file(void) { keep(open("/proc/self/maps", O_RDONLY), "a file of /proc"); }
-static void take_proc_directory(void) { keep(open("/proc/self", O_RDONLY | O_DIRECTORY), "a directory of /proc"); }
+static void take_proc_file(void) { keep(open("/proc/1/status", O_RDONLY), "a file of /proc"); }
+static void take_kernel_switch(void) { keep(open("/proc/sys/kernel/hostname", O_RDWR), "a switch of the kernel"); }
 
 static void take_secret_memory(void) {
     int file = syscall(SYS_memfd_secret, 0);
@@ -366,9 +351,6 @@ static const struct kind {
              {"pseudo_terminal", take_pseudo_terminal},
              {"seccomp", take_seccomp},
              {"huge_pages", take_huge_pages},
-             {"lock", take_lock},
-             {"record_lock", take_record_lock},
-             {"description_lock", take_description_lock},
              {"lease", take_lease},
              {"kernel_log", take_kernel_log},
              {"tun", take_tun},
@@ -382,7 +364,7 @@ static const struct kind {
              {"pidfd", take_pidfd},
              {"namespace", take_namespace},
              {"proc_file", take_proc_file},
-             {"proc_directory", take_proc_directory},
+             {"kernel_switch", take_kernel_switch},
              {"secret_memory", take_secret_memory},
              {"memory_file", take_memory_file},
              {"protection_key", take_protection_key},

@@ -1,0 +1,89 @@
+"""Files of /proc and /sys: views of the kernel, opened again where they stood. Those of the process itself lead to itself again.
+
+What is read from them is what the kernel says then. Whatever acts on the machine when it is written to is refused, and so are
+files of other processes.
+
+Facts: ``descriptors``; ``path``, with ``{pid}`` in place of the program's own number; ``flags`` of open(2); ``offset``.
+
+Source: proc(5), sysfs(5).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections.abc import Iterator
+from typing import Final
+
+from checkpoint.linux import procfs
+from checkpoint.linux.call_table import CallTable
+from checkpoint.linux.descriptors import Descriptor
+from checkpoint.model import Resource
+from checkpoint.resources import OpenFile, Surroundings
+from checkpoint.resources.rebuilding import Rebuilding, number_of
+
+KIND: Final = "kernel_files"
+PLACES: Final = ("/proc", "/sys")
+UNREADABLE: Final = ("/proc/kmsg", "/sys/kernel/debug", "/sys/kernel/tracing", "/sys/fs/bpf", "/proc/sys/fs/binfmt_misc")
+"""What is used up by being read, or is no view at all."""
+OWN: Final = "/proc/{pid}"
+O_PATH: Final = 0o10000000
+
+_OF_A_PROCESS: Final = re.compile(r"/proc/(\d+)(/.*)?")
+_OF_A_THREAD: Final = re.compile(r"/task/\d+")
+
+
+def is_kernels(one: Descriptor) -> bool:
+    """Whether a descriptor is a file or directory of /proc or /sys."""
+    is_file = stat.S_ISREG(one.mode) or stat.S_ISDIR(one.mode)
+    return is_file and any(f"{one.target}/".startswith(f"{place}/") for place in PLACES)
+
+
+def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
+    """Where it is and how far it was read."""
+    if not is_kernels(held.first):
+        return None
+    flags, path = held.first.flags & ~os.O_CLOEXEC, _path_of(held)
+    return Resource(KIND, held.name, {"descriptors": held.numbers, "path": path, "flags": flags, "offset": held.first.offset})
+
+
+def _path_of(held: OpenFile) -> str:
+    """Its path, with ``{pid}`` for the program's own number."""
+    match = _OF_A_PROCESS.fullmatch(held.first.target)
+    if match is None or int(match[1]) != procfs.status(held.pid).pids[-1]:
+        return held.first.target
+    return OWN + (match[2] or "").replace(f"/task/{match[1]}", "/task/{pid}")
+
+
+def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
+    """Why it cannot be opened again."""
+    if not is_kernels(held.first):
+        return None
+    path, what = _path_of(held), f"{held.name} is {held.first.target}"
+    if path.endswith(procfs.DELETED) or any(f"{path}/".startswith(f"{place}/") for place in UNREADABLE):
+        return f"{what}, a part of this machine's kernel that cannot be opened again as it was: let the program close it"
+    if path.startswith(OWN):
+        return f"{what}, of one of its threads: let the program close it" if _OF_A_THREAD.search(path) else None
+    if _OF_A_PROCESS.fullmatch(path):
+        return f"{what}, a view of another process: let the program close it after reading"
+    if held.first.flags & os.O_ACCMODE != os.O_RDONLY and not held.first.flags & O_PATH:
+        return f"{what}, open for writing, by which it acts on this machine's kernel: let the program open it only to write"
+    return None
+
+
+def mismatches(held: Resource) -> Iterator[str]:
+    """Why it is not here."""
+    path = str(held.facts["path"])
+    if not path.startswith(OWN) and not os.path.exists(path):
+        yield f"{path}, open as {held.name}, is not offered by this kernel: boot the same one, or attach what it shows"
+
+
+def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
+    """Open it again."""
+    path = str(held.facts["path"]).replace("{pid}", str(rebuilding.inner_pid))
+    flags, offset = number_of(held.facts["flags"]), number_of(held.facts["offset"])
+    made = table.open(path, flags)
+    if offset and not flags & O_PATH:
+        table.attempt(f"{held.name} ({path}) is read from its beginning", "lseek", made, offset, os.SEEK_SET)
+    return made
