@@ -10,7 +10,7 @@ from typing import Final
 
 from checkpoint import pages
 from checkpoint.linux.procfs import DELETED, MapsLine
-from checkpoint.linux.tracking import NOT_CARRIED
+from checkpoint.linux.tracking import NOT_CARRIED, is_shared_object
 from checkpoint.model import FileIdentity, Vma, VmaKind
 from checkpoint.pages import Words
 from checkpoint.resources import files
@@ -66,11 +66,12 @@ class Identities:
     def of_mapping(self, line: MapsLine) -> FileIdentity:
         """The file behind a mapping."""
         key = _key(line)
-        if key not in self._known:
+        if key not in self._known or is_shared_object(line):  # the size of such a one is told by nothing else
             through = f"/proc/{self._pid}/map_files/{line.start:x}-{line.end:x}"
             deleted = line.name.endswith(DELETED)
             path = line.name.removesuffix(DELETED) if deleted else line.name
-            self._known[key] = self._identity(path, through if deleted else f"/proc/{self._pid}/root{path}", deleted)
+            place = through if deleted else f"/proc/{self._pid}/root{path}"
+            self._known[key] = self._identity(path, place, deleted, is_memory=is_shared_object(line))
         return self._known[key]
 
     def executable(self) -> FileIdentity:
@@ -79,7 +80,7 @@ class Identities:
         deleted = target.endswith(DELETED)
         return self._identity(target.removesuffix(DELETED), f"/proc/{self._pid}/exe", deleted)
 
-    def _identity(self, path: str, through: str, deleted: bool) -> FileIdentity:
+    def _identity(self, path: str, through: str, deleted: bool, *, is_memory: bool = False) -> FileIdentity:
         try:
             about = os.stat(through)
         except OSError:
@@ -91,8 +92,8 @@ class Identities:
             mode=about.st_mode,
             size=about.st_size,
             mtime_ns=about.st_mtime_ns,
-            build_id=build_id(through),
-            digest=files.digest_at(through, (about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns)),
+            build_id=b"" if is_memory else build_id(through),
+            digest=b"" if is_memory else files.digest_at(through, (about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns)),
             deleted=deleted,
         )
 

@@ -96,6 +96,7 @@ class _Restore:
         self._tracee = Tracee(vessel_pid)
         self._others: list[tuple[Tracee, ThreadState]] = []
         self._notes: list[str] = []
+        self._objects: dict[tuple[int, int], int] = {}
 
     def run(self) -> RestoredProgram:
         try:
@@ -184,13 +185,13 @@ class _Restore:
         restore_memory.clear(table, mappings)
         ours, theirs = restore_memory.kernel_pages(mappings), restore_memory.kernel_pages_of(vmas)
         restore_memory.move_kernel_pages(table, ours, theirs, refuge)
-        restore_memory.map_program(table, vmas, runs)
+        self._objects = restore_memory.map_program(table, vmas, runs)
         return table
 
     def _state_table(self, table: CallTable, vessel: Vessel) -> CallTable:
         process, thread = self._state.process, self._thread
         restore_memory.settle(table, self._state.vmas, self._state.runs)
-        self._notes += rebuild_all(table, self._state, self._options, vessel.inner_pid)
+        self._notes += rebuild_all(table, self._state, self._options, vessel.inner_pid, self._objects)
         restore_process.memory_layout(table, process, with_executable=vessel.may_choose_executable)
         restore_process.signal_actions(table, process.signal_actions)
         restore_process.thread_marks(table, thread)

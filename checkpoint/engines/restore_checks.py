@@ -16,7 +16,7 @@ from checkpoint.arch import x86_64, x86_64_stub
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines.description import this_machine
 from checkpoint.engines.identities import build_id
-from checkpoint.engines.restore_memory import is_file_mapping, kernel_pages, kernel_pages_of
+from checkpoint.engines.restore_memory import is_file_mapping, kernel_pages, kernel_pages_of, makes_shared_memory
 from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux import abi, procfs
 from checkpoint.model import FileIdentity, Resource, Snapshot
@@ -97,8 +97,13 @@ def _of_files(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
     """The executable and everything that is mapped: the program runs their bytes, so they must be the very same."""
     mapped = [vma.file for vma in state.vmas if vma.file is not None and is_file_mapping(vma)]
     for identity in {identity.path: identity for identity in (state.process.executable, *mapped)}.values():
-        if identity.path not in options.accept_changed:
+        if identity.path not in options.accept_changed and not _is_made(state, identity.path):
             yield from _of_file(identity)
+
+
+def _is_made(state: Snapshot, path: str) -> bool:
+    """Whether a file is missing here, and a restore makes it."""
+    return not os.path.lexists(path) and makes_shared_memory(state.vmas, path)
 
 
 def _of_file(identity: FileIdentity) -> Iterator[str]:
@@ -140,6 +145,8 @@ def _of_descriptors(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
         if held.kind not in rebuild.KINDS:
             yield f"{held.name} is of kind {held.kind!r}, which this version does not know: use the version that captured it"
         elif held.kind == "files" and not held.facts.get("deleted") and path not in options.accept_changed:
+            if _is_made(state, path):
+                continue
             yield from _of_open_file(held, path, state.machine.boot_id == this_machine().boot_id)
         elif held.kind in rebuild.NEEDED:
             yield from rebuild.NEEDED[held.kind](held)

@@ -21,7 +21,9 @@ from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import MapsLine
+from checkpoint.linux.tracking import MEMORY_PLACE
 from checkpoint.model import PageRun, Snapshot, Vma, VmaKind
+from checkpoint.resources import memory_files, rebuild
 
 MREMAP_MAYMOVE_FIXED: Final = 1 | 2
 MAP_LOCKED_ON_FAULT: Final = 1
@@ -78,18 +80,75 @@ def _move(table: CallTable, start: int, target: int, size: int) -> None:
     )
 
 
-def map_program(table: CallTable, vmas: Iterable[Vma], runs: Sequence[PageRun]) -> None:
-    """Map everything that the program had; what will be filled is writable for now."""
+def map_program(table: CallTable, vmas: Iterable[Vma], runs: Sequence[PageRun]) -> dict[tuple[int, int], int]:
+    """Map everything that the program had; what will be filled is writable for now.
+
+    Answers with a descriptor of each shared object without a name, by (device, inode): open files may be of the same one.
+    """
     carried = Carried(runs)
     mapped = [vma for vma in vmas if vma.kind not in KERNEL_KINDS]
     files = [vma for vma in mapped if is_file_mapping(vma)]
     for (path, writable), group in groupby(sorted(files, key=_file_order), key=_file_order):
-        descriptor = table.open(path, (os.O_RDWR if writable else os.O_RDONLY) | os.O_CLOEXEC)
-        for vma in group:
+        pieces = list(group)
+        if path.startswith(MEMORY_PLACE) and not os.path.lexists(path):
+            descriptor = _make_shared_memory(table, pieces[0])
+        else:
+            descriptor = table.open(path, (os.O_RDWR if writable else os.O_RDONLY) | os.O_CLOEXEC)
+        for vma in pieces:
             _map(table, vma, _first_protection(vma, carried), descriptor)
         table.close(descriptor)
-    for piece in joined_shared(vma for vma in mapped if not is_file_mapping(vma)):
+    objects = [vma for vma in mapped if is_object_mapping(vma)]
+    made = {key: _make_object(table, list(group)) for key, group in groupby(sorted(objects, key=_object), key=_object)}
+    for vma in objects:
+        _map(table, vma, _first_protection(vma, carried), made[_object(vma)])
+    for piece in joined_shared(vma for vma in mapped if not is_file_mapping(vma) and not is_object_mapping(vma)):
         _map(table, piece, _first_protection(piece, carried), -1)
+    return made
+
+
+def _make_shared_memory(table: CallTable, vma: Vma) -> int:
+    """Make POSIX shared memory that the program had to itself, and that this machine lacks."""
+    file = vma.file
+    assert file is not None
+    made = table.open(file.path, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_CLOEXEC, file.mode & 0o7777)
+    table.call(f"set the mode of {file.path}", "fchmod", made, file.mode & 0o7777)
+    table.call(f"size {file.path}", "ftruncate", made, file.size)
+    return made
+
+
+def makes_shared_memory(vmas: Iterable[Vma], path: str) -> bool:
+    """Whether a file is shared memory of which the program has mapped everything: then a restore can make it."""
+    mapped = sorted(
+        (vma for vma in vmas if vma.file is not None and vma.file.path == path and vma.shared), key=lambda vma: vma.offset
+    )
+    if not path.startswith(MEMORY_PLACE) or not mapped or not all(vma.protection & abi.PROT_WRITE for vma in mapped):
+        return False
+    end = 0
+    for vma in mapped:
+        end = max(end, vma.offset + vma.size) if vma.offset <= end else end
+    return mapped[0].file is not None and end >= mapped[0].file.size
+
+
+def is_object_mapping(vma: Vma) -> bool:
+    """Whether it is a shared mapping of a memory file, or of a file that has no name any more."""
+    return vma.kind is VmaKind.FILE and vma.shared and vma.file is not None and vma.file.deleted
+
+
+def _object(vma: Vma) -> tuple[int, int]:
+    assert vma.file is not None
+    return vma.file.device, vma.file.inode
+
+
+def _make_object(table: CallTable, vmas: Sequence[Vma]) -> int:
+    """Make what they are mappings of, long enough for all; its content is written through them."""
+    file = vmas[0].file
+    assert file is not None
+    size, mode = file.size, file.mode & 0o7777
+    if file.path.startswith(memory_files.PREFIX):
+        return memory_files.make(table, file.path.removeprefix(memory_files.PREFIX), mode, size)
+    made = rebuild.make_nameless(table, file.path, mode)
+    table.call(f"size {file.path}", "ftruncate", made, size)
+    return made
 
 
 def is_file_mapping(vma: Vma) -> bool:

@@ -5,7 +5,8 @@ Needs nothing of the kernel, and costs a pass over the memory.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
@@ -15,7 +16,7 @@ from checkpoint.linux import abi
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.pagetables import existence
 from checkpoint.linux.procfs import MapsLine
-from checkpoint.linux.tracking import NONE, Scan, extents_of, is_orphan
+from checkpoint.linux.tracking import NONE, Scan, extents_of, is_orphan, is_shared_object
 from checkpoint.pages import PageMap, Words
 
 READ_CHUNK: Final = 8 << 20
@@ -97,6 +98,18 @@ def chunks_of(ranges: Words, size: int = READ_CHUNK) -> list[Words]:
     return [np.array(part, dtype=np.uint64) for part in parts if part]
 
 
+def data_extents(file: int, begin: int = 0) -> Iterator[tuple[int, int]]:
+    """Parts of a file that hold something, whole pages, from an offset on. Source: SEEK_DATA of lseek(2)."""
+    place = begin
+    while True:
+        try:
+            first = os.lseek(file, place, os.SEEK_DATA)
+        except OSError:  # nothing more
+            return
+        place = os.lseek(file, first, os.SEEK_HOLE)
+        yield first & -abi.PAGE_SIZE, -(-place // abi.PAGE_SIZE) * abi.PAGE_SIZE
+
+
 class SharedPages:
     """Mappings that are compared by page digest at every scan: shared ones, which others may write behind our page tables, and
     those of deleted files, of which every page is carried."""
@@ -117,11 +130,30 @@ class SharedPages:
         return compared(before, self._known)
 
     def existing(self, lines: Sequence[MapsLine]) -> Words:
-        """Populated pages of shared mappings, and all that can be read of deleted files."""
+        """Populated pages of shared mappings, what else their objects hold, and all that can be read of deleted files."""
         shared = extents_of([line for line in lines if not is_orphan(line)])
         orphans = extents_of([line for line in lines if is_orphan(line)])
         populated = self._existence.existing(shared, own=False) if len(shared) else NONE
+        for line in filter(is_shared_object, lines):
+            populated = pages.union(populated, self._held_by_object(line))
         return pages.union(populated, self._memory.readable_pages(orphans)[0]) if len(orphans) else populated
+
+    def _held_by_object(self, line: MapsLine) -> Words:
+        """The mapped pages of an object that hold something, whoever wrote them: reading would make some where none are."""
+        path = f"/proc/{self._pid}/map_files/{line.start:x}-{line.end:x}"
+        try:
+            file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        except OSError:  # without the right to look there: what was touched through this mapping must do
+            return NONE
+        try:
+            found = [
+                (line.start + max(first - line.offset, 0), line.start + min(last - line.offset, line.size))
+                for first, last in data_extents(file, line.offset)
+                if first < line.offset + line.size
+            ]
+        finally:
+            os.close(file)
+        return np.array(found, dtype=np.uint64).reshape(-1, 2)
 
     def forget(self) -> None:
         """Let the next scan find everything."""

@@ -103,6 +103,19 @@ def is_shared(line: MapsLine) -> bool:
     return line.shared and line.name not in NOT_CARRIED and not from_its_file
 
 
+MEMORY_PLACE: Final = "/dev/shm/"
+"""Where files are memory (shm_overview(7)): on another machine they are missing."""
+
+
+def is_shared_object(line: MapsLine) -> bool:
+    """Whether it is shared memory that may hold more than was touched through this mapping, and that no other machine has.
+
+    A memory file (memfd), POSIX shared memory, and any file that was deleted; anonymous memory is no file.
+    """
+    is_gone = line.name.endswith(procfs.DELETED) and line.name != f"/dev/zero{procfs.DELETED}"
+    return is_shared(line) and line.has_file and (is_gone or line.name.startswith(MEMORY_PLACE))
+
+
 def extents_of(lines: Sequence[MapsLine]) -> Words:
     """The set of pages that mappings cover."""
     if not lines:

@@ -66,8 +66,6 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     if not is_file(first):
         return None
     what = f"{held.name} is {first.target}"
-    if first.target.startswith(MEMORY_FILE):
-        return f"{what}: a memory file without a name is not kept; let the program use a file in /dev/shm"
     if first.target.startswith("/secretmem"):
         return f"{what}: secret memory cannot be read, that is its purpose; run the program without it"
     if not (_was_found(held) if is_deleted(first) else _is_found(held) or _has_just_lost_its_name(held)):

@@ -19,6 +19,7 @@ from checkpoint.resources import (
     files,
     internet_sockets,
     kernel_files,
+    memory_files,
     pipes,
     signalfds,
     sockets,
@@ -48,6 +49,7 @@ class Kind(Protocol):
 ASKED: Final[tuple[Kind, ...]] = (
     streams,
     kernel_files,
+    memory_files,
     files,
     devices,
     pipes,
@@ -75,6 +77,8 @@ def observer_of(one: Descriptor) -> Observer | None:
     """What asks an open file for what only a process that stands still can tell."""
     if sockets.is_socket(one):
         return _observe_socket
+    if memory_files.is_memory_file(one):
+        return memory_files.observe
     return fifos.observe if fifos.is_fifo(one) else _OBSERVED.get(one.target)
 
 

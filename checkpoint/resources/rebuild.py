@@ -31,6 +31,7 @@ from checkpoint.resources import (
     internet_sockets,
     kernel_files,
     locks,
+    memory_files,
     pipes,
     signalfds,
     signalling,
@@ -56,6 +57,7 @@ MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
     watches.KIND: watches.rebuild,
     fifos.KIND: fifos.rebuild,
     kernel_files.KIND: kernel_files.rebuild,
+    memory_files.KIND: memory_files.rebuild,
 }
 """Kinds that are made anew: each adds its calls and answers with a descriptor."""
 NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
@@ -79,11 +81,14 @@ class Wanted:
     resource: Resource
 
 
-def rebuild_all(table: CallTable, state: Snapshot, options: RestoreOptions, inner_pid: int) -> tuple[str, ...]:
+def rebuild_all(
+    table: CallTable, state: Snapshot, options: RestoreOptions, inner_pid: int, objects: Mapping[tuple[int, int], int]
+) -> tuple[str, ...]:
     """Add the calls that bring all descriptors back: a note for each difference.
 
     Args:
         inner_pid: what the process itself will know as its PID.
+        objects: files without a name that were made for its mappings: a descriptor of each, by (device, inode).
 
     Raises:
         RestoreError: a resource of a kind that this version does not know.
@@ -95,11 +100,15 @@ def rebuild_all(table: CallTable, state: Snapshot, options: RestoreOptions, inne
             )
     wanted = sorted(descriptors_of(state), key=lambda one: one.number)
     if not wanted:
+        for number in objects.values():
+            table.close(number)
         return ()
-    moved = _move_streams_away(table, wanted[-1].number + 1)
+    moved = _move_streams_away(table, max(wanted[-1].number, *objects.values(), 0) + 1)
     piped = pipes.rebuild(table, [held for held in state.resources if held.kind == pipes.KIND], moved[-1] + 1)
     connected = _prepare_sockets(table, state, moved[-1] + 1 + len(piped))
-    rebuilding = Rebuilding(options, state.clocks, inner_pid)
+    rebuilding = Rebuilding(options, state.clocks, inner_pid, moved[-1] + 1 + len(piped) + len(connected))
+    for key, number in objects.items():
+        rebuilding.keep(table, key, number)
     holders: dict[int, int] = {}  # which number already stands for an open file description
     for one in wanted:
         if id(one.resource) in holders:
@@ -108,7 +117,8 @@ def rebuild_all(table: CallTable, state: Snapshot, options: RestoreOptions, inne
             _obtain(table, one, moved, piped, connected, rebuilding)
             holders[id(one.resource)] = one.number
             signalling.rebuild(table, one.number, one.resource, inner_pid)
-    for number in (*moved, *piped.values(), *connected.values()):
+    memory_files.seal(table, [held for held in state.resources if held.kind == memory_files.KIND], rebuilding)
+    for number in (*moved, *piped.values(), *connected.values(), *rebuilding.objects.values()):
         table.close(number)
     _settle(table, wanted, holders)
     return ()
@@ -189,7 +199,8 @@ def _obtain(
     if one.resource.kind in MADE:
         opened = MADE[one.resource.kind](table, one.resource, rebuilding)
     else:
-        opened = _open_deleted(table, one.resource) if facts.get("deleted") else _open(table, one.resource, rebuilding.options)
+        open_file = _open_deleted if facts.get("deleted") else _open
+        opened = open_file(table, one.resource, rebuilding)
     if opened != one.number:
         table.duplicate(opened, one.number, os.O_CLOEXEC if one.close_on_exec else 0)
         table.close(opened)
@@ -201,35 +212,41 @@ def _duplicate(table: CallTable, holder: int, one: Wanted) -> None:
     table.duplicate(holder, one.number, os.O_CLOEXEC if one.close_on_exec else 0)
 
 
-def _open(table: CallTable, held: Resource, options: RestoreOptions) -> int:
+def _open(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     facts = held.facts
     path, flags = str(facts["path"]), number_of(facts["flags"])
     descriptor = table.open(path, flags & (O_PATH | os.O_NOFOLLOW | os.O_DIRECTORY if flags & O_PATH else REOPENED_FLAGS))
     if held.kind == "files" and not flags & O_PATH:
-        if path not in options.accept_changed and has_grown(held):
+        if path not in rebuilding.options.accept_changed and has_grown(held):
             size = number_of(facts["size"])
             table.call(f"cut {path} back to {size} bytes", "ftruncate", descriptor, size)
         _seek(table, descriptor, held)
     return descriptor
 
 
-def _open_deleted(table: CallTable, held: Resource) -> int:
-    """Make a file that no name leads to, with the content that it had, opened as it was."""
+def make_nameless(table: CallTable, path: str, mode: int) -> int:
+    """Make an empty file that no name leads to, where it had its name."""
+    if os.path.lexists(path):
+        return table.open(os.path.dirname(path), os.O_TMPFILE | os.O_RDWR, mode)
+    made = table.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR, mode)
+    table.call(f"unlink {path}", "unlinkat", -100, table.place_path(path), 0)
+    return made
+
+
+def _open_deleted(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
+    """Make a file that no name leads to, with the content that it had, opened as it was; it may be mapped already."""
     facts = held.facts
     path, content = str(facts["path"]), facts.get("content", b"")
     assert isinstance(content, bytes)
-    mode = number_of(facts.get("mode", 0o600)) & 0o7777
-    if os.path.lexists(path):
-        made = table.open(os.path.dirname(path), os.O_TMPFILE | os.O_RDWR, mode)
-    else:
-        made = table.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR, mode)
-        table.call(f"unlink {path}", "unlinkat", -100, table.place_path(path), 0)
+    key = number_of(facts["device"]), number_of(facts["inode"])
+    if key not in rebuilding.objects:
+        rebuilding.keep(table, key, make_nameless(table, path, number_of(facts.get("mode", 0o600)) & 0o7777))
+    made = rebuilding.objects[key]
     if content:
         size = len(content)
         table.call(f"fill {path}", "pwrite64", made, table.place(content), size, 0, least=size, most=size)
     flags = number_of(facts["flags"]) & REOPENED_FLAGS & ~os.O_DIRECTORY  # part of O_TMPFILE, by which it may have been made
     opened = table.open(f"/proc/self/fd/{made}", flags)
-    table.close(made)
     _seek(table, opened, held)
     return opened
 
@@ -258,5 +275,8 @@ def grows_at_its_end(held: Resource) -> bool:
 
 def has_grown(held: Resource) -> bool:
     """Whether a regular file is longer here than the program knows: what it wrote after the snapshot is to be cut off."""
-    about = os.stat(str(held.facts["path"]))
+    try:
+        about = os.stat(str(held.facts["path"]))
+    except FileNotFoundError:  # shared memory, which the restore makes
+        return False
     return stat.S_ISREG(about.st_mode) and grows_at_its_end(held) and about.st_size > number_of(held.facts["size"])

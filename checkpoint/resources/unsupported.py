@@ -41,7 +41,6 @@ _MAPPINGS: Final = (
     (re.compile(r"/\[aio\]"), "a ring of asynchronous I/O (aio)"),
     (re.compile(r"/SYSV[0-9a-f]+"), "System V shared memory"),
     (re.compile(r"/secretmem"), "secret memory"),
-    (re.compile(r"/memfd:"), "a memory file"),
     (re.compile(r"/anon_hugepage"), "huge pages"),
     (re.compile(r"/dev/(?!zero|shm/)"), "memory of a device"),
 )
@@ -124,9 +123,7 @@ def refuse_mapping(line: MapsLine, flags: tuple[str, ...]) -> str | None:
             return f"{where} is {_VM_FLAGS[flag]}, which {_ADVICE}"
     if line.has_file and line.name.endswith(procfs.DELETED) and not is_shared_anonymous(line):
         replaced = f"{where} is of {line.name}, replaced since the program started"
-        if not is_orphan(line):
-            return f"{replaced}, and shared: restart the program, then protect it"
-        if line.size > ORPHAN_LIMIT:
+        if is_orphan(line) and line.size > ORPHAN_LIMIT:
             return f"{replaced}, and larger than {ORPHAN_LIMIT >> 20} MiB: restart the program, then protect it"
     return None
 

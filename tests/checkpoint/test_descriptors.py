@@ -32,6 +32,7 @@ CASES = {
         "epoll_simple epoll_ready epoll_nested epoll_once epoll_edge epoll_exclusive epoll_renumbered epoll_waiting"
     ),
     "path_descriptors": "inotify_directories inotify_gaps fifo_both fifo_reader path_only kernel_files file_locks",
+    "memory_objects": "memfd_content memfd_sealed memfd_mapped posix_named posix_unlinked",
     "sockets": (
         "pair_stream pair_datagram pair_packets pair_much pair_options pair_half_closed pair_orphan listener_path "
         "listener_abstract unix_with_itself unix_datagrams unix_fresh tcp_listener_4 tcp_listener_6 tcp_fresh udp_queue "
@@ -61,6 +62,16 @@ def test_a_named_pipe_is_made_where_it_is_missing(compiled: Compiled, tmp_path: 
     with ended(tracee):
         snapshot = captured_and_killed(tracee)
     (tmp_path / "pipe").unlink()
+    with ended(restored(snapshot, tmp_path)) as tracee:
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_shared_memory_is_made_where_it_is_missing(compiled: Compiled, tmp_path: Path) -> None:
+    tracee = start_tracee(compiled("memory_objects", "-O2"), tmp_path, "posix_named")
+    with ended(tracee):
+        snapshot = captured_and_killed(tracee)
+    Path(tracee.output.splitlines()[0]).unlink()
     with ended(restored(snapshot, tmp_path)) as tracee:
         tracee.tell()
         expect_ok(tracee)
