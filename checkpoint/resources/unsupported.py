@@ -18,7 +18,7 @@ from checkpoint.linux import procfs
 from checkpoint.linux.procfs import MapsLine, Status
 from checkpoint.linux.tracking import is_orphan
 from checkpoint.model import Resource
-from checkpoint.resources import OpenFile, Surroundings, refused_threads
+from checkpoint.resources import OpenFile, Surroundings, refused_threads, shared_objects
 
 KIND: Final = "unsupported"
 
@@ -196,6 +196,7 @@ def refuse_process(pid: int, status: Status) -> Iterator[str]:
         yield f"it has child processes ({', '.join(children)}), which are not kept yet: protect it while it has none"
     if status.seccomp:
         yield "it runs under a seccomp filter, which forbids what a capture asks of it: run it without the filter"
+    yield from shared_objects.refuse(pid)
     yield from _refuse_image(pid)
     yield from _refuse_places(pid)
     yield from _refuse_namespaces(pid)

@@ -128,3 +128,18 @@ def test_a_listener_whose_name_another_process_has_taken_is_refused_by_name(comp
         assert b"listens.sock\0" in names or b"listens.sock" in names
         with pytest.raises(CheckpointError, match=r"listens\.sock"):
             restored(snapshot, tmp_path)
+
+
+def test_shared_memory_that_another_process_has_mapped_is_refused(compiled: Compiled, tmp_path: Path) -> None:
+    tracee = start_tracee(compiled("memory_objects", "-O2"), tmp_path, "posix_named")
+    with ended(tracee):
+        path = Path(tracee.output.splitlines()[0])
+        maps = (
+            f"import mmap, os, time; m = mmap.mmap(os.open('{path}', os.O_RDWR), 0); print('ready', flush=True); time.sleep(600)"
+        )
+        (tmp_path / "other").mkdir()
+        with ended(start([sys.executable, "-c", maps], tmp_path / "other")) as other:
+            other.wait_for_line("ready")
+            with pytest.raises(UnsupportedError, match=f"pid {other.pid}"):
+                ENGINE.protect(tracee.pid, "/test/shared", None)
+        path.unlink()

@@ -1,0 +1,61 @@
+"""Shared memory that other processes have, too: what they write to each other cannot move with one of them.
+
+Looked at are memory files, files in /dev/shm and files that were deleted; others that are mapped shared lie on a disk, where
+every robot has its own.
+
+Source: proc_pid_maps(5).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import Final
+
+from checkpoint.errors import ProbeError, ProcessGoneError
+from checkpoint.linux import procfs
+
+_MAPPED: Final = re.compile(rb"^\S+ ...s \S+ (\S+ [1-9]\d*) +(/dev/shm/.*|.* \(deleted\))$", re.MULTILINE)
+"""Device and inode number, and the name."""
+_ANONYMOUS: Final = b"/dev/zero (deleted)"
+
+
+def refuse(pid: int) -> Iterator[str]:
+    """Why shared memory of a process cannot be kept: one sentence for each object that another one has mapped as well."""
+    for key, name in dict(_objects(pid)).items():
+        others = [other for other in _mappers(pid, time.monotonic_ns() // 1_000_000_000).get(key, ()) if other != pid]
+        if others:
+            yield (
+                f"the shared memory {os.fsdecode(name)} is mapped by pid {others[0]} too, which stays behind: protect the "
+                "program when that has ended"
+            )
+
+
+def _objects(pid: int) -> Iterator[tuple[bytes, bytes]]:
+    for key, name in _MAPPED.findall(procfs.read_bytes(pid, "maps")):
+        if name != _ANONYMOUS:
+            yield key, name
+
+
+@lru_cache(maxsize=1)
+def _mappers(pid: int, second: int) -> dict[bytes, list[int]]:
+    """Who has mapped which object: processes by device and inode number.
+
+    Args:
+        pid: whose question it is; that one and we are not looked at.
+        second: of our clock; all that is asked within one second looks once.
+    """
+    found: dict[bytes, list[int]] = {}
+    for other in os.listdir("/proc"):
+        if not other.isdigit() or int(other) in (pid, os.getpid()):
+            continue
+        try:
+            objects = dict(_objects(int(other)))
+        except (ProbeError, ProcessGoneError):  # another user's, or ended meanwhile
+            continue
+        for key in objects:
+            found.setdefault(key, []).append(int(other))
+    return found
