@@ -46,9 +46,9 @@ def test_what_a_program_has_open_is_as_it_was_after_three_restores(
     program: str, case: str, compiled: Compiled, tmp_path: Path
 ) -> None:
     tracee = start_tracee(compiled(program, "-O2"), tmp_path, case)
-    captured(tracee)
     for _ in range(ROUNDS):
         with ended(tracee):
+            captured(tracee)
             snapshot = captured_and_killed(tracee)
         tracee = restored(snapshot, tmp_path)
     with ended(tracee):
