@@ -98,7 +98,7 @@ def chunks_of(ranges: Words, size: int = READ_CHUNK) -> list[Words]:
     return [np.array(part, dtype=np.uint64) for part in parts if part]
 
 
-def data_extents(file: int, begin: int = 0) -> Iterator[tuple[int, int]]:
+def filled_extents(file: int, begin: int = 0) -> Iterator[tuple[int, int]]:
     """Parts of a file that hold something, whole pages, from an offset on. Source: SEEK_DATA of lseek(2)."""
     place = begin
     while True:
@@ -148,7 +148,7 @@ class SharedPages:
         try:
             found = [
                 (line.start + max(first - line.offset, 0), line.start + min(last - line.offset, line.size))
-                for first, last in data_extents(file, line.offset)
+                for first, last in filled_extents(file, line.offset)
                 if first < line.offset + line.size
             ]
         finally:

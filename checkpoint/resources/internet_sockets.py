@@ -53,7 +53,7 @@ def observe(held: OpenFile, looked: socket.socket) -> dict[str, Fact]:
     Raises:
         OSError: it cannot be looked into.
     """
-    facts = sockets.common_facts(held.first, looked)
+    facts = sockets.general_facts(held.first, looked)
     state, waiting, backlog = CLOSED, 0, 0
     if looked.proto == socket.IPPROTO_TCP:
         state, *_, waiting, backlog = _TCP_INFO.unpack(looked.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size))

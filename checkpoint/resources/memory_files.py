@@ -20,7 +20,7 @@ from checkpoint.errors import CaptureError
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.descriptors import Descriptor, copy_of
-from checkpoint.linux.digests import data_extents
+from checkpoint.linux.digests import filled_extents
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile, Surroundings, elsewhere
 from checkpoint.resources.rebuilding import Rebuilding, number_of
@@ -67,7 +67,7 @@ def _key(one: Descriptor) -> tuple[int, int]:
 def _content(held: OpenFile) -> list[Fact]:
     file = os.open(f"/proc/{held.pid}/fd/{held.first.number}", os.O_RDONLY | os.O_CLOEXEC)
     try:
-        return [[first, os.pread(file, last - first, first)] for first, last in data_extents(file)]
+        return [[first, os.pread(file, last - first, first)] for first, last in filled_extents(file)]
     finally:
         os.close(file)
 

@@ -104,7 +104,7 @@ def looked_into(pid: int, number: int) -> Iterator[socket.socket]:
             copied.close()
 
 
-def common_facts(one: Descriptor, looked: socket.socket) -> dict[str, Fact]:
+def general_facts(one: Descriptor, looked: socket.socket) -> dict[str, Fact]:
     """Family, kind and options."""
     form = Form(looked.family, looked.type, looked.proto)
     return {

@@ -45,7 +45,7 @@ def observe(held: OpenFile, looked: socket.socket, opened: Sequence[OpenFile]) -
     told = unix_socket(held.first.inode)
     if told is None:
         raise CaptureError(f"cannot ask the kernel about the unix socket {held.name} (sock_diag): load the module unix_diag")
-    facts = sockets.common_facts(held.first, looked)
+    facts = sockets.general_facts(held.first, looked)
     has_queue = told.state == ESTABLISHED or told.type == socket.SOCK_DGRAM
     queue = sockets.queue_of(looked) if has_queue else sockets.Queue((), (), False, False)
     ours = {one.first.inode for one in opened}
