@@ -6,9 +6,9 @@
     seize, stand in a hole       the vessel is ours and dies with us; loop and tables lie where neither has a mapping
     first table                  its own mappings go, the vdso moves, everything the program had is mapped
     pages                        written from outside
-    second table                 protections, files, marks, signals
-    threads                      each born with its own id, and a table of its own (`restore_threads`)
-    third table                  timers, rights
+    second table                 protections, descriptors, marks, signals
+    threads                      each born with its own id, and a table of its own (`restore_threads`); they share the descriptors
+    third table                  timers, rights, file locks, watches
     registers                    SIGTRAP's action, the area unmapped by the vdso's own syscall instruction, then the program's own
 
 Until `Restored.resume` the program stands still and dies with its tracer (PTRACE_O_EXITKILL): an unfinished one leaves nothing.
