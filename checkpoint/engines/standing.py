@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 from dataclasses import dataclass
@@ -103,7 +104,8 @@ class Onlooker:
         if self._inquiry is None:
             special, _, _ = procfs.signal_sets(procfs.read_bytes(self._tracee.pid, "status"))
             self._questions(special)
-            with_contents(gather(self._tracee.pid))
+            with contextlib.suppress(CaptureError):  # it runs: one of its threads has just closed something
+                with_contents(gather(self._tracee.pid))
         self._others.prepare()
 
     def place(self) -> Place:
