@@ -16,6 +16,7 @@ class Case:
         results: files that it leaves, besides its output.
         progress: the file whose growth shows how far it is.
         in_place: it writes into the middle of files, so it must not run on between capture and kill.
+        has_threads: it has several, which know each other by their ids.
     """
 
     name: str
@@ -24,6 +25,7 @@ class Case:
     results: tuple[str, ...] = ()
     progress: str = "out"
     in_place: bool = False
+    has_threads: bool = False
 
     def __str__(self) -> str:
         return self.name
@@ -222,6 +224,6 @@ PLAIN = [
 CASES = [
     *PLAIN,
     Case("ruby", ("ruby", "script.rb"), (("script.rb", RUBY),)),
-    Case("guile", ("guile", "--no-auto-compile", "-s", "script.scm"), (("script.scm", GUILE),)),
-    Case("octave", ("octave-cli", "-q", "--no-init-file", "--no-history", "--eval", OCTAVE)),
+    Case("guile", ("guile", "--no-auto-compile", "-s", "script.scm"), (("script.scm", GUILE),), has_threads=True),
+    Case("octave", ("octave-cli", "-q", "--no-init-file", "--no-history", "--eval", OCTAVE), has_threads=True),
 ]
