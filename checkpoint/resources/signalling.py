@@ -1,7 +1,8 @@
 """Who gets which signal when a descriptor becomes ready: F_SETOWN and F_SETSIG of fcntl(2), kept of every kind of open file.
 
-Facts, added to a resource's own: ``signal`` (0 for SIGIO) and ``owner``: 1 if it is the process itself. Directory notifications
-(F_NOTIFY) cannot be asked for; they are lost with the descriptor's next opening.
+Facts, added to a resource's own: ``signal`` (0 for SIGIO) and ``owner``: 1 if it is the process itself, 2 if its first thread
+alone (F_OWNER_TID), 0 if nobody. Directory notifications (F_NOTIFY) cannot be asked for; they are lost with the descriptor's next
+opening.
 """
 
 from __future__ import annotations
@@ -18,7 +19,12 @@ from checkpoint.resources import OpenFile
 
 F_SETOWN_EX: Final = 15
 F_GETOWN_EX: Final = 16
+F_OWNER_TID: Final = 0
 F_OWNER_PID: Final = 1
+F_OWNER_PGRP: Final = 2
+THE_PROCESS: Final = 1
+ITS_FIRST_THREAD: Final = 2
+_OWNERS: Final = {F_OWNER_PID: THE_PROCESS, F_OWNER_TID: ITS_FIRST_THREAD}
 _OWNER: Final = struct.Struct("<ii")
 O_PATH: Final = 0o10000000
 
@@ -29,21 +35,26 @@ def describe(held: OpenFile) -> dict[str, Fact]:
     if asked is None:
         return {}
     signal, kind, owner = asked
-    return {"signal": signal, "owner": int(kind == F_OWNER_PID and owner == held.pid)}
+    return {"signal": signal, "owner": _OWNERS.get(kind, 0) if owner == held.pid else 0}
 
 
 def refuse(held: OpenFile) -> str | None:
     """Why its signals cannot be kept: they go to somebody else."""
     asked = _asked(held)
-    if asked is None or asked[2] in (0, held.pid):
+    if asked is None or asked[2] == 0:
         return None
-    return f"{held.name} sends its signals to {asked[2]}, not to the process itself, which is not kept: let it own them itself"
+    _, kind, owner = asked
+    if owner == held.pid and kind in _OWNERS:
+        return None
+    whom = {F_OWNER_TID: f"thread {owner} alone", F_OWNER_PGRP: f"process group {owner}"}.get(kind, str(owner))
+    return f"{held.name} sends its signals to {whom}, not to the process itself, which is not kept: let it own them itself"
 
 
 def rebuild(table: CallTable, descriptor: int, held: Resource, inner_pid: int) -> None:
     """Set them again."""
     if held.facts.get("owner"):
-        owner = table.place(_OWNER.pack(F_OWNER_PID, inner_pid))
+        kind = F_OWNER_TID if held.facts["owner"] == ITS_FIRST_THREAD else F_OWNER_PID
+        owner = table.place(_OWNER.pack(kind, inner_pid))
         table.call(f"own the signals of {held.name}", "fcntl", descriptor, F_SETOWN_EX, owner)
     if held.facts.get("signal"):
         table.call(f"choose the signal of {held.name}", "fcntl", descriptor, fcntl.F_SETSIG, int(str(held.facts["signal"])))

@@ -64,6 +64,7 @@ REFUSED = {
     "deleted_directory": "directory",
     "root": "root",
     "own_namespace": "namespace",
+    "owner_group": "process group",
 }
 """What each kind of ``tests/tracees/refused.c`` must be called in the refusal: one of the words, in any case."""
 

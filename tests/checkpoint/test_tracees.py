@@ -113,7 +113,7 @@ PORTRAITS = cases(
 FILES = cases(
     "files",
     "read_offset write_offset append odd_flags shared_offset holes deleted deleted_read_only devices directory path_only "
-    "beyond_end odd_name owner_signal",
+    "beyond_end odd_name owner_signal owner_thread",
 )
 
 THREADS = [*cases("threads"), *cases("threads", "many")]

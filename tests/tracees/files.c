@@ -189,6 +189,16 @@ static void owner_signal(const char *go) {
     EXPECT_EQUAL("signal", fcntl(file, F_GETSIG), SIGUSR2);
 }
 
+static void owner_thread(const char *go) {
+    int file = make("owned", O_RDONLY);
+    struct f_owner_ex owner = {F_OWNER_TID, gettid()};
+    fcntl(file, F_SETOWN_EX, &owner);
+    ready(), wait_for_go(go);
+    EXPECT_EQUAL("asked", fcntl(file, F_GETOWN_EX, &owner), 0);
+    EXPECT_EQUAL("kind of owner", owner.type, F_OWNER_TID);
+    EXPECT_EQUAL("owner", owner.pid, gettid());
+}
+
 int main(int count, char **arguments) {
     static const struct {
         const char *name;
@@ -197,7 +207,8 @@ int main(int count, char **arguments) {
                  {"odd_flags", odd_flags},     {"shared_offset", shared_offset}, {"holes", holes},
                  {"deleted", deleted},         {"deleted_read_only", deleted_read_only}, {"devices", devices},
                  {"directory", directory},     {"path_only", path_only}, {"beyond_end", beyond_end},
-                 {"memory_file", memory_file}, {"odd_name", odd_name}, {"owner_signal", owner_signal}};
+                 {"memory_file", memory_file}, {"odd_name", odd_name}, {"owner_signal", owner_signal},
+                 {"owner_thread", owner_thread}};
     for (size_t index = 0; index < sizeof kinds / sizeof *kinds; index++)
         if (count > 2 && !strcmp(arguments[2], kinds[index].name)) {
             kinds[index].act(arguments[1]);

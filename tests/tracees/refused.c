@@ -321,6 +321,12 @@ static void take_directory_notice(void) {
     if (fcntl(opened, F_NOTIFY, DN_CREATE | DN_MULTISHOT)) cannot("ask for notices");
 }
 
+static void take_owner_group(void) {
+    keep(open(".", O_RDONLY | O_DIRECTORY), "the directory");
+    if (getpgrp() != getpid() && setpgid(0, 0)) cannot("lead a process group");
+    if (fcntl(opened, F_SETOWN, -getpgrp())) cannot("own signals as a group");
+}
+
 static const struct kind {
     const char *name;
     void (*take)(void);
@@ -371,6 +377,7 @@ static const struct kind {
              {"deleted_directory", take_deleted_directory},
              {"root", take_root},
              {"own_namespace", take_own_namespace},
+             {"owner_group", take_owner_group},
              {"directory_notice", take_directory_notice}};
 
 int main(int count, char **arguments) {
