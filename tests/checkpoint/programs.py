@@ -107,7 +107,7 @@ RUBY = """
 $stdout.sync = true
 x = 3; seen = Hash.new(0)
 300.times do |round|
-  2500.times { |i| x = (x * 48271 + i) % 2147483647; seen[(x % 701).to_s] += i }
+  12000.times { |i| x = (x * 48271 + i) % 2147483647; seen[(x % 701).to_s] += i }
   puts "#{round} #{x} #{seen.values.sum} #{seen.keys.sort.first(3).join(',')} #{(2**(round % 300)).to_s[0, 30]}"
 end
 """
