@@ -8,8 +8,10 @@ from unittest.mock import patch
 from failover.core import speaker
 from failover.core.types import MS, ComponentSpec, Config, Launch, OnLoss, Rule, Rules, WhenAlone
 from tests.simulation.invariants import Broken, Invariants
+from tests.simulation.robots import KEEPS_STATE
+from tests.simulation.teams import elective, pair
 from tests.simulation.troubles import Trouble
-from tests.simulation.world import KEEPS_STATE, World, elective, pair
+from tests.simulation.world import World
 
 TROUBLE_NS = 3_000 * MS
 FAULT_NS = 200 * MS

@@ -8,7 +8,8 @@ from checkpoint.model import Position
 from failover.core import acts
 from failover.core.messages import Beat
 from failover.core.types import ENDED, Ballot, ComponentView, OnLoss, State, WhenAlone
-from tests.simulation.world import KEEPS_STATE, NewDisk, World, ballot_of
+from tests.simulation.robots import KEEPS_STATE, NewDisk, ballot_of
+from tests.simulation.world import World
 
 
 class Broken(AssertionError):

@@ -34,7 +34,8 @@ from failover.core import acts
 from failover.core.events import Handover, Run, Stop
 from failover.core.types import MS, ComponentSpec, Config, Launch, Rules
 from tests.simulation.invariants import Invariants, seen_at, state_at
-from tests.simulation.world import World, elective, pair
+from tests.simulation.teams import elective, pair
+from tests.simulation.world import World
 
 COMPONENT = "/team/part"
 

@@ -10,7 +10,8 @@ from checkpoint.model import Position
 from failover.core import acts
 from failover.core.types import MS, ComponentSpec, Launch, OnCrash, Rule, Rules, State
 from tests.simulation.invariants import seen_at, state_at
-from tests.simulation.world import World, elective, pair
+from tests.simulation.teams import elective, pair
+from tests.simulation.world import World
 
 PART = "/team/part"
 CRASH = 11

@@ -6,7 +6,8 @@ import pytest
 
 from failover.core.types import MS, ComponentSpec, Launch, Rules, WhenAlone
 from tests.simulation.invariants import Invariants
-from tests.simulation.world import World, elective, pair
+from tests.simulation.teams import elective, pair
+from tests.simulation.world import World
 
 A, B = "/team/a", "/team/b"
 AT_HOME = {A: ["robot1"], B: ["robot2"]}

@@ -8,7 +8,8 @@ from failover.core import acts
 from failover.core.events import Handover, Promote
 from failover.core.types import MS, ComponentSpec, Launch, OnLoss, Rule, Rules, State, WhenAlone
 from tests.simulation.invariants import Invariants, seen_at, state_at
-from tests.simulation.world import Watcher, World, elective, pair
+from tests.simulation.teams import elective, pair
+from tests.simulation.world import Watcher, World
 
 PART = "/team/part"
 SETTLED_NS = 2_000 * MS

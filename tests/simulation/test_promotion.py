@@ -7,7 +7,8 @@ import pytest
 from failover.core.events import Promote
 from failover.core.types import MS, ComponentSpec, Launch, OnLoss, Rules, State, WhenAlone
 from tests.simulation.invariants import seen_at, state_at
-from tests.simulation.world import World, elective, pair
+from tests.simulation.teams import elective, pair
+from tests.simulation.world import World
 
 PART = "/team/part"
 HOLD = Rules(on_loss=OnLoss.HOLD)

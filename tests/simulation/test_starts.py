@@ -11,7 +11,8 @@ import pytest
 from failover.core.names import weight
 from failover.core.types import MS, ComponentSpec, Config, Launch, Rule, State
 from tests.simulation.invariants import Invariants, seen_at, state_at
-from tests.simulation.world import World, pair
+from tests.simulation.teams import pair
+from tests.simulation.world import World
 
 SPEC = ComponentSpec("/team/part", launch=Launch(("part",)))
 STARTS = 1_000

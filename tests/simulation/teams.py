@@ -1,0 +1,40 @@
+"""Configurations of simulated teams."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from failover.core.types import ComponentSpec, Config, Rule
+
+
+def pair(components: tuple[ComponentSpec, ...] = (), names: tuple[str, ...] = ("robot1", "robot2")) -> list[Config]:
+    """Configurations of a small team, with times that make a minute of life cheap to simulate."""
+    plain = Config(names[0], (), components, 25, 150, 20, 10, 300, 200, 2_000, 400, 3_000, 2_000)
+    return [replace(plain, robot=name, peers=tuple(other for other in names if other != name)) for name in names]
+
+
+def elective(
+    robots: int,
+    components: tuple[ComponentSpec, ...] = (),
+    servers: int = 0,
+    witnesses: int = 0,
+    patience_ms: int = 60_000,
+    lease_ms: int = 150,
+) -> list[Config]:
+    """Configurations of a team that votes."""
+    kinds = {"robot": robots, "server": servers, "witness": witnesses}
+    names = {kind: tuple(f"{kind}{number + 1}" for number in range(count)) for kind, count in kinds.items()}
+    return [
+        replace(
+            config,
+            rule=Rule.MAJORITY,
+            servers=names["server"],
+            witnesses=names["witness"],
+            patience_ms=patience_ms,
+            lease_ms=lease_ms,
+            margin_percent=12,
+            archive_ms=500,
+            components=components if config.robot in names["robot"] else (),
+        )
+        for config in pair(components, sum(names.values(), ()))
+    ]
