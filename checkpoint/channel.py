@@ -17,6 +17,7 @@ from typing import Any, Final, Generic, TypeVar
 
 import msgspec
 
+from checkpoint.capability import Capability
 from checkpoint.engine import PTRACE, Report
 from checkpoint.errors import UNDECODABLE, CheckpointError
 from checkpoint.model import Position
@@ -195,6 +196,10 @@ class Probe(msgspec.Struct, frozen=True, tag=True):
     pid: int
 
 
+class Tabulate(msgspec.Struct, frozen=True, tag=True):
+    """Tell what this version preserves and refuses, of any program. Answer: `Tabulated`."""
+
+
 class Protect(msgspec.Struct, frozen=True, tag=True):
     """Begin to follow a process. Answer: `Protected`.
 
@@ -267,6 +272,12 @@ class Probed(msgspec.Struct, frozen=True, tag=True):
     """What a capture would preserve."""
 
     report: Report
+
+
+class Tabulated(msgspec.Struct, frozen=True, tag=True):
+    """The table of what comes back, in its order."""
+
+    rows: tuple[Capability, ...]
 
 
 class Protected(msgspec.Struct, frozen=True, tag=True):
@@ -349,5 +360,5 @@ class Failed(msgspec.Struct, frozen=True, tag=True):
     reasons: tuple[str, ...] = ()
 
 
-Request = Probe | Protect | Capture | Acknowledge | Restore | Fill | Resume | Release
-Reply = Probed | Protected | Captured | Unchanged | Restored | Filled | Resumed | Released | Failed
+Request = Probe | Tabulate | Protect | Capture | Acknowledge | Restore | Fill | Resume | Release
+Reply = Probed | Tabulated | Protected | Captured | Unchanged | Restored | Filled | Resumed | Released | Failed

@@ -48,6 +48,7 @@ class Keeper:
         self._robot = ""
         self._verbs: dict[type[msgspec.Struct], Callable[..., Answer | None]] = {
             channel.Probe: self._probe,
+            channel.Tabulate: self._tabulate,
             channel.Protect: self._protect,
             channel.Capture: self._capture,
             channel.Acknowledge: self._acknowledge,
@@ -83,6 +84,11 @@ class Keeper:
 
     def _probe(self, request: channel.Probe, _: Descriptors) -> Answer:
         return channel.Probed(self._tracer.probe(request.pid)), ()
+
+    def _tabulate(self, _: channel.Tabulate, __: Descriptors) -> Answer:
+        from checkpoint import capabilities
+
+        return channel.Tabulated(capabilities.rows()), ()
 
     def _protect(self, request: channel.Protect, descriptors: Descriptors) -> Answer:
         if self._session is not None or self._restored is not None:

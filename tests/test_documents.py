@@ -18,7 +18,6 @@ import failover.errors
 from agent import view
 from agent.config import ComponentConfig, Config
 from agent.transport import LinkState
-from checkpoint.resources import unsupported
 from failover.cli import parser
 from failover.client.team import Robot
 
@@ -148,9 +147,3 @@ def test_every_word_of_the_status_is_told() -> None:
     of_robots = {"unknown", "live", "suspect", "dead"}
     words = of_components | of_robots | {"degraded"} | {str(state) for state in LinkState}
     assert [word for word in sorted(words) if not re.search(rf"\*{word}\b", text)] == []
-
-
-def test_everything_that_is_refused_by_name_is_listed() -> None:
-    text = (ROOT / "docs" / "limits.md").read_text()
-    wanted = [name.replace("_event", " event").replace("eventpoll", "epoll") for name in unsupported.ANONYMOUS_INODES]
-    assert [name for name in wanted if name not in text] == []

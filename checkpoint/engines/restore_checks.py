@@ -9,10 +9,12 @@ import mmap
 import os
 import stat
 from collections.abc import Iterator
+from typing import Final
 
 from blake3 import blake3
 
 from checkpoint.arch import x86_64, x86_64_stub
+from checkpoint.capability import Area, refused
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines.description import this_machine
 from checkpoint.engines.identities import build_id
@@ -22,6 +24,59 @@ from checkpoint.linux import abi, procfs
 from checkpoint.model import FileIdentity, Resource, Snapshot
 from checkpoint.resources import rebuild, writers
 from checkpoint.resources.rebuilding import number_of
+
+CAPABILITIES: Final = (
+    refused(
+        Area.THERE,
+        "a file that is mapped or open is missing, or another one (size, build, content)",
+        "install the same on all robots, or accept it as shared where its content does not matter",
+        "is another file: {} bytes here",
+        "is another file: as long",
+        "is another build of that file",
+        "cannot be used ({}): {}",
+        "is of another type here",
+        "bytes here and {} there",
+        "has another content here",
+    ),
+    refused(
+        Area.THERE,
+        "a file that the program writes was changed by somebody else, or is being written",
+        "one writer for each file",
+        "was written to since the snapshot",
+        "is held open for writing by",
+    ),
+    refused(
+        Area.THERE,
+        "another architecture, page size, or a processor without the instructions (AVX-512 …)",
+        "processors of the same kind",
+        "it was taken on {}, this machine is",
+        "its pages are {} bytes",
+        "this processor lacks",
+    ),
+    refused(
+        Area.THERE,
+        "a kernel whose vdso differs, or without what the program uses",
+        "boot the same kernel on all robots",
+        "is laid out unlike ours",
+        "differs from ours",
+        "which our kernel ({}) does not know",
+    ),
+    refused(
+        Area.THERE,
+        "a directory in which the program works is missing",
+        "make it",
+        "its working directory {} is missing",
+        "its root directory is",
+    ),
+    refused(
+        Area.THERE,
+        "a snapshot of another version, or one that is not whole",
+        "use the version that captured it, or capture again",
+        "which this version does not know",
+        "its first thread is not told",
+        "are not those of this processor",
+    ),
+)
 
 _FAR: str = "bring it here from the machine that ran the program"
 

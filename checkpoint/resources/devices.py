@@ -9,10 +9,13 @@ import os
 import stat
 from typing import Final
 
+from checkpoint.capability import Area, preserved
 from checkpoint.model import Resource
 from checkpoint.resources import OpenFile, Surroundings
 
 KIND: Final = "devices"
+
+CAPABILITIES: Final = (preserved(Area.DEVICES, "/dev/null, zero, full, random, urandom", "opened again"),)
 
 MEMORY_MAJOR: Final = 1
 STATELESS: Final = {3: "/dev/null", 5: "/dev/zero", 7: "/dev/full", 8: "/dev/random", 9: "/dev/urandom"}

@@ -14,8 +14,18 @@ from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Final
 
+from checkpoint.capability import Area, refused
 from checkpoint.linux import abi
 from checkpoint.resources import OpenFile
+
+CAPABILITIES: Final = (
+    refused(
+        Area.PIPES,
+        "an event, timer, signal, epoll or inotify descriptor, memory file or socket that another process holds too",
+        "protect the program when that has ended",
+        "holds too: protect the program when that has ended",
+    ),
+)
 
 PRIVATE_KNOWN: Final = 8192
 """Open files remembered as held by nobody else."""

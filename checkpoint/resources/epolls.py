@@ -20,6 +20,7 @@ import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Final
 
+from checkpoint.capability import Area, preserved, refused
 from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
@@ -27,6 +28,19 @@ from checkpoint.resources import OpenFile, Surroundings, elsewhere
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "epolls"
+
+CAPABILITIES: Final = (
+    preserved(
+        Area.PIPES, "epoll, also nested", "with all that it watches; what was reported by edge (EPOLLET) is reported once more"
+    ),
+    refused(
+        Area.PIPES,
+        "an epoll instance that watches what the program has closed and somebody else holds",
+        "take it out (EPOLL_CTL_DEL) before closing",
+        "take that out (EPOLL_CTL_DEL)",
+    ),
+)
+
 TARGET: Final = "anon_inode:[eventpoll]"
 
 EPOLL_CTL_ADD: Final = 1

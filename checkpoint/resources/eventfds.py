@@ -10,12 +10,24 @@ from __future__ import annotations
 import os
 from typing import Final
 
+from checkpoint.capability import Area, preserved, refused
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Resource
 from checkpoint.resources import OpenFile, Surroundings, elsewhere
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "eventfds"
+
+CAPABILITIES: Final = (
+    preserved(Area.PIPES, "event counters (eventfd)", "with their count"),
+    refused(
+        Area.PIPES,
+        "an eventfd on a kernel before 6.5",
+        "boot Linux 6.5 or later: an older one does not tell of which kind it is",
+        "does not tell of which kind",
+    ),
+)
+
 TARGET: Final = "anon_inode:[eventfd]"
 EFD_SEMAPHORE: Final = 1
 INITIAL_MAX: Final = (1 << 32) - 1

@@ -14,6 +14,7 @@ import stat
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
+from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.descriptors import Descriptor, copy_of
@@ -22,6 +23,29 @@ from checkpoint.resources import OpenFile, Surroundings, elsewhere, pipes
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "fifos"
+
+CAPABILITIES: Final = (
+    preserved(
+        Area.PIPES,
+        "named pipes (fifo) that nobody else has open",
+        "opened again by name, with what is in them; made where they are missing",
+    ),
+    refused(
+        Area.PIPES,
+        "a named pipe that another process has open, or whose name is gone",
+        "protect the program when the other has closed it; let it open a name that stays",
+        "whose name is gone",
+        "has open too",
+    ),
+    refused(
+        Area.THERE,
+        "the place of a named pipe is missing, or something else has its name",
+        "make the directory; remove what is there",
+        "is no named pipe here",
+        "the directory of the named pipe",
+    ),
+)
+
 O_PATH: Final = 0o10000000
 _AT_FDCWD: Final = -100
 

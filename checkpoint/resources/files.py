@@ -16,6 +16,7 @@ from typing import Final
 
 from blake3 import blake3
 
+from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError
 from checkpoint.linux import procfs
 from checkpoint.linux.descriptors import Descriptor
@@ -23,6 +24,35 @@ from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile, Surroundings
 
 KIND: Final = "files"
+
+CAPABILITIES: Final = (
+    preserved(
+        Area.FILES,
+        "regular files, directories and paths (O_PATH)",
+        "opened again at the same offset; what was only read must be the same, what only grew is cut back",
+    ),
+    preserved(Area.FILES, "deleted files", "carried whole, up to 16 MiB"),
+    refused(
+        Area.FILES,
+        "a deleted file over 16 MiB, or with another name; a deleted directory",
+        "give it a name",
+        "cannot be opened again; let the program close it",
+        "still has another name",
+        "a deleted file is carried up to",
+    ),
+    refused(
+        Area.FILES,
+        "secret memory (memfd_secret)",
+        "it cannot be read, that is its purpose; run the program without it",
+        "secret memory cannot be read",
+    ),
+    refused(
+        Area.FILES,
+        "files that no path leads to (message queues)",
+        "let the program close them, or use a unix socket",
+        "which no path leads to from here",
+    ),
+)
 
 DIGEST_LIMIT: Final = 256 << 20
 """Bytes of a file that are digested: about 50 ms of one core, once for each version of the file."""

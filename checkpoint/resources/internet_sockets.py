@@ -20,6 +20,7 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
+from checkpoint.capability import Area, preserved, refused
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
@@ -27,6 +28,35 @@ from checkpoint.resources import OpenFile, Surroundings, elsewhere, sockets
 from checkpoint.resources.rebuilding import number_of
 
 KIND: Final = "internet_sockets"
+
+CAPABILITIES: Final = (
+    preserved(Area.SOCKETS, "TCP listeners", "bound and listening again, with their options"),
+    preserved(
+        Area.SOCKETS,
+        "UDP sockets",
+        "with their groups and options; datagrams from other machines that wait are lost, as the network may lose them",
+    ),
+    refused(
+        Area.SOCKETS,
+        "TCP connections",
+        "protect the program while it has none, or let it keep its state itself (docs/decorator.md)",
+        "is a TCP connection",
+    ),
+    refused(
+        Area.SOCKETS,
+        "a TCP listener where a connection waits",
+        "it is kept as soon as the program has accepted it",
+        "where a connection waits to be accepted",
+    ),
+    refused(
+        Area.THERE,
+        "an address or an interface that a socket is bound to is missing",
+        "bind to all addresses (0.0.0.0, ::), or give it to the machine",
+        "this machine does not have that address",
+        "has joined the group",
+    ),
+)
+
 FAMILIES: Final = (socket.AF_INET, socket.AF_INET6)
 PROTOCOLS: Final = (socket.IPPROTO_TCP, socket.IPPROTO_UDP)
 

@@ -16,6 +16,7 @@ import stat
 from collections.abc import Iterator
 from typing import Final
 
+from checkpoint.capability import Area, preserved, refused
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.descriptors import Descriptor
@@ -24,6 +25,40 @@ from checkpoint.resources import OpenFile, Surroundings
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "kernel_files"
+
+CAPABILITIES: Final = (
+    preserved(
+        Area.FILES,
+        "files of /proc and /sys that are read",
+        "opened again where they stood; those of the program itself lead to itself again",
+    ),
+    refused(
+        Area.FILES,
+        "the kernel’s log and debugging files",
+        "let the program close them",
+        "a part of this machine's kernel that cannot be opened again",
+    ),
+    refused(
+        Area.FILES,
+        "files of /proc of single threads and of other processes",
+        "let the program close them after reading",
+        "of one of its threads: let the program close it",
+        "a view of another process",
+    ),
+    refused(
+        Area.FILES,
+        "files of /proc and /sys that are open for writing",
+        "let the program open them only to write",
+        "by which it acts on this machine",
+    ),
+    refused(
+        Area.THERE,
+        "a file of /proc or /sys that the other kernel lacks",
+        "boot the same kernel, or attach what the file shows",
+        "is not offered by this kernel",
+    ),
+)
+
 PLACES: Final = ("/proc", "/sys")
 UNREADABLE: Final = ("/proc/kmsg", "/sys/kernel/debug", "/sys/kernel/tracing", "/sys/fs/bpf", "/proc/sys/fs/binfmt_misc")
 """What is used up by being read, or is no view at all."""

@@ -15,10 +15,16 @@ import struct
 from collections.abc import Iterator
 from typing import Final
 
+from checkpoint.capability import Area, preserved, refused
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile
 from checkpoint.resources.rebuilding import number_of
+
+CAPABILITIES: Final = (
+    preserved(Area.FILES, "file locks (flock, fcntl, open file description locks)", "taken again before the program runs"),
+    refused(Area.FILES, "leases of files", "protect the program while it holds none", "with a lock of the kind"),
+)
 
 F_OFD_SETLK: Final = 37
 KINDS: Final = ("FLOCK", "POSIX", "OFDLCK")

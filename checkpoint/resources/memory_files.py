@@ -16,6 +16,7 @@ import stat
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
+from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
@@ -26,6 +27,19 @@ from checkpoint.resources import OpenFile, Surroundings, elsewhere
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "memory_files"
+
+CAPABILITIES: Final = (
+    preserved(Area.FILES, "memory files (memfd)", "with name, content, size and seals, up to 16 MiB"),
+    refused(
+        Area.FILES,
+        "memory files over 16 MiB, of huge pages, or sealed against writing and mapped",
+        "use a file in /dev/shm",
+        "of huge pages, which are not kept",
+        "MiB, which is the limit",
+        "sealed against writing and mapped",
+    ),
+)
+
 PREFIX: Final = "/memfd:"
 CONTENT_LIMIT: Final = 16 << 20
 """Bytes of one that a snapshot carries: it is copied while the program stands still."""

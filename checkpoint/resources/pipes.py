@@ -22,6 +22,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import Final
 
+from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError
 from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
@@ -30,6 +31,18 @@ from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile, Surroundings
 
 KIND: Final = "pipes"
+
+CAPABILITIES: Final = (
+    preserved(Area.PIPES, "pipes that the program keeps to itself", "with what is in them"),
+    refused(
+        Area.PIPES,
+        "a pipe to another process",
+        "redirect it to a file, or start the programs so that one holds both ends",
+        "to somebody else: only pipes of which",
+        "that another process holds too",
+    ),
+    refused(Area.PIPES, "a pipe in packet mode (O_DIRECT)", "use an ordinary one", "in packet mode"),
+)
 
 F_SETPIPE_SZ: Final = 1031
 F_GETPIPE_SZ: Final = 1032

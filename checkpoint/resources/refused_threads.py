@@ -12,11 +12,52 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
+from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.procfs import Status
 from checkpoint.linux.threads import thread_ids
 from checkpoint.linux.timers import parse_timers
+
+CAPABILITIES: Final = (
+    preserved(
+        Area.THREADS,
+        "all threads of the program, up to 4,096",
+        "frozen together; with ids, names, registers, signals, stacks, robust lists, rseq, scheduling, processors",
+    ),
+    refused(Area.THREADS, "more than 4,096 threads", "let it start fewer", "threads; the limit is"),
+    refused(
+        Area.THREADS,
+        "threads that outlive the first one (pthread_exit in main)",
+        "let the first one wait for them",
+        "its first thread has ended while",
+    ),
+    refused(
+        Area.THREADS,
+        "a thread with other rights, a seccomp filter, namespaces, open files, directory or personality of its own (unshare)",
+        "let all threads share these",
+        "runs under a seccomp filter",
+        "has other rights (user, groups",
+        "has its own {} (unshare)",
+        "open files",
+        "working directory and root",
+        "lives in a namespace of its own ({})",
+        "has an execution domain of its own",
+    ),
+    refused(Area.THREADS, "a thread that a debugger traces", "end that debugger", "is traced by pid"),
+    refused(
+        Area.TIME,
+        "a timer of several threads on CLOCK_THREAD_CPUTIME_ID",
+        "use another clock: nobody tells whose time it counts",
+        "a timer that counts the processor time of one of its threads",
+    ),
+    refused(
+        Area.PROCESS,
+        "a process that shares the memory of its parent (vfork, CLONE_VM)",
+        "it is kept as soon as it has executed a program",
+        "it shares its memory with its parent",
+    ),
+)
 
 THREAD_LIMIT: Final = 4096
 """Threads of one program: the state of each takes 3 to 12 KB, of 32 MiB."""

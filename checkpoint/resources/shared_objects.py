@@ -15,8 +15,18 @@ from collections.abc import Iterator
 from functools import lru_cache
 from typing import Final
 
+from checkpoint.capability import Area, refused
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import procfs
+
+CAPABILITIES: Final = (
+    refused(
+        Area.MEMORY,
+        "shared memory that another process has mapped too",
+        "protect the program when that has ended",
+        "which stays behind: protect the program",
+    ),
+)
 
 _MAPPED: Final = re.compile(rb"^\S+ ...s \S+ (\S+ [1-9]\d*) +(/dev/shm/.*|.* \(deleted\))$", re.MULTILINE)
 """Device and inode number, and the name."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from typing import Final
 
+from checkpoint.capability import Area, preserved
 from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Resource
@@ -17,6 +18,11 @@ from checkpoint.resources import OpenFile, Surroundings, elsewhere
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "signalfds"
+
+CAPABILITIES: Final = (
+    preserved(Area.PIPES, "signals that are read (signalfd)", "with their mask; what waits in them are pending signals"),
+)
+
 TARGET: Final = "anon_inode:[signalfd]"
 
 

@@ -12,10 +12,21 @@ import fcntl
 import struct
 from typing import Final
 
+from checkpoint.capability import Area, preserved, refused
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.descriptors import copy_of
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile
+
+CAPABILITIES: Final = (
+    preserved(Area.PIPES, "signals of a descriptor (F_SETOWN, F_SETSIG) to the program itself or its first thread", "set again"),
+    refused(
+        Area.PIPES,
+        "signals of a descriptor to another process, a group or another thread",
+        "let the program own them itself",
+        "sends its signals to",
+    ),
+)
 
 F_SETOWN_EX: Final = 15
 F_GETOWN_EX: Final = 16

@@ -12,10 +12,20 @@ import os
 import stat
 from typing import Final
 
+from checkpoint.capability import Area, preserved
 from checkpoint.model import Resource
 from checkpoint.resources import OpenFile, Surroundings
 
 KIND: Final = "streams"
+
+CAPABILITIES: Final = (
+    preserved(
+        Area.TERMINALS,
+        "standard input, output and error",
+        "become the streams of the component where it goes on; nothing written is lost or repeated",
+    ),
+)
+
 STANDARD: Final = (0, 1, 2)
 
 

@@ -21,6 +21,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from checkpoint.capability import Area, preserved
 from checkpoint.errors import CaptureError
 from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
@@ -30,6 +31,15 @@ from checkpoint.resources import OpenFile, Surroundings, elsewhere
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "timerfds"
+
+CAPABILITIES: Final = (
+    preserved(
+        Area.TIME,
+        "timers that are read (timerfd)",
+        "with what was left, the outage counted, and the expirations that were not read yet",
+    ),
+)
+
 TARGET: Final = "anon_inode:[timerfd]"
 
 TFD_TIMER_ABSTIME: Final = 1

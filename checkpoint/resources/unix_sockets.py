@@ -21,6 +21,7 @@ import stat
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
+from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
@@ -30,6 +31,45 @@ from checkpoint.resources import OpenFile, Surroundings, elsewhere, sockets
 from checkpoint.resources.rebuilding import number_of
 
 KIND: Final = "unix_sockets"
+
+CAPABILITIES: Final = (
+    preserved(Area.SOCKETS, "unix sockets that the program keeps to itself", "pairs and connections with what waits in them"),
+    preserved(
+        Area.SOCKETS,
+        "unix listeners, and unix sockets for datagrams",
+        "bound to their names again, or connected to the names that they were connected to",
+    ),
+    refused(
+        Area.SOCKETS,
+        "a unix socket that is connected to another process",
+        "open it for a moment and close it again: captures are taken in between",
+        "connected to another process",
+        "connected to a socket of another process",
+    ),
+    refused(
+        Area.SOCKETS,
+        "a unix socket with descriptors on their way, messages of a named sender, or over 4 MiB that wait",
+        "it is kept as soon as the program has taken them",
+        "with descriptors on their way",
+        "MiB wait: it is kept as soon as",
+        "with messages of a sender that has a name",
+    ),
+    refused(
+        Area.SOCKETS,
+        "a unix listener where a connection waits",
+        "it is kept as soon as the program has accepted it",
+        "where a connection waits to be accepted",
+    ),
+    refused(
+        Area.THERE,
+        "something else has the name of a unix socket, or there is no place for it",
+        "end or remove what is there; make the directory",
+        "the directory of the unix socket",
+        "is something else here",
+        "is another process's here",
+    ),
+)
+
 _AT_FDCWD: Final = -100
 BOTH_DIRECTIONS: Final = 3
 _SHUTDOWN_HOW: Final = {1: socket.SHUT_RD, 2: socket.SHUT_WR, 3: socket.SHUT_RDWR}

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
+from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.procfs import MapsLine, Status
@@ -21,6 +22,111 @@ from checkpoint.model import Resource
 from checkpoint.resources import OpenFile, Surroundings, refused_threads, shared_objects
 
 KIND: Final = "unsupported"
+
+CAPABILITIES: Final = (
+    refused(Area.PIPES, "io_uring", "poll(2) or epoll on what is kept", "an io_uring", "the rings of an io_uring"),
+    refused(Area.PIPES, "fanotify", "use inotify, which is kept", "a fanotify group"),
+    refused(Area.PIPES, "asynchronous I/O (io_setup)", "use threads", "a ring of asynchronous I/O (aio)"),
+    refused(Area.PIPES, "perf events", "run it without", "a perf event", "the buffer of a perf event"),
+    refused(Area.PIPES, "pidfds", "let the program close them, or wait by number", "a pidfd"),
+    refused(Area.PIPES, "namespaces that are held open", "let the program close them", "a namespace ({})"),
+    refused(
+        Area.PIPES,
+        "open files of any other kind (BPF …)",
+        "protect the program while it has none open",
+        "a pipe ({})",
+        "a named pipe (fifo {})",
+        "an open {}",
+        "of a kind that we do not know",
+    ),
+    refused(
+        Area.SOCKETS,
+        "sockets of other families (netlink, packet, CAN, vsock …) and protocols (ICMP, SCTP …)",
+        "open it for a moment and close it again; captures are taken in between",
+        "a socket ({}, {})",
+    ),
+    refused(
+        Area.DEVICES,
+        "all other devices, and terminals that are not the standard streams",
+        "a driver process of its own holds the device, the protected program holds none",
+        "the device {}{}",
+    ),
+    refused(Area.DEVICES, "memory of a device", "the driver process maps it", "memory of a device"),
+    refused(Area.MEMORY, "System V shared memory", "use a file in /dev/shm", "System V shared memory"),
+    refused(Area.MEMORY, "secret memory that is mapped", "run it without", "secret memory"),
+    refused(
+        Area.MEMORY,
+        "huge pages (hugetlb)",
+        "use transparent ones, which are kept as ordinary pages",
+        "huge pages",
+        "huge pages (hugetlb)",
+    ),
+    refused(
+        Area.MEMORY,
+        "memory that the program itself watches by userfaultfd",
+        "run it without",
+        "a userfaultfd",
+        "own userfaultfd watches",
+        "own userfaultfd write-protects",
+    ),
+    refused(Area.MEMORY, "protection keys, shadow stacks", "run it without", "has protection key", "a shadow stack"),
+    preserved(
+        Area.MEMORY,
+        "mapped files that were replaced or deleted since the program started",
+        "the old ones are carried, compared at every checkpoint, up to 64 MiB each",
+        "KiB of the old one are carried",
+    ),
+    refused(
+        Area.MEMORY,
+        "a mapping of more than 64 MiB of a deleted file",
+        "restart the program, then protect it",
+        "replaced since the program started",
+        "and larger than",
+    ),
+    refused(
+        Area.PROCESS,
+        "child processes",
+        "protect it while it has none; start each as a component of its own",
+        "it has child processes",
+    ),
+    refused(
+        Area.PROCESS,
+        "a seccomp filter",
+        "run it without: a capture asks system calls of it that the filter forbids",
+        "it runs under a seccomp filter",
+    ),
+    refused(Area.PROCESS, "programs of 32 bits", "use a 64-bit build", "it is a program of 32 bits"),
+    refused(
+        Area.PROCESS,
+        "a program whose own file is gone",
+        "restart the program, then protect it",
+        "is no longer there: restart the program",
+    ),
+    refused(
+        Area.PROCESS,
+        "a working directory that is gone, a root directory of its own (chroot)",
+        "change the directory; run it without the chroot",
+        "its working directory",
+        "its root directory is",
+    ),
+    refused(
+        Area.PROCESS,
+        "network, IPC, UTS, cgroup, mount and user namespaces of its own (containers)",
+        "run it, and failover, in the same one",
+        "namespace of its own, which is not kept yet: run it",
+    ),
+    refused(
+        Area.PROCESS,
+        "kernel threads, zombies, threads named as processes, what a debugger traces, failover itself",
+        "name a program that runs, and end the debugger",
+        "it is a thread of process",
+        "it is a kernel thread",
+        "its first thread has ended while",
+        "it has ended and is a zombie",
+        "a process cannot trace itself",
+        "is its tracer already",
+    ),
+)
 
 _ADVICE: Final = (
     "is not kept yet: protect the program while it has none, or let the program keep its state itself (docs/decorator.md)"

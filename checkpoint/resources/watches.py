@@ -20,6 +20,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Final
 
+from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
@@ -29,6 +30,29 @@ from checkpoint.resources import OpenFile, Surroundings, elsewhere
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "watches"
+
+CAPABILITIES: Final = (
+    preserved(
+        Area.PIPES,
+        "watches of files (inotify)",
+        "each on the same path under its number; what happens between the checkpoint and the restore is not told",
+    ),
+    refused(
+        Area.PIPES,
+        "an inotify instance with events that were not read",
+        "it is kept as soon as they are read",
+        "with events that the program has not read yet",
+    ),
+    refused(
+        Area.PIPES,
+        "an inotify watch of a file without a name, or the ten thousandth",
+        "remove the watch, or open another instance",
+        "is of a file that no path leads to",
+        "whose watch has number",
+    ),
+    refused(Area.THERE, "what the program watches (inotify) is missing", "make it", "which the program watches by"),
+)
+
 TARGET: Final = "anon_inode:inotify"
 
 IN_DELETE_SELF: Final = 0x400

@@ -55,7 +55,7 @@ def positive(text: str) -> int:
     return number
 
 
-def _pid(room: argparse.ArgumentParser, optional: bool = False) -> None:
+def _pid(room: argparse._ActionsContainer, optional: bool = False) -> None:
     room.add_argument("pid", metavar="PID", type=positive, nargs="?" if optional else None, help="the process")
 
 
@@ -209,7 +209,9 @@ def inspect(room: argparse.ArgumentParser) -> None:
 
 def check(room: argparse.ArgumentParser) -> None:
     """Of ``failover check``."""
-    _pid(room, optional=True)
+    either = room.add_mutually_exclusive_group()
+    _pid(either, optional=True)
+    either.add_argument("--table", action="store_true", help="show what comes back of any program, and what is refused")
     _json(room)
 
 

@@ -150,7 +150,9 @@ def _print_notes(notes: tuple[str, ...]) -> None:
 
 
 def check(arguments: argparse.Namespace) -> int:
-    """Say whether a process, or this machine, can be protected, and what to change."""
+    """Say whether a process, or this machine, can be protected, and what to change; or what can be in general."""
+    if arguments.table:
+        return _show_table(arguments)
     if arguments.pid is None:
         from failover.cli.machine import check_machine
 
@@ -169,3 +171,17 @@ def check(arguments: argparse.Namespace) -> int:
         "it can be captured" if report.supported else f"it cannot be captured: {len(report.reasons)} reasons, see refused above"
     )
     return 0 if report.supported else 1
+
+
+def _show_table(arguments: argparse.Namespace) -> int:
+    """Show what comes back of any program, by which rule, and what is refused."""
+    with Keeper.spawn() as keeper:
+        rows = keeper.ask(channel.Tabulate(), channel.Tabulated)[0].rows
+    if arguments.json:
+        render.as_json([{"area": row.area, "kind": row.kind, "verdict": row.verdict, "sentence": row.sentence} for row in rows])
+        return 0
+    for area in dict.fromkeys(row.area for row in rows):
+        lines = [(row.kind, row.verdict, row.sentence) for row in rows if row.area == area]
+        render.table(("kind", "verdict", "how, or what to do instead"), lines, area[0].upper() + area[1:])
+        print()
+    return 0

@@ -288,10 +288,12 @@ VERBS: Final = (
         "can this machine, or this process, be protected; and what to change",
         """
         Without PID: what this machine offers, and what is missing. With PID: whether that process can be captured now,
-        what would come back otherwise than it was, and every reason why not. The process is not touched.
+        what would come back otherwise than it was, and every reason why not. The process is not touched. With --table: each
+        kind of thing that a program may hold, and whether it is preserved, preserved by a rule of the operator's, or refused.
 
           failover check
           failover check 4711
+          failover check --table
         """,
         arguments.check,
         "failover.cli.oneshot:check",

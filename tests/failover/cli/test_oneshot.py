@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from checkpoint import capabilities
 from tests.failover.cli.test_verbs import failover
 
 PYTHON = getattr(sys, "_base_executable", sys.executable)
@@ -216,7 +217,11 @@ def test_an_existing_file_is_not_overwritten_unless_asked(tmp_path: Path) -> Non
 
 def test_check_names_what_stands_against_a_capture_and_touches_nothing(tmp_path: Path) -> None:
     with subprocess.Popen(
-        [PYTHON, "-c", "import socket, sys; a = socket.socket(); print(flush=True); sys.stdin.read()"],
+        [
+            PYTHON,
+            "-c",
+            "import socket, sys; a = socket.socket(socket.AF_NETLINK, socket.SOCK_RAW); print(flush=True); sys.stdin.read()",
+        ],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     ) as process:
@@ -238,6 +243,14 @@ def test_check_without_a_pid_says_what_this_machine_offers() -> None:
     offers = json.loads(ran.stdout)["offers"]
     assert {offer["what"] for offer in offers} >= {"processor", "looking into programs", "written pages"}
     assert ran.returncode == 0
+
+
+def test_check_shows_the_table_of_what_comes_back_as_the_code_has_it() -> None:
+    ran = failover("check", "--table", "--json")
+    rows = [(row["area"], row["kind"], row["verdict"], row["sentence"]) for row in json.loads(ran.stdout)]
+    assert rows == [(row.area, row.kind, row.verdict, row.sentence) for row in capabilities.rows()]
+    told = failover("check", "--table").stdout
+    assert [row.kind for row in capabilities.rows() if row.kind not in told] == []
 
 
 FILTERED = """

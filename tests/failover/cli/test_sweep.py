@@ -30,6 +30,7 @@ USAGE = (
     *(["bogus"], [], ["status", "--bogus"], ["status", "--every-ms", "x"], ["completion", "x"], ["team"]),
     ["stop", "x", "--signal", "?"],
     *(["check", pid] for pid in NO_PIDS),
+    ["check", "1", "--table"],
     *(["protect", pid] for pid in NO_PIDS),
 )
 

@@ -1,0 +1,88 @@
+"""The table of what comes back: the rows of all files that carry some."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from functools import cache
+from types import ModuleType
+from typing import Final
+
+from checkpoint.capability import Area, Capability, Verdict
+from checkpoint.engines import preserved, restore_checks
+from checkpoint.resources import (
+    devices,
+    elsewhere,
+    epolls,
+    eventfds,
+    fifos,
+    files,
+    internet_sockets,
+    kernel_files,
+    locks,
+    memory_files,
+    pipes,
+    refused_threads,
+    shared_objects,
+    signalfds,
+    signalling,
+    streams,
+    timerfds,
+    unix_sockets,
+    unsupported,
+    watches,
+)
+
+CARRIERS: Final[tuple[ModuleType, ...]] = (
+    preserved,
+    refused_threads,
+    shared_objects,
+    files,
+    kernel_files,
+    memory_files,
+    locks,
+    pipes,
+    fifos,
+    eventfds,
+    signalfds,
+    epolls,
+    watches,
+    signalling,
+    elsewhere,
+    timerfds,
+    unix_sockets,
+    internet_sockets,
+    streams,
+    devices,
+    unsupported,
+    restore_checks,
+)
+"""In the order in which their rows stand within an area and a verdict."""
+
+
+def rows() -> tuple[Capability, ...]:
+    """Every row: by area, within an area what is preserved first and what is refused last."""
+    areas, verdicts = list(Area), list(Verdict)
+    found = [row for carrier in CARRIERS for row in carried_by(carrier)]
+    return tuple(sorted(found, key=lambda row: (areas.index(row.area), verdicts.index(row.verdict))))
+
+
+def carried_by(carrier: ModuleType) -> tuple[Capability, ...]:
+    """The rows of one file."""
+    found: tuple[Capability, ...] = carrier.CAPABILITIES
+    return found
+
+
+def row_of(sentence: str) -> Capability | None:
+    """The row that a refusal or note belongs to, by the words that it says; None where no row has them."""
+    return next((row for row in rows() for part in row.said if _pattern(part).search(sentence)), None)
+
+
+@cache
+def _pattern(part: str) -> re.Pattern[str]:
+    return re.compile(".*".join(map(re.escape, part.split("{}"))))
+
+
+def by_area() -> Mapping[Area, tuple[Capability, ...]]:
+    """The rows of each area."""
+    return {area: tuple(row for row in rows() if row.area == area) for area in Area}

@@ -1,0 +1,66 @@
+"""One row of the table of what comes back: each file of ``resources`` carries its own, `checkpoint.capabilities` gathers them.
+
+A row is about one kind of thing that a program may hold. The table in README.md and docs/capabilities.md is written from these
+rows (``./run table``), and tests hold it and every refusal in the code against them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Verdict(StrEnum):
+    """What becomes of a kind."""
+
+    PRESERVED = "preserved"
+    BY_RULE = "by rule"
+    REFUSED = "refused"
+
+
+class Area(StrEnum):
+    """What a kind is a part of, in the order of the table."""
+
+    PROCESS = "the process"
+    THREADS = "threads"
+    MEMORY = "memory"
+    TIME = "clocks and timers"
+    FILES = "files"
+    PIPES = "pipes, events, watches"
+    SOCKETS = "sockets"
+    TERMINALS = "terminals"
+    DEVICES = "devices"
+    THERE = "at the other robot"
+
+
+@dataclass(frozen=True, slots=True)
+class Capability:
+    """One row.
+
+    Attributes:
+        kind: what it is, in a few words that a reader of the table would look for.
+        sentence: how it comes back, by which rule, or what to do instead.
+        said: a part of each sentence by which the code refuses or notes it, as it stands in the source: ``{}`` for what is filled
+            in.
+    """
+
+    area: Area
+    kind: str
+    verdict: Verdict
+    sentence: str
+    said: tuple[str, ...] = ()
+
+
+def preserved(area: Area, kind: str, sentence: str, *said: str) -> Capability:
+    """A row about what comes back as it was."""
+    return Capability(area, kind, Verdict.PRESERVED, sentence, said)
+
+
+def by_rule(area: Area, kind: str, sentence: str, *said: str) -> Capability:
+    """A row about what comes back where the operator's rules say how."""
+    return Capability(area, kind, Verdict.BY_RULE, sentence, said)
+
+
+def refused(area: Area, kind: str, sentence: str, *said: str) -> Capability:
+    """A row about what is refused by name, before the program is touched."""
+    return Capability(area, kind, Verdict.REFUSED, sentence, said)

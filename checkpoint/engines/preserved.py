@@ -1,0 +1,70 @@
+"""What the engines bring back of every program besides what it has open: rows of the table, see `checkpoint.capability`."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from checkpoint.capability import Area, by_rule, preserved, refused
+
+CAPABILITIES: Final = (
+    preserved(
+        Area.PROCESS,
+        "name, arguments, environment, executable, directory, umask, limits, nice, switches of prctl(2)",
+        "as they were",
+    ),
+    preserved(
+        Area.PROCESS,
+        "signals: actions, masks, what is pending, alternate stacks",
+        "as they were; how often a timer went off while its signal was pending is lost",
+    ),
+    by_rule(
+        Area.PROCESS,
+        "the PID",
+        "the same wherever `failover run` gave a PID namespace, or it is free; else a new one, and that is said",
+    ),
+    by_rule(
+        Area.PROCESS,
+        "user, groups, capabilities",
+        "as far as the agent has them; the program of an ordinary user comes back with his and no more",
+        "of the program are not kept: we do not have them",
+    ),
+    preserved(
+        Area.THREADS,
+        "system calls in which a thread sleeps or waits",
+        "made again with the time that is left; a few with a finite timeout end early with EINTR (README)",
+    ),
+    refused(
+        Area.THERE,
+        "a PID or thread id that is taken, of a program of several threads or one whose lock names it",
+        "free it, or start the program with `failover run`, in PIDs of its own",
+        "it holds a lock that names its own pid",
+        "and a lock that the program holds names it",
+        "that id is in use",
+        "choosing an id needs CAP_CHECKPOINT_RESTORE",
+    ),
+    preserved(
+        Area.MEMORY,
+        "private memory: heap, stacks, mapped files",
+        "with protection, guard pages and advice; zero pages and untouched ones cost nothing",
+    ),
+    preserved(
+        Area.MEMORY,
+        "shared memory that is the program's alone: anonymous, POSIX (/dev/shm), files",
+        "made again, or mapped again where the file is",
+    ),
+    preserved(
+        Area.PROCESS,
+        "registers, floating point, SSE, AVX and AVX-512, thread-local storage",
+        "as they were",
+    ),
+    preserved(
+        Area.TIME,
+        "interval timers, POSIX timers, sleeps",
+        "go on with what was left, the outage counted",
+    ),
+    by_rule(
+        Area.TIME,
+        "monotonic and boot clocks",
+        "never go back, and go on from their reading where `failover run` gave a time namespace; the hour is the machine's",
+    ),
+)
