@@ -9,7 +9,7 @@ from types import ModuleType
 from typing import Final
 
 from checkpoint.capability import Area, Capability, Verdict
-from checkpoint.engines import preserved, restore_checks
+from checkpoint.engines import preserved, restore_checks, restore_vdso
 from checkpoint.resources import (
     devices,
     elsewhere,
@@ -56,6 +56,7 @@ CARRIERS: Final[tuple[ModuleType, ...]] = (
     devices,
     unsupported,
     restore_checks,
+    restore_vdso,
 )
 """In the order in which their rows stand within an area and a verdict."""
 

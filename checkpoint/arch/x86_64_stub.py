@@ -146,6 +146,30 @@ SYSTEM_CALLS: Final = {
 """Numbers of the system calls that a restore makes inside a vessel (asm/unistd_64.h)."""
 
 
+VDSO_CALLS: Final = {
+    "__vdso_clock_gettime": 228,
+    "__vdso_gettimeofday": 96,
+    "__vdso_time": 201,
+    "__vdso_clock_getres": 229,
+    "__vdso_getcpu": 309,
+}
+"""Functions of the vdso that can be had from any other, each with the system call that does the same. Not among them is
+__vdso_getrandom: what a program keeps for it has another form with each kernel, and without the kernel's data it makes the
+system call by itself. Source: vdso(7); lib/vdso/getrandom.c.
+"""
+JUMP_SIZE: Final = 15
+
+
+def jump_to(address: int) -> bytes:
+    """``notrack jmp [rip+0]`` and where to: `JUMP_SIZE` bytes that go on at any address, all registers as they are."""
+    return b"\x3e\xff\x25" + bytes(4) + struct.pack("<Q", address)
+
+
+def call_and_return(number: int) -> bytes:
+    """``mov eax, number; syscall; ret``: a function that is a system call."""
+    return b"\xb8" + struct.pack("<I", number) + x86_64.SYSCALL + b"\xc3"
+
+
 def with_registers(registers: bytes, **values: int) -> bytes:
     """A copy of NT_PRSTATUS with some registers changed; the thread is not in a system call any more."""
     return x86_64.encode_registers(x86_64.decode_registers(registers) | {x86_64.CALL_NUMBER: x86_64.NO_CALL, **values})

@@ -35,6 +35,7 @@ LARGE_COUNT: Final = 256
 """Pages that are worth a pass while the program runs: they take 0.4 ms to copy, as long as everything else about them."""
 PASS_LIMIT: Final = 3
 """Passes after the first: a program that writes faster than we copy is not caught up with by more of them."""
+VDSO: Final = "[vdso]"
 UNACKNOWLEDGED_LIMIT: Final = 64
 """Scans that are remembered one by one. Beyond, the oldest two become one, and the older position can be acknowledged no more: a
 standby whose disk is full for a week must not make every freeze longer."""
@@ -131,6 +132,7 @@ class MemoryCapture:
         self._shared_lines: list[MapsLine] = []
         self._had_shared = False
         self._mapped: Words = NONE
+        self._vdso: Words = NONE
         self._followed: Words = NONE
         self._buffer = bytearray(BUFFER_SIZE)
         self._is_armed = False
@@ -246,6 +248,8 @@ class MemoryCapture:
             copied.spoil(scan)
             copied.valid = pages.intersection(copied.valid, self._mapped if base else written)
         missing = pages.difference(written, copied.valid)
+        if base:
+            missing = pages.union(missing, self._vdso)  # for a machine whose kernel has another one
         content = memoryview(self._memory.read_pages(missing, self._buffer))[: pages.total_size(missing)]
         return Taken(
             lines=self.lines,
@@ -265,6 +269,7 @@ class MemoryCapture:
         self._shared_lines = [line for line in self.lines if tracking.is_shared(line) or tracking.is_orphan(line)]
         self._followed = tracking.extents_of(self._private)
         self._mapped = tracking.extents_of([line for line in self.lines if line.name not in tracking.NOT_CARRIED])
+        self._vdso = tracking.extents_of([line for line in self.lines if line.name == VDSO])
 
     def _scan(self) -> Scan:
         """What was written since the last scan. One that fails half-way has protected pages that it tells nobody of."""

@@ -22,17 +22,17 @@ import os
 import resource
 import signal
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 from checkpoint import epoch_variable
 from checkpoint.arch import x86_64, x86_64_stub
 from checkpoint.engine import RestoreOptions
-from checkpoint.engines import restore_checks, restore_memory, restore_process, restore_threads, switches
+from checkpoint.engines import restore_checks, restore_memory, restore_process, restore_threads, restore_vdso, switches
 from checkpoint.engines.restore_process import Vessel
 from checkpoint.errors import CheckpointError, MismatchError, RestoreError
-from checkpoint.linux import abi, call_table, procfs
+from checkpoint.linux import abi, call_table, procfs, vdso
 from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee
@@ -97,6 +97,8 @@ class _Restore:
         self._others: list[tuple[Tracee, ThreadState]] = []
         self._notes: list[str] = []
         self._objects: dict[tuple[int, int], int] = {}
+        self._foreign: tuple[Vma, ...] = ()
+        self._own_functions: tuple[vdso.Function, ...] = ()
 
     def run(self) -> RestoredProgram:
         try:
@@ -121,8 +123,18 @@ class _Restore:
         self._xstate_size = len(tracee.xstate())
         self._start_registers = tracee.registers()
         mappings = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
+        self._adapt(mappings)
         self._build_and_run(vessel, mappings)
         self._become_program()
+
+    def _adapt(self, mappings: tuple[procfs.MapsLine, ...]) -> None:
+        """Have a program of another kernel use this one's vdso."""
+        ours = restore_memory.kernel_pages(mappings)
+        if restore_vdso.fits(self._state, ours):
+            return
+        image = self._tracee.memory.read(ours[-1].start, ours[-1].size)
+        self._state, self._foreign = restore_vdso.with_own_image(self._state)
+        self._own_functions = vdso.functions(image)
 
     def _require_identity(self, vessel: Vessel) -> None:
         """A program of several threads knows their ids; so does one that holds robust or priority-inheriting locks."""
@@ -137,7 +149,7 @@ class _Restore:
                 (reason,),
             )
         head = self._thread.robust_list[0]
-        listed = content_at(self._state, head, ROBUST_HEAD.size) if head else None
+        listed = restore_memory.content_at(self._state, head, ROBUST_HEAD.size) if head else None
         if listed is None:
             return
         first, _, acquiring = ROBUST_HEAD.unpack(listed)
@@ -165,9 +177,12 @@ class _Restore:
             )
         self._area_size = size
         stub = Stub(tracee, base)
-        stub.install(self._syscall_instruction(kernel_pages[-1]), size)
+        stub.install(self._syscall_instruction(kernel_pages[-1].start, kernel_pages[-1].size), size)
         self._notes += stub.run(first)
         restore_memory.fill(tracee.memory, state)
+        if self._own_functions:
+            self._leave_old_vdso()
+            tracee.memory.write_each(restore_vdso.jumps(state, self._vdso, self._own_functions))
         if self._options.epoch:
             _renew_token(tracee, state, self._options.epoch)
         self._notes += stub.run(second)
@@ -177,6 +192,28 @@ class _Restore:
         _write_oom_score(tracee.pid, state.process.oom_score_adj, self._notes)
         _write_coredump_filter(tracee.pid, state.process.coredump_filter, self._notes)
 
+    def _leave_old_vdso(self) -> None:
+        """Lead whatever thread stands in the middle of another kernel's vdso out of it."""
+        if not self._foreign:
+            return
+        *places, image = self._foreign
+        instruction = self._syscall_instruction(self._vdso, self._vdso_size)
+
+        def protect(protection: int) -> None:
+            for place in places:
+                self._single(instruction, "mprotect", place.start, place.size, protection)
+
+        def led_out(thread: ThreadState) -> ThreadState:
+            if not restore_vdso.stands_in(thread.registers["prstatus"], image):
+                return thread
+            outside = restore_vdso.run_out(self._tracee, thread.registers["prstatus"], image, lambda: protect(abi.PROT_READ))
+            protect(abi.PROT_NONE)
+            return replace(thread, registers={**thread.registers, "prstatus": outside}, interrupted="")
+
+        self._state = replace(self._state, threads=tuple(map(led_out, self._state.threads)))
+        self._thread = self._state.threads[0]
+        protect(abi.PROT_READ)
+
     def _mappings_table(self, table: CallTable, vessel: Vessel, mappings: tuple[procfs.MapsLine, ...], refuge: int) -> CallTable:
         vmas, runs = self._state.vmas, self._state.runs
         restore_process.raise_limits(table, vessel)
@@ -184,7 +221,8 @@ class _Restore:
             restore_process.own_eyes(table, self._state.process, vessel)
         restore_memory.clear(table, mappings)
         ours, theirs = restore_memory.kernel_pages(mappings), restore_memory.kernel_pages_of(vmas)
-        restore_memory.move_kernel_pages(table, ours, theirs, refuge)
+        self._vdso = restore_memory.move_kernel_pages(table, ours, theirs, refuge)
+        self._vdso_size = ours[-1].size
         self._objects = restore_memory.map_program(table, vmas, runs)
         return table
 
@@ -235,8 +273,7 @@ class _Restore:
     def _become_program(self) -> None:
         """SIGTRAP's action, our area gone, then the program's own registers and masks."""
         tracee, state = self._tracee, self._state
-        vdso = restore_memory.kernel_pages_of(state.vmas)[-1]
-        instruction = self._syscall_instruction(vdso)
+        instruction = self._syscall_instruction(self._vdso, self._vdso_size)
         action = restore_process.trap_action(state.process.signal_actions)
         tracee.memory.write(self._stub.base + abi.PAGE_SIZE, restore_process.packed_action(action))
         arguments = (signal.SIGTRAP, self._stub.base + abi.PAGE_SIZE, 0, abi.SIGSET_SIZE)
@@ -260,7 +297,7 @@ class _Restore:
         rseq = thread.rseq
         if rseq is None:
             return
-        pointer = content_at(self._state, rseq.address + RSEQ_SECTION_OFFSET, 8)
+        pointer = restore_memory.content_at(self._state, rseq.address + RSEQ_SECTION_OFFSET, 8)
         if pointer is not None and any(pointer):
             self._tracee.memory.write(rseq.address + RSEQ_SECTION_OFFSET, pointer)
 
@@ -268,7 +305,8 @@ class _Restore:
         """Have the vessel execute the program's own file, so that /proc/PID/exe is right without a right to set it."""
         tracee, path = self._tracee, self._state.process.executable.path
         mappings = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
-        instruction = self._syscall_instruction(restore_memory.kernel_pages(mappings)[-1])
+        own_vdso = restore_memory.kernel_pages(mappings)[-1]
+        instruction = self._syscall_instruction(own_vdso.start, own_vdso.size)
         stack = next(line for line in mappings if line.name == "[stack]")
         content = os.fsencode(path) + b"\0"
         place = stack.start + abi.PAGE_SIZE
@@ -287,12 +325,12 @@ class _Restore:
         self._tracee.request("step", abi.PTRACE_SYSCALL)
         return self._tracee.wait(call_table.RUN_TIMEOUT_S)
 
-    def _syscall_instruction(self, vdso: procfs.MapsLine | Vma) -> int:
-        image = self._tracee.memory.read(vdso.start, vdso.size)
+    def _syscall_instruction(self, start: int, size: int) -> int:
+        image = self._tracee.memory.read(start, size)
         offset = image.find(x86_64.SYSCALL)
         if offset < 0:
             raise RestoreError("cannot restore: this kernel's vdso has no syscall instruction to leave by")
-        return vdso.start + offset
+        return start + offset
 
     def _single(self, instruction: int, name: str, *arguments: int) -> None:
         number = x86_64_stub.SYSTEM_CALLS[name]
@@ -306,17 +344,6 @@ ROBUST_HEAD: Final = struct.Struct("<QqQ")
 
 RSEQ_SECTION_OFFSET: Final = 8
 """Offset of rseq_cs in struct rseq (linux/rseq.h)."""
-
-
-def content_at(state: Snapshot, address: int, size: int) -> bytes | None:
-    """Bytes of the program's memory, as far as the snapshot carries the page; None when it does not."""
-    position = 0
-    for run in state.runs:
-        if run.start <= address and address + size <= run.end:
-            offset = position + address - run.start
-            return bytes(memoryview(state.contents)[offset : offset + size])
-        position += run.size
-    return None
 
 
 def _renew_token(tracee: Tracee, state: Snapshot, epoch: int) -> None:

@@ -16,9 +16,10 @@ from blake3 import blake3
 from checkpoint.arch import x86_64, x86_64_stub
 from checkpoint.capability import Area, refused
 from checkpoint.engine import RestoreOptions
+from checkpoint.engines import restore_vdso
 from checkpoint.engines.description import this_machine
 from checkpoint.engines.identities import build_id
-from checkpoint.engines.restore_memory import is_file_mapping, kernel_pages, kernel_pages_of, makes_shared_memory
+from checkpoint.engines.restore_memory import is_file_mapping, kernel_pages, makes_shared_memory
 from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux import abi, procfs
 from checkpoint.model import FileIdentity, Resource, Snapshot
@@ -55,10 +56,8 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.THERE,
-        "a kernel whose vdso differs, or without what the program uses",
-        "boot the same kernel on all robots",
-        "is laid out unlike ours",
-        "differs from ours",
+        "a kernel without what the program uses",
+        "boot one that has it",
         "which our kernel ({}) does not know",
     ),
     refused(
@@ -110,11 +109,8 @@ def _of_machine(state: Snapshot) -> Iterator[str]:
         yield f"its pages are {machine.page_size} bytes, this kernel's {abi.PAGE_SIZE}: boot a kernel with the same"
     yield from _of_threads(state)
     ours = kernel_pages(procfs.parse_maps(procfs.read_text(os.getpid(), "maps")))
-    theirs = kernel_pages_of(state.vmas)
-    if [page.size for page in ours] != [page.size for page in theirs]:
-        yield f"the vdso of its kernel ({machine.kernel}) is laid out unlike ours ({os.uname().release}): boot the same kernel"
-    elif machine.vdso_digest != here.vdso_digest:
-        yield f"the vdso of its kernel ({machine.kernel}) differs from ours ({here.kernel}): boot the same kernel"
+    if not restore_vdso.fits(state, ours):
+        yield from restore_vdso.refuse(state)
     if lacking := set(machine.features) & x86_64_stub.INSTRUCTION_SETS - set(here.features):
         listed = ", ".join(sorted(lacking))
         yield f"this processor lacks {listed}, by which the program may have chosen its code: use one that has them"

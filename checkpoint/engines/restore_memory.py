@@ -10,19 +10,21 @@ Sources: mmap(2), mremap(2), madvise(2), process_vm_writev(2).
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from checkpoint import pages
 from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.tracking import MEMORY_PLACE
 from checkpoint.model import PageRun, Snapshot, Vma, VmaKind
+from checkpoint.pages import Words
 from checkpoint.resources import memory_files, rebuild
 
 MREMAP_MAYMOVE_FIXED: Final = 1 | 2
@@ -33,6 +35,7 @@ KERNEL_KINDS: Final = frozenset({VmaKind.VDSO, VmaKind.VVAR, VmaKind.VSYSCALL})
 
 KERNEL_NAMES: Final = ("[vdso]", "[vvar", "[vsyscall]")
 VSYSCALL: Final = "[vsyscall]"
+LAST_ADDRESS: Final = (1 << 64) - 1
 
 ADVICE: Final = {"sr": 2, "rr": 1, "dc": 10, "mg": 12, "hg": 14, "nh": 15, "dd": 16, "wf": 18}
 """madvise(2) by the letters of VmFlags: sequential, random, don't fork, mergeable, huge, not huge, don't dump, wipe on fork."""
@@ -58,20 +61,23 @@ def kernel_pages_of(vmas: Iterable[Vma]) -> list[Vma]:
     return [vma for vma in vmas if vma.kind in (VmaKind.VDSO, VmaKind.VVAR)]
 
 
-def move_kernel_pages(table: CallTable, vessel: Sequence[MapsLine], program: Sequence[Vma], refuge: int) -> None:
-    """Move the vdso and its data to where the program has them.
+def move_kernel_pages(table: CallTable, vessel: Sequence[MapsLine], program: Sequence[Vma], refuge: int) -> int:
+    """Move the vdso and its data to where the program has them; where the vdso lies then.
 
     Args:
+        program: empty where it has another kernel's (`restore_vdso`): they stay in the refuge.
         refuge: an address with room for all of them in a hole; they go there first, so that old and new places may overlap.
     """
-    moves = [(ours.start, theirs.start, ours.size) for ours, theirs in zip(vessel, program, strict=True)]
     places = []
-    for start, _, size in moves:
-        _move(table, start, refuge, size)
+    for line in vessel:
+        _move(table, line.start, refuge, line.size)
         places.append(refuge)
-        refuge += size
-    for place, (_, target, size) in zip(places, moves, strict=True):
-        _move(table, place, target, size)
+        refuge += line.size
+    if not program:
+        return places[-1]
+    for place, line, theirs in zip(places, vessel, program, strict=True):
+        _move(table, place, theirs.start, line.size)
+    return program[-1].start
 
 
 def _move(table: CallTable, start: int, target: int, size: int) -> None:
@@ -208,13 +214,41 @@ class Carried:
 
 
 def fill(memory: Memory, snapshot: Snapshot) -> None:
-    """Write every page that the snapshot carries."""
-    if not snapshot.runs:
-        return
-    ranges = np.empty((len(snapshot.runs), 2), np.uint64)
-    ranges[:, 0] = np.fromiter((run.start for run in snapshot.runs), np.uint64, len(snapshot.runs))
-    ranges[:, 1] = np.fromiter((run.size for run in snapshot.runs), np.uint64, len(snapshot.runs))
-    memory.write_from(ranges, np.frombuffer(snapshot.contents, np.uint8))
+    """Write every page that the snapshot carries, but for those of the kernel's own mappings, which have come with the vessel."""
+    contents, position = np.frombuffer(snapshot.contents, np.uint8), 0
+    mapped = pages.extents(vma for vma in snapshot.vmas if vma.kind not in KERNEL_KINDS)
+    for is_wanted, piece in _cut(snapshot.runs, mapped):
+        ranges = piece.copy()
+        ranges[:, 1] -= ranges[:, 0]
+        size = int(ranges[:, 1].sum())
+        if is_wanted:
+            memory.write_from(ranges, contents[position : position + size])
+        position += size
+
+
+def _cut(runs: Sequence[PageRun], mapped: Words) -> Iterator[tuple[bool, Words]]:
+    """The runs in order, as few pieces as there are changes between what is in a set and what is not."""
+    whole = pages.extents(runs)
+    outside = pages.difference(whole, mapped)
+    begin = 0
+    for first, last in outside.tolist():
+        before = pages.intersection(whole, np.array([[begin, first]], np.uint64))
+        yield from ((True, before),) if len(before) else ()
+        yield False, np.array([[first, last]], np.uint64)
+        begin = last
+    rest = pages.intersection(whole, np.array([[begin, LAST_ADDRESS]], np.uint64))
+    yield from ((True, rest),) if len(rest) else ()
+
+
+def content_at(state: Snapshot, address: int, size: int) -> bytes | None:
+    """Bytes of the program's memory, as far as the snapshot carries the page; None when it does not."""
+    position = 0
+    for run in state.runs:
+        if run.start <= address and address + size <= run.end:
+            offset = position + address - run.start
+            return bytes(memoryview(state.contents)[offset : offset + size])
+        position += run.size
+    return None
 
 
 def settle(table: CallTable, vmas: Iterable[Vma], runs: Sequence[PageRun]) -> None:

@@ -49,11 +49,6 @@ def test_a_processor_that_lacks_a_feature_is_said_so(snapshot: Snapshot, tmp_pat
     _expect_nothing_started(richer, tmp_path, "avx512f")
 
 
-def test_a_foreign_vdso_is_said_so(snapshot: Snapshot, tmp_path: Path) -> None:
-    other = replace(snapshot, machine=replace(snapshot.machine, vdso_digest=bytes(32), kernel="2.6.18"))
-    _expect_nothing_started(other, tmp_path, r"vdso.*2\.6\.18")
-
-
 def test_a_thread_whose_id_is_taken_is_said_so(snapshot: Snapshot, tmp_path: Path) -> None:
     """By then the vessel has a thread already, which must not be left."""
     (thread,) = snapshot.threads

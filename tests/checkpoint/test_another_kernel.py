@@ -1,0 +1,157 @@
+"""A program whose snapshot comes from a kernel with another vdso: it reads the clocks through this one's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from checkpoint.arch import x86_64
+from checkpoint.engines.restore_memory import content_at
+from checkpoint.errors import CheckpointError
+from checkpoint.linux import procfs, vdso
+from checkpoint.linux.vdso import Function
+from checkpoint.model import Snapshot, Vma, VmaKind
+from tests.checkpoint.round_trip import (
+    CaptureOrder,
+    Program,
+    captured,
+    captured_and_killed,
+    captured_at_last,
+    ended,
+    expect_ok,
+    protected,
+    restored,
+    start_tracee,
+)
+from tests.conftest import children
+
+pytestmark = [pytest.mark.compiler, pytest.mark.root]
+
+Compiled = Callable[..., Path]
+
+BREAKPOINT = b"\xcc"
+"""An instruction that ends whoever comes to it."""
+ATTEMPTS = 400
+"""Captures after which a program that reads clocks all the time has been met while it does."""
+
+
+def image_of(snapshot: Snapshot) -> Vma:
+    """The mapping of the kernel's own image."""
+    return next(vma for vma in snapshot.vmas if vma.kind is VmaKind.VDSO)
+
+
+def functions_of(snapshot: Snapshot) -> tuple[Function, ...]:
+    """Its functions."""
+    image = image_of(snapshot)
+    return vdso.functions(content_at(snapshot, image.start, image.size) or b"")
+
+
+def of_another_kernel(snapshot: Snapshot) -> Snapshot:
+    """The same, as if its kernel had another vdso than ours."""
+    return replace(snapshot, machine=replace(snapshot.machine, vdso_digest=bytes(32), kernel="2.6.18"))
+
+
+def written_over(snapshot: Snapshot, address: int, content: bytes) -> Snapshot:
+    """The same with other memory."""
+    whole, position = bytearray(snapshot.contents), 0
+    for run in snapshot.runs:
+        if run.start <= address < run.end:
+            place = position + address - run.start
+            whole[place : place + len(content)] = content
+        position += run.size
+    return replace(snapshot, contents=bytes(whole))
+
+
+def with_deadly_functions(snapshot: Snapshot) -> Snapshot:
+    """The same with an old vdso of which every instruction ends the program: nobody may come to it any more."""
+    for function in functions_of(snapshot):
+        if function.name != "__vdso_getrandom":
+            place = image_of(snapshot).start + function.offset
+            snapshot = written_over(snapshot, place, BREAKPOINT * function.size)
+    return snapshot
+
+
+def laid_out_otherwise(snapshot: Snapshot) -> Snapshot:
+    """The same with a page less of the kernel's data: no vdso of ours fits into its place."""
+    first = next(vma for vma in snapshot.vmas if vma.kind is VmaKind.VVAR)
+    shorter = replace(first, start=first.start + snapshot.machine.page_size)
+    return replace(snapshot, vmas=tuple(shorter if vma is first else vma for vma in snapshot.vmas))
+
+
+def outside_the_image(program: Program) -> Snapshot:
+    """A snapshot of a program whose only thread is not just reading a clock."""
+    return captured_where(program, inside=False)
+
+
+def captured_where(program: Program, *, inside: bool) -> Snapshot:
+    """A snapshot of a program that just reads a clock, or does not."""
+    with protected(program) as session:
+        for _ in range(ATTEMPTS):
+            snapshot = captured_at_last(session, CaptureOrder())
+            image = image_of(snapshot)
+            place = x86_64.decode_registers(snapshot.threads[0].registers["prstatus"])["rip"]
+            if (image.start <= place < image.end) is inside:
+                return snapshot
+    raise AssertionError(f"not met {'inside' if inside else 'outside'} the vdso in {ATTEMPTS} captures")
+
+
+@pytest.mark.parametrize("change", [of_another_kernel, laid_out_otherwise])
+def test_a_program_of_another_kernel_reads_the_clocks_of_this_one(
+    change: Callable[[Snapshot], Snapshot], compiled: Compiled, tmp_path: Path
+) -> None:
+    with ended(start_tracee(compiled("clock_reader", "-O2"), tmp_path)) as tracee:
+        snapshot = outside_the_image(tracee)
+        assert {function.name for function in functions_of(snapshot)} >= {"__vdso_clock_gettime", "__vdso_time"}
+    with ended(restored(with_deadly_functions(change(snapshot)), tmp_path)) as tracee:
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_a_program_that_goes_to_and_fro_carries_one_old_image(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("clock_reader", "-O2"), tmp_path)) as tracee:
+        snapshot = with_deadly_functions(of_another_kernel(outside_the_image(tracee)))
+    counts = []
+    for change in (of_another_kernel, lambda same: same, laid_out_otherwise, of_another_kernel):
+        with ended(restored(snapshot, tmp_path)) as tracee:
+            counts.append(len(procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))))
+            snapshot = change(captured_and_killed(tracee))
+    assert len(set(counts)) == 1
+    with ended(restored(snapshot, tmp_path)) as tracee:
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_a_thread_that_was_just_reading_a_clock_reads_it_to_the_end(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("clock_reader", "-O2"), tmp_path, "1000")) as tracee:
+        snapshot = captured_where(tracee, inside=True)
+    with ended(restored(of_another_kernel(snapshot), tmp_path)) as tracee:
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_a_thread_that_would_take_zeros_for_the_time_is_said_so(compiled: Compiled, tmp_path: Path) -> None:
+    """It stands before the first instruction of time(2), which reads the kernel's data without looking whether they are good."""
+    with ended(start_tracee(compiled("clock_reader", "-O2"), tmp_path)) as tracee:
+        snapshot = captured(tracee)
+    (offset,) = (function.offset for function in functions_of(snapshot) if function.name == "__vdso_time")
+    (thread,) = snapshot.threads
+    registers = x86_64.decode_registers(thread.registers["prstatus"])
+    registers |= {"rip": image_of(snapshot).start + offset, "rdi": 0, "orig_rax": x86_64.NO_CALL}
+    inside = replace(thread, registers={**thread.registers, "prstatus": x86_64.encode_registers(registers)}, interrupted="")
+    before = children()
+    with pytest.raises(CheckpointError, match="reading a clock"):
+        restored(of_another_kernel(replace(snapshot, threads=(inside,))), tmp_path).kill()
+    assert children() == before
+
+
+def test_a_snapshot_without_the_old_image_is_said_so(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("heap", "-O2"), tmp_path)) as tracee:
+        snapshot = captured_and_killed(tracee)
+    blank = written_over(snapshot, image_of(snapshot).start, bytes(4096))
+    before = children()
+    with pytest.raises(CheckpointError, match=r"vdso.*2\.6\.18.*does not hold the old one"):
+        restored(of_another_kernel(blank), tmp_path).kill()
+    assert children() == before
