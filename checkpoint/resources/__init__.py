@@ -179,4 +179,4 @@ def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
                 resources.append(replace(resource, facts={**resource.facts, **signalling.describe(held), **locks.describe(held)}))
                 findings.append(Finding(kind.KIND, held.name, KEPT, f"{held.name} is {held.first.target}"))
                 break
-    return Held(tuple(resources), tuple(findings))
+    return Held(tuple(resources), (*findings, *kinds.findings_of_all(resources)))

@@ -1,7 +1,8 @@
 """Sockets of TCP and UDP: listeners, sockets for datagrams with their groups, and those that are not connected yet.
 
 A socket is bound to the same address again. Datagrams that wait come back where their sender's address is this machine's own;
-others are lost, as the network may lose them. A TCP connection is refused: it has another end, which knows its numbers.
+others are lost, as the network may lose them. So are connections that nobody has accepted yet: who asked for one is
+reset. Connections of TCP are in ``tcp_connections``.
 
 Facts besides those of every socket: ``state`` of tcp(7), `CLOSED` for UDP; ``address`` and ``peer``: [host, port] or [host, port,
 flow, scope], empty if there is none; ``backlog``; ``waiting``: connections not accepted yet; ``sources``: addresses from which
@@ -17,10 +18,11 @@ import ctypes
 import os
 import socket
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
+from checkpoint.engine import NOTED, Finding
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
@@ -30,23 +32,13 @@ from checkpoint.resources.rebuilding import number_of
 KIND: Final = "internet_sockets"
 
 CAPABILITIES: Final = (
-    preserved(Area.SOCKETS, "TCP listeners", "bound and listening again, with their options"),
+    preserved(
+        Area.SOCKETS, "TCP listeners", "bound and listening again, with their options; connections not accepted yet are reset"
+    ),
     preserved(
         Area.SOCKETS,
         "UDP sockets",
         "with their groups and options; datagrams from other machines that wait are lost, as the network may lose them",
-    ),
-    refused(
-        Area.SOCKETS,
-        "TCP connections",
-        "protect the program while it has none, or let it keep its state itself (docs/decorator.md)",
-        "is a TCP connection",
-    ),
-    refused(
-        Area.SOCKETS,
-        "a TCP listener where a connection waits",
-        "it is kept as soon as the program has accepted it",
-        "where a connection waits to be accepted",
     ),
     refused(
         Area.THERE,
@@ -60,7 +52,6 @@ CAPABILITIES: Final = (
 FAMILIES: Final = (socket.AF_INET, socket.AF_INET6)
 PROTOCOLS: Final = (socket.IPPROTO_TCP, socket.IPPROTO_UDP)
 
-ESTABLISHED: Final = 1
 CLOSED: Final = 7
 LISTENING: Final = 10
 _TCP_INFO: Final = struct.Struct("<B7x4I2I")
@@ -106,7 +97,7 @@ def _bound(address: Sequence[Fact]) -> list[Fact]:
     return list(address) if address[1] else []
 
 
-def _in_words(address: Sequence[Fact]) -> str:
+def in_words(address: Sequence[Fact]) -> str:
     return f"{address[0]!s} port {address[1]!s}"
 
 
@@ -178,17 +169,16 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return None
     seen = held.observed
     name = {socket.IPPROTO_TCP: "a TCP socket", socket.IPPROTO_UDP: "a UDP socket"}[number_of(seen["protocol"])]
-    if seen["state"] == LISTENING and seen["waiting"]:
-        return f"{held.name} is {name} where a connection waits to be accepted: it is kept as soon as the program has accepted it"
-    if seen["state"] not in (CLOSED, LISTENING):
-        peer = seen["peer"]
-        assert isinstance(peer, list)
-        other = f" with {_in_words(peer)}" if peer else ""
-        return (
-            f"{held.name} is a TCP connection{other}, which is not kept yet: protect the program while it has none, or let it "
-            "keep its state itself (docs/decorator.md)"
-        )
     return elsewhere.refuse(held, name)
+
+
+def findings(held: Iterable[Resource]) -> Iterator[Finding]:
+    """Connections that are lost."""
+    for one in held:
+        if one.kind == KIND and number_of(one.facts["waiting"]):
+            count = number_of(one.facts["waiting"])
+            text = f"{count} connections that {one.name} has not accepted yet are reset when the program comes back"
+            yield Finding(KIND, one.name, NOTED, text)
 
 
 def mismatches(held: Resource) -> Iterator[str]:
@@ -197,7 +187,7 @@ def mismatches(held: Resource) -> Iterator[str]:
     assert isinstance(address, list)
     if address and not _has_option(held, socket.IPPROTO_IP, IP_FREEBIND) and not is_ours(address):
         yield (
-            f"{held.name} is bound to {_in_words(address)}, and this machine does not have that address: give it to one of its "
+            f"{held.name} is bound to {in_words(address)}, and this machine does not have that address: give it to one of its "
             "interfaces, or let the program bind to all (0.0.0.0 or ::)"
         )
     for interface, group, _ in _joined(held):
@@ -252,13 +242,13 @@ def prepare(table: CallTable, held: Sequence[Resource], first: int) -> dict[int,
         number, peer = made[number_of(one.facts["socket"])], one.facts["peer"]
         assert isinstance(peer, list)
         if peer:
-            what = f"{one.name} is not connected to {_in_words(peer)}, where no way leads from here"
-            table.attempt(what, "connect", number, table.place(sockaddr(peer)), _size(peer))
+            what = f"{one.name} is not connected to {in_words(peer)}, where no way leads from here"
+            table.attempt(what, "connect", number, table.place(sockaddr(peer)), size_of(peer))
         sockets.set_flags(table, one, number)
     return made
 
 
-def _size(address: Sequence[Fact]) -> int:
+def size_of(address: Sequence[Fact]) -> int:
     return 28 if ":" in str(address[0]) else 16
 
 
@@ -266,11 +256,16 @@ def _place(table: CallTable, one: Resource, made: int) -> None:
     """Bind it, let it listen, join its groups."""
     address = one.facts["address"]
     assert isinstance(address, list)
+    shares = number_of(one.facts["state"]) == LISTENING and not _has_option(one, socket.SOL_SOCKET, socket.SO_REUSEADDR)
+    if shares:  # its port with connections of the program that are there already
+        _reuse(table, made, 1)
     if address:
-        what = f"bind {one.name} to {_in_words(address)}"
-        table.call(what, "bind", made, table.place(sockaddr(address)), _size(address))
+        what = f"bind {one.name} to {in_words(address)}"
+        table.call(what, "bind", made, table.place(sockaddr(address)), size_of(address))
     if number_of(one.facts["state"]) == LISTENING:
         table.call(f"listen at {one.name}", "listen", made, number_of(one.facts["backlog"]))
+    if shares:
+        _reuse(table, made, 0)
     for interface, group, packed in _joined(one):
         index = socket.if_nametoindex(interface)
         level = socket.IPPROTO_IPV6 if ":" in group else socket.IPPROTO_IP
@@ -281,6 +276,11 @@ def _place(table: CallTable, one: Resource, made: int) -> None:
         if mode != EXCLUDE or count:
             request = struct.pack("<I", index) + packed[4:]
             table.call(what, "setsockopt", made, level, MCAST_MSFILTER, table.place(request), len(request))
+
+
+def _reuse(table: CallTable, made: int, value: int) -> None:
+    place = table.place(value.to_bytes(4, "little"))
+    table.call("set SO_REUSEADDR", "setsockopt", made, socket.SOL_SOCKET, socket.SO_REUSEADDR, place, 4)
 
 
 def _send_again(table: CallTable, one: Resource, held: Sequence[Resource], made: Mapping[int, int]) -> None:
@@ -301,7 +301,14 @@ def _send_again(table: CallTable, one: Resource, held: Sequence[Resource], made:
         if sender is None and not _is_free(source):
             continue
         lent = sender if sender is not None else _sender(table, one, source)
-        arguments = (lent, table.place(message), len(message), socket.MSG_DONTWAIT, table.place(sockaddr(target)), _size(target))
+        arguments = (
+            lent,
+            table.place(message),
+            len(message),
+            socket.MSG_DONTWAIT,
+            table.place(sockaddr(target)),
+            size_of(target),
+        )
         table.attempt(f"a datagram that waited in {one.name} is lost", "sendto", *arguments)
         if sender is None:
             table.close(lent)
@@ -326,5 +333,5 @@ def _is_free(source: Sequence[Fact]) -> bool:
 def _sender(table: CallTable, one: Resource, source: list[Fact]) -> int:
     family = socket.AF_INET6 if ":" in str(source[0]) else socket.AF_INET
     made = table.obtain(f"make a sender for {one.name}", "socket", family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC, 0)
-    table.call(f"bind a sender for {one.name}", "bind", made, table.place(sockaddr(source)), _size(source))
+    table.call(f"bind a sender for {one.name}", "bind", made, table.place(sockaddr(source)), size_of(source))
     return made

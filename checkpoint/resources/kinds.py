@@ -6,6 +6,7 @@ import socket
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, Protocol
 
+from checkpoint.engine import Finding
 from checkpoint.errors import CaptureError
 from checkpoint.linux.descriptors import Descriptor
 from checkpoint.model import Fact, Resource
@@ -24,6 +25,7 @@ from checkpoint.resources import (
     signalfds,
     sockets,
     streams,
+    tcp_connections,
     timerfds,
     unix_sockets,
     unsupported,
@@ -60,6 +62,7 @@ ASKED: Final[tuple[Kind, ...]] = (
     epolls,
     watches,
     unix_sockets,
+    tcp_connections,
     internet_sockets,
     unsupported,
 )
@@ -93,7 +96,19 @@ def _observe_socket(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, 
             if looked.family == socket.AF_UNIX:
                 return unix_sockets.observe(held, looked, opened)
             if looked.family in internet_sockets.FAMILIES and looked.proto in internet_sockets.PROTOCOLS:
-                return internet_sockets.observe(held, looked)
+                return _observe_internet_socket(held, looked)
     except OSError as error:
         raise CaptureError(f"cannot look into the socket {held.name} of pid {held.pid}: {error.strerror}; try again") from error
     return {}
+
+
+def _observe_internet_socket(held: OpenFile, looked: socket.socket) -> Mapping[str, Fact]:
+    facts = internet_sockets.observe(held, looked)
+    if looked.proto == socket.IPPROTO_TCP and facts["state"] == internet_sockets.CLOSED:
+        facts["ends"] = tcp_connections.ends_of(looked)
+    return facts | tcp_connections.observe(held, looked, facts) if tcp_connections.is_connection(facts) else facts
+
+
+def findings_of_all(resources: Sequence[Resource]) -> tuple[Finding, ...]:
+    """What can be told only of all resources together."""
+    return (*tcp_connections.findings(resources), *internet_sockets.findings(resources))

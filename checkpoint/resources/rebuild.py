@@ -36,6 +36,7 @@ from checkpoint.resources import (
     signalfds,
     signalling,
     streams,
+    tcp_connections,
     timerfds,
     unix_sockets,
     watches,
@@ -68,7 +69,7 @@ NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
     internet_sockets.KIND: internet_sockets.mismatches,
 }
 """Kinds that need something of this machine: why it does not have that, one sentence each."""
-SOCKETS: Final = (unix_sockets.KIND, internet_sockets.KIND)
+SOCKETS: Final = (unix_sockets.KIND, tcp_connections.KIND, internet_sockets.KIND)
 KINDS: Final = (files.KIND, devices.KIND, streams.KIND, pipes.KIND, *MADE, *SOCKETS)
 
 
@@ -106,7 +107,7 @@ def rebuild_all(
     moved = _move_streams_away(table, max(wanted[-1].number, *objects.values(), 0) + 1)
     piped = pipes.rebuild(table, [held for held in state.resources if held.kind == pipes.KIND], moved[-1] + 1)
     connected = _prepare_sockets(table, state, moved[-1] + 1 + len(piped))
-    rebuilding = Rebuilding(options, state.clocks, inner_pid, moved[-1] + 1 + len(piped) + len(connected))
+    rebuilding = Rebuilding(options, state.clocks, inner_pid, max((moved[-1] + len(piped), *connected.values())) + 1)
     for key, number in objects.items():
         rebuilding.keep(table, key, number)
     holders: dict[int, int] = {}  # which number already stands for an open file description
@@ -121,18 +122,23 @@ def rebuild_all(
     for number in (*moved, *piped.values(), *connected.values(), *rebuilding.objects.values()):
         table.close(number)
     _settle(table, wanted, holders)
-    return ()
+    return tcp_connections.notes(state.resources)
 
 
 def _prepare_sockets(table: CallTable, state: Snapshot, first: int) -> dict[int, int]:
     """Make all sockets at numbers from ``first`` on, in the working directory: names may be relative to it."""
     of_unix = [held for held in state.resources if held.kind == unix_sockets.KIND]
     of_internet = [held for held in state.resources if held.kind == internet_sockets.KIND]
+    of_tcp = [held for held in state.resources if held.kind == tcp_connections.KIND]
     if of_unix:
         directory = state.process.working_directory
         table.call(f"enter the working directory {directory}", "chdir", table.place_path(directory))
     made = unix_sockets.prepare(table, of_unix, first)
-    return made | internet_sockets.prepare(table, of_internet, first + len(made) + 1)
+    connected = tcp_connections.prepare(table, of_tcp, first + len(made) + 1)
+    made |= connected
+    made |= internet_sockets.prepare(table, of_internet, first + len(made) + 1)
+    tcp_connections.settle(table, of_tcp, connected)
+    return made
 
 
 def _settle(table: CallTable, wanted: list[Wanted], holders: Mapping[int, int]) -> None:

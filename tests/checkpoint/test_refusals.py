@@ -34,7 +34,6 @@ REFUSED = {
     "zombie_child": "child",
     "shared_files_child": "child",
     "traced_child": "child",
-    "tcp_connection": "tcp connection",
     "unix_rights": "scm_rights",
     "unix_waiting": "accepted",
     "netlink_socket": "socket",

@@ -12,7 +12,6 @@
 #include <linux/seccomp.h>
 #include <linux/userfaultfd.h>
 #include <mqueue.h>
-#include <netinet/in.h>
 #include <pthread.h>
 #include <pty.h>
 #include <sys/fanotify.h>
@@ -128,17 +127,6 @@ static void take_pipe(void) {
     int ends[2];
     if (pipe(ends)) cannot("make a pipe");
     keep(ends[1], "a pipe");
-}
-
-static void take_tcp_connection(void) {
-    struct sockaddr_in address = {.sin_family = AF_INET, .sin_addr = {htonl(INADDR_LOOPBACK)}};
-    socklen_t size = sizeof address;
-    int listens = socket(AF_INET, SOCK_STREAM, 0);
-    if (bind(listens, (struct sockaddr *)&address, size) || listen(listens, 1)) cannot("listen");
-    getsockname(listens, (struct sockaddr *)&address, &size);
-    keep(socket(AF_INET, SOCK_STREAM, 0), "a socket");
-    if (connect(opened, (struct sockaddr *)&address, size)) cannot("connect");
-    accept(listens, NULL, NULL);
 }
 
 static void take_unix_rights(void) {
@@ -345,7 +333,6 @@ static const struct kind {
              {"traced_child", take_traced_child},
              {"pipe", take_pipe},
              {"unix_rights", take_unix_rights},
-             {"tcp_connection", take_tcp_connection},
              {"unix_waiting", take_unix_waiting},
              {"netlink_socket", take_netlink_socket},
              {"fanotify", take_fanotify},

@@ -1,0 +1,397 @@
+"""TCP connections: those of the program with itself come back; every other one ends, and the program sees a reset.
+
+The other end of a connection to somebody else has gone on since the capture: it has been told things, or has told some, that
+the program which comes back knows nothing of. So the program finds what it would find had its peer crashed: ECONNRESET,
+EPOLLHUP and EPOLLERR; what had waited to be read is gone. Where the peer had ended its side and all of it was read, it reads the
+end of file again. A connection that was being asked for (SYN_SENT) is asked for anew.
+
+A connection of which both ends are the program's is made again between the same addresses, where those can be had, with what
+waits at both ends. It is made as any other is, without TCP_REPAIR: no right is needed, and no capture may leave a
+socket in repair.
+
+Facts besides those of ``internet_sockets``: ``local``: both addresses are one machine's; ``queue``: what waits to be read in a
+local one, one message; ``unread``: bytes that wait; ``sent`` and ``received``: bytes that went over it; ``unsent``: bytes still
+to be sent; ``ends``: what poll(2) says of its end, `READ_ENDED` and `FAILED`.
+
+Source: tcp(7), tcp_ioctl() and tcp_poll() in net/ipv4/tcp.c; linux/tcp.h for struct tcp_info.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import select
+import socket
+import struct
+import termios
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from ipaddress import ip_address
+from typing import Final
+
+from checkpoint.capability import Area, by_rule, preserved, refused
+from checkpoint.engine import NOTED, REFUSED, Finding
+from checkpoint.linux import connection_remains, procfs
+from checkpoint.linux.call_table import CallTable
+from checkpoint.model import Fact, Resource
+from checkpoint.resources import OpenFile, Surroundings, elsewhere, internet_sockets, sockets
+from checkpoint.resources.internet_sockets import CLOSED, LISTENING, in_words, size_of, sockaddr
+from checkpoint.resources.rebuilding import number_of
+
+KIND: Final = "tcp_connections"
+
+CAPABILITIES: Final = (
+    preserved(
+        Area.SOCKETS,
+        "TCP connections of the program with itself",
+        "with what waits in them, between the same addresses where their ports are free",
+        "the TCP connection",
+    ),
+    by_rule(
+        Area.SOCKETS,
+        "TCP connections with others",
+        "they are reset: the program finds what it would find had its peer crashed (ECONNRESET, EPOLLHUP, EPOLLERR); after the "
+        "end of file it reads that again; one that is being asked for is asked for anew",
+    ),
+    refused(
+        Area.SOCKETS,
+        "a TCP connection of the program with itself that is full",
+        "it is kept as soon as what was sent has arrived, or was read",
+        "have not arrived at its other end",
+        "in which more than {} MiB wait",
+    ),
+)
+
+SYN_SENT: Final = 2
+FIN_WAIT_1: Final = 4
+FIN_WAIT_2: Final = 5
+CLOSE_WAIT: Final = 8
+LAST_ACK: Final = 9
+CLOSING: Final = 11
+_WE_ENDED: Final = (FIN_WAIT_1, FIN_WAIT_2, LAST_ACK, CLOSING)
+_PEER_ENDED: Final = (CLOSE_WAIT, LAST_ACK, CLOSING)
+
+READ_ENDED: Final = 1
+FAILED: Final = 2
+
+_TCP_INFO_SIZE: Final = 216
+_RECEIVED: Final = struct.Struct("<Q")
+_RECEIVED_AT: Final = 128
+_UNSENT_AT: Final = 144
+_SENT_AT: Final = 200
+"""tcpi_bytes_received; tcpi_notsent_bytes; tcpi_bytes_sent and tcpi_bytes_retrans (Linux 4.19)."""
+
+_RESET_AT_CLOSE: Final = struct.pack("<ii", 1, 0)
+"""SO_LINGER: no time is left for what is underway, so the connection is reset."""
+_ROOM: Final = 1 << 16
+
+
+def observe(held: OpenFile, looked: socket.socket, facts: Mapping[str, Fact]) -> dict[str, Fact]:
+    """What else must be known of a TCP socket that is neither fresh nor listens.
+
+    Args:
+        facts: as ``internet_sockets`` found them.
+
+    Raises:
+        OSError: it cannot be looked into.
+    """
+    told = looked.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO_SIZE)
+    peer = _asked_for(held, looked.family) if facts["state"] == SYN_SENT else facts["peer"]
+    is_local = _is_local(facts["address"], peer)
+    unread = (
+        int.from_bytes(fcntl.ioctl(looked.fileno(), termios.FIONREAD, bytes(4)), "little")
+        if facts["state"] not in (CLOSED, SYN_SENT)
+        else 0
+    )
+    sent, again = struct.unpack_from("<QQ", told.ljust(_TCP_INFO_SIZE, b"\0"), _SENT_AT)
+    return {
+        "peer": peer,
+        "local": is_local,
+        "queue": [_peek(looked, unread)] if is_local and 0 < unread <= sockets.QUEUE_LIMIT else [],
+        "unread": unread,
+        "sent": sent - again,
+        "received": _RECEIVED.unpack_from(told, _RECEIVED_AT)[0],
+        "unsent": int.from_bytes(told[_UNSENT_AT : _UNSENT_AT + 4], "little"),
+    }
+
+
+def _asked_for(held: OpenFile, family: int) -> list[Fact]:
+    """Whom a connection is being asked for, which getpeername(2) does not tell yet. Source: proc_pid_net(5)."""
+    for line in procfs.read_text(held.pid, "net/tcp6" if family == socket.AF_INET6 else "net/tcp").splitlines()[1:]:
+        words = line.split()
+        if int(words[9]) == held.first.inode:
+            host, _, port = words[2].partition(":")
+            packed = b"".join(bytes.fromhex(host[place : place + 8])[::-1] for place in range(0, len(host), 8))
+            return [socket.inet_ntop(family, packed), int(port, 16), *([0, 0] if family == socket.AF_INET6 else [])]
+    return []
+
+
+def ends_of(looked: socket.socket) -> int:
+    """Whether nothing more can be read, and whether an error waits to be told: neither is used up by being asked for."""
+    poll = select.poll()
+    poll.register(looked, select.POLLRDHUP)
+    found = dict(poll.poll(0)).get(looked.fileno(), 0)
+    return bool(found & select.POLLRDHUP) * READ_ENDED | bool(found & select.POLLERR) * FAILED
+
+
+def _is_local(address: Fact, peer: Fact) -> bool:
+    """Whether both ends are this machine's as far as the addresses alone tell, which mean the same on every machine."""
+    if not (isinstance(address, list) and isinstance(peer, list) and address and peer):
+        return False
+    hosts = [str(end[0]).partition("%")[0] for end in (address, peer)]
+    return hosts[0] == hosts[1] or all(ip_address(host.removeprefix("::ffff:")).is_loopback for host in hosts)
+
+
+def _peek(looked: socket.socket, size: int) -> bytes:
+    return looked.recv(size, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+
+
+def is_connection(facts: Mapping[str, Fact]) -> bool:
+    """Whether a TCP socket is or was connected, or is on its way there."""
+    if facts.get("protocol") != socket.IPPROTO_TCP or facts.get("state") == LISTENING:
+        return False
+    return facts["state"] != CLOSED or bool(facts.get("ends"))
+
+
+def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
+    """The connection as it was observed."""
+    if not is_connection(held.observed):
+        return None
+    facts: dict[str, Fact] = {"descriptors": held.numbers, "flags": held.first.flags & ~os.O_CLOEXEC, **held.observed}
+    return Resource(KIND, held.name, facts)
+
+
+def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
+    """Why a connection can neither come back nor end."""
+    return elsewhere.refuse(held, "a TCP connection") if is_connection(held.observed) else None
+
+
+def findings(held: Sequence[Resource]) -> Iterator[Finding]:
+    """What can be told only of all connections together: which cannot be made again yet, and which end."""
+    others = pairs(held)
+    for one in held:
+        if one.kind != KIND:
+            continue
+        other = others.get(_number(one, "socket"))
+        if other is not None:
+            yield from (Finding(KIND, one.name, REFUSED, reason) for reason in _refuse_end(one, other))
+        elif text := note(one):
+            yield Finding(KIND, one.name, NOTED, f"{text} when the program comes back")
+
+
+def _refuse_end(one: Resource, other: Resource) -> Iterator[str]:
+    """Why a connection of the program with itself cannot be made again."""
+    underway = _number(one, "unsent") + _number(one, "sent") - _number(other, "received") + (other.facts["state"] in _PEER_ENDED)
+    what = f"{one.name} is a TCP connection of the program with itself"
+    if underway > 0:
+        yield f"{what}, {underway} bytes of which have not arrived at its other end: it is kept as soon as they have"
+    if _number(one, "unread") > sockets.QUEUE_LIMIT:
+        yield f"{what}, in which more than {sockets.QUEUE_LIMIT >> 20} MiB wait: it is kept as soon as they are read"
+
+
+def note(held: Resource) -> str | None:
+    """What becomes of a connection whose other end is somebody else's; None of one that had ended, or is asked for anew."""
+    if held.facts["state"] in (CLOSED, SYN_SENT):
+        return None
+    peer = held.facts["peer"]
+    where = f" with {in_words(peer)}" if isinstance(peer, list) and peer else ""
+    return (
+        f"the TCP connection {held.name}{where} is ended"
+        if _reads_the_end(held)
+        else f"the TCP connection {held.name}{where} is reset"
+    )
+
+
+def notes(held: Sequence[Resource]) -> tuple[str, ...]:
+    """What a restore loses, one sentence each."""
+    others = pairs(held)
+    ending = (one for one in held if one.kind == KIND and _number(one, "socket") not in others)
+    return tuple(text for one in ending if (text := note(one)))
+
+
+def pairs(held: Iterable[Resource]) -> dict[int, Resource]:
+    """The other end of each connection that has one among these, by the socket's number; this machine has their addresses."""
+    local = [one for one in held if one.kind == KIND and one.facts["local"]]
+    by_ends = {(_plain(one.facts["address"]), _plain(one.facts["peer"])): one for one in local}
+    found = {}
+    for (address, peer), one in by_ends.items():
+        other = by_ends.get((peer, address))
+        if (
+            other is not None
+            and other is not one
+            and all(internet_sockets.is_ours(_address(one, end)) for end in ("address", "peer"))
+        ):
+            found[_number(one, "socket")] = other
+    return found
+
+
+def _plain(address: Fact) -> tuple[str, int]:
+    """Host and port: a connection may have one end of IPv6 and one of IPv4."""
+    if not isinstance(address, list) or not address:
+        return "", 0
+    return str(address[0]).removeprefix("::ffff:"), number_of(address[1])
+
+
+def _number(held: Resource, name: str) -> int:
+    return number_of(held.facts[name])
+
+
+def _reads_the_end(held: Resource) -> bool:
+    """Whether all was read that its peer had to say before it ended."""
+    return held.facts["state"] in _PEER_ENDED and not held.facts["unread"]
+
+
+# --- Restore -----------------------------------------------------------------------------------------------------------
+
+
+def prepare(table: CallTable, held: Sequence[Resource], first: int) -> dict[int, int]:
+    """Make all of them at numbers from ``first`` on, before anybody listens: the descriptor of each, by the socket's number."""
+    return _Work(table, held, first).run() if held else {}
+
+
+class _Work:
+    """One restore of connections.
+
+    Attributes:
+        next: the number to which the next one is moved.
+    """
+
+    def __init__(self, table: CallTable, held: Sequence[Resource], first: int) -> None:
+        self._table = table
+        self._held = held
+        self._others = pairs(held)
+        self._made: dict[int, int] = {}
+        self._next = first
+
+    def run(self) -> dict[int, int]:
+        """Make them all."""
+        for one in self._held:
+            if _number(one, "socket") in self._made:
+                continue
+            other = self._others.get(_number(one, "socket"))
+            if other is not None:
+                self._join(one, other)
+            elif one.facts["state"] == SYN_SENT:
+                self._keep(one, sockets.make(self._table, one))
+            else:
+                self._end(one)
+        return self._made
+
+    def _keep(self, one: Resource, made: int) -> None:
+        """Move a descriptor above all that are wanted."""
+        self._table.duplicate(made, self._next, os.O_CLOEXEC)
+        self._table.close(made)
+        self._made[_number(one, "socket")] = self._next
+        self._next += 1
+
+    def _join(self, one: Resource, other: Resource) -> None:
+        """Connect two ends with each other, by a listener in place of the one that it was accepted from."""
+        table, room = self._table, max(len(_queue(one)), len(_queue(other)))
+        connection_remains.remove([_plain(one.facts[name]) for name in ("address", "peer")])
+        lent, connecting = self._socket(one, room), self._socket(other, room)
+        place = self._bind(one, lent)
+        self._bind(other, connecting)
+        table.call(f"let {one.name} be connected", "listen", lent, 1)
+        target = _address(other, "peer")
+        if one.facts["family"] == other.facts["family"]:  # wherever it listens, if it could not be where it was
+            size = table.place(size_of(target).to_bytes(4, "little"))
+            table.call(f"ask where {one.name} is", "getsockname", lent, place, size)
+        else:
+            place = table.place(sockaddr(target))
+        table.call(f"connect {other.name}", "connect", connecting, place, size_of(target))
+        accepted = table.obtain(f"accept the connection of {one.name}", "accept4", lent, 0, 0, socket.SOCK_CLOEXEC)
+        table.close(lent)
+        self._keep(one, accepted)
+        self._keep(other, connecting)
+
+    def _bind(self, one: Resource, made: int) -> int:
+        """Give it the address that it had, if that is free: where that lies in the vessel."""
+        address = _address(one, "address")
+        place = self._table.place(sockaddr(address))
+        lost = f"{one.name} was at {in_words(address)}, which is taken here"
+        self._table.attempt(lost, "bind", made, place, size_of(address))
+        return place
+
+    def _socket(self, one: Resource, room: int) -> int:
+        """A socket with room for what waits, whose port may have been in use a moment ago."""
+        table = self._table
+        form = (_number(one, "family"), _number(one, "type") | socket.SOCK_CLOEXEC, _number(one, "protocol"))
+        made = table.obtain(f"make the socket of {one.name}", "socket", *form)
+        _set(table, made, socket.SO_REUSEADDR, 1)
+        if room:
+            for number, forced in ((socket.SO_SNDBUF, 32), (socket.SO_RCVBUF, 33)):
+                for way in (number, forced):
+                    _set(table, made, way, 2 * room + _ROOM)
+        return made
+
+    def _end(self, one: Resource) -> None:
+        """A connection with a listener of our own, which then ends it."""
+        table, is_six = self._table, _number(one, "family") == socket.AF_INET6
+        host: list[Fact] = ["::ffff:127.0.0.1" if is_six else "127.0.0.1", 0]
+        form = (_number(one, "family"), socket.SOCK_STREAM | socket.SOCK_CLOEXEC, _number(one, "protocol"))
+        lent = table.obtain(f"make a listener for {one.name}", "socket", *form)
+        address, size = table.place(sockaddr(host)), table.place(size_of(host).to_bytes(4, "little"))
+        table.call(f"bind a listener for {one.name}", "bind", lent, address, size_of(host))
+        table.call(f"listen for {one.name}", "listen", lent, 1)
+        table.call(f"ask for the port of {one.name}", "getsockname", lent, address, size)
+        made = table.obtain(f"make the socket of {one.name}", "socket", *form)
+        table.call(f"connect {one.name}", "connect", made, address, size_of(host))
+        accepted = table.obtain(f"accept the connection of {one.name}", "accept4", lent, 0, 0, socket.SOCK_CLOEXEC)
+        table.close(lent)
+        if not (_reads_the_end(one) or _has_told(one)):
+            place = table.place(_RESET_AT_CLOSE)
+            table.call(f"reset {one.name}", "setsockopt", accepted, socket.SOL_SOCKET, socket.SO_LINGER, place, 8)
+        table.close(accepted)
+        table.call(f"wait for the end of {one.name}", "poll", table.place(struct.pack("<ihh", made, select.POLLRDHUP, 0)), 1, -1)
+        if _has_told(one):
+            table.call(f"shut {one.name} down", "shutdown", made, socket.SHUT_RDWR)
+        self._keep(one, made)
+
+
+def _has_told(one: Resource) -> bool:
+    """Whether it had ended before, and the program has seen why: then nothing is left but the end of file."""
+    return one.facts["state"] == CLOSED and not _number(one, "ends") & FAILED
+
+
+def _address(one: Resource, name: str) -> list[Fact]:
+    address = one.facts[name]
+    assert isinstance(address, list)
+    return address
+
+
+def _queue(one: Resource) -> bytes:
+    messages = one.facts["queue"]
+    assert isinstance(messages, list)
+    return b"".join(message for message in messages if isinstance(message, bytes))
+
+
+def _set(table: CallTable, made: int, option: int, value: int) -> None:
+    table.attempt("", "setsockopt", made, socket.SOL_SOCKET, option, table.place(value.to_bytes(4, "little")), 4)
+
+
+def settle(table: CallTable, held: Sequence[Resource], made: Mapping[int, int]) -> None:
+    """Once those who listen do: options, what waits, and which side has ended."""
+    others = pairs(held)
+    for one in held:
+        number, other = made[_number(one, "socket")], others.get(_number(one, "socket"))
+        if one.facts["state"] == SYN_SENT:
+            _ask_again(table, one, number)
+        elif other is not None:
+            _set(table, number, socket.SO_REUSEADDR, 0)
+            _set(table, number, sockets.SO_BUF_LOCK, 0)
+            sockets.set_options(table, one, number)
+            if _queue(one):
+                sockets.fill(table, one, made[_number(other, "socket")])
+    for one in held:
+        number = made[_number(one, "socket")]
+        if _number(one, "socket") in others and one.facts["state"] in _WE_ENDED:
+            table.call(f"end the side of {one.name}", "shutdown", number, socket.SHUT_WR)
+        sockets.set_flags(table, one, number)
+
+
+def _ask_again(table: CallTable, one: Resource, number: int) -> None:
+    """Ask for the connection without waiting for it: the program does, or it was told that it need not."""
+    peer = one.facts["peer"]
+    if isinstance(peer, list) and peer:
+        table.call(f"let {one.name} not wait", "fcntl", number, fcntl.F_SETFL, os.O_NONBLOCK)
+        table.attempt("", "connect", number, table.place(sockaddr(peer)), size_of(peer))
+        table.call(f"let {one.name} wait", "fcntl", number, fcntl.F_SETFL, 0)

@@ -1,0 +1,111 @@
+"""TCP connections: of a program with itself they come back, others end as if the peer had crashed; three restores in a row."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from checkpoint.errors import UnsupportedError
+from tests.checkpoint.round_trip import ENGINE, captured, captured_and_killed, ended, expect_ok, restored, start_tracee
+
+pytestmark = [pytest.mark.compiler, pytest.mark.root]
+
+Compiled = Callable[..., Path]
+
+ROUNDS = 3
+WITH_ITSELF = ["itself_4", "itself_6", "itself_much", "itself_half_closed", "itself_ended"]
+WITH_OTHERS = ["other_reset", "other_told", "other_ended_unread", "other_ended"]
+
+
+@pytest.fixture
+def peer() -> Iterator[int]:
+    """A port at which each caller who says "end" is told "last", and no more."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        kept: list[socket.socket] = []
+
+        def serve() -> None:
+            while True:
+                try:
+                    accepted, _ = listener.accept()
+                except OSError:
+                    return
+                kept.append(accepted)
+                threading.Thread(target=_answer, args=(accepted,), daemon=True).start()
+
+        server = threading.Thread(target=serve)
+        server.start()
+        yield listener.getsockname()[1]
+        listener.shutdown(socket.SHUT_RDWR)
+        server.join()
+        for accepted in kept:
+            accepted.close()
+
+
+def _answer(accepted: socket.socket) -> None:
+    try:
+        if accepted.recv(4) == b"end\n":
+            accepted.sendall(b"last")
+            accepted.shutdown(socket.SHUT_WR)
+    except OSError:  # closed at the end of the test, or reset
+        return
+
+
+@pytest.mark.parametrize("case", WITH_ITSELF)
+def test_a_connection_of_a_program_with_itself_comes_back(case: str, compiled: Compiled, tmp_path: Path) -> None:
+    three_lives(compiled("tcp_connections", "-O2"), tmp_path, case)
+
+
+@pytest.mark.parametrize("case", WITH_OTHERS)
+def test_a_connection_with_somebody_else_ends_as_if_he_had_crashed(
+    case: str, peer: int, compiled: Compiled, tmp_path: Path
+) -> None:
+    three_lives(compiled("tcp_connections", "-O2"), tmp_path, case, str(peer))
+
+
+def three_lives(program: Path, directory: Path, *arguments: str) -> None:
+    """Capture, kill and restore three times, then let the tracee look."""
+    tracee = start_tracee(program, directory, *arguments)
+    for _ in range(ROUNDS):
+        with ended(tracee):
+            captured(tracee)
+            snapshot = captured_and_killed(tracee)
+        tracee = restored(snapshot, directory)
+    with ended(tracee):
+        captured(tracee)
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_a_connection_that_was_asked_for_is_asked_for_anew(compiled: Compiled, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0), backlog=0) as listener:
+        port = listener.getsockname()[1]
+        with socket.create_connection(("127.0.0.1", port)):  # the queue is full: whoever asks next waits
+            tracee = start_tracee(compiled("tcp_connections", "-O2"), tmp_path, "other_asked", str(port))
+            with ended(tracee):
+                snapshot = captured_and_killed(tracee)
+        listener.accept()[0].close()
+        with ended(restored(snapshot, tmp_path)) as tracee:
+            accepted, _ = listener.accept()
+            tracee.tell()
+            with accepted:
+                _answer(accepted)
+                expect_ok(tracee)
+
+
+def test_a_connection_with_itself_that_is_full_is_refused_by_name(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("tcp_connections", "-O2"), tmp_path, "itself_full")) as tracee:
+        with pytest.raises(UnsupportedError, match="bytes of which have not arrived"):
+            ENGINE.protect(tracee.pid, "/test/full", None)
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_the_report_tells_which_connections_end(peer: int, compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("tcp_connections", "-O2"), tmp_path, "other_reset", str(peer))) as tracee:
+        report = ENGINE.probe(tracee.pid)
+        assert report.supported
+        assert any(f"127.0.0.1 port {peer} is reset" in note for note in report.notes), report.notes
