@@ -26,6 +26,9 @@ Offset = Annotated[int, msgspec.Meta(ge=0)]
 Age = Annotated[int, msgspec.Meta(ge=0, le=1 << 50)]
 """Milliseconds since something happened; 0 for no limit."""
 
+HookName = Literal["before_capture", "before_resume", "after_resume"]
+"""Occasions for a command that comes with a program, see `agent.hooks`."""
+
 T = TypeVar("T")
 
 
@@ -54,7 +57,7 @@ class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
     user: str = ""
     engine: Literal["auto", "ptrace", "cooperative"] = "auto"
     output: Literal["immediate", "committed"] = "immediate"
-    on_resume: list[Text] = []
+    hooks: dict[HookName, list[Text]] = {}
 
 
 class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):

@@ -157,7 +157,9 @@ class Charge:
             case acts.Capture():
                 if act.hold:
                     self._is_thaw_owed = False  # a lease that comes meanwhile lets nothing run that is to be handed over
-                await self._snapshots.capture(self._present(), act)
+                component = self._present()
+                await self._occasions.before_capture(act)
+                await self._snapshots.capture(component, act)
             case acts.Acknowledge():
                 if self.component is not None:
                     await self.component.acknowledge(act.position, is_safe=act.is_safe)
@@ -222,6 +224,7 @@ class Charge:
     async def _start(self, act: acts.Start) -> None:
         self.standby.cool()
         adopted = self.component is not None
+        self._occasions.runs_here(act.spec)
         self.around.records.note(self.name, act.epoch)
         if self.component is None:
             await self.around.settled(self.name)
@@ -282,7 +285,7 @@ class Charge:
         self._notice(sentence)
         self._watch_the_end()
         if occasion is not None:
-            self._task(self._occasions.resumed(act.spec, occasion))
+            self._task(self._occasions.after_resume(act.spec, occasion))
 
     async def _resumed(self, act: acts.Restore, chain: list[int], outage_ns: int, laps: clock.Laps) -> tuple[Component, int]:
         """The component, running, and the age of its state: what waits here for it, or, where that fails, from its beginning."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from agent.errors import ConfigError
+from agent.hooks import KINDS
 from failover.client import strict_toml
 from failover.client import team as team_directory
 from failover.client.quantities import size_bytes, span_ms
@@ -30,6 +31,31 @@ HOOK_S_MAX: Final = 50
 
 
 @dataclass(frozen=True, slots=True)
+class HooksConfig:
+    """This robot's own commands around one component, see `agent.hooks`; () for none.
+
+    Attributes:
+        before_start: before it begins here.
+        before_capture: before a whole snapshot is taken of it here, and before the last one of a handover.
+        before_resume, after_resume: before and after it goes on here from a checkpoint.
+        limit_s: seconds that each of them may take.
+        must_prepare: where before_start or before_resume fails, the program does not run on this robot.
+    """
+
+    before_start: tuple[str, ...] = field(default_factory=tuple)
+    before_capture: tuple[str, ...] = field(default_factory=tuple)
+    before_resume: tuple[str, ...] = field(default_factory=tuple)
+    after_resume: tuple[str, ...] = field(default_factory=tuple)
+    limit_s: int = 5
+    must_prepare: bool = False
+
+    def command(self, occasion: str) -> tuple[str, ...]:
+        """What is run on an occasion."""
+        found: tuple[str, ...] = getattr(self, occasion)
+        return found
+
+
+@dataclass(frozen=True, slots=True)
 class ComponentConfig:
     """What the operator wants for one component; ``[components."/lab/robot1/mapper"]``.
 
@@ -44,9 +70,7 @@ class ComponentConfig:
         command: a program that keeps its state itself is started here again by this; () for the command line of `failover run`.
         directory: and in this one, an absolute path; "" for that of `failover run`.
         environment: and with these variables besides, or instead.
-        before_start, on_resume: this robot's own commands around a program that begins or goes on here, see `agent.hooks`; ().
-        hook_s: seconds that each of them may take.
-        must_prepare: where before_start fails, the program does not run on this robot.
+        hooks: this robot's own commands around it.
     """
 
     on_loss: Literal["takeover", "hold"] = "takeover"
@@ -59,10 +83,7 @@ class ComponentConfig:
     command: tuple[str, ...] = field(default_factory=tuple)
     directory: str = ""
     environment: dict[str, str] = field(default_factory=dict)
-    before_start: tuple[str, ...] = field(default_factory=tuple)
-    on_resume: tuple[str, ...] = field(default_factory=tuple)
-    hook_s: int = 5
-    must_prepare: bool = False
+    hooks: HooksConfig = field(default_factory=HooksConfig)
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,10 +270,11 @@ def _check_command(where: str, component: ComponentConfig) -> None:
     for name in component.environment:
         if not name or "=" in name:
             raise ConfigError(f"{where}: environment has a variable {name!r}; a name is not empty and has no '=' in it")
-    for key, hook in (("before_start", component.before_start), ("on_resume", component.on_resume)):
+    for key in KINDS:
+        hook = component.hooks.command(key)
         if hook and (not hook[0] or any("\0" in word for word in hook)):
             raise ConfigError(f"{where}: {key} begins with an empty word, or holds a zero byte; the first word names the program")
-    if not 1 <= component.hook_s <= HOOK_S_MAX:
-        raise ConfigError(f"{where}: hook_s is {component.hook_s}; at least 1 and at most {HOOK_S_MAX}")
+    if not 1 <= component.hooks.limit_s <= HOOK_S_MAX:
+        raise ConfigError(f"{where}: limit_s of its hooks is {component.hooks.limit_s}; at least 1 and at most {HOOK_S_MAX}")
     if any("\0" in word for word in (*component.command, component.directory, *component.environment.values())):
         raise ConfigError(f"{where}: command, directory or environment holds a zero byte; no program can be given one")

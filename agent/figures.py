@@ -78,7 +78,8 @@ class Figures:
     outage_ms: float | None = None
     reasons: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    hook: str = ""
+    hooks: dict[str, str] = field(default_factory=dict)
+    """By occasion: what the last run of a hook had to complain of."""
     engine: str = PTRACE
     commits: Commits = field(default_factory=Commits)
 

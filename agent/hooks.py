@@ -1,17 +1,19 @@
-"""Commands of the operator's that a robot runs before a program runs here, and after it was resumed.
+"""Commands that a robot runs before a program begins here, before it is captured, and before and after it goes on here.
 
 What no snapshot carries is theirs: a device is opened, an address taken over, the places of this robot's own wheels written where
 the program looks for them. They are told in their environment which robot this is now, and why:
 
-    FAILOVER_HOOK        before_start or on_resume
+    FAILOVER_HOOK        before_start, before_capture, before_resume or after_resume
     FAILOVER_COMPONENT   the component's name
     FAILOVER_ROBOT       this robot
-    FAILOVER_EPOCH       the fencing token of the program that begins, or goes on
-    FAILOVER_WHY         started, restarted (here, after a crash), taken over, handed over
-    FAILOVER_FROM        the robot whose checkpoint it goes on from; not where it is started
+    FAILOVER_EPOCH       the fencing token of the program that begins, is captured, or goes on
+    FAILOVER_GENERATION  of the snapshots that are taken of it here
+    FAILOVER_WHY         started, captured, restarted (here, after a crash), taken over, handed over
+    FAILOVER_FROM        the robot whose checkpoint it goes on from; not where it is started or captured
     FAILOVER_AGE_MS      how old that checkpoint is; likewise
 
-Standard output and error go to the agent's log, under systemd to the journal. No shell reads the command.
+Standard output and error go to the agent's log, under systemd to the journal, and the last line to ``failover why``: the
+component's own output is the program's alone. No shell reads the command.
 """
 
 from __future__ import annotations
@@ -29,11 +31,16 @@ from typing import Any, Final, Literal
 from agent.units import in_a_unit
 from checkpoint.linux.inheritance import Inheritance
 
-Kind = Literal["before_start", "on_resume"]
+Kind = Literal["before_start", "before_capture", "before_resume", "after_resume"]
+KINDS: Final[tuple[Kind, ...]] = ("before_start", "before_capture", "before_resume", "after_resume")
 
 STARTED: Final = "started"
+CAPTURED: Final = "captured"
 OUTPUT_MAX: Final = 4_096
 """Bytes of what a hook said that stand in the log: the last ones."""
+
+LINE_MAX: Final = 300
+"""Characters of the last line that ``failover why`` shows."""
 
 END_S: Final = 2.0
 """How long the end of a hook that took too long is waited for."""
@@ -63,11 +70,12 @@ class Hook:
 
 @dataclass(frozen=True, slots=True)
 class Occasion:
-    """Why a hook is run. ``source`` is "" and ``age_ns`` 0 where the program begins."""
+    """Why a hook is run. ``source`` is "" and ``age_ns`` 0 where the program does not go on from a checkpoint."""
 
     component: str
     robot: str
     epoch: int
+    generation: int
     why: str
     source: str = ""
     age_ns: int = 0
@@ -79,11 +87,25 @@ class Occasion:
             "FAILOVER_COMPONENT": self.component,
             "FAILOVER_ROBOT": self.robot,
             "FAILOVER_EPOCH": str(self.epoch),
+            "FAILOVER_GENERATION": str(self.generation),
             "FAILOVER_WHY": self.why,
         }
         if self.source:
             told |= {"FAILOVER_FROM": self.source, "FAILOVER_AGE_MS": str(self.age_ns // 1_000_000)}
         return {"PATH": PATH, **told}
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a hook ended.
+
+    Attributes:
+        failure: why it failed, a sentence; "" if it did not.
+        last_line: what it said last; "" if nothing.
+    """
+
+    failure: str = ""
+    last_line: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,10 +118,8 @@ class Hooks:
 
     starter: str = ""
 
-    async def run(self, kind: Kind, hook: Hook, occasion: Occasion) -> str:
-        """Run one and wait for its end; why it failed, "" if it did not, or if there is none."""
-        if not hook.command:
-            return ""
+    async def run(self, kind: Kind, hook: Hook, occasion: Occasion) -> Outcome:
+        """Run one and wait for its end."""
         name = secrets.token_hex(4)
         try:
             process = await self._begun(name, hook, occasion.environment(kind))
@@ -110,10 +130,10 @@ class Hooks:
         except TimeoutError:
             await _end(process)
             return self._told(kind, hook, occasion, f"took longer than {hook.limit_s:g} s and was ended")
-        _log_output(kind, occasion, said)
+        last_line = _log_output(kind, occasion, said)
         if not process.returncode:
-            return ""
-        return self._told(kind, hook, occasion, self._failure(name, process.returncode))
+            return Outcome(last_line=last_line)
+        return self._told(kind, hook, occasion, self._failure(name, process.returncode), last_line)
 
     def _failure(self, name: str, status: int) -> str:
         if self.starter:
@@ -140,10 +160,10 @@ class Hooks:
             **wanted,
         )
 
-    def _told(self, kind: Kind, hook: Hook, occasion: Occasion, why: str) -> str:
+    def _told(self, kind: Kind, hook: Hook, occasion: Occasion, why: str, last_line: str = "") -> Outcome:
         sentence = f"{kind} ({' '.join(hook.command)}) failed on {occasion.robot}, {occasion.why}: {why}"
         log.warning("%s: %s", occasion.component, sentence)
-        return sentence
+        return Outcome(sentence, last_line)
 
 
 def _user_of(user: Inheritance | None) -> dict[str, Any]:
@@ -161,6 +181,9 @@ async def _end(process: asyncio.subprocess.Process) -> None:
         await asyncio.wait_for(process.wait(), END_S)
 
 
-def _log_output(kind: Kind, occasion: Occasion, said: bytes) -> None:
-    for line in said[-OUTPUT_MAX:].decode(errors="replace").splitlines():
+def _log_output(kind: Kind, occasion: Occasion, said: bytes) -> str:
+    """Put what a hook said into the log; its last line."""
+    lines = said[-OUTPUT_MAX:].decode(errors="replace").splitlines()
+    for line in lines:
         log.info("%s: %s said: %s", occasion.component, kind, line)
+    return next((line.strip() for line in reversed(lines) if line.strip()), "")[:LINE_MAX]

@@ -1,27 +1,35 @@
-"""When the operator's commands are run for a component, whose they are, and what they are told."""
+"""When commands are run for a component, whose they are, and what they are told."""
 
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Final
 
-from agent import hooks
+from agent import clock, hooks
 from agent.errors import AgentError
 from agent.figures import Figures
 from agent.hooks import Hook, Kind, Occasion
 from agent.surroundings import Surroundings, program_of
 from checkpoint import format
-from failover.core import acts
+from failover.core import acts, events
 from failover.core.types import ComponentSpec
 
+CAPTURE_PAUSE_S: Final = 10
+"""Between two runs of before_capture: a whole snapshot that cannot be taken is tried again every second."""
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(slots=True)
 class Occasions:
-    """Of one component. What a hook had to complain of stands in its figures."""
+    """Of one component. What a hook had to complain of stands in its figures, how it went in ``failover why``."""
 
     name: str
     around: Surroundings
     figures: Figures
+    _spec: ComponentSpec | None = None
+    """Of the program that runs here."""
+    _prepared_ns: int = field(default=-CAPTURE_PAUSE_S * 10**9)
+    """When before_capture began last."""
 
     async def before_start(self, act: acts.Start) -> None:
         """Run what is to be run before it begins here.
@@ -29,10 +37,22 @@ class Occasions:
         Raises:
             AgentError: it failed, and the program must not run here without it.
         """
-        await self._run("before_start", act.spec, self._occasion(act.epoch, hooks.STARTED))
+        await self._prepare("before_start", act.spec, self._occasion(act, hooks.STARTED))
+
+    async def before_capture(self, act: acts.Capture) -> None:
+        """Run what is to be run before a whole snapshot, or the last one of a handover; it runs on meanwhile.
+
+        A snapshot is taken whatever comes of it: one of a program that is not prepared is better than none.
+        """
+        pause_ns = CAPTURE_PAUSE_S * 10**9
+        if not self._hook("before_capture", self._spec).command:
+            return
+        if act.hold or (act.base and clock.now_ns() - self._prepared_ns >= pause_ns):
+            self._prepared_ns = clock.now_ns()
+            await self._run("before_capture", self._spec, self._occasion(act, hooks.CAPTURED))
 
     async def before_resume(self, act: acts.Restore, newest: int, age_ns: int) -> Occasion | None:
-        """Run what this robot's operator wants before it goes on here; why it does, where anybody is to be told.
+        """Run what is to be run before it goes on here; why it does, where anybody is to be told.
 
         Args:
             newest: descriptor of the newest snapshot, which is so old.
@@ -40,31 +60,54 @@ class Occasions:
         Raises:
             AgentError: it failed, and the program must not run here without it.
         """
-        here = self.around.here(self.name)
-        if not (here.before_start or here.on_resume or (act.spec is not None and act.spec.launch.on_resume)):
+        self.runs_here(act.spec)
+        if not (self._hook("before_resume", act.spec).command or self._hook("after_resume", act.spec).command):
             return None
         source = (await asyncio.to_thread(format.read_outline, newest)).machine.robot
-        occasion = self._occasion(act.epoch, act.why, source, age_ns)
-        await self._run("before_start", act.spec, occasion)
+        occasion = self._occasion(act, act.why, source, age_ns)
+        await self._prepare("before_resume", act.spec, occasion)
         return occasion
 
-    async def resumed(self, spec: ComponentSpec | None, occasion: Occasion) -> None:
+    async def after_resume(self, spec: ComponentSpec | None, occasion: Occasion) -> None:
         """Run what is to be run once it has gone on here."""
-        await self._run("on_resume", spec, occasion)
+        await self._run("after_resume", spec, occasion)
 
-    def _occasion(self, epoch: int, why: str, source: str = "", age_ns: int = 0) -> Occasion:
-        return Occasion(self.name, self.around.places.robot, epoch, why, source, age_ns)
+    def runs_here(self, spec: ComponentSpec | None) -> None:
+        """From now on this is the program that captures are of."""
+        self._spec = spec
 
-    async def _run(self, kind: Kind, spec: ComponentSpec | None, occasion: Occasion) -> None:
-        """Run this robot's own command for the occasion, else the one that came with the program.
+    def _occasion(self, act: acts.Start | acts.Capture | acts.Restore, why: str, source: str = "", age_ns: int = 0) -> Occasion:
+        return Occasion(self.name, self.around.places.robot, act.epoch, act.generation, why, source, age_ns)
+
+    def _hook(self, kind: Kind, spec: ComponentSpec | None) -> Hook:
+        """This robot's own command for the occasion, else the one that came with the program, with its user's rights."""
+        here = self.around.here(self.name).hooks
+        if spec is None or here.command(kind):
+            return Hook(here.command(kind), here.limit_s)
+        return Hook(dict(spec.launch.hooks).get(kind, ()), here.limit_s, program_of(spec.launch).inheritance)
+
+    async def _prepare(self, kind: Kind, spec: ComponentSpec | None, occasion: Occasion) -> None:
+        """Run one without which the program perhaps must not run here.
 
         Raises:
-            AgentError: it failed, and the program must not run here without it.
+            AgentError: that is so, and it failed.
         """
-        here = self.around.here(self.name)
-        hook = Hook(here.before_start if kind == "before_start" else here.on_resume, here.hook_s)
-        if kind == "on_resume" and not hook.command and spec is not None:
-            hook = Hook(spec.launch.on_resume, here.hook_s, program_of(spec.launch).inheritance)
-        self.figures.hook = await self.around.hooks.run(kind, hook, occasion)
-        if self.figures.hook and kind == "before_start" and here.must_prepare:
-            raise AgentError(f"{self.name} does not run here unprepared: {self.figures.hook}")
+        failure = await self._run(kind, spec, occasion)
+        if failure and self.around.here(self.name).hooks.must_prepare:
+            raise AgentError(f"{self.name} does not run here unprepared: {failure}")
+
+    async def _run(self, kind: Kind, spec: ComponentSpec | None, occasion: Occasion) -> str:
+        """Run one, where there is one; why it failed, "" if it did not."""
+        hook = self._hook(kind, spec)
+        self.figures.hooks.pop(kind, None)
+        if not hook.command:
+            return ""
+        began_ns = clock.now_ns()
+        outcome = await self.around.hooks.run(kind, hook, occasion)
+        if outcome.failure:
+            self.figures.hooks[kind] = outcome.failure + ("; the checkpoint was taken without it" * (kind == "before_capture"))
+        said = f"; it said: {outcome.last_line}" if outcome.last_line else ""
+        took_ms = (clock.now_ns() - began_ns) / 1e6
+        told = outcome.failure or f"{kind} ({' '.join(hook.command)}) ended well after {took_ms:.0f} ms"
+        self.around.tell(events.Noticed(self.name, told + said))
+        return outcome.failure

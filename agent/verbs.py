@@ -124,7 +124,7 @@ class Verbs(Questions):
             inheritance=msgspec.msgpack.encode(inheritance),
             engine=wanted.engine,
             output=wanted.output,
-            on_resume=tuple(wanted.on_resume),
+            hooks=tuple((occasion, tuple(command)) for occasion, command in wanted.hooks.items() if command),
         )
         charge = await self._begin(name, launch, inheritance.uid)
         started: dict[str, Any] = {"name": name, "notes": list(charge.figures.notes), "reasons": list(charge.figures.reasons)}

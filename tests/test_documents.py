@@ -16,7 +16,7 @@ import agent.main
 import checkpoint.errors
 import failover.errors
 from agent import view
-from agent.config import ComponentConfig, Config
+from agent.config import ComponentConfig, Config, HooksConfig
 from agent.transport import LinkState
 from failover.cli import parser
 from failover.client.team import Robot
@@ -119,7 +119,12 @@ def defaults(kind: type[Any]) -> dict[str, object]:
 
 @pytest.mark.parametrize(
     ("heading", "kind"),
-    [("agent.toml: one robot", Config), ("agent.toml: one component", ComponentConfig), ("team.toml: who belongs", Robot)],
+    [
+        ("agent.toml: one robot", Config),
+        ("agent.toml: one component", ComponentConfig),
+        ("agent.toml: hooks of one component", HooksConfig),
+        ("team.toml: who belongs", Robot),
+    ],
 )
 def test_every_key_and_its_default_are_told(heading: str, kind: type[Any]) -> None:
     told = rows(ROOT / "docs" / "configuration.md", heading)

@@ -35,6 +35,13 @@ def _name(room: argparse.ArgumentParser) -> None:
     room.add_argument("name", metavar="NAME", help="the component's name, as failover status shows it")
 
 
+HOOKS: Final = {
+    "before_capture": "before a whole snapshot is taken of it, and before the last one of a handover",
+    "before_resume": "on a robot where it is about to go on",
+    "after_resume": "on a robot where it went on; told which robot, epoch, generation and why in FAILOVER_* variables",
+}
+"""Occasions for a command that comes with a program, and when they are."""
+
 NUMBER_MAX: Final = (1 << 31) - 1
 """What a PID can be at most."""
 
@@ -85,13 +92,9 @@ def run(room: argparse.ArgumentParser) -> None:
         help="committed: show output once another robot holds a checkpoint that contains it, so that no takeover takes back or "
         "repeats what was seen (default: immediate, as it is written)",
     )
-    room.add_argument(
-        "--on-resume",
-        metavar="CMD",
-        type=shlex.split,
-        default=[],
-        help="run this, as you, on a robot where it went on; told which robot, epoch and why in FAILOVER_* variables",
-    )
+    for hook, when in HOOKS.items():
+        option = f"--{hook.replace('_', '-')}"
+        room.add_argument(option, metavar="CMD", type=shlex.split, default=[], help=f"run this, as you, {when}")
     room.add_argument("--user", metavar="USER", help="run it as this user, by name or number (only root may; default: as you)")
     room.add_argument("command", metavar="CMD", nargs="+", help="the program and its arguments, after --")
     _agent(room)

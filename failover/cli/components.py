@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from failover.cli import picture, render
 from failover.cli.agent import connect
+from failover.cli.arguments import HOOKS
 from failover.client.control import Control, Output, Result, Update
 from failover.errors import AgentRefusedError, FailoverError, LostAgentError, NoAgentError
 
@@ -31,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Start a program under protection; its output and exit status become ours."""
     wanted: dict[str, Any] = {"argv": arguments.command, "env": dict(os.environ), "cwd": os.getcwd(), "umask": _umask()}
     wanted |= {"engine": arguments.engine, "isolate": arguments.isolate, "wait": not arguments.detach}
-    wanted |= {"output": arguments.output, "on_resume": arguments.on_resume}
+    wanted |= {"output": arguments.output, "hooks": {kind: getattr(arguments, kind) for kind in HOOKS}}
     if arguments.name:
         wanted["name"] = arguments.name
     if arguments.user:

@@ -20,12 +20,14 @@ class Start:
 
     Attributes:
         lease_until_ns: given to the guard before the program runs; 0 = no lease.
+        generation: of the snapshots that will be taken of it.
     """
 
     component: str
     epoch: int
     spec: ComponentSpec
     lease_until_ns: int = 0
+    generation: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +39,7 @@ class Restore:
     Attributes:
         lease_until_ns: given to the guard before the program runs; 0 = no lease.
         why: what the program is told.
+        generation: of the snapshots that will be taken of it.
     """
 
     component: str
@@ -45,6 +48,7 @@ class Restore:
     spec: ComponentSpec | None
     lease_until_ns: int = 0
     why: Resumption = Resumption.RESTARTED
+    generation: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -122,10 +122,12 @@ def begin(component: Component, turn: Turn) -> None:
     if component.plan is None:
         assert component.spec is not None, f"{component.name}: claimed without knowing what to start"
         component.move(Cause.START)
-        turn.order(acts.Start(component.name, component.epoch, component.spec, lease_ns))
+        turn.order(acts.Start(component.name, component.epoch, component.spec, lease_ns, generation_of(component, turn)))
     else:
         component.move(Cause.RESTORE)
-        turn.order(acts.Restore(component.name, component.epoch, component.plan, component.spec, lease_ns, component.resumption))
+        plan, why = component.plan, component.resumption
+        generation = generation_of(component, turn)
+        turn.order(acts.Restore(component.name, component.epoch, plan, component.spec, lease_ns, why, generation))
     component.lease_ns = component.told_ns = lease_ns
 
 
@@ -138,10 +140,15 @@ def entrust_holder(component: Component, turn: Turn) -> None:
             component.entrusted = (peer.robot,)
 
 
+def generation_of(component: Component, turn: Turn) -> int:
+    """Of this robot's primacy under the component's epoch."""
+    names = sorted((turn.me, *turn.config.peers), key=weight)
+    return component.epoch * (PEERS_MAX + 1) + names.index(turn.me)
+
+
 def open_line(component: Component, turn: Turn) -> None:
     """A new generation, unlike any other robot's: the next snapshot is a base. An agent that came back goes on counting."""
-    names = sorted((turn.me, *turn.config.peers), key=weight)
-    component.generation = component.epoch * (PEERS_MAX + 1) + names.index(turn.me)
+    component.generation = generation_of(component, turn)
     component.sequence = max((held.sequence for held in component.held if held.generation == component.generation), default=0)
     restart_line(component, turn)
 

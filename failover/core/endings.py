@@ -137,7 +137,8 @@ def _recover(component: Component, turn: Turn, status: int) -> None:
     component.until_ns = turn.now_ns + turn.config.restore_ms * MS
     component.lease_ns = component.told_ns = lease.first_ns(component, turn)
     why = component.resumption
-    turn.order(acts.Restore(component.name, component.epoch, position, component.spec, component.lease_ns, why))
+    spec, lease_ns, generation = component.spec, component.lease_ns, component.generation
+    turn.order(acts.Restore(component.name, component.epoch, position, spec, lease_ns, why, generation))
     turn.say(component, f"{turn.me} saw it crash, {count} in the window, and resumes it from {position.sequence}")
 
 

@@ -122,7 +122,7 @@ class Launch:
         environment: (name, value) pairs.
         pid: of a running program to protect (``failover protect``), 0 otherwise; means something on its home robot only.
         isolate: PID and time namespaces of its own.
-        on_resume: command that is run, as the program's user, after it went on somewhere; () for none.
+        hooks: (occasion, command) pairs that came with the program and are run as its user, see `agent.hooks`.
         output: `IMMEDIATE` or `COMMITTED`: when what it writes is shown.
         inheritance: whose rights, limits and priorities it gets, packed (`checkpoint.linux.inheritance`); b"": the agent's own.
     """
@@ -137,7 +137,7 @@ class Launch:
     terminal: bool = False
     inheritance: bytes = b""
     output: str = IMMEDIATE
-    on_resume: tuple[str, ...] = ()
+    hooks: tuple[tuple[str, tuple[str, ...]], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

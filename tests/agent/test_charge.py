@@ -13,6 +13,7 @@ from agent import comeback
 from agent.charge import Charge
 from agent.clock import Laps
 from agent.component import Component
+from agent.config import ComponentConfig
 from agent.errors import GuardError
 from agent.records import Records
 from agent.standby import Standby
@@ -60,7 +61,7 @@ def carried_out(orders: Callable[[Charge, Told], Any], directory: Path) -> Told:
 
     async def run() -> None:
         none = cast(Any, None)
-        around = Surroundings(none, none, Records(directory), lambda _: None, none, none, none)
+        around = Surroundings(none, none, Records(directory), lambda _: None, none, none, lambda _: ComponentConfig())
         charge = Charge(NAME, around, cast(Component, guard), epoch=3)
         orders(charge, guard)
         charge.begin()

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from agent.hooks import KINDS
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_deaths import COUNT
@@ -23,6 +24,7 @@ NOTE = """#!/bin/sh
 [ -e "$1/hang-$FAILOVER_ROBOT" ] && sleep 1000
 cat >"$1/part.$$" <<END
 {"hook": "$FAILOVER_HOOK", "robot": "$FAILOVER_ROBOT", "epoch": "$FAILOVER_EPOCH", "why": "$FAILOVER_WHY",
+ "generation": "$FAILOVER_GENERATION",
  "from": "$FAILOVER_FROM", "age": "$FAILOVER_AGE_MS", "component": "$FAILOVER_COMPONENT", "uid": "$(id -u)"}
 END
 cat "$1/part.$$" | tr -d '\\n' >>"$1/told"; echo >>"$1/told"
@@ -37,8 +39,8 @@ def pair_with(directory: Path, *settings: str) -> Iterator[Pair]:
     note = directory / "note"
     note.write_text(NOTE)
     note.chmod(0o755)
-    hooks = [f'{key} = ["{note}", "{directory}"]' for key in ("before_start", "on_resume")]
-    lines = ['[components."/demo/robot1/count"]', *hooks, *settings, ""]
+    hooks = [f'{key} = ["{note}", "{directory}"]' for key in KINDS]
+    lines = ['[components."/demo/robot1/count".hooks]', *hooks, *settings, ""]
     with robots.two_robots(directory, "\n".join(lines)) as both:
         yield both
 
@@ -54,6 +56,11 @@ def move(robot: RobotMachine, order: str) -> None:
     robots.until(lambda: robots.failover(robot, order, "count").returncode == 0, f"a {order}")
 
 
+def around(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Without those that came before captures."""
+    return [line for line in lines if line["hook"] != "before_capture"]
+
+
 def essence(line: dict[str, Any]) -> tuple[str, ...]:
     return tuple(line[key] for key in ("hook", "robot", "why", "from"))
 
@@ -67,17 +74,25 @@ def test_hooks_are_told_which_robot_this_is_and_why(tmp_path: Path) -> None:
         move(second, "failback")
         robots.until_protected(first)
         first.cut_power()
-        robots.until(lambda: len(told(tmp_path)) == 7, "the hooks after the takeover")
-        lines = told(tmp_path)
+        robots.until(lambda: len(around(told(tmp_path))) == 7, "the hooks after the takeover")
+        lines = around(told(tmp_path))
         assert [essence(line) for line in lines] == [
             ("before_start", "robot1", "started", ""),
-            ("before_start", "robot2", "handed over", "robot1"),
-            ("on_resume", "robot2", "handed over", "robot1"),
-            ("before_start", "robot1", "handed over", "robot2"),
-            ("on_resume", "robot1", "handed over", "robot2"),
-            ("before_start", "robot2", "taken over", lines[-1]["from"]),
-            ("on_resume", "robot2", "taken over", lines[-1]["from"]),
+            ("before_resume", "robot2", "handed over", "robot1"),
+            ("after_resume", "robot2", "handed over", "robot1"),
+            ("before_resume", "robot1", "handed over", "robot2"),
+            ("after_resume", "robot1", "handed over", "robot2"),
+            ("before_resume", "robot2", "taken over", lines[-1]["from"]),
+            ("after_resume", "robot2", "taken over", lines[-1]["from"]),
         ]
+        captures = [line for line in told(tmp_path) if line["hook"] == "before_capture"]
+        assert {(line["robot"], line["why"], line["from"]) for line in captures} == {
+            ("robot1", "captured", ""),
+            ("robot2", "captured", ""),
+        }
+        generations = {(line["robot"], line["epoch"]): line["generation"] for line in lines}
+        assert len(set(generations.values())) == len(generations)
+        assert all(line["generation"] == generations[line["robot"], line["epoch"]] for line in captures)
         epochs = [int(line["epoch"]) for line in lines]
         assert epochs == sorted(epochs)
         assert epochs[-1] == robots.component(second, "count")["epoch"]
@@ -85,7 +100,7 @@ def test_hooks_are_told_which_robot_this_is_and_why(tmp_path: Path) -> None:
 
 
 def test_a_hook_that_fails_is_told_and_the_program_runs(tmp_path: Path) -> None:
-    with pair_with(tmp_path, "hook_s = 1") as (first, second):
+    with pair_with(tmp_path, "limit_s = 1") as (first, second):
         for kind in ("refuse", "hang"):
             (tmp_path / f"{kind}-robot2").touch()
             if kind == "refuse":
@@ -117,6 +132,24 @@ def test_a_program_that_must_be_prepared_does_not_run_where_it_is_not(tmp_path: 
         robots.until(lambda: robots.component(second, "count")["state"] == "running", "another try")
 
 
+def test_a_snapshot_is_taken_whatever_becomes_of_the_hook_before_it_and_that_is_said(tmp_path: Path) -> None:
+    with pair_with(tmp_path, "limit_s = 1") as (first, second):
+        (tmp_path / "hang-robot1").touch()
+        robots.run(first, "count", "/usr/bin/python3", "-S", "-c", COUNT)
+        robots.until_protected(first)
+        notes = robots.component(first, "count")["notes"]
+        assert any("before_capture" in note and "took longer than 1 s" in note for note in notes), notes
+        assert any("the checkpoint was taken without it" in note for note in notes), notes
+        story = robots.failover(first, "why", "count").stdout
+        assert "before_capture" in story
+        (tmp_path / "hang-robot1").unlink()
+        before = len(told(tmp_path))
+        move(first, "handover")
+        robots.until_protected(second)
+        again = [line for line in told(tmp_path)[before:] if line["hook"] == "before_capture" and line["robot"] == "robot1"]
+        assert again, "the last snapshot of a handover is prepared, however short ago the one before was"
+
+
 @pytest.fixture
 def open_to_all() -> Iterator[Path]:
     """A directory that every user may write to: pytest's own are closed."""
@@ -131,12 +164,12 @@ def test_a_hook_that_comes_with_the_program_runs_as_its_user(tmp_path: Path, ope
     note.chmod(0o755)
     nobody = pwd.getpwnam("nobody")
     with robots.two_robots(tmp_path) as (first, second):
-        options = ("--detach", "--name", "count", "--user", nobody.pw_name, "--on-resume", f"{note} '{open_to_all}'")
+        options = ("--detach", "--name", "count", "--user", nobody.pw_name, "--after-resume", f"{note} '{open_to_all}'")
         ran = robots.failover(first, "run", *options, "--", "/usr/bin/python3", "-S", "-c", COUNT)
         assert ran.returncode == 0, ran
         robots.until_protected(first)
         move(first, "handover")
         (line,) = robots.until(lambda: told(open_to_all), "the hook to be run")
-        assert essence(line) == ("on_resume", "robot2", "handed over", "robot1")
+        assert essence(line) == ("after_resume", "robot2", "handed over", "robot1")
         assert line["uid"] == str(nobody.pw_uid)
         assert robots.component(second, "count")["role"] == "primary"

@@ -152,9 +152,9 @@ def test_the_program_ends_by_its_own_status_after_all_that(machine: Machine) -> 
 
 HOOKED = """
 [components."/lab/robot1/hooked"]
-before_start = ["/bin/sh", "-c", "grep CapEff /proc/self/status >/run/hooked; echo $FAILOVER_WHY >>/run/hooked"]
+hooks.before_start = ["/bin/sh", "-c", "grep CapEff /proc/self/status >/run/hooked; echo $FAILOVER_WHY >>/run/hooked"]
 [components."/lab/robot1/unhooked"]
-before_start = ["/bin/false"]
+hooks.before_start = ["/bin/false"]
 """
 
 
