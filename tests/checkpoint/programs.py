@@ -16,6 +16,7 @@ class Case:
         results: files that it leaves, besides its output.
         progress: the file whose growth shows how far it is.
         in_place: it writes into the middle of files, so it must not run on between capture and kill.
+        environment: variables besides the usual ones.
         has_threads: it has several, which know each other by their ids.
     """
 
@@ -26,6 +27,7 @@ class Case:
     progress: str = "out"
     in_place: bool = False
     has_threads: bool = False
+    environment: tuple[tuple[str, str], ...] = ()
 
     def __str__(self) -> str:
         return self.name
@@ -195,6 +197,55 @@ DC = "[la 1 + dsa lb * 7 + 1000000007 % dsb p la 120000 >x] sx 0sa 12345sb lx x"
 NUMBERS = "".join(f"{index * 7919 % 100003}\n" for index in range(30000))
 
 
+PYTHON_THREADS = """
+import queue, threading, hashlib
+work, done = queue.Queue(maxsize=8), queue.Queue()
+def worker():
+    while (item := work.get()) is not None:
+        digest = hashlib.sha256(str(item).encode())
+        for _ in range(400):
+            digest = hashlib.sha256(digest.digest())
+        done.put((item, digest.hexdigest()))
+        work.task_done()
+threads = [threading.Thread(target=worker) for _ in range(4)]
+for thread in threads:
+    thread.start()
+for round in range(150):
+    for item in range(20):
+        work.put(round * 20 + item)
+    work.join()
+    print(round, hash(tuple(sorted(int(done.get()[1][:12], 16) for _ in range(20)))), flush=True)
+for _ in threads:
+    work.put(None)
+for thread in threads:
+    thread.join()
+print("the end", work.qsize(), done.qsize())
+"""
+
+NUMPY_POOL = """
+import numpy as np
+a = np.random.default_rng(7).random((160, 160))
+for i in range(200):
+    a = a @ a.T / 40 + np.sin(a)
+    a /= np.abs(a).max()
+    print(i, repr(float(a.sum())), flush=True)
+"""
+
+NODE = """
+const crypto = require('crypto');
+const table = new Map();
+let digest = '7';
+function round(count) {
+  for (let i = 0; i < 800; i++) { digest = crypto.createHash('sha256').update(digest).digest('hex'); table.set(i, digest); }
+  crypto.pbkdf2(digest, 'salt', 500, 24, 'sha256', (error, key) => {
+    console.log(count, key.toString('hex'), table.size);
+    if (count < 300) setTimeout(round, 5, count + 1);
+  });
+}
+round(1);
+"""
+
+
 PLAIN = [
     Case("bc", ("bc", "-ql", "script.bc"), (("script.bc", BC),)),
     Case("cpython", (sys.executable, "script.py"), (("script.py", PYTHON),)),
@@ -226,4 +277,13 @@ CASES = [
     Case("ruby", ("ruby", "script.rb"), (("script.rb", RUBY),)),
     Case("guile", ("guile", "--no-auto-compile", "-s", "script.scm"), (("script.scm", GUILE),), has_threads=True),
     Case("octave", ("octave-cli", "-q", "--no-init-file", "--no-history", "--eval", OCTAVE), has_threads=True),
+    Case("threads_of_cpython", (sys.executable, "script.py"), (("script.py", PYTHON_THREADS),), has_threads=True),
+    Case(
+        "pool_of_numpy",
+        (sys.executable, "script.py"),
+        (("script.py", NUMPY_POOL),),
+        has_threads=True,
+        environment=(("OPENBLAS_NUM_THREADS", "3"),),
+    ),
+    Case("node", ("node", "script.js"), (("script.js", NODE),), has_threads=True),
 ]

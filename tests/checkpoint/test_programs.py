@@ -80,7 +80,7 @@ def three_lives(case: Case, prepared: Callable[[Case, str], Path], *, keep_pid: 
     undisturbed = prepared(case, "undisturbed")
     expected, status = run_to_the_end(case, undisturbed)
     disturbed = prepared(case, "disturbed")
-    program = start(case.argv, disturbed, env=ENVIRONMENT)
+    program = start(case.argv, disturbed, env=environment_of(case))
     size = 0
     for round_number in range(1, ROUNDS + 1):
         with ended(program):
@@ -97,9 +97,14 @@ def three_lives(case: Case, prepared: Callable[[Case, str], Path], *, keep_pid: 
     return "the same"
 
 
+def environment_of(case: Case) -> dict[str, str]:
+    """What a program finds in its environment."""
+    return ENVIRONMENT | dict(case.environment)
+
+
 def run_to_the_end(case: Case, directory: Path) -> tuple[dict[str, int], int]:
     """Run a program undisturbed: the sizes of what it leaves, and its exit code."""
-    program = start(case.argv, directory, env=ENVIRONMENT)
+    program = start(case.argv, directory, env=environment_of(case))
     with ended(program):
         status = program.finish()
     assert status == 0, program.complaints
