@@ -125,7 +125,8 @@ class ThreadState:
     """One thread, as it stood when it was frozen.
 
     Attributes:
-        registers: register sets by name as the kernel gives them ("prstatus", "xstate" …), see ``checkpoint.arch``.
+        registers: register sets by name as the kernel gives them ("prstatus", "xstate" …), see ``checkpoint.arch``; with those of
+            the first thread "xstate_layout": where the processor has put the components of every "xstate".
             They stand where the program must go on: an interrupted system call is already set to be made again.
         signal_mask: blocked signals, bit 0 is signal 1.
         pending: signals pending for this thread alone, each a whole siginfo (128 bytes).

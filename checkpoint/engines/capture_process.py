@@ -6,11 +6,12 @@ import os
 from dataclasses import replace
 
 from checkpoint.arch import x86_64 as arch
+from checkpoint.arch import x86_64_xstate
 from checkpoint.engines import description
 from checkpoint.engines.identities import Identities
 from checkpoint.engines.standing import Standing
 from checkpoint.engines.standing_threads import ThreadStanding
-from checkpoint.linux import abi, procfs
+from checkpoint.linux import abi, processor, procfs
 from checkpoint.model import PosixTimer, ProcessState, ThreadState
 
 
@@ -46,7 +47,11 @@ def _first_thread(pid: int, standing: Standing) -> ThreadState:
     return ThreadState(
         tid=status.pids[-1],
         name=status.name,
-        registers={"prstatus": arch.encode_registers(standing.settled), "xstate": standing.xstate},
+        registers={
+            "prstatus": arch.encode_registers(standing.settled),
+            "xstate": standing.xstate,
+            "xstate_layout": x86_64_xstate.encode_layout(processor.xstate_layout()),
+        },
         signal_mask=place.mask,
         pending=place.pending,
         altstack=told.altstack,

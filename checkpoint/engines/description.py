@@ -5,13 +5,12 @@ from __future__ import annotations
 import functools
 import os
 import socket
-from typing import Final
 
 from blake3 import blake3
 
 from checkpoint.engines.inquiry import Told
 from checkpoint.errors import ProbeError, ProcessGoneError
-from checkpoint.linux import abi, procfs
+from checkpoint.linux import abi, processor, procfs
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import Stat, Status
 from checkpoint.model import Credentials, Machine, MemoryLayout
@@ -71,15 +70,6 @@ def affinity(pid: int) -> tuple[int, ...]:
         raise ProcessGoneError(f"pid {pid} ended while it was being described") from error
 
 
-XSTATE_HEADER: Final = 512
-"""Offset of XSTATE_BV, the bits of the components that are in use. Source: Intel SDM volume 1, 13.4.2."""
-
-
-def xstate_mask(xstate: bytes) -> int:
-    """Which parts of the processor\'s state are in use."""
-    return int.from_bytes(xstate[XSTATE_HEADER : XSTATE_HEADER + 8], "little")
-
-
 @functools.cache
 def this_machine() -> Machine:
     """Where we run; ``robot`` and ``xstate_mask`` are left to the capture."""
@@ -92,17 +82,9 @@ def this_machine() -> Machine:
         kernel=about.release,
         boot_id=boot_id,
         hostname=socket.gethostname(),
-        features=_features(),
+        features=processor.features(),
         vdso_digest=_vdso_digest(),
     )
-
-
-def _features() -> tuple[str, ...]:
-    with open("/proc/cpuinfo") as file:
-        for line in file:
-            if line.startswith("flags"):
-                return tuple(sorted(line.partition(":")[2].split()))
-    return ()
 
 
 def _vdso_digest() -> bytes:

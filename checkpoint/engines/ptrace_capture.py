@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from checkpoint import pages
+from checkpoint.arch import x86_64_xstate
 from checkpoint.chain import position_of
 from checkpoint.engine import PTRACE, CaptureOrder, Streams
 from checkpoint.engines import description, entering
@@ -63,9 +64,7 @@ class Frozen:
 
 def _xstate_mask(standing: Standing) -> int:
     """Which parts of the processor's state any thread uses."""
-    return functools.reduce(
-        operator.or_, map(description.xstate_mask, (standing.xstate, *(one.xstate for one in standing.others)))
-    )
+    return functools.reduce(operator.or_, map(x86_64_xstate.in_use, (standing.xstate, *(one.xstate for one in standing.others))))
 
 
 class PtraceSession:

@@ -27,12 +27,12 @@ from pathlib import Path
 from typing import Final
 
 from checkpoint import epoch_variable
-from checkpoint.arch import x86_64, x86_64_stub
+from checkpoint.arch import x86_64, x86_64_stub, x86_64_xstate
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import restore_checks, restore_memory, restore_process, restore_threads, restore_vdso, switches
 from checkpoint.engines.restore_process import Vessel
 from checkpoint.errors import CheckpointError, MismatchError, RestoreError
-from checkpoint.linux import abi, call_table, procfs, vdso
+from checkpoint.linux import abi, call_table, processor, procfs, vdso
 from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee
@@ -42,6 +42,11 @@ from checkpoint.resources.rebuild import rebuild_all, rebuild_last
 PTRACE_O_TRACESYSGOOD: Final = 1
 PTRACE_EVENT_EXEC: Final = 4
 OPTIONS: Final = abi.PTRACE_O_EXITKILL | PTRACE_O_TRACESYSGOOD | abi.PTRACE_O_TRACEEXEC | abi.PTRACE_O_TRACECLONE
+
+AMX: Final = frozenset({"amx_tile"})
+AMX_TILES: Final = 18
+ARCH_REQ_XCOMP_PERM: Final = 0x1023
+"""Source: Documentation/arch/x86/xstate.rst."""
 
 REFUGE_SIZE: Final = 1 << 20
 """Bytes beside the area where vdso and its data stay while their old and new places are cleared."""
@@ -120,7 +125,7 @@ class _Restore:
         self._require_identity(vessel)
         if not vessel.may_choose_executable:
             self._execute_program()
-        self._xstate_size = len(tracee.xstate())
+        self._own_xstate = tracee.xstate()
         self._start_registers = tracee.registers()
         mappings = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
         self._adapt(mappings)
@@ -234,6 +239,8 @@ class _Restore:
         restore_process.signal_actions(table, process.signal_actions)
         restore_process.thread_marks(table, thread)
         restore_process.surroundings(table, process)
+        if set(self._state.machine.features) & set(processor.features()) >= AMX:
+            table.attempt("", "arch_prctl", ARCH_REQ_XCOMP_PERM, AMX_TILES)  # it may have asked for them
         return table
 
     def _rights_table(self, table: CallTable, vessel: Vessel) -> CallTable:
@@ -285,7 +292,8 @@ class _Restore:
     def _take_place(self, tracee: Tracee, thread: ThreadState) -> None:
         """Give a thread its registers and mask; it stands in a stop that it can be let go from."""
         self._restore_rseq_section(thread)
-        tracee.set_xstate(thread.registers["xstate"][: self._xstate_size].ljust(self._xstate_size, b"\0"))
+        theirs, ours = restore_checks.xstate_layouts(self._state)
+        tracee.set_xstate(x86_64_xstate.fitted(thread.registers["xstate"], theirs, ours, self._own_xstate))
         tracee.interrupt()  # a signal that comes from now on finds the thread where the kernel decides about interrupted calls
         tracee.cont()
         tracee.wait(call_table.RUN_TIMEOUT_S)

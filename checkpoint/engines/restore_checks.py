@@ -13,7 +13,8 @@ from typing import Final
 
 from blake3 import blake3
 
-from checkpoint.arch import x86_64, x86_64_stub
+from checkpoint.arch import x86_64, x86_64_stub, x86_64_xstate
+from checkpoint.arch.x86_64_xstate import Layout
 from checkpoint.capability import Area, refused
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import restore_vdso
@@ -21,7 +22,7 @@ from checkpoint.engines.description import this_machine
 from checkpoint.engines.identities import build_id
 from checkpoint.engines.restore_memory import is_file_mapping, kernel_pages, makes_shared_memory
 from checkpoint.errors import CheckpointError, MismatchError
-from checkpoint.linux import abi, procfs
+from checkpoint.linux import abi, processor, procfs
 from checkpoint.model import FileIdentity, Resource, Snapshot
 from checkpoint.resources import rebuild, writers
 from checkpoint.resources.rebuilding import number_of
@@ -53,6 +54,12 @@ CAPABILITIES: Final = (
         "it was taken on {}, this machine is",
         "its pages are {} bytes",
         "this processor lacks",
+    ),
+    refused(
+        Area.THERE,
+        "a processor without the registers that a thread is just using; AMX tiles in use",
+        "the same processor, or another checkpoint; registers at rest do not count, nor where the processor puts them",
+        "is using {}, which cannot be had here",
     ),
     refused(
         Area.THERE,
@@ -129,6 +136,18 @@ def _of_threads(state: Snapshot) -> Iterator[str]:
         registers = thread.registers
         if len(registers.get("prstatus", b"")) != x86_64.REGISTERS_SIZE or not registers.get("xstate"):
             yield f"the registers of its thread {thread.tid} are not those of this processor: capture it again"
+            continue
+        if names := ", ".join(x86_64_xstate.lacking(registers["xstate"], *xstate_layouts(state))):
+            cure = "use the same processor, or another checkpoint"
+            yield f"its thread {thread.tid} is using {names}, which cannot be had here: {cure}"
+
+
+def xstate_layouts(state: Snapshot) -> tuple[Layout, Layout]:
+    """Where the components of the threads' extended states lie there, and here; the same where nobody has told."""
+    ours = processor.xstate_layout()
+    told = state.threads[0].registers.get("xstate_layout", b"") if state.threads else b""
+    theirs = x86_64_xstate.decode_layout(told)
+    return theirs or ours, ours or theirs
 
 
 def can_install_guards() -> bool:

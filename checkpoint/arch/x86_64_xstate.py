@@ -1,0 +1,177 @@
+"""The extended state of a thread (XSAVE), and how it gets from one processor to another that lays it out differently or has less.
+
+The kernel tells it in the standard form: a legacy region, a header that says which components are in use, and each component at
+its place. That place is the processor's own: PKRU lies at 2,688 with Intel and at 2,432 with AMD. A component that is not in use,
+or holds what it holds at first, need not be carried over.
+
+Source: Intel SDM volume 1, chapter 13; volume 2, CPUID leaf 0DH; AMD APM volume 3, CPUID Fn0000_000D; pkeys(7).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final
+
+COMPONENTS: Final = {
+    0: "x87",
+    1: "SSE",
+    2: "AVX",
+    3: "MPX bounds",
+    4: "MPX settings",
+    5: "AVX-512 masks",
+    6: "AVX-512 upper halves (ZMM)",
+    7: "AVX-512 upper registers (ZMM16 to ZMM31)",
+    9: "protection keys (PKRU)",
+    11: "shadow stack",
+    17: "AMX settings",
+    18: "AMX tiles",
+    19: "APX registers",
+}
+"""By number: what a message calls it."""
+LEGACY_SIZE: Final = 512
+LEGACY_USED: Final = 464
+"""Bytes of the legacy region that are registers; the kernel uses the rest for itself (arch/x86/include/uapi/asm/sigcontext.h)."""
+HEADER_SIZE: Final = 64
+FIRST_EXTENDED: Final = 2
+"""Components 0 and 1 lie in the legacy region."""
+PKRU: Final = 9
+PKRU_OF_LINUX: Final = 0x55555554
+"""What every thread begins with: nothing but key 0. Source: arch/x86/mm/pkeys.c, init_pkru_value."""
+HIGHEST: Final = 62
+AMX: Final = (17, 18)
+"""Only for a process that has asked for it, and 8 KiB a thread: kept while its tiles are released, as between computations."""
+
+
+@dataclass(frozen=True, slots=True)
+class Component:
+    """One component of a processor's extended state, in the standard form.
+
+    Attributes:
+        offset, size: in bytes.
+    """
+
+    number: int
+    offset: int
+    size: int
+
+    @property
+    def name(self) -> str:
+        """What a message calls it."""
+        return COMPONENTS.get(self.number, f"component {self.number}")
+
+
+Layout = tuple[Component, ...]
+"""The components beyond the legacy region, in order of their numbers; () where nobody could tell."""
+
+_ENTRY: Final = struct.Struct("<III")
+
+
+def encode_layout(layout: Layout) -> bytes:
+    """As a snapshot holds it: number, offset and size of each component, 32 bits each."""
+    return b"".join(_ENTRY.pack(one.number, one.offset, one.size) for one in layout)
+
+
+def decode_layout(content: bytes) -> Layout:
+    """The reverse of `encode_layout`; () for what is none."""
+    if len(content) % _ENTRY.size:
+        return ()
+    return tuple(Component(*entry) for entry in _ENTRY.iter_unpack(content))
+
+
+def in_use(xstate: bytes) -> int:
+    """The bits of the components that are in use (XSTATE_BV)."""
+    return int.from_bytes(xstate[LEGACY_SIZE : LEGACY_SIZE + 8], "little")
+
+
+def lacking(xstate: bytes, theirs: Layout, ours: Layout) -> Iterator[str]:
+    """Names of the components that are in use and cannot be had here."""
+    known = {one.number: one for one in ours}
+    for one in _extended_in_use(xstate, theirs):
+        here = known.get(one.number) if one.number not in AMX else None
+        if (here is None or here.size != one.size) and not _is_as_at_first(one.number, _content(xstate, one)):
+            yield one.name
+    told = {one.number for one in theirs}
+    for number in range(FIRST_EXTENDED, HIGHEST):
+        if in_use(xstate) >> number & 1 and number not in told:
+            yield COMPONENTS.get(number, f"component {number}")
+
+
+def fitted(xstate: bytes, theirs: Layout, ours: Layout, example: bytes) -> bytes:
+    """The same state as this processor lays it out. What is `lacking` here is left out.
+
+    Args:
+        example: the state of any thread here: of its size, with the kernel's own words.
+    """
+    known = {one.number: one for one in ours}
+    made = bytearray(len(example))
+    made[:LEGACY_USED] = xstate[:LEGACY_USED]
+    made[LEGACY_USED:LEGACY_SIZE] = example[LEGACY_USED:LEGACY_SIZE]
+    used = in_use(xstate) & ((1 << FIRST_EXTENDED) - 1)
+    for one in _extended_in_use(xstate, theirs):
+        here = known.get(one.number)
+        if here is not None and here.size == one.size and here.offset + here.size <= len(made):
+            made[here.offset : here.offset + here.size] = _content(xstate, one)
+            used |= 1 << one.number
+    if PKRU in known and PKRU not in {one.number for one in theirs}:
+        made[known[PKRU].offset : known[PKRU].offset + 4] = PKRU_OF_LINUX.to_bytes(4, "little")
+        used |= 1 << PKRU
+    made[LEGACY_SIZE : LEGACY_SIZE + 8] = used.to_bytes(8, "little")
+    return bytes(made)
+
+
+def _extended_in_use(xstate: bytes, layout: Layout) -> Iterator[Component]:
+    """Those that are in use and inside what was told."""
+    used = in_use(xstate)
+    return (one for one in layout if used >> one.number & 1 and one.offset + one.size <= len(xstate))
+
+
+def _content(xstate: bytes, one: Component) -> bytes:
+    return xstate[one.offset : one.offset + one.size]
+
+
+def _is_as_at_first(number: int, content: bytes) -> bool:
+    """Whether a component holds what a thread finds there when it begins."""
+    return not any(content) or (number == PKRU and int.from_bytes(content[:4], "little") == PKRU_OF_LINUX)
+
+
+# --- What this processor has: asked by ``checkpoint.linux.processor`` ---------------------------------------------------
+
+ASK: Final = bytes.fromhex(
+    "53"  #        push rbx
+    "89f0"  #      mov  eax, esi     leaf
+    "89d1"  #      mov  ecx, edx     subleaf
+    "0fa2"  #      cpuid
+    "8907"  #      mov  [rdi], eax
+    "895f04"  #    mov  [rdi+4], ebx
+    "894f08"  #    mov  [rdi+8], ecx
+    "89570c"  #    mov  [rdi+12], edx
+    "5b"  #        pop  rbx
+    "c3"  #        ret
+)
+"""``cpuid(words, leaf, subleaf)`` as a function of C: eax, ebx, ecx and edx as four 32-bit words."""
+ASK_ENABLED: Final = bytes.fromhex(
+    "31c9"  #        xor  ecx, ecx
+    "0f01d0"  #      xgetbv
+    "48c1e220"  #    shl  rdx, 32
+    "4809d0"  #      or   rax, rdx
+    "c3"  #          ret
+)
+"""The components that the kernel has turned on (XCR0), as a function of C. Only where /proc/cpuinfo says "xsave"."""
+LEAF_XSTATE: Final = 0xD
+
+
+def read_layout(ask: Callable[[int, int], tuple[int, int, int, int]], enabled: int) -> Layout:
+    """The components that a processor has and its kernel has turned on.
+
+    Args:
+        ask: CPUID of a leaf and subleaf.
+        enabled: their bits (XCR0).
+    """
+    found = []
+    for number in range(FIRST_EXTENDED, HIGHEST):
+        size, offset, _, _ = ask(LEAF_XSTATE, number) if enabled >> number & 1 else (0, 0, 0, 0)
+        if size:
+            found.append(Component(number, offset, size))
+    return tuple(found)
