@@ -8,6 +8,7 @@ Sources: struct user_regs_struct of sys/user.h; arch/x86/entry/syscalls/syscall_
 
 from __future__ import annotations
 
+import errno
 import operator
 import struct
 from collections.abc import Mapping, Sequence
@@ -54,6 +55,8 @@ CALL_NUMBER: Final = "orig_rax"
 """Number of the system call that the thread stands in; -1 outside of one."""
 NO_CALL: Final = _WORD
 """As `CALL_NUMBER`, unsigned: the thread is not in a system call, so the kernel has none to restart."""
+LOST_IN_A_CALL: Final = ("rcx", "r11")
+"""What every system call changes, besides its result. Source: psABI, A.2.1."""
 ARGUMENTS: Final = ("rdi", "rsi", "rdx", "r10", "r8", "r9")
 
 # System calls
@@ -61,11 +64,12 @@ ARGUMENTS: Final = ("rdi", "rsi", "rdx", "r10", "r8", "r9")
 SYSCALL: Final = b"\x0f\x05"
 SYSCALLS: Final[Mapping[str, int]] = {
     "read": 0, "write": 1, "open": 2, "close": 3, "poll": 7, "mmap": 9, "mprotect": 10, "munmap": 11, "brk": 12,
-    "rt_sigaction": 13, "rt_sigprocmask": 14, "select": 23, "madvise": 28, "pause": 34, "nanosleep": 35,
-    "getitimer": 36, "semop": 65, "sigaltstack": 131, "rt_sigtimedwait": 128, "rt_sigsuspend": 130, "prctl": 157,
+    "rt_sigaction": 13, "rt_sigprocmask": 14, "readv": 19, "writev": 20, "select": 23, "madvise": 28, "pause": 34,
+    "nanosleep": 35, "getitimer": 36, "getpid": 39, "accept": 43, "sendto": 44, "recvfrom": 45, "sendmsg": 46,
+    "recvmsg": 47, "semop": 65, "sigaltstack": 131, "rt_sigtimedwait": 128, "rt_sigsuspend": 130, "prctl": 157,
     "futex": 202, "io_getevents": 208, "restart_syscall": 219, "semtimedop": 220, "timer_gettime": 224,
     "timer_getoverrun": 225, "clock_gettime": 228, "clock_nanosleep": 230, "epoll_wait": 232, "pselect6": 270,
-    "ppoll": 271, "get_robust_list": 274, "epoll_pwait": 281, "userfaultfd": 323, "io_uring_enter": 426,
+    "ppoll": 271, "get_robust_list": 274, "epoll_pwait": 281, "accept4": 288, "userfaultfd": 323, "io_uring_enter": 426,
     "epoll_pwait2": 441, "futex_waitv": 449,
 }  # fmt: skip
 """Numbers by name: those that we make or tell of."""
@@ -79,15 +83,70 @@ RESTART_BLOCK: Final = -516
 """ERESTART_RESTARTBLOCK: to be gone on with by restart_syscall(2), from what the kernel remembers."""
 REMAINING_TIME: Final[Mapping[str, tuple[int, int]]] = {"nanosleep": (0, 1), "clock_nanosleep": (2, 3)}
 """Which argument points to the time asked for, and which to where the kernel has written what remains of it."""
-ENDLESS_TIMEOUT: Final[Mapping[str, tuple[int, int] | None]] = {
+ERESTARTNOHAND: Final = -514
+"""What a stopped call returns when it is to be made again, unless a signal handler comes first: that makes it EINTR."""
+
+MILLISECONDS: Final = "ms"
+TIMESPEC: Final = "timespec"
+SOCKET: Final = "socket"
+
+
+@dataclass(frozen=True, slots=True)
+class Timeout:
+    """How long a call waits.
+
+    Attributes:
+        argument: index of the argument that tells; of a `SOCKET`, of its descriptor.
+        form: `MILLISECONDS` (an int, negative for ever), `TIMESPEC` (address of one, 0 for ever), or `SOCKET`.
+        at_end: what the call returns when that time is over.
+        option: of a `SOCKET`: SO_RCVTIMEO or SO_SNDTIMEO.
+    """
+
+    argument: int
+    form: str
+    at_end: int
+    option: int = 0
+
+
+_RECEIVING: Final = Timeout(0, SOCKET, -errno.EAGAIN, 20)
+_SENDING: Final = Timeout(0, SOCKET, -errno.EAGAIN, 21)
+ENDED_BY_A_STOP: Final[Mapping[str, Timeout | None]] = {
     "semop": None,
-    "rt_sigtimedwait": (2, 0),
-    "semtimedop": (3, 0),
-    "epoll_wait": (3, 0xFFFFFFFF),
-    "epoll_pwait": (3, 0xFFFFFFFF),
-    "epoll_pwait2": (3, 0),
+    "rt_sigtimedwait": Timeout(2, TIMESPEC, -errno.EAGAIN),
+    "semtimedop": Timeout(3, TIMESPEC, -errno.EAGAIN),
+    "epoll_wait": Timeout(3, MILLISECONDS, 0),
+    "epoll_pwait": Timeout(3, MILLISECONDS, 0),
+    "epoll_pwait2": Timeout(3, TIMESPEC, 0),
 }
-"""Calls that return EINTR merely because of a stop, and the argument (index, value) that makes them wait for ever."""
+"""Calls that return EINTR merely because of a stop, and their timeouts. Source: signal(7)."""
+SOCKET_TIMEOUT: Final[Mapping[str, Timeout]] = {
+    **dict.fromkeys(("read", "readv", "recvfrom", "recvmsg", "accept", "accept4"), _RECEIVING),
+    **dict.fromkeys(("write", "writev", "sendto", "sendmsg"), _SENDING),
+}
+"""Calls that do so only at a socket that has a timeout. connect(2) is not made again: it would answer EALREADY."""
+CALL_NUMBER_BITS: Final = 32
+"""Of the register with a call's number newer kernels look at the lower half only, and keep both in `CALL_NUMBER`: the upper one
+can hold a mark by which a call is known again, until its result takes that place. 0: no room for a mark."""
+MARK_LIMIT: Final = 1 << 31
+"""Marks are smaller: the highest bit says that the thread is in no call."""
+
+
+def call_number(registers: Mapping[str, int]) -> int:
+    """The number of the system call that a thread stands in, without a mark; -1 outside of one."""
+    word = registers[CALL_NUMBER]
+    return -1 if word >> 63 else word & ((1 << CALL_NUMBER_BITS) - 1)
+
+
+def mark_of(registers: Mapping[str, int]) -> int:
+    """The mark of the system call that a thread stands in, 0 if it has none."""
+    return registers[CALL_NUMBER] >> CALL_NUMBER_BITS
+
+
+def marked(number: int, mark: int) -> int:
+    """A call's number with a mark."""
+    return mark << CALL_NUMBER_BITS | number
+
+
 RESTART_BLOCK_USERS: Final = ("clock_nanosleep", "nanosleep", "poll", "futex")
 
 

@@ -178,9 +178,8 @@ def with_registers(registers: bytes, **values: int) -> bytes:
 
 
 ERESTARTSYS: Final = -512
-ERESTARTNOHAND: Final = -514
 ALWAYS_INTERRUPTED: Final = frozenset(
-    ("pause", "rt_sigsuspend", "select", "pselect6", "ppoll", *x86_64.RESTART_BLOCK_USERS, *x86_64.ENDLESS_TIMEOUT)
+    ("pause", "rt_sigsuspend", "select", "pselect6", "ppoll", *x86_64.RESTART_BLOCK_USERS, *x86_64.ENDED_BY_A_STOP)
 )
 """Calls that return EINTR after any signal handler; the others are made again after one with SA_RESTART. Source: signal(7)."""
 
@@ -195,7 +194,7 @@ def in_interrupted_call(registers: bytes, interrupted: str) -> bytes:
     if not interrupted:
         return with_registers(registers)
     values = x86_64.decode_registers(registers)
-    result = ERESTARTNOHAND if interrupted in ALWAYS_INTERRUPTED else ERESTARTSYS
+    result = x86_64.ERESTARTNOHAND if interrupted in ALWAYS_INTERRUPTED else ERESTARTSYS
     after = values["rip"] + len(x86_64.SYSCALL)
     return with_registers(registers, rip=after, rax=result, orig_rax=values["rax"])
 

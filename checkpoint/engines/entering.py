@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from typing import Final
 
 from checkpoint.arch import x86_64 as arch
-from checkpoint.engines.restart import Interruption, outside_critical_section, undisturbed
+from checkpoint.engines.restart import Interruptions, outside_critical_section
 from checkpoint.errors import CaptureError
 from checkpoint.linux import dirty, entry, procfs, remote
 from checkpoint.linux.digests import DigestTracker
 from checkpoint.linux.dirty import SoftDirtyTracker
-from checkpoint.linux.memory import Memory
 from checkpoint.linux.remote import BorrowedPages
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Tracee
@@ -30,33 +29,28 @@ LEAVE_PAUSE_S: Final = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Entered:
-    """What one session works with; ``notes`` are sentences for the operator.
-
-    Attributes:
-        interruption: of the first thread.
-    """
+    """What one session works with; ``notes`` are sentences for the operator."""
 
     pages: BorrowedPages
     tracker: Tracker
-    interruption: Interruption
+    interruptions: Interruptions
     notes: tuple[str, ...]
 
 
-def enter(threads: Threads) -> Entered:
+def enter(threads: Threads, interruptions: Interruptions) -> Entered:
     """Borrow pages, choose how to track, and let go again.
 
     Raises:
         CaptureError, ProcessGoneError: it could not be entered; nothing of ours is left in it.
     """
-    interruption = Interruption(Memory(threads.pid))
     deadline = time.perf_counter() + LEAVE_TIMEOUT_S
-    while (entered := _try_to_enter(threads, interruption, last=time.perf_counter() > deadline)) is None:
+    while (entered := _try_to_enter(threads, interruptions, last=time.perf_counter() > deadline)) is None:
         time.sleep(LEAVE_PAUSE_S)
     tracker, notes = _tracker_for(threads.pid, entered)
-    return Entered(entered.pages, tracker, interruption, notes)
+    return Entered(entered.pages, tracker, interruptions, notes)
 
 
-def _try_to_enter(threads: Threads, interruption: Interruption, *, last: bool) -> entry.Entered | None:
+def _try_to_enter(threads: Threads, interruptions: Interruptions, *, last: bool) -> entry.Entered | None:
     """Enter once, by the first thread; None while the program still stands in the code of a tracer that died.
 
     Args:
@@ -65,8 +59,7 @@ def _try_to_enter(threads: Threads, interruption: Interruption, *, last: bool) -
     tracee = threads.leader
     with stopped(threads):
         mask = tracee.signal_mask()
-        pending = (*tracee.pending(shared=False), *tracee.pending(shared=True))
-        decoded = where_it_stands(tracee, mask, pending, tracee.rseq())
+        decoded = where_it_stands(tracee, interruptions, tracee.rseq())
         lines = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
         left = entry.leftovers(tracee.memory, lines)
         places = [decoded[arch.INSTRUCTION_POINTER], *map(_instruction_pointer, threads.others)]
@@ -77,7 +70,7 @@ def _try_to_enter(threads: Threads, interruption: Interruption, *, last: bool) -
             if last:
                 raise CaptureError(f"pid {tracee.pid} does not leave the code of an earlier tracer; protect it again")
             return None
-        interruption.settled(decoded)  # remembers the call that it stands in
+        interruptions.of(tracee).settled(decoded)  # remembers the call that it stands in
         registers = arch.encode_registers(decoded)
         for borrowed in left:
             if borrowed.state() == remote.ARMED:
@@ -98,12 +91,12 @@ def _instruction_pointer(tracee: Tracee) -> int:
     return arch.decode_registers(tracee.registers())[arch.INSTRUCTION_POINTER]
 
 
-def where_it_stands(tracee: Tracee, mask: int, pending: tuple[bytes, ...], rseq: Rseq | None) -> arch.Registers:
+def where_it_stands(tracee: Tracee, interruptions: Interruptions, rseq: Rseq | None) -> arch.Registers:
     """The registers that the program is given back: as they are, but for what our stop alone has brought about."""
     decoded = arch.decode_registers(tracee.registers())
     if decoded[arch.CALL_NUMBER] >> 63:
         return outside_critical_section(decoded, tracee.memory, rseq.address) if rseq else decoded
-    return undisturbed(decoded, bool(_unblocked(pending, mask)))
+    return interruptions.of(tracee).waiting.undisturbed(decoded)
 
 
 def _tracker_for(pid: int, entered: entry.Entered) -> tuple[Tracker, tuple[str, ...]]:
@@ -127,8 +120,3 @@ def stopped(threads: Threads) -> Iterator[None]:
         yield
     finally:
         threads.thaw()
-
-
-def _unblocked(pending: tuple[bytes, ...], mask: int) -> list[int]:
-    numbers = (int.from_bytes(siginfo[:4], "little") for siginfo in pending)
-    return [number for number in numbers if not mask >> (number - 1) & 1]

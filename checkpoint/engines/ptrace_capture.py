@@ -34,6 +34,7 @@ from checkpoint.engines.capture_process import process_state, thread_states
 from checkpoint.engines.entering import Entered
 from checkpoint.engines.identities import Identities
 from checkpoint.engines.outputs import Outputs
+from checkpoint.engines.restart import Interruptions
 from checkpoint.engines.standing import Onlooker, Standing
 from checkpoint.errors import ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import abi, procfs
@@ -107,8 +108,9 @@ class PtraceSession:
             if not report.supported:
                 listed = "; ".join(report.reasons)
                 raise UnsupportedError(f"cannot protect pid {pid} ({report.command}): {listed}", report.reasons)
-            threads = Threads(Tracee(pid))
-            session = cls(pid, component, threads, entering.enter(threads))
+            interruptions = Interruptions()
+            threads = Threads(Tracee(pid), interruptions.mend)
+            session = cls(pid, component, threads, entering.enter(threads, interruptions))
         except BaseException:
             if outputs:
                 outputs.close()

@@ -1,7 +1,8 @@
 """Interrupted system calls: how a snapshot goes on from a stop inside one.
 
-The live program needs nothing of this: it gets its registers back as they were and the kernel decides. A snapshot has no
-kernel that remembers, so the call is set to be made again, with what is left of its time where the program can be told.
+The live program needs nothing of this: it gets its registers back as they were and the kernel decides (but for the calls of
+`checkpoint.engines.waits`). A snapshot has no kernel that remembers, so the call is set to be made again, with what is left of
+its time where the program can be told.
 
 Source: signal(7), restart_syscall(2), nanosleep(2).
 """
@@ -10,10 +11,13 @@ from __future__ import annotations
 
 import ctypes
 import errno
+from collections.abc import Container
 
 from checkpoint.arch import x86_64 as arch
+from checkpoint.engines.waits import Waiting
 from checkpoint.errors import CaptureError
 from checkpoint.linux.memory import Memory
+from checkpoint.linux.tracee import Tracee
 
 CODE_LOOKED_AT = 32
 """Bytes before a ``syscall`` instruction in which the C library loads the call's number."""
@@ -26,16 +30,20 @@ class Interruption:
     """Remembers which call a thread stands in, over several stops of the same call.
 
     After the first stop the kernel goes on by restart_syscall(2), and the number of the call itself is gone from the registers.
+
+    Attributes:
+        waiting: of those calls that do not go on by themselves.
     """
 
     def __init__(self, memory: Memory) -> None:
+        self.waiting = Waiting(memory)
         self._memory = memory
         self._place: Place = ()
         self._number = -1
 
     def settled(self, registers: arch.Registers) -> tuple[arch.Registers, str]:
         """The registers that a snapshot goes on with, and the name of the call that is made again ("" if none)."""
-        number = ctypes.c_int64(registers[arch.CALL_NUMBER]).value
+        number = arch.call_number(registers)
         result = ctypes.c_int64(registers[arch.RESULT]).value
         if number < 0:
             return registers, ""
@@ -69,17 +77,28 @@ class Interruption:
         return -1 if found is None else found
 
 
-def undisturbed(registers: arch.Registers, signals_wait: bool) -> arch.Registers:
-    """The registers that the live program gets back: a call that returned EINTR merely because of our stop is made again.
+class Interruptions:
+    """Those of all threads of one process."""
 
-    Args:
-        signals_wait: a signal that is not blocked is pending: then EINTR is what the program must see.
-    """
-    number = ctypes.c_int64(registers[arch.CALL_NUMBER]).value
-    result = ctypes.c_int64(registers[arch.RESULT]).value
-    if number >= 0 and result == -errno.EINTR and not signals_wait and _is_endless(registers, number):
-        return _again(registers, number)[0]
-    return registers
+    def __init__(self) -> None:
+        self._by_tid: dict[int, Interruption] = {}
+
+    def of(self, tracee: Tracee) -> Interruption:
+        """Of one thread."""
+        if tracee.pid not in self._by_tid:
+            self._by_tid[tracee.pid] = Interruption(tracee.memory)
+        return self._by_tid[tracee.pid]
+
+    def keep_only(self, tids: Container[int]) -> None:
+        """Forget threads that have ended."""
+        self._by_tid = {tid: kept for tid, kept in self._by_tid.items() if tid in tids}
+
+    def mend(self, tracee: Tracee) -> None:
+        """Let a thread that stands still, and has not been given registers, go on as if it had not been stopped."""
+        found = arch.decode_registers(tracee.registers())
+        mended = self.of(tracee).waiting.undisturbed(found)
+        if mended != found:
+            tracee.set_registers(arch.encode_registers(mended))
 
 
 def _again(registers: arch.Registers, number: int) -> tuple[arch.Registers, str]:
@@ -90,18 +109,6 @@ def _again(registers: arch.Registers, number: int) -> tuple[arch.Registers, str]
         arch.INSTRUCTION_POINTER: registers[arch.INSTRUCTION_POINTER] - len(arch.SYSCALL),
     }
     return again, arch.SYSCALL_NAMES.get(number, str(number))
-
-
-def _is_endless(registers: arch.Registers, number: int) -> bool:
-    name = arch.SYSCALL_NAMES.get(number, "")
-    if name not in arch.ENDLESS_TIMEOUT:
-        return False
-    condition = arch.ENDLESS_TIMEOUT[name]
-    if condition is None:
-        return True
-    index, value = condition
-    mask = 0xFFFFFFFF if value else (1 << 64) - 1
-    return registers[arch.ARGUMENTS[index]] & mask == value
 
 
 def outside_critical_section(registers: arch.Registers, memory: Memory, rseq_address: int) -> arch.Registers:

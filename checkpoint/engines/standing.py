@@ -93,9 +93,9 @@ class Onlooker:
     def __init__(self, threads: Threads, entered: Entered) -> None:
         self._tracee = threads.leader
         self._threads = threads
-        self._others = ThreadOnlooker(threads, entered.pages)
+        self._others = ThreadOnlooker(threads, entered)
         self._borrowed = entered.pages
-        self._interruption = entered.interruption
+        self._interruptions = entered.interruptions
         self._inquiry: Inquiry | None = None
         self._inquiry_key: tuple[int, bytes] = (0, b"")
 
@@ -120,10 +120,10 @@ class Onlooker:
         pending = tracee.pending(shared=False) if waits_here else ()
         shared_pending = tracee.pending(shared=True) if waits_shared else ()
         mask, rseq = tracee.signal_mask(), tracee.rseq()
-        registers = where_it_stands(tracee, mask, (*pending, *shared_pending), rseq)
+        registers = where_it_stands(tracee, self._interruptions, rseq)
         if self._borrowed.holds(registers[arch.INSTRUCTION_POINTER]):
             raise CaptureError(f"pid {tracee.pid} still stands in code of an earlier look; capture it again in a moment")
-        others = self._others.places(shared_pending)
+        others = self._others.places()
         return Place(registers, mask, special, pending, shared_pending, rseq, status, others)
 
     def ask(self, place: Place, outputs: Outputs | None) -> Standing:
@@ -135,7 +135,7 @@ class Onlooker:
         waiting = (*tracee.pending(shared=False), *tracee.pending(shared=True))
         if inquiry.has_timers:
             waiting += self._others.waiting(place.others)
-        settled, interrupted = self._interruption.settled(place.registers)
+        settled, interrupted = self._interruptions.of(tracee).settled(place.registers)
         return Standing(
             place=place,
             others=others,

@@ -13,12 +13,11 @@ from dataclasses import dataclass
 
 from checkpoint.arch import x86_64 as arch
 from checkpoint.engines import description
-from checkpoint.engines.entering import where_it_stands
-from checkpoint.engines.restart import Interruption
+from checkpoint.engines.entering import Entered, where_it_stands
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.procfs import Stat
-from checkpoint.linux.remote import SMALL, Answers, Batch, BorrowedPages, Desk, Guest
+from checkpoint.linux.remote import SMALL, Answers, Batch, Desk, Guest
 from checkpoint.linux.threads import Threads, thread_ids
 from checkpoint.linux.tracee import Tracee
 from checkpoint.model import Rseq
@@ -130,12 +129,12 @@ def _start_time(stat_text: bytes) -> int:
 class ThreadOnlooker:
     """Asks the threads of one process besides the first, again and again."""
 
-    def __init__(self, threads: Threads, borrowed: BorrowedPages) -> None:
+    def __init__(self, threads: Threads, entered: Entered) -> None:
         self._threads = threads
-        self._borrowed = borrowed
-        self._questions = [ThreadQuestions(desk) for desk in borrowed.desks]
+        self._borrowed = entered.pages
+        self._questions = [ThreadQuestions(desk) for desk in entered.pages.desks]
         self._inner_tids: dict[Life, int] = {}
-        self._interruptions: dict[int, Interruption] = {}
+        self._interruptions = entered.interruptions
 
     def prepare(self) -> None:
         """Look up, while the program runs, what does not change."""
@@ -164,26 +163,24 @@ class ThreadOnlooker:
             self._inner_tids[life] = status.pids[-1]
         return self._inner_tids[life]
 
-    def places(self, shared_pending: tuple[bytes, ...]) -> tuple[ThreadPlace, ...]:
+    def places(self) -> tuple[ThreadPlace, ...]:
         """Where they stand.
 
         Raises:
             CaptureError: one has not left the code of an earlier look yet.
         """
-        found = tuple(self._place(tracee, shared_pending) for tracee in self._threads.others)
+        found = tuple(self._place(tracee) for tracee in self._threads.others)
         if len(self._inner_tids) > len(found):
             lives = {place.life for place in found}
             self._inner_tids = {life: tid for life, tid in self._inner_tids.items() if life in lives}
-            self._interruptions = {
-                tid: kept for tid, kept in self._interruptions.items() if any(tid == life[0] for life in lives)
-            }
+            self._interruptions.keep_only({self._threads.pid, *(tid for tid, _ in lives)})
         return found
 
-    def _place(self, tracee: Tracee, shared_pending: tuple[bytes, ...]) -> ThreadPlace:
+    def _place(self, tracee: Tracee) -> ThreadPlace:
         stat_text = self._stat_text(tracee.pid)
         pending = tracee.pending(shared=False)
         mask, rseq = tracee.signal_mask(), tracee.rseq()
-        registers = where_it_stands(tracee, mask, (*pending, *shared_pending), rseq)
+        registers = where_it_stands(tracee, self._interruptions, rseq)
         if self._borrowed.holds(registers[arch.INSTRUCTION_POINTER]):
             raise CaptureError(f"thread {tracee.pid} still stands in code of an earlier look; capture it again in a moment")
         life = tracee.pid, _start_time(stat_text)
@@ -203,8 +200,7 @@ class ThreadOnlooker:
 
     def _standing(self, place: ThreadPlace, questions: ThreadQuestions, answers: Answers) -> ThreadStanding:
         tid = place.tracee.pid
-        interruption = self._interruptions.setdefault(tid, Interruption(place.tracee.memory))
-        settled, interrupted = interruption.settled(place.registers)
+        settled, interrupted = self._interruptions.of(place.tracee).settled(place.registers)
         return ThreadStanding(
             place=place,
             xstate=place.tracee.xstate(),

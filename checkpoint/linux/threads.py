@@ -63,10 +63,14 @@ class Threads:
 
     Attributes:
         leader: the first thread, whose id is the process's.
+
+    Args:
+        mend: what is done to each thread that is let go as it was found, of which nothing else was asked.
     """
 
-    def __init__(self, leader: Tracee) -> None:
+    def __init__(self, leader: Tracee, mend: Callable[[Tracee], None] | None = None) -> None:
         self.leader = leader
+        self._mend = mend
         self._known: dict[int, Tracee] = {leader.pid: leader}
         self._held: dict[int, Tracee] = {}
         self._moving: set[int] = set()
@@ -171,6 +175,8 @@ class Threads:
         held, self._held = self._held, {}
         for tid, tracee in held.items():
             try:
+                if self._mend and tracee.is_as_found:
+                    self._mend(tracee)
                 tracee.detach()
             except CheckpointError:
                 self._loose[tid] = tracee

@@ -66,6 +66,9 @@ def _is_dead(pid: int) -> bool:
 class Tracee:
     """One thread of another process, from `seize` to `detach`.
 
+    Attributes:
+        is_as_found: nobody has set its registers since it was seized.
+
     Args:
         pid: the thread's id; for the first thread of a process that of the process.
         memory: its process's, if somebody has it already.
@@ -74,6 +77,7 @@ class Tracee:
     def __init__(self, pid: int, memory: Memory | None = None) -> None:
         self.pid = pid
         self.memory = memory or Memory(pid)
+        self.is_as_found = True
         self._registers = ctypes.create_string_buffer(REGISTERS_SIZE)
         self._xstate = ctypes.create_string_buffer(XSTATE_SIZE)
         self._iov = abi.IoVec()
@@ -116,6 +120,7 @@ class Tracee:
             ProbeError: not permitted, or traced by somebody else.
         """
         self.request("seize", abi.PTRACE_SEIZE, 0, options)
+        self.is_as_found = True
 
     def interrupt(self) -> None:
         """Ask it to stop; `wait` tells when it has."""
@@ -211,6 +216,7 @@ class Tracee:
 
     def set_registers(self, content: bytes) -> None:
         """Write the general registers."""
+        self.is_as_found = False
         self._setregset("write registers of", abi.NT_PRSTATUS, content, self._registers)
 
     def xstate(self) -> bytes:

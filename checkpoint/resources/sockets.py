@@ -30,6 +30,8 @@ from checkpoint.resources.rebuilding import number_of
 QUEUE_LIMIT: Final = 4 << 20
 """Bytes that wait in one socket and are carried."""
 MESSAGES_MAX: Final = 65536
+MUCH: Final = 1 << 15
+"""Bytes that wait and may not find room again in a buffer of the usual size: the smallest is larger (wmem_default)."""
 PIECE_SIZE: Final = 1 << 18
 """Bytes that are looked at in one go: more than any datagram has."""
 RIGHTS_SPACE: Final = socket.CMSG_SPACE(253 * 4)
@@ -228,24 +230,53 @@ def set_options(table: CallTable, held: Resource, made: int) -> None:
         assert isinstance(one, list) and isinstance(one[2], bytes)
         level, number, value = number_of(one[0]), number_of(one[1]), one[2]
         if level == socket.SOL_SOCKET and number in _BUFFERS:
-            value = (int.from_bytes(value, "little") // 2).to_bytes(4, "little")
-            table.attempt("", "setsockopt", made, level, number, table.place(value), len(value))
-            number = _FORCED[number]
-            lost = ""
+            _set_buffer(table, made, number, int.from_bytes(value, "little"))
         else:
             lost = f"option {number} of level {level} of {held.name} is not kept"
-        table.attempt(lost, "setsockopt", made, level, number, table.place(value), len(value))
+            table.attempt(lost, "setsockopt", made, level, number, table.place(value), len(value))
 
 
-def fill(table: CallTable, held: Resource, sender: int) -> None:
-    """Send what waited, through a socket whose messages arrive there."""
+def _set_buffer(table: CallTable, made: int, number: int, size: int) -> None:
+    """Set the size of a buffer, in bytes as the kernel tells it, beyond its limit where we may."""
+    value = (size // 2).to_bytes(4, "little")
+    for option in (number, _FORCED[number]):
+        table.attempt("", "setsockopt", made, socket.SOL_SOCKET, option, table.place(value), len(value))
+
+
+def fill(table: CallTable, held: Resource, sender: int, sending: Resource | None) -> None:
+    """Send what waited, through a socket whose messages arrive there.
+
+    A full buffer may be fuller than one that is filled again in other pieces: it is made large meanwhile.
+
+    Args:
+        sending: the sender, if it is the program's.
+    """
     messages = held.facts["queue"]
     assert isinstance(messages, list)
+    is_much = sum(len(message) for message in messages if isinstance(message, bytes)) > MUCH
+    if is_much:
+        _set_buffer(table, sender, socket.SO_SNDBUF, 4 * QUEUE_LIMIT)
     for message in messages:
         assert isinstance(message, bytes)
         size, what = len(message), f"fill {held.name} with what waited in it"
         arguments = (sender, table.place(message), size, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL, 0, 0)
         table.call(what, "sendto", *arguments, least=size, most=size)
+    if is_much and sending is not None:
+        _set_send_buffer_back(table, sending, sender)
+
+
+def _set_send_buffer_back(table: CallTable, held: Resource, made: int) -> None:
+    """Give a socket's send buffer the size that the program had chosen, or else the kernel's own."""
+    options = held.facts["options"]
+    assert isinstance(options, list)
+    place = [socket.SOL_SOCKET, socket.SO_SNDBUF]
+    chosen = [one[2] for one in options if isinstance(one, list) and one[:2] == place and isinstance(one[2], bytes)]
+    family, kind, protocol = (number_of(held.facts[name]) for name in ("family", "type", "protocol"))
+    usual = _fresh_options(Form(family, kind, protocol))[socket.SOL_SOCKET, socket.SO_SNDBUF]
+    _set_buffer(table, made, socket.SO_SNDBUF, int.from_bytes((chosen or [usual])[0], "little"))
+    if not chosen:
+        free = bytes(4)
+        table.attempt("", "setsockopt", made, socket.SOL_SOCKET, SO_BUF_LOCK, table.place(free), len(free))
 
 
 def set_flags(table: CallTable, held: Resource, made: int) -> None:

@@ -236,7 +236,7 @@ class _Work:
         for one in self._held.values():
             self._connect_datagrams(one)
             if one.facts["queue"]:
-                sockets.fill(table, one, self._sender_to(one, others))
+                sockets.fill(table, one, self._sender_to(one, others), self._held.get(_of(one, "peer")))
         for inode, one in self._held.items():
             if how := _of(one, "shutdown"):
                 table.attempt("", "shutdown", self._made[inode], _SHUTDOWN_HOW[how])

@@ -1,0 +1,222 @@
+"""Calls that the kernel ends with EINTR at every stop: a program that is captured many times a second does not notice."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from checkpoint.arch import x86_64 as arch
+from checkpoint.engine import CaptureOrder
+from checkpoint.engines import waits
+from checkpoint.engines.waits import Wait, decide
+from tests.checkpoint.round_trip import (
+    PATIENCE_S,
+    Program,
+    captured_and_killed,
+    captured_at_last,
+    ended,
+    expect_ok,
+    protected,
+    restored,
+    start_tracee,
+)
+
+Compiled = Callable[..., Path]
+
+TOGETHER = (
+    ("epoll", "thread", "pwait2", "handlers"),
+    ("inline", "sigtimedwait", "semtimedop", "ticks"),
+    ("recv", "read", "accept", "send"),
+    ("bytes", "edges"),
+)
+"""What is waited in. So few at a time that each is captured several times in one wait."""
+ROUNDS = {"ticks": 50, "bytes": 120, "edges": 120, "handlers": 300}
+"""Waits that a program has ended at least while it is captured: those that end soon, for much longer than their timeout."""
+FEW_ROUNDS = 2
+"""Of those that take 0.4 s each."""
+PAUSE_S = 0.02
+"""Between two rounds of captures: how often is part of what is tested, not something that is waited for."""
+
+
+def rounds(program: Program) -> int:
+    """How many waits have ended."""
+    return program.output.count("round\n")
+
+
+def has_done_enough(program: Program) -> bool:
+    """Whether enough of its waits have ended."""
+    return rounds(program) >= ROUNDS.get(program.directory.name, FEW_ROUNDS)
+
+
+@contextlib.contextmanager
+def waiting(compiled: Compiled, directory: Path, kinds: tuple[str, ...], *more: str) -> Iterator[list[Program]]:
+    """One program for each kind of wait, all at once, because each takes its time."""
+    with contextlib.ExitStack() as stack:
+        found = []
+        for kind in kinds:
+            (directory / kind).mkdir()
+            program = start_tracee(compiled("waits", "-O2", "-pthread"), directory / kind, kind, *more)
+            found.append(stack.enter_context(ended(program)))
+        yield found
+
+
+def capture_until(programs: list[Program], enough: Callable[[Program], bool]) -> None:
+    """Capture all of them, again and again, each in one session."""
+    with contextlib.ExitStack() as stack:
+        sessions = [stack.enter_context(protected(program)) for program in programs]
+        sequence, deadline = 0, time.monotonic() + PATIENCE_S
+        while late := [program.directory.name for program in programs if not enough(program)]:
+            assert time.monotonic() < deadline, f"still waiting: {late}"
+            sequence += 1
+            for session in sessions:
+                session.acknowledge(captured_at_last(session, CaptureOrder(sequence=sequence)).position)
+            assert all(program.poll() is None for program in programs)
+            time.sleep(PAUSE_S)
+
+
+def expect_all_ok(programs: list[Program]) -> None:
+    """Tell them to end, and show what each of them found to differ."""
+    complaints = []
+    for program in programs:
+        program.tell()
+    for program in programs:
+        try:
+            expect_ok(program)
+        except AssertionError as error:
+            complaints.append(f"{program.directory.name}: {error}")
+    assert not complaints, "\n".join(complaints)
+
+
+@pytest.mark.compiler
+@pytest.mark.root
+@pytest.mark.parametrize("kinds", TOGETHER, ids="-".join)
+def test_waits_end_as_they_do_undisturbed_however_often_the_program_is_captured(
+    compiled: Compiled, tmp_path: Path, kinds: tuple[str, ...]
+) -> None:
+    with waiting(compiled, tmp_path, kinds) as programs:
+        capture_until(programs, has_done_enough)
+        expect_all_ok(programs)
+
+
+@pytest.mark.compiler
+@pytest.mark.root
+def test_without_room_for_a_mark_a_wait_ends_with_eintr_only_when_its_time_is_over(
+    compiled: Compiled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(waits, "has_room_for_marks", lambda: False)
+    with waiting(compiled, tmp_path, ("epoll", "thread", "sigtimedwait", "recv"), "lenient") as programs:
+        capture_until(programs, has_done_enough)
+        expect_all_ok(programs)
+
+
+@pytest.mark.compiler
+@pytest.mark.root
+def test_a_wait_goes_on_after_each_of_three_restores(compiled: Compiled, tmp_path: Path) -> None:
+    kinds = ("epoll", "thread", "sigtimedwait", "send", "handlers")
+    with waiting(compiled, tmp_path, kinds) as programs, contextlib.ExitStack() as stack:
+        for _ in range(3):
+            snapshots = [captured_and_killed(program) for program in programs]
+            programs = [restored(snapshot, program.directory) for snapshot, program in zip(snapshots, programs, strict=True)]
+            for program in programs:
+                stack.enter_context(ended(program))
+        expect_all_ok(programs)
+
+
+@pytest.mark.compiler
+@pytest.mark.root
+def test_a_wait_that_a_keeper_had_made_again_ends_by_itself_when_that_is_killed(compiled: Compiled, tmp_path: Path) -> None:
+    with waiting(compiled, tmp_path, ("epoll", "thread", "read")) as programs:
+        for program in programs:
+            keeper = os.fork()
+            if not keeper:
+                with contextlib.suppress(BaseException):
+                    (program.directory / "captured").mkdir()
+                    capture_until([program], lambda program: (program.directory / "captured" / "often").exists())
+                os._exit(1)
+            try:
+                program.wait_until((program.directory / "captured").exists, "its keeper")
+                before = rounds(program)
+                program.wait_until(lambda: rounds(program) > before, "a wait that ends while it is captured")  # noqa: B023
+            finally:
+                os.kill(keeper, signal.SIGKILL)
+                os.waitpid(keeper, 0)
+        expect_all_ok(programs)
+
+
+# --- The table of rules ------------------------------------------------------------------------------------------------
+
+ASKED_NS = 1_000
+BEGAN_NS = 50_000
+
+
+def stopped(mark: int = 0, **changed: int) -> arch.Registers:
+    """Registers of a thread that a stop has found in an epoll_wait."""
+    registers = dict.fromkeys(arch.REGISTER_NAMES, 7)
+    return {
+        **registers,
+        arch.RESULT: -errno.EINTR & (1 << 64) - 1,
+        arch.CALL_NUMBER: arch.marked(arch.SYSCALLS["epoll_wait"], mark),
+        **changed,
+    }
+
+
+def decided(registers: arch.Registers, before: Wait | None, now_ns: int) -> tuple[arch.Registers, Wait | None]:
+    """The rules, for an epoll_wait of `ASKED_NS`."""
+    return decide(registers, before, ASKED_NS, 0, now_ns)
+
+
+def first_seen() -> tuple[arch.Registers, Wait]:
+    """A call that is met by a capture for the first time."""
+    again, wait = decided(stopped(), None, BEGAN_NS)
+    assert wait is not None and wait.deadline_ns == BEGAN_NS + ASKED_NS
+    return again, wait
+
+
+def is_made_again(registers: arch.Registers, mark: int) -> bool:
+    """Whether the kernel makes the call again, with this mark."""
+    return registers == {**stopped(mark), arch.RESULT: arch.ERESTARTNOHAND}
+
+
+def test_a_call_that_is_seen_for_the_first_time_is_made_again_with_a_mark() -> None:
+    again, wait = first_seen()
+    assert 0 < wait.mark < arch.MARK_LIMIT
+    assert is_made_again(again, wait.mark)
+    assert arch.call_number(again) == arch.SYSCALLS["epoll_wait"]
+
+
+def test_a_marked_call_keeps_its_mark_until_its_time_is_over_and_times_out_then() -> None:
+    _, wait = first_seen()
+    registers, kept = decided(stopped(wait.mark), wait, wait.deadline_ns - 1)
+    assert is_made_again(registers, wait.mark)
+    assert kept is not None and (kept.mark, kept.deadline_ns) == (wait.mark, wait.deadline_ns)
+    registers, left = decided(stopped(wait.mark), kept, wait.deadline_ns)
+    assert (registers[arch.RESULT], registers[arch.CALL_NUMBER], left) == (0, arch.NO_CALL, None)
+    assert registers[arch.INSTRUCTION_POINTER] == stopped()[arch.INSTRUCTION_POINTER]
+
+
+@pytest.mark.parametrize("found", [stopped(), stopped(mark=12345), stopped(rip=8)], ids=["unmarked", "another mark", "elsewhere"])
+def test_a_call_without_our_mark_begins_anew_whatever_the_time(found: arch.Registers) -> None:
+    _, wait = first_seen()
+    registers, fresh = decided(found, wait, wait.deadline_ns + 1)
+    assert fresh is not None and fresh.deadline_ns == wait.deadline_ns + 1 + ASKED_NS
+    assert fresh.mark != wait.mark
+    assert registers[arch.RESULT] == arch.ERESTARTNOHAND
+
+
+def test_without_marks_a_call_that_may_be_another_one_never_times_out_by_us(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(waits, "has_room_for_marks", lambda: False)
+    _, wait = first_seen()
+    assert wait.mark == 0
+    registers, kept = decided(stopped(), wait, BEGAN_NS + ASKED_NS // 2)
+    assert is_made_again(registers, 0)
+    assert kept is not None and kept.deadline_ns == wait.deadline_ns
+    assert decided(stopped(), kept, wait.deadline_ns) == (stopped(), None)  # EINTR, once
+    _, fresh = decided(stopped(), kept, BEGAN_NS + ASKED_NS // 2 + ASKED_NS)  # the kernel would have ended it by now
+    assert fresh is not None and fresh.deadline_ns > wait.deadline_ns
