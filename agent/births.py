@@ -154,7 +154,14 @@ async def restore(
         await _vessel(component, request, keeper)
         laps.lap("vessel")
         order = channel.Restore(
-            component.pid, name, outage_ns, streams=True, robot=places.robot, own_eyes=owner != ROOT, epoch=epoch
+            component.pid,
+            name,
+            outage_ns,
+            streams=True,
+            robot=places.robot,
+            own_eyes=owner != ROOT,
+            epoch=epoch,
+            contents=places.contents,
         )
         restored, _ = await component.keeper.ask(order, (*chain, *component.streams))
         laps.lap("restore")

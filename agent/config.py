@@ -106,6 +106,8 @@ class Config:
         realtime: ask for SCHED_FIFO and locked memory.
         link_mbit_s: cap on snapshot traffic; 0 for none.
         snapshots_over: wired: they never leave over a wireless link; any: over whichever has the bulk address.
+        bring: files of programs that this robot lacks, or has in another version, are brought here and kept, by content.
+        bring_size: of all that is brought for one component; beyond it its checkpoints are refused.
         keep_checkpoints: older ones of each component that are kept for people, besides those that the team needs.
         keep_for: spread over this span; older ones go.
         keep_size: of the whole store; beyond it the oldest of those go. "": as much as there is.
@@ -128,6 +130,8 @@ class Config:
     link_mbit_s: int = 0
     snapshots_over: Literal["wired", "any"] = "wired"
     wireless: list[str] = field(default_factory=list)
+    bring: bool = True
+    bring_size: str = "1GB"
     keep_checkpoints: int = 0
     keep_for: str = "7d"
     keep_size: str = ""
@@ -157,6 +161,7 @@ class Config:
         if not 0 <= self.keep_checkpoints <= KEEP_MAX:
             raise ValueError(f"keep_checkpoints is {self.keep_checkpoints}; at most {KEEP_MAX}, and 0 keeps none")
         _check_quantity("keep_for", span_ms, self.keep_for)
+        _check_quantity("bring_size", size_bytes, self.bring_size)
         if self.keep_size:
             _check_quantity("keep_size", size_bytes, self.keep_size)
         if self.link_mbit_s < 0:

@@ -58,11 +58,17 @@ class Deposit:
         Raises:
             Refusal: with the reason for the sender's status.
         """
-        admitted = self._admitted.get(offer.component)
-        if admitted is None or admitted.sender != peer:
-            raise Refusal(f"this robot does not take snapshots of {offer.component} from {peer}")
+        if hindrance := self.hindrance(offer.component, peer):
+            raise Refusal(hindrance)
+        admitted = self._admitted[offer.component]
         if offer.epoch < admitted.epoch:
             raise Refusal(f"epoch {offer.epoch} of {offer.component} is over; {admitted.epoch} has begun")
+
+    def hindrance(self, component: str, peer: str) -> str:
+        """Why nothing of a component is taken from a peer; "" if it is."""
+        admitted = self._admitted.get(component)
+        taken = admitted is not None and admitted.sender == peer
+        return "" if taken else f"this robot does not take snapshots of {component} from {peer}"
 
     async def make_room(self, size: int) -> None:
         """Have room for a snapshot of so many bytes, if what is kept for people can give it."""

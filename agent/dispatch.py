@@ -7,11 +7,14 @@ import logging
 import os
 from collections.abc import Callable
 
-from agent.errors import LaneError
+from agent.bringing import Bringing
+from agent.errors import AgentError, LaneError
 from agent.mistake import end_lanes_on_mistake
 from agent.shipping import Shipper, digest_of
+from checkpoint import format
 from checkpoint.errors import CheckpointError
 from checkpoint.model import Position
+from checkpoint.needs import needs
 from checkpoint.shelf import Entry
 from checkpoint.store import Store
 from failover.core.acts import CancelShip, Ship
@@ -25,12 +28,19 @@ class Dispatch:
     """The transfers that the core ordered, each a task of its own."""
 
     def __init__(
-        self, store: Store, shipper: Shipper, tell: Callable[[Event], None], hindrance: Callable[[], str] = lambda: ""
+        self,
+        store: Store,
+        shipper: Shipper,
+        tell: Callable[[Event], None],
+        hindrance: Callable[[], str] = lambda: "",
+        bringing: Bringing | None = None,
     ) -> None:
         """
         Args:
             hindrance: why no snapshot may leave this robot now; "" if they may.
+            bringing: sees that a peer has the files that a snapshot needs, before it is offered; None: they are there already.
         """
+        self._bringing = bringing
         self._hindrance = hindrance
         self._store = store
         self._shipper = shipper
@@ -63,7 +73,7 @@ class Dispatch:
         reason = ""
         try:
             await self._send(act)
-        except (LaneError, CheckpointError) as error:
+        except (AgentError, CheckpointError) as error:
             reason = str(error)
         except OSError as error:
             reason = f"snapshot {act.position.sequence} of {act.component} cannot be read here: {error.strerror}"
@@ -78,6 +88,9 @@ class Dispatch:
         entry = await asyncio.to_thread(self._entry, act)
         descriptor = os.open(entry.path, os.O_RDONLY | os.O_CLOEXEC)
         try:
+            if self._bringing is not None:
+                outline = await asyncio.to_thread(format.read_outline, descriptor)
+                await self._bringing.bring(act.to, act.component, needs(outline))
             digest = await asyncio.to_thread(digest_of, descriptor, entry.size)
             offer = Offer(0, act.component, entry.epoch, entry.position, entry.parent, entry.size, digest, act.spec)
             await self._shipper.ship(act.to, offer, descriptor)

@@ -80,6 +80,8 @@ class Figures:
     notes: tuple[str, ...] = ()
     hooks: dict[str, str] = field(default_factory=dict)
     """By occasion: what the last run of a hook had to complain of."""
+    bringing: dict[str, str] = field(default_factory=dict)
+    """By robot: how far its files are on their way there."""
     engine: str = PTRACE
     commits: Commits = field(default_factory=Commits)
 

@@ -10,17 +10,21 @@ from __future__ import annotations
 import asyncio
 import logging
 import sys
+from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any, Final
 
 from agent import births
+from agent.belongings import Limits, Stock
+from agent.bringing import Bringing, Sources
 from agent.charge import Charge
 from agent.config import Settings
 from agent.deposit import Deposit
 from agent.dispatch import Dispatch
 from agent.door import Inventory, ToLanes, Told
-from agent.errors import GuardLostError
+from agent.errors import GuardLostError, LaneError
 from agent.hooks import Hooks
+from agent.mistake import end_lanes_on_mistake
 from agent.nursery import Nursery
 from agent.places import Places, guard_sockets
 from agent.records import Records
@@ -31,18 +35,24 @@ from agent.switchboard import Switchboard, live, make_directory
 from agent.units import starter
 from agent.verbs import Verbs
 from agent.view import team_view
-from checkpoint import format
+from checkpoint import channel, format
 from checkpoint.channel import Channel, close_all
+from checkpoint.contents import FOLDER as CONTENTS_FOLDER
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CheckpointError, StoreError
 from checkpoint.model import Snapshot
+from checkpoint.needs import Need
 from checkpoint.store import Store, open_store
+from failover.client.quantities import size_bytes
 from failover.core import acts
 from failover.core.messages import (
+    Belongings,
     Bulk,
     Cancel,
     Chunk,
+    Content,
     Credit,
+    Lacking,
     Offer,
     Refuse,
     Taken,
@@ -50,6 +60,9 @@ from failover.core.messages import (
 from failover.core.types import HISTORY_MAX, Found, Held
 
 BYTES_A_MEGABIT: Final = 125_000
+TIDY_S: Final = 900.0
+"""Between two looks for brought files that nobody needs any more."""
+
 STORE_TRIES: Final = 50
 STORE_PAUSE_S: Final = 0.1
 """Between two tries to have the store: it is also what keeps two lives of an agent apart."""
@@ -69,7 +82,8 @@ class Lanes(Switchboard):
         sockets = runtime / "guards"
         self._starter = starter()
         self._nursery = Nursery(sockets, self._starter)
-        self.places = Places(sockets, state / "logs", self._nursery, robot=config.robot)
+        contents = str(self._store_path / CONTENTS_FOLDER) if config.bring else ""
+        self.places = Places(sockets, state / "logs", self._nursery, robot=config.robot, contents=contents)
         self._shipper = Shipper(self._lane, config.link_mbit_s * BYTES_A_MEGABIT)
         self.connect(Verbs(self))
 
@@ -83,8 +97,12 @@ class Lanes(Switchboard):
         self._deposit = Deposit(store, self.places, self.tell, self._stored)
         settled = self._deposit.settled
         self._around = Surroundings(self.places, store, records, self.tell, self._silence_ns, settled, here, hooks)
-        self._dispatch = Dispatch(store, self._shipper, self.tell, self._links.hindrance)
+        self._bringing = Bringing(self._shipper, self._lane.say, Sources(store, self._from_program).open, self._note_bringing)
+        self._dispatch = Dispatch(store, self._shipper, self.tell, self._links.hindrance, self._bringing)
         self._receiver = Receiver(self._lane, self._store_path, self._deposit)
+        self._stock = Stock(store, self._limits(), self.settings.config.robot, self._deposit.hindrance)
+        self._contents = Receiver(self._lane, self._store_path, self._stock)
+        self._tasks = {asyncio.create_task(self._tidy_contents())}
         found = await self._find_guards(records)
         await self._mend_logs(found)
         self._nursery.prepare()
@@ -92,7 +110,11 @@ class Lanes(Switchboard):
 
     async def stop_work(self) -> None:
         """Give up what is under way; guards and programs live on."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
         await self._dispatch.close()
+        await self._bringing.close()
         await asyncio.gather(*(charge.close() for charge in self.charges.values()))
 
     async def close(self) -> None:
@@ -163,20 +185,74 @@ class Lanes(Switchboard):
                 self._lane.say(peer, Refuse(message.transfer, f"snapshots wait: at {self.settings.config.robot} {hindrance}"))
             case Offer():
                 self._receiver.offered(peer, message)
+            case Belongings() | Content() if self.votes_only(peer):
+                return
+            case Belongings():
+                self._task(self._compare(peer, message))
+            case Lacking():
+                self._bringing.heard(peer, message)
+            case Content():
+                self._contents.offered(peer, message)
             case Chunk():
                 self._receiver.chunk(peer, message)
+                self._contents.chunk(peer, message)
             case Cancel():
                 self._receiver.cancelled(peer, message)
+                self._contents.cancelled(peer, message)
             case Credit() | Taken() | Refuse():
                 self._shipper.heard(peer, message)
 
     def lane_lost(self, peer: str) -> None:
         """The bulk lane to a peer is gone, and every transfer on it."""
         self._shipper.lost(peer)
+        self._bringing.lost(peer)
 
     def lane_is_new(self, peer: str) -> None:
         """A peer greets on a new bulk lane: what was half here stays half."""
         self._receiver.lost(peer)
+        self._contents.lost(peer)
+        self._stock.lost(peer)
+
+    # --- files that programs bring along ---
+
+    def _limits(self) -> Limits:
+        config = self.settings.config
+        return Limits(config.bring, size_bytes(config.bring_size), runs=self.settings.me.role != "server")
+
+    async def _compare(self, peer: str, asked: Belongings) -> None:
+        self._lane.say(peer, await self._stock.compare(peer, asked))
+
+    async def _from_program(self, component: str, need: Need) -> int:
+        """A file that only the running program leads to, through its keeper."""
+        running = self.charge(component).component
+        if running is None:
+            raise LaneError(f"{need.path} is not here any more, and the program does not run here")
+        _, (descriptor,) = await running.keeper.ask(channel.OpenFile(need.path, need.digest))
+        return int(descriptor)
+
+    def _note_bringing(self, component: str, peer: str, sentence: str) -> None:
+        on_its_way = self.charge(component).figures.bringing
+        on_its_way.pop(peer, None)
+        if sentence:
+            on_its_way[peer] = sentence
+
+    async def _tidy_contents(self) -> None:
+        """Now and then remove what no snapshot names any more."""
+        while True:
+            await asyncio.sleep(TIDY_S)
+            try:
+                freed = await asyncio.to_thread(self._around.store.collect_contents)
+            except (CheckpointError, OSError) as error:
+                log.warning("brought files are not tidied: %s", error)
+                continue
+            if freed:
+                log.info("removed %d bytes of brought files that no checkpoint needs", freed)
+
+    def _task(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        task.add_done_callback(end_lanes_on_mistake)
 
     def _stored(self, component: str, snapshot: Snapshot, size: int) -> None:
         self.charge(component).figures.stored(snapshot.position, size, snapshot.engine)

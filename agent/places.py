@@ -22,6 +22,7 @@ class Places:
         nursery: where guards and keepers come from.
         cgroup: a delegated cgroup v2 directory that each component gets a cgroup of its own in; "" for the guard's own.
         robot: this robot's name, for the snapshots.
+        contents: directory of files that programs brought along; "": none are brought to this robot.
     """
 
     sockets: Path
@@ -29,6 +30,7 @@ class Places:
     nursery: Nursery
     cgroup: str = ""
     robot: str = ""
+    contents: str = ""
 
 
 def guard_sockets(places: Places) -> tuple[Path, ...]:

@@ -1,7 +1,7 @@
-"""Snapshots across the bulk lane: transfers under credit, out of a memory file here, into an unnamed file there.
+"""Snapshots and the files of programs across the bulk lane: transfers under credit, from a file here into an unnamed one there.
 
-Nothing here knows what a snapshot is. A transfer ends in one of two ways: the receiver has every byte, or nothing of it is kept
-on either side and both say why.
+Nothing here knows what a snapshot is. Files give way to snapshots, so that bringing a program along delays no checkpoint. A
+transfer ends in one of two ways: the receiver has every byte, or nothing of it is kept on either side and both say why.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Any, Final, Protocol, TypeVar
 
 import msgspec
 from blake3 import blake3
 
 from agent.errors import LaneError
+from checkpoint.errors import StoreError
 from failover.core.messages import (
     CHUNK_SIZE_MAX,
     SNAPSHOT_SIZE_MAX,
@@ -27,6 +28,7 @@ from failover.core.messages import (
     Bulk,
     Cancel,
     Chunk,
+    Content,
     Credit,
     Offer,
     Refuse,
@@ -39,6 +41,9 @@ PATIENCE_S: Final = 5.0
 WINDOW: Final = WINDOW_CHUNKS * CHUNK_SIZE_MAX
 """Bytes under way without credit for more: keeps a 1 Gbit/s link with 10 ms of delay busy."""
 
+GIVE_WAY_S: Final = 0.02
+"""How long a chunk of a file waits for snapshots at most: they have the link to themselves, and a file arrives all the same."""
+
 INCOMING_LIMIT: Final = 64
 """Transfers that one peer may have open here: one a component is all that it needs."""
 
@@ -50,12 +55,19 @@ class Lane(Protocol):
     async def ship(self, peer: str, chunk: Chunk) -> None: ...
 
 
+SNAPSHOT: Final = "snapshot"
+FILE: Final = "file"
+
 log = logging.getLogger("failover.lane")
+
+
+Offered = Offer | Content
 
 
 @dataclass(slots=True)
 class _Outgoing:
     peer: str
+    what: str
     until: int = 0
     taken: bool = False
     refused: str = ""
@@ -75,7 +87,7 @@ class Shipper:
         self._numbers = itertools.count(time.monotonic_ns())
         self._outgoing: dict[int, _Outgoing] = {}
 
-    async def ship(self, peer: str, offer: Offer, descriptor: int) -> None:
+    async def ship(self, peer: str, offer: Offered, descriptor: int) -> None:
         """Send ``offer.size`` bytes of a file to a peer; returns when the peer has all of them.
 
         Args:
@@ -86,13 +98,15 @@ class Shipper:
             LaneError: the connection went down, the peer refused, or it was silent for `PATIENCE_S`.
         """
         number = next(self._numbers)
-        transfer = self._outgoing[number] = _Outgoing(peer)
+        transfer = self._outgoing[number] = _Outgoing(peer, SNAPSHOT if isinstance(offer, Offer) else FILE)
         try:
             if not self._lane.say(peer, msgspec.structs.replace(offer, transfer=number)):
                 raise LaneError(f"the bulk lane to {peer} is not connected")
             for offset in range(0, offer.size, CHUNK_SIZE_MAX):
                 size = min(CHUNK_SIZE_MAX, offer.size - offset)
                 await self._until(transfer, lambda end=offset + size: transfer.until >= end)  # type: ignore[misc]
+                if isinstance(offer, Content):
+                    await self._give_way()
                 await self._pace.wait(size)
                 await self._lane.ship(peer, Chunk(number, offset, os.pread(descriptor, size, offset)))
             await self._until(transfer, lambda: transfer.taken)
@@ -116,6 +130,12 @@ class Shipper:
                 transfer.refused = message.reason or "no reason given"
         transfer.moved.set()
 
+    async def _give_way(self) -> None:
+        """Let the snapshots that are under way go first, as long as a file may wait."""
+        until = time.monotonic() + GIVE_WAY_S
+        while any(one.what is SNAPSHOT for one in self._outgoing.values()) and time.monotonic() < until:
+            await asyncio.sleep(GIVE_WAY_S / 10)
+
     def lost(self, peer: str) -> None:
         """The connection to the peer is gone, and with it every transfer on it."""
         for transfer in self._outgoing.values():
@@ -129,9 +149,11 @@ class Shipper:
             try:
                 await asyncio.wait_for(transfer.moved.wait(), PATIENCE_S)
             except TimeoutError:
-                raise LaneError(f"{transfer.peer} took nothing for {PATIENCE_S:.0f} s in the middle of a snapshot") from None
+                raise LaneError(
+                    f"{transfer.peer} took nothing for {PATIENCE_S:.0f} s in the middle of a {transfer.what}"
+                ) from None
         if transfer.refused:
-            raise LaneError(f"{transfer.peer} gave the snapshot back: {transfer.refused}")
+            raise LaneError(f"{transfer.peer} gave the {transfer.what} back: {transfer.refused}")
 
 
 class Pace:
@@ -158,33 +180,44 @@ class Refusal(Exception):
         self.needs_base = needs_base
 
 
-class Desk(Protocol):
+Kind = TypeVar("Kind", Offer, Content, contravariant=True)
+"""What is offered: each kind has a receiver of its own."""
+
+
+class Desk(Protocol[Kind]):
     """Who decides about what comes in."""
 
-    def admits(self, peer: str, offer: Offer) -> None:
-        """Raises `Refusal` when the snapshot is not wanted from this peer."""
+    def admits(self, peer: str, offer: Kind) -> None:
+        """Raises `Refusal` when it is not wanted from this peer."""
 
-    async def take(self, peer: str, offer: Offer, descriptor: int) -> None:
-        """All bytes are in the file and their digest is right. The descriptor is closed afterwards."""
+    async def take(self, peer: str, offer: Kind, descriptor: int) -> None:
+        """All bytes are in the file and their digest is right. The descriptor is closed afterwards.
+
+        Raises:
+            StoreError: the disk does not take a content; whoever sent it is told.
+        """
 
     async def make_room(self, size: int) -> None:
         """So many bytes are about to be written."""
 
-    def not_taken(self, peer: str, offer: Offer, why: str) -> None:
+    def not_taken(self, peer: str, offer: Kind, why: str) -> None:
         """They could not be written."""
 
 
 @dataclass(slots=True)
 class _Incoming:
-    offer: Offer
+    offer: Offered
     chunks: asyncio.Queue[Chunk]
     task: asyncio.Task[None] | None = None
 
 
 class Receiver:
-    """The transfers that come in. Bytes are written by a thread, chunk by chunk; credit is given as they are written."""
+    """The transfers that come in to one desk.
 
-    def __init__(self, lane: Lane, directory: Path, desk: Desk) -> None:
+    Bytes are written by a thread, chunk by chunk; credit is given as they are written.
+    """
+
+    def __init__(self, lane: Lane, directory: Path, desk: Desk[Any]) -> None:
         """
         Args:
             directory: on the store's file system, for the unnamed files.
@@ -194,10 +227,10 @@ class Receiver:
         self._desk = desk
         self._incoming: dict[tuple[str, int], _Incoming] = {}
 
-    def offered(self, peer: str, offer: Offer) -> None:
-        """Begin to receive; an older transfer of the same component is dropped."""
+    def offered(self, peer: str, offer: Offered) -> None:
+        """Begin to receive; an older transfer of the same component, or the same content, is dropped."""
         for key, older in list(self._incoming.items()):
-            if key == (peer, offer.transfer) or (key[0] == peer and older.offer.component == offer.component):
+            if key == (peer, offer.transfer) or (key[0] == peer and _of(older.offer) == _of(offer)):
                 self._drop(key)
         try:
             self._check(peer, offer)
@@ -227,11 +260,12 @@ class Receiver:
         for key in [key for key in self._incoming if key[0] == peer]:
             self._drop(key)
 
-    def _check(self, peer: str, offer: Offer) -> None:
-        if not 0 < offer.size <= SNAPSHOT_SIZE_MAX:
+    def _check(self, peer: str, offer: Offered) -> None:
+        least = 1 if isinstance(offer, Offer) else 0
+        if not least <= offer.size <= SNAPSHOT_SIZE_MAX:
             raise Refusal(f"a size of {offer.size} bytes is outside the limits")
         if sum(1 for key in self._incoming if key[0] == peer) >= INCOMING_LIMIT:
-            raise Refusal(f"{INCOMING_LIMIT} snapshots of {peer} are under way already")
+            raise Refusal(f"{INCOMING_LIMIT} transfers of {peer} are under way already")
         self._desk.admits(peer, offer)
 
     def _drop(self, key: tuple[str, int]) -> None:
@@ -247,30 +281,34 @@ class Receiver:
             descriptor = os.open(self._directory, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
             try:
                 await self._fill(peer, transfer, descriptor)
-                self._lane.say(peer, Taken(offer.transfer))
-                self._incoming.pop((peer, offer.transfer), None)
+                if isinstance(offer, Offer):
+                    self._lane.say(peer, Taken(offer.transfer))  # that it is stored, and proved, is said by the beat
+                    self._incoming.pop((peer, offer.transfer), None)
                 await self._desk.take(peer, offer, descriptor)
+                if isinstance(offer, Content):
+                    self._lane.say(peer, Taken(offer.transfer))
             finally:
                 os.close(descriptor)
         except OSError as error:
             why = f"cannot write it there: {error.strerror}"
-            log.warning("gave up snapshot %d of %s from %s: %s", offer.position.sequence, offer.component, peer, why)
+            log.warning("gave up %s from %s: %s", _named(offer), peer, why)
             self._lane.say(peer, Refuse(offer.transfer, why))
             self._desk.not_taken(peer, offer, why)
-        except LaneError as error:
-            log.warning("gave up snapshot %d of %s: %s", offer.position.sequence, offer.component, error)
+        except (LaneError, StoreError) as error:
+            log.warning("gave up %s: %s", _named(offer), error)
             self._lane.say(peer, Refuse(offer.transfer, str(error)))
         finally:
             self._incoming.pop((peer, offer.transfer), None)
 
     async def _fill(self, peer: str, transfer: _Incoming, descriptor: int) -> None:
         offer, digest, end = transfer.offer, blake3(), 0
+        what = SNAPSHOT if isinstance(offer, Offer) else FILE
         self._lane.say(peer, Credit(offer.transfer, WINDOW))
         while end < offer.size:
             try:
                 chunk = await asyncio.wait_for(transfer.chunks.get(), PATIENCE_S)
             except TimeoutError:
-                raise LaneError(f"{peer} was silent for {PATIENCE_S:.0f} s in the middle of a snapshot") from None
+                raise LaneError(f"{peer} was silent for {PATIENCE_S:.0f} s in the middle of a {what}") from None
             if chunk.offset != end or len(chunk.content) != min(CHUNK_SIZE_MAX, offer.size - end):
                 raise LaneError(f"{peer} sent {len(chunk.content)} bytes at {chunk.offset} where {end} of {offer.size} was due")
             await asyncio.to_thread(_keep, descriptor, chunk, digest)
@@ -278,6 +316,17 @@ class Receiver:
             self._lane.say(peer, Credit(offer.transfer, end + WINDOW))
         if digest.digest() != offer.digest:
             raise LaneError(f"{peer} sent {offer.size} bytes that have not the promised digest")
+
+
+def _of(offer: Offered) -> str | bytes:
+    """What a newer offer takes the place of."""
+    return offer.component if isinstance(offer, Offer) else offer.digest
+
+
+def _named(offer: Offered) -> str:
+    if isinstance(offer, Offer):
+        return f"snapshot {offer.position.sequence} of {offer.component}"
+    return f"a file of {offer.size} bytes ({offer.digest.hex()[:16]}…)"
 
 
 def _keep(descriptor: int, chunk: Chunk, digest: blake3) -> None:

@@ -115,7 +115,7 @@ def _own_notes(view: ComponentView, figures: Figures | None) -> tuple[str, ...]:
     """What this robot's own work on it found out."""
     if figures is None:
         return ()
-    return (*figures.notes, *_overdue(view, figures), *figures.hooks.values())
+    return (*figures.notes, *_overdue(view, figures), *figures.hooks.values(), *figures.bringing.values())
 
 
 def _waiting_output(view: ComponentView, waiting: int) -> tuple[str, ...]:

@@ -238,7 +238,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
 
     Attributes:
         streams: the last five descriptors are the streams, as with `Protect`.
-        own_eyes, epoch: see `checkpoint.engine.RestoreOptions`.
+        own_eyes, epoch, contents: see `checkpoint.engine.RestoreOptions`.
     """
 
     pid: int
@@ -249,6 +249,18 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
     robot: str = ""
     own_eyes: bool = False
     epoch: int = 0
+    contents: str = ""
+
+
+class OpenFile(msgspec.Struct, frozen=True, tag=True):
+    """Open a file as the followed program has it: perhaps no name leads to it any more. Answer: `Opened` with the descriptor.
+
+    Attributes:
+        digest: of its content when it was captured; whoever asks compares.
+    """
+
+    path: str
+    digest: bytes
 
 
 class Fill(msgspec.Struct, frozen=True, tag=True):
@@ -325,6 +337,10 @@ class Filled(msgspec.Struct, frozen=True, tag=True):
     position: Position
 
 
+class Opened(msgspec.Struct, frozen=True, tag=True):
+    """The file, as a descriptor."""
+
+
 class Restored(msgspec.Struct, frozen=True, tag=True):
     """The program stands in the vessel, still stopped."""
 
@@ -360,5 +376,5 @@ class Failed(msgspec.Struct, frozen=True, tag=True):
     reasons: tuple[str, ...] = ()
 
 
-Request = Probe | Tabulate | Protect | Capture | Acknowledge | Restore | Fill | Resume | Release
-Reply = Probed | Tabulated | Protected | Captured | Unchanged | Restored | Filled | Resumed | Released | Failed
+Request = Probe | Tabulate | Protect | Capture | Acknowledge | Restore | OpenFile | Fill | Resume | Release
+Reply = Probed | Tabulated | Protected | Captured | Unchanged | Restored | Opened | Filled | Resumed | Released | Failed

@@ -115,12 +115,15 @@ class RestoreOptions:
         accept_changed: paths of files that may differ from what the snapshot recorded (rule ``shared``).
         epoch: of the primacy under which it goes on; a program that was born with one finds it in its environment. 0: none.
         own_eyes: open its files with its own user's rights, not with ours: that user could have put other files in their place.
+        contents: directory of files that were brought along (`checkpoint.contents`), for what this machine lacks or has in
+            another version; "": there are none.
     """
 
     elapsed_ns: int = 0
     accept_changed: tuple[str, ...] = ()
     own_eyes: bool = False
     epoch: int = 0
+    contents: str = ""
 
 
 class Session(Protocol):
@@ -146,6 +149,17 @@ class Session(Protocol):
 
     def acknowledge(self, position: Position) -> None:
         """A standby holds everything up to ``position``: what was written before it may be forgotten."""
+        ...
+
+    def open_file(self, path: str, digest: bytes) -> int:
+        """A descriptor of a file that the program needs, as it has it, the caller's to close.
+
+        Args:
+            digest: of its content at a capture; the file may have been written to since.
+
+        Raises:
+            CaptureError: it has no such file.
+        """
         ...
 
     def close(self) -> None:

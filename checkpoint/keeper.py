@@ -54,6 +54,7 @@ class Keeper:
             channel.Acknowledge: self._acknowledge,
             channel.Restore: self._restore,
             channel.Fill: self._fill,
+            channel.OpenFile: self._open_file,
             channel.Resume: self._resume,
             channel.Release: self._release,
         }
@@ -136,7 +137,7 @@ class Keeper:
             state = folded(files)
         finally:
             channel.close_all(files)
-        options = RestoreOptions(request.elapsed_ns, request.accept_changed, request.own_eyes, request.epoch)
+        options = RestoreOptions(request.elapsed_ns, request.accept_changed, request.own_eyes, request.epoch, request.contents)
         self._restored = self._tracer.restore(request.pid, state, options)
         self._revived = request, ends
         return channel.Restored(self._restored.pid, self._restored.position, self._restored.notes), ()
@@ -150,6 +151,10 @@ class Keeper:
 
         segment = fill_segment(state)
         return channel.Filled(state.position), (segment.descriptor,)
+
+    def _open_file(self, request: channel.OpenFile, _: Descriptors) -> Answer:
+        session = self._following("open a file of what is followed")
+        return channel.Opened(), (session.open_file(request.path, request.digest),)
 
     def _resume(self, _: channel.Resume, __: Descriptors) -> Answer:
         restored, revived = self._restored, self._revived

@@ -21,10 +21,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from checkpoint import chain, format
+from checkpoint.contents import Contents
 from checkpoint.disk import Disk, lock_exclusively
 from checkpoint.errors import ChainError, FormatError, StoreError
-from checkpoint.history import History, Retention
+from checkpoint.history import HISTORY_FOLDER, History, Retention
 from checkpoint.model import OutputPiece, Position, Snapshot
+from checkpoint.needs import needs
 from checkpoint.pages import PageTable
 from checkpoint.shelf import BASE_SUFFIX, DELTA_SUFFIX, FOLDER_PREFIX, Entry, Shelf, file_name, folder_name, order_of_name
 from checkpoint.state import header_of
@@ -32,6 +34,8 @@ from checkpoint.validity import place
 from checkpoint.whole_files import TEMPORARY_PREFIX, WholeFiles, disk_trouble
 
 log = logging.getLogger("failover.store")
+
+SUFFIXES = (BASE_SUFFIX, DELTA_SUFFIX)
 
 ASIDE_FOLDER = "aside"
 """Holds what is kept for inspection only."""
@@ -90,6 +94,9 @@ class Store:
     def __init__(self, root: Path, disk: Disk, lock: int, retention: Retention) -> None:
         self._root = root
         self._files = WholeFiles(disk)
+        self.contents = Contents(root, self._files)
+        """Files that programs brought along."""
+        self._named: dict[Path, frozenset[bytes]] = {}
         self._history = History(root, self._files, retention)
         self._lock_descriptor = lock
         self._lock = threading.RLock()
@@ -364,6 +371,30 @@ class Store:
             self._shelves.pop(component, None)
             self._proved.pop(component, None)
 
+    def collect_contents(self) -> int:
+        """Remove the brought files that no snapshot here names any more; how many bytes that were.
+
+        As long as one of the snapshots cannot be read nothing is removed: perhaps it names them.
+        """
+        with disk_trouble(f"look through {self._root}"):
+            paths = [path for folder in self._snapshot_folders() for path in folder.iterdir() if path.suffix in SUFFIXES]
+        named: dict[Path, frozenset[bytes]] = {}
+        for path in paths:
+            try:
+                named[path] = self._named.get(path) or frozenset(need.digest for need in needs(format.read_outline(path)))
+            except FormatError as error:
+                if path.exists():
+                    log.info("brought files are not tidied: %s", error)
+                    return 0
+        self._named = named
+        return self.contents.collect(frozenset().union(*named.values()))
+
+    def _snapshot_folders(self) -> list[Path]:
+        """Wherever a whole snapshot may lie: of components, set aside, kept for people."""
+        history = self._root / HISTORY_FOLDER
+        parents = (self._root, history) if history.is_dir() else (self._root,)
+        return [one for parent in parents for one in parent.iterdir() if one.is_dir() and one != self.contents.folder]
+
     def close(self) -> None:
         """Let another process have the store; nothing else may be called afterwards."""
         os.close(self._lock_descriptor)
@@ -421,7 +452,7 @@ class Store:
             if path.name.startswith(TEMPORARY_PREFIX):
                 self._files.remove(path)
                 self._notice(f"{path} had not arrived whole and was removed")
-            elif folder.name.startswith(FOLDER_PREFIX) and path.suffix in (BASE_SUFFIX, DELTA_SUFFIX):
+            elif folder.name.startswith(FOLDER_PREFIX) and path.suffix in SUFFIXES:
                 self._read_file(path)
 
     def _read_file(self, path: Path) -> None:

@@ -96,6 +96,7 @@ SYSTEM_CALLS: Final = {
     "lseek": 8,
     "madvise": 28,
     "memfd_create": 319,
+    "mkdirat": 258,
     "mknodat": 259,
     "mlock2": 325,
     "mmap": 9,

@@ -9,7 +9,7 @@ from __future__ import annotations
 from checkpoint.engine import COOPERATIVE, NOTED, CaptureOrder, Finding, Report, Restored, RestoreOptions, Session, Streams
 from checkpoint.engines.cooperative import CooperativeSession, now, open_segment
 from checkpoint.engines.outputs import Outputs
-from checkpoint.errors import ProcessGoneError, RestoreError
+from checkpoint.errors import CaptureError, ProcessGoneError, RestoreError
 from checkpoint.linux import procfs
 from checkpoint.model import Position, Snapshot
 
@@ -54,6 +54,10 @@ class GuardedTask:
         """See `checkpoint.engine.Session.acknowledge`."""
         if self._session:
             self._session.acknowledge(position)
+
+    def open_file(self, path: str, digest: bytes) -> int:
+        """See `checkpoint.engine.Session.open_file`."""
+        raise CaptureError(f"cannot open {path} of {self.component}: it is not among the files that the program maps")
 
     def close(self) -> None:
         """See `checkpoint.engine.Session.close`."""

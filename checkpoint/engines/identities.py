@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import stat
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
 from checkpoint import pages
+from checkpoint.errors import CaptureError
+from checkpoint.linux import procfs
 from checkpoint.linux.procfs import DELETED, MapsLine
 from checkpoint.linux.tracking import NOT_CARRIED, is_shared_object
 from checkpoint.model import FileIdentity, Vma, VmaKind
@@ -79,6 +83,31 @@ class Identities:
         target = os.readlink(f"/proc/{self._pid}/exe")
         deleted = target.endswith(DELETED)
         return self._identity(target.removesuffix(DELETED), f"/proc/{self._pid}/exe", deleted)
+
+    def open(self, path: str, digest: bytes) -> int:
+        """A descriptor of a file that the process runs, or has at that path; no name need lead to it any more.
+
+        Raises:
+            CaptureError: there is none.
+        """
+        for place in self._places(path, digest):
+            with contextlib.suppress(OSError):  # the next place may do
+                descriptor = os.open(place, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
+                if stat.S_ISREG(os.fstat(descriptor).st_mode):
+                    return descriptor
+                os.close(descriptor)
+        raise CaptureError(f"cannot open {path} of pid {self._pid}: no name leads to it any more, nor has the process it mapped")
+
+    def _places(self, path: str, digest: bytes) -> Iterator[str]:
+        """Where a file of the process may be opened, the surest first."""
+        lines = procfs.parse_maps(procfs.read_text(self._pid, "maps"))
+        if self.executable().digest == digest:
+            yield f"/proc/{self._pid}/exe"
+        for line in lines:
+            known = self._known.get(_key(line))
+            if known is not None and known.digest == digest:
+                yield f"/proc/{self._pid}/map_files/{line.start:x}-{line.end:x}"
+        yield f"/proc/{self._pid}/root{path}"
 
     def _identity(self, path: str, through: str, deleted: bool, *, is_memory: bool = False) -> FileIdentity:
         try:

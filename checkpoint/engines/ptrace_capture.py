@@ -135,6 +135,10 @@ class PtraceSession:
         if self._memory.acknowledge(position):
             self._forget_totals()
 
+    def open_file(self, path: str, digest: bytes) -> int:
+        """See ``checkpoint.engine.Session.open_file``."""
+        return self._identities.open(path, digest)
+
     def _forget_totals(self) -> None:
         """Of positions that no delta can be relative to any more."""
         known = self._memory.positions()

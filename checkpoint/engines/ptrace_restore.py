@@ -30,6 +30,7 @@ from checkpoint import epoch_variable
 from checkpoint.arch import x86_64, x86_64_stub, x86_64_xstate
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import restore_checks, restore_memory, restore_process, restore_threads, restore_vdso, switches
+from checkpoint.engines.restore_checks import Brought
 from checkpoint.engines.restore_process import Vessel
 from checkpoint.errors import CheckpointError, MismatchError, RestoreError
 from checkpoint.linux import abi, call_table, processor, procfs, vdso
@@ -37,7 +38,9 @@ from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee
 from checkpoint.model import Credentials, Position, Snapshot, ThreadState, Vma
+from checkpoint.resources import files
 from checkpoint.resources.rebuild import rebuild_all, rebuild_last
+from checkpoint.resources.rebuilding import number_of
 
 PTRACE_O_TRACESYSGOOD: Final = 1
 PTRACE_EVENT_EXEC: Final = 4
@@ -82,9 +85,9 @@ def restore(vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restor
     """See ``checkpoint.engine.Engine.restore``."""
     if not state.is_base:
         raise RestoreError("cannot restore a delta by itself: fold its chain first")
-    restore_checks.require(state, options, vessel_pid)
+    brought = restore_checks.require(state, options, vessel_pid)
     try:
-        return _Restore(vessel_pid, state, options).run()
+        return _Restore(vessel_pid, state, options, brought).run()
     except RestoreError:
         raise
     except CheckpointError as error:
@@ -94,8 +97,10 @@ def restore(vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restor
 class _Restore:
     """One restore, from the seizing of the vessel to the program's own registers."""
 
-    def __init__(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> None:
+    def __init__(self, vessel_pid: int, state: Snapshot, options: RestoreOptions, brought: Brought) -> None:
         self._state = state
+        self._brought = brought
+        self._executable: int | None = None
         self._options = options
         self._thread = state.threads[0]
         self._tracee = Tracee(vessel_pid)
@@ -222,20 +227,40 @@ class _Restore:
     def _mappings_table(self, table: CallTable, vessel: Vessel, mappings: tuple[procfs.MapsLine, ...], refuge: int) -> CallTable:
         vmas, runs = self._state.vmas, self._state.runs
         restore_process.raise_limits(table, vessel)
+        brought = self._open_brought(table)  # with our rights, from a place of ours
         if self._options.own_eyes:
             restore_process.own_eyes(table, self._state.process, vessel)
+        restore_process.make_directories(table, restore_checks.missing_directories(self._state))
         restore_memory.clear(table, mappings)
         ours, theirs = restore_memory.kernel_pages(mappings), restore_memory.kernel_pages_of(vmas)
         self._vdso = restore_memory.move_kernel_pages(table, ours, theirs, refuge)
         self._vdso_size = ours[-1].size
-        self._objects = restore_memory.map_program(table, vmas, runs)
+        self._objects |= restore_memory.map_program(table, vmas, runs, brought)
+        self._executable = brought.pop(self._state.process.executable.path, None)
+        for descriptor in brought.values():
+            table.close(descriptor)
         return table
+
+    def _open_brought(self, table: CallTable) -> dict[str, int]:
+        """Open what was brought along: descriptors of what is run, by path; what is only read joins the nameless objects."""
+        flags = os.O_RDONLY | os.O_CLOEXEC
+        run = {path: table.open(content, flags) for path, content in self._brought.run.items()}
+        for held in self._state.resources:
+            content = self._brought.opened.get(str(held.facts.get("path")))
+            key = number_of(held.facts.get("device", 0)), number_of(held.facts.get("inode", 0))
+            if content is not None and held.kind == files.KIND and key not in self._objects:
+                self._objects[key] = table.open(content, flags)
+        elsewhere = sorted({**self._brought.run, **self._brought.opened})
+        self._notes += [f"{path} is not this machine's: the program goes on with what was brought of it" for path in elsewhere]
+        return run
 
     def _state_table(self, table: CallTable, vessel: Vessel) -> CallTable:
         process, thread = self._state.process, self._thread
         restore_memory.settle(table, self._state.vmas, self._state.runs)
+        restore_process.memory_layout(
+            table, process, with_executable=vessel.may_choose_executable, brought=self._executable
+        )  # before the program's own descriptors take their numbers
         self._notes += rebuild_all(table, self._state, self._options, vessel.inner_pid, self._objects)
-        restore_process.memory_layout(table, process, with_executable=vessel.may_choose_executable)
         restore_process.signal_actions(table, process.signal_actions)
         restore_process.thread_marks(table, thread)
         restore_process.surroundings(table, process)
@@ -311,7 +336,8 @@ class _Restore:
 
     def _execute_program(self) -> None:
         """Have the vessel execute the program's own file, so that /proc/PID/exe is right without a right to set it."""
-        tracee, path = self._tracee, self._state.process.executable.path
+        path = self._state.process.executable.path
+        tracee, path = self._tracee, self._brought.run.get(path, path)
         mappings = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
         own_vdso = restore_memory.kernel_pages(mappings)[-1]
         instruction = self._syscall_instruction(own_vdso.start, own_vdso.size)

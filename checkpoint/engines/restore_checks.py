@@ -8,14 +8,15 @@ from __future__ import annotations
 import mmap
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
-
-from blake3 import blake3
 
 from checkpoint.arch import x86_64, x86_64_stub, x86_64_xstate
 from checkpoint.arch.x86_64_xstate import Layout
 from checkpoint.capability import Area, refused
+from checkpoint.contents import DIGEST_SIZE, digest_of_file, path_in
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import restore_vdso
 from checkpoint.engines.description import this_machine
@@ -87,8 +88,21 @@ CAPABILITIES: Final = (
 _FAR: str = "bring it here from the machine that ran the program"
 
 
-def require(state: Snapshot, options: RestoreOptions, vessel_pid: int) -> None:
-    """Refuse a snapshot that cannot come back here.
+@dataclass(frozen=True, slots=True)
+class Brought:
+    """Contents that are opened in place of this machine's own files, by the paths that the program knows.
+
+    Attributes:
+        run: the executable, and what is mapped.
+        opened: what is open for reading.
+    """
+
+    run: Mapping[str, str] = field(default_factory=dict)
+    opened: Mapping[str, str] = field(default_factory=dict)
+
+
+def require(state: Snapshot, options: RestoreOptions, vessel_pid: int) -> Brought:
+    """Refuse a snapshot that cannot come back here; answers with what must come from elsewhere than its own path.
 
     Args:
         vessel_pid: what is to become the program; it, we and our forebears may hold files that the program writes to.
@@ -96,21 +110,27 @@ def require(state: Snapshot, options: RestoreOptions, vessel_pid: int) -> None:
     Raises:
         MismatchError: with one reason for each difference.
     """
-    reasons = (*mismatches(state, options), *_of_writers(state, options, vessel_pid))
+    reasons, brought = _compare(state, options)
+    reasons = (*reasons, *_of_writers(state, options, vessel_pid))
     if reasons:
         listed = "; ".join(reasons)
         raise MismatchError(f"cannot restore {state.component} here: {listed}", reasons)
+    return brought
 
 
-def mismatches(state: Snapshot, options: RestoreOptions) -> tuple[str, ...]:
-    """Everything in which this machine differs from what the snapshot needs, one sentence each."""
+def _compare(state: Snapshot, options: RestoreOptions) -> tuple[tuple[str, ...], Brought]:
+    """Everything in which this machine differs from what the snapshot needs, one sentence each; and what was brought for it."""
     architecture = os.uname().machine
     if state.machine.architecture != architecture or architecture != x86_64.NAME:
-        return (f"it was taken on {state.machine.architecture}, this machine is {architecture}: restore it on such a machine",)
-    return (*_of_machine(state), *_of_files(state, options), *_of_descriptors(state, options))
+        reason = f"it was taken on {state.machine.architecture}, this machine is {architecture}: restore it on such a machine"
+        return (reason,), Brought()
+    run: dict[str, str] = {}
+    opened: dict[str, str] = {}
+    of_files = (*_of_files(state, options, run), *_of_descriptors(state, options, opened))
+    return (*_of_machine(state, options), *of_files), Brought(run, opened)
 
 
-def _of_machine(state: Snapshot) -> Iterator[str]:
+def _of_machine(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
     machine, here = state.machine, this_machine()
     if machine.page_size != abi.PAGE_SIZE:
         yield f"its pages are {machine.page_size} bytes, this kernel's {abi.PAGE_SIZE}: boot a kernel with the same"
@@ -125,8 +145,16 @@ def _of_machine(state: Snapshot) -> Iterator[str]:
         yield f"it has guard pages of madvise(2), which our kernel ({here.kernel}) does not know: boot Linux 6.13 or later"
     if state.process.root_directory != "/":
         yield f"its root directory is {state.process.root_directory}: programs in a chroot are not supported"
-    if not os.path.isdir(state.process.working_directory):
+    if not os.path.isdir(state.process.working_directory) and not (options.contents and missing_directories(state)):
         yield f"its working directory {state.process.working_directory} is missing: make it"
+
+
+def missing_directories(state: Snapshot) -> tuple[str, ...]:
+    """What must be made so that the program's working directory is there, the outermost first; nothing where that cannot be."""
+    directory = Path(state.process.working_directory)
+    missing = [one for one in (directory, *directory.parents) if not os.path.lexists(one)]
+    is_plain = directory.is_absolute() and ".." not in directory.parts
+    return tuple(str(one) for one in reversed(missing)) if is_plain else ()
 
 
 def _of_threads(state: Snapshot) -> Iterator[str]:
@@ -163,12 +191,36 @@ def can_install_guards() -> bool:
 # --- Files -----------------------------------------------------------------------------------------------------------
 
 
-def _of_files(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
-    """The executable and everything that is mapped: the program runs their bytes, so they must be the very same."""
+def _of_files(state: Snapshot, options: RestoreOptions, brought: dict[str, str]) -> Iterator[str]:
+    """The executable and everything that is mapped: the program runs their bytes, so they must be the very same.
+
+    Args:
+        brought: gets the content to open, by path, where this machine has not the same file.
+    """
     mapped = [vma.file for vma in state.vmas if vma.file is not None and is_file_mapping(vma)]
+    written = {vma.file.path for vma in state.vmas if vma.file is not None and vma.shared and vma.protection & abi.PROT_WRITE}
     for identity in {identity.path: identity for identity in (state.process.executable, *mapped)}.values():
-        if identity.path not in options.accept_changed and not _is_made(state, identity.path):
-            yield from _of_file(identity)
+        if identity.path in options.accept_changed or _is_made(state, identity.path):
+            continue
+        reasons = tuple(_of_file(identity))
+        content, damage = _content(options, identity.digest if reasons and identity.path not in written else b"")
+        if content:
+            brought[identity.path] = content
+        else:
+            yield from (reason + damage for reason in reasons)
+
+
+def _content(options: RestoreOptions, digest: bytes) -> tuple[str, str]:
+    """The file that was brought with this digest, or "" and what is wrong with it ("" if there is none)."""
+    if not options.contents or len(digest) != DIGEST_SIZE:
+        return "", ""
+    path = str(path_in(options.contents, digest))
+    try:
+        if digest_of_file(path) == digest:
+            return path, ""
+    except OSError:
+        return "", ""
+    return "", f"; what was brought of it ({path}) is damaged: remove that, it is brought again"
 
 
 def _is_made(state: Snapshot, path: str) -> bool:
@@ -187,29 +239,13 @@ def _of_file(identity: FileIdentity) -> Iterator[str]:
         return
     if identity.size and about.st_size != identity.size:
         yield f"{path} is another file: {about.st_size} bytes here, {identity.size} there; {_FAR}"
-    elif identity.digest and digest_of(path) != identity.digest:
+    elif identity.digest and digest_of_file(path) != identity.digest:
         yield f"{path} is another file: as long, but its content differs; {_FAR}"
     elif not identity.digest and identity.build_id and build_id(path) != identity.build_id:
         yield f"{path} is another build of that file (its build id differs); {_FAR}"
 
 
-def digest_of(path: str) -> bytes:
-    """The blake3 digest of a whole file, 32 bytes.
-
-    Raises:
-        OSError: it cannot be read.
-    """
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        if not os.fstat(descriptor).st_size:
-            return blake3(b"").digest()
-        with mmap.mmap(descriptor, 0, prot=mmap.PROT_READ) as content:
-            return blake3(content).digest()
-    finally:
-        os.close(descriptor)
-
-
-def _of_descriptors(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
+def _of_descriptors(state: Snapshot, options: RestoreOptions, brought: dict[str, str]) -> Iterator[str]:
     for held in state.resources:
         path = str(held.facts.get("path", ""))
         if held.kind not in rebuild.KINDS:
@@ -217,7 +253,13 @@ def _of_descriptors(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
         elif held.kind == "files" and not held.facts.get("deleted") and path not in options.accept_changed:
             if _is_made(state, path):
                 continue
-            yield from _of_open_file(held, path, state.machine.boot_id == this_machine().boot_id)
+            reasons = tuple(_of_open_file(held, path, state.machine.boot_id == this_machine().boot_id))
+            digest = held.facts.get("digest")
+            content, damage = _content(options, digest if reasons and isinstance(digest, bytes) else b"")
+            if content:
+                brought[path] = content
+            else:
+                yield from (reason + damage for reason in reasons)
         elif held.kind in rebuild.NEEDED:
             yield from rebuild.NEEDED[held.kind](held)
 
@@ -246,7 +288,7 @@ def _of_open_file(held: Resource, path: str, same_boot: bool) -> Iterator[str]:
         yield f"{named} has {about.st_size} bytes here and {size} there; {_FAR}, or {shared}"
     elif same_file and about.st_mtime_ns != facts["mtime_ns"] and rebuild.is_written(held) and not grows:
         yield f"{named} was written to since the snapshot, and not only at its end; end the program with the capture, or {shared}"
-    elif digest and digest_of(path) != digest:
+    elif digest and digest_of_file(path) != digest:
         yield f"{named} has another content here; {_FAR}, or {shared}"
 
 

@@ -10,7 +10,7 @@ Sources: mmap(2), mremap(2), madvise(2), process_vm_writev(2).
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Final
 
@@ -86,16 +86,25 @@ def _move(table: CallTable, start: int, target: int, size: int) -> None:
     )
 
 
-def map_program(table: CallTable, vmas: Iterable[Vma], runs: Sequence[PageRun]) -> dict[tuple[int, int], int]:
+def map_program(
+    table: CallTable, vmas: Iterable[Vma], runs: Sequence[PageRun], brought: Mapping[str, int]
+) -> dict[tuple[int, int], int]:
     """Map everything that the program had; what will be filled is writable for now.
 
     Answers with a descriptor of each shared object without a name, by (device, inode): open files may be of the same one.
+
+    Args:
+        brought: descriptors of what is mapped in place of this machine's files, by path; they stay open.
     """
     carried = Carried(runs)
     mapped = [vma for vma in vmas if vma.kind not in KERNEL_KINDS]
     files = [vma for vma in mapped if is_file_mapping(vma)]
     for (path, writable), group in groupby(sorted(files, key=_file_order), key=_file_order):
         pieces = list(group)
+        if path in brought and not writable:
+            for vma in pieces:
+                _map(table, vma, _first_protection(vma, carried), brought[path])
+            continue
         if path.startswith(MEMORY_PLACE) and not os.path.lexists(path):
             descriptor = _make_shared_memory(table, pieces[0])
         else:

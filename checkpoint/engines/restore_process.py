@@ -19,7 +19,7 @@ from typing import Final
 
 from checkpoint.errors import RestoreError
 from checkpoint.linux import abi
-from checkpoint.linux.call_table import CallTable
+from checkpoint.linux.call_table import AT_FDCWD, CallTable
 from checkpoint.model import Credentials, IntervalTimer, PosixTimer, ProcessState, SignalAction, ThreadState
 
 _NO_FILE: Final = 0xFFFFFFFF
@@ -45,6 +45,9 @@ CLOCK_MONOTONIC_COARSE: Final = 6
 
 _CPU_TIME_CLOCKS: Final = (2, 3)
 """CLOCK_PROCESS_CPUTIME_ID and CLOCK_THREAD_CPUTIME_ID; a negative clock counts some process's CPU time too."""
+
+DIRECTORY_MODE: Final = 0o755
+"""Of a working directory that is missing; the umask takes from it."""
 
 RLIM_INFINITY: Final = (1 << 64) - 1
 RAISED_LIMITS: Final = (1, 2, 7, 8, 9)
@@ -94,10 +97,17 @@ class Vessel:
 # --- The address space's marks ---------------------------------------------------------------------------------------
 
 
-def memory_layout(table: CallTable, process: ProcessState, *, with_executable: bool) -> None:
-    """Set the marks of heap, stack, arguments, environment and auxiliary vector, and what /proc/PID/exe shows."""
+def memory_layout(table: CallTable, process: ProcessState, *, with_executable: bool, brought: int | None = None) -> None:
+    """Set the marks of heap, stack, arguments, environment and auxiliary vector, and what /proc/PID/exe shows.
+
+    Args:
+        brought: descriptor of the executable, where it is not this machine's own file; None: it is. It is closed.
+    """
     layout = process.layout
-    executable = table.open(process.executable.path, os.O_RDONLY | os.O_CLOEXEC) if with_executable else _NO_FILE
+    executable = _NO_FILE
+    if with_executable:
+        own = brought is None
+        executable = table.open(process.executable.path, os.O_RDONLY | os.O_CLOEXEC) if own else brought  # type: ignore[assignment]
     packed = _MM_MAP.pack(
         *(
             layout.start_code,
@@ -113,7 +123,7 @@ def memory_layout(table: CallTable, process: ProcessState, *, with_executable: b
     )
     what = f"set the marks of the address space (prctl PR_SET_MM_MAP, executable {process.executable.path})"
     table.call(what, "prctl", abi.PR_SET_MM, abi.PR_SET_MM_MAP, table.place(packed), len(packed), 0)
-    if with_executable:
+    if executable != _NO_FILE:
         table.close(executable)
 
 
@@ -280,6 +290,12 @@ def _left_of(timer: PosixTimer, elapsed_ns: int) -> int:
 
 
 # --- Limits and the rest of the process --------------------------------------------------------------------------------
+
+
+def make_directories(table: CallTable, directories: Iterable[str]) -> None:
+    """Make what leads to the working directory, each as the program would: empty, and its user's."""
+    for directory in directories:
+        table.call(f"make the directory {directory}", "mkdirat", AT_FDCWD, table.place_path(directory), DIRECTORY_MODE)
 
 
 def surroundings(table: CallTable, process: ProcessState) -> None:

@@ -25,7 +25,7 @@ AREA_SIZE: Final = 64 << 20
 ANY: Final = -(1 << 63)
 MOST: Final = (1 << 63) - 1
 
-_AT_FDCWD: Final = -100
+AT_FDCWD: Final = -100
 
 _LOWEST_ADDRESS: Final = 0x10000000000
 _HIGHEST_ADDRESS: Final = 0x7000_0000_0000
@@ -76,7 +76,7 @@ class CallTable:
 
     def open(self, path: str, flags: int, mode: int = 0) -> int:
         """Add the opening of a file: the descriptor that it will have."""
-        return self.obtain(f"open {path}", "openat", _AT_FDCWD, self.place_path(path), flags, mode)
+        return self.obtain(f"open {path}", "openat", AT_FDCWD, self.place_path(path), flags, mode)
 
     def obtain(self, what: str, name: str, *arguments: int) -> int:
         """Add a call that makes a descriptor: the number that it will have."""

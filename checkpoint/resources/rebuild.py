@@ -221,9 +221,12 @@ def _duplicate(table: CallTable, holder: int, one: Wanted) -> None:
 def _open(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     facts = held.facts
     path, flags = str(facts["path"]), number_of(facts["flags"])
+    brought = rebuilding.objects.get((number_of(facts.get("device", 0)), number_of(facts.get("inode", 0))))
+    if brought is not None and not flags & O_PATH:
+        path = f"/proc/self/fd/{brought}"  # what was brought along in its place
     descriptor = table.open(path, flags & (O_PATH | os.O_NOFOLLOW | os.O_DIRECTORY if flags & O_PATH else REOPENED_FLAGS))
     if held.kind == "files" and not flags & O_PATH:
-        if path not in rebuilding.options.accept_changed and has_grown(held):
+        if brought is None and path not in rebuilding.options.accept_changed and has_grown(held):
             size = number_of(facts["size"])
             table.call(f"cut {path} back to {size} bytes", "ftruncate", descriptor, size)
         _seek(table, descriptor, held)

@@ -113,6 +113,9 @@ CHUNK_SIZE_MAX = 256 * 1024
 WINDOW_CHUNKS = 8
 """Chunks that may be on their way without credit for more."""
 
+BELONGINGS_MAX = 512
+"""Files in one message: with long paths it stays a small one beside a chunk."""
+
 SNAPSHOT_SIZE_MAX = 1 << 38
 """Bytes that an encoded snapshot may claim to have; the disk decides earlier."""
 
@@ -159,6 +162,57 @@ class Offer(msgspec.Struct, frozen=True, tag="offer"):
     spec: ComponentSpec
 
 
+class Belonging(msgspec.Struct, frozen=True, array_like=True):
+    """A file that a program needs wherever it goes on.
+
+    Attributes:
+        path: as the program names it, absolute.
+        size: bytes; ``digest``: blake3 of them, 32 bytes, b"" where it was not taken: such a file cannot be brought.
+    """
+
+    path: str
+    size: int
+    digest: bytes
+
+
+class Belongings(msgspec.Struct, frozen=True, tag="belongings"):
+    """What a program needs: which of it do you lack? Comes before the offer of a snapshot. Answered by Lacking.
+
+    Attributes:
+        number: chosen by the sender, never used twice in one life of it.
+        files: at most ``BELONGINGS_MAX``; more are asked in several.
+    """
+
+    number: int
+    component: str
+    files: tuple[Belonging, ...]
+
+
+class Lacking(msgspec.Struct, frozen=True, tag="lacking"):
+    """Which of the files the sender has neither at their paths nor by content.
+
+    Attributes:
+        digests: of those that it will take; they may be offered to it from now on.
+        reason: why it cannot take all that it lacks, a sentence that names files; "" when it can.
+    """
+
+    number: int
+    digests: tuple[bytes, ...]
+    reason: str = ""
+
+
+class Content(msgspec.Struct, frozen=True, tag="content"):
+    """The content of a file that you lack is ready for you. Answered by Credit or Refuse; Taken says that it is stored.
+
+    Attributes:
+        transfer: as of an Offer; of ``size`` bytes with this blake3 ``digest``.
+    """
+
+    transfer: int
+    size: int
+    digest: bytes
+
+
 class Credit(msgspec.Struct, frozen=True, tag="credit"):
     """Bytes [0, ``until``) of the transfer may be sent."""
 
@@ -175,7 +229,7 @@ class Chunk(msgspec.Struct, frozen=True, tag="chunk"):
 
 
 class Taken(msgspec.Struct, frozen=True, tag="taken"):
-    """All bytes arrived and their digest is right. (That they are stored is said by the beat.)"""
+    """All bytes arrived and their digest is right. (That they are stored is said by the beat; a content is stored by then.)"""
 
     transfer: int
 
@@ -226,4 +280,4 @@ class ErrandDone(msgspec.Struct, frozen=True, tag="errand_done"):
     reasons: tuple[str, ...] = ()
 
 
-Bulk = Hello | Goodbye | Offer | Credit | Chunk | Taken | Refuse | Cancel | Errand | ErrandDone
+Bulk = Hello | Goodbye | Belongings | Lacking | Content | Offer | Credit | Chunk | Taken | Refuse | Cancel | Errand | ErrandDone

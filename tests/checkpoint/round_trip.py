@@ -202,7 +202,13 @@ def captured_and_killed(program: Program) -> Snapshot:
 
 
 def restored(
-    state: Snapshot | Sequence[Snapshot], directory: Path, *, keep_pid: bool = True, accept_changed: tuple[str, ...] = ()
+    state: Snapshot | Sequence[Snapshot],
+    directory: Path,
+    *,
+    keep_pid: bool = True,
+    accept_changed: tuple[str, ...] = (),
+    contents: Path | str = "",
+    own_eyes: bool = False,
 ) -> Program:
     """Bring a base, or a base with its deltas, back as a child of ours and let it run."""
     snapshots = [state] if isinstance(state, Snapshot) else list(state)
@@ -211,7 +217,8 @@ def restored(
     with _stdio(directory) as stdio:
         born = spawn_vessel(Birth(inner_pid=whole.process.pid if keep_pid else 0, stdio=stdio))
     try:
-        program = ENGINE.restore(born.pid, whole, RestoreOptions(elapsed_ns=elapsed_ns, accept_changed=accept_changed))
+        options = RestoreOptions(elapsed_ns, accept_changed, own_eyes, contents=str(contents))
+        program = ENGINE.restore(born.pid, whole, options)
         program.resume()
     except BaseException:
         discard(born)

@@ -1,0 +1,81 @@
+"""Which files a program needs wherever it goes on: its executable and what is mapped, and by choice what it only reads.
+
+Pure: told by the snapshot alone. What is there of it on a machine, and where the rest comes from, others find out.
+"""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from checkpoint.model import Fact, FileIdentity, Snapshot, Vma, VmaKind
+
+OPEN_FILES: Final = "files"
+"""The kind of resource that open files are, `checkpoint.resources.files`."""
+
+MEMORY_PLACE: Final = "/dev/shm/"
+"""What lies here is memory with a name, and no file that could be brought."""
+
+WRITE: Final = 2
+ACCESS_MODE: Final = 3
+PATH_ONLY: Final = 0o10000000
+"""Bits of mmap(2)'s protection, and of open(2)'s flags: O_ACCMODE, O_PATH."""
+
+
+@dataclass(frozen=True, slots=True)
+class Need:
+    """One file.
+
+    Attributes:
+        path: as the program names it.
+        size: bytes.
+        digest: blake3 of its content, 32 bytes; b"" where it was not taken (too large, or closed to us): it cannot be brought.
+    """
+
+    path: str
+    size: int
+    digest: bytes
+
+
+def needs(state: Snapshot, *, opened: bool = True) -> tuple[Need, ...]:
+    """Every file that a program of the ptrace engine must find again, one for each path.
+
+    Args:
+        opened: also those that it has open for reading only.
+    """
+    if not state.threads:
+        return ()
+    found = [_need(state.process.executable)]
+    found += [_need(vma.file) for vma in state.vmas if vma.file is not None and _is_run(vma)]
+    if opened:
+        found += _opened(state)
+    return tuple({need.path: need for need in found}.values())
+
+
+def _need(file: FileIdentity) -> Need:
+    return Need(file.path, file.size, file.digest)
+
+
+def _is_run(vma: Vma) -> bool:
+    """Whether it is mapped from a file with a name, and only to be read: what is written to the file is another matter."""
+    file = vma.file
+    if vma.kind is not VmaKind.FILE or file is None or file.deleted or not stat.S_ISREG(file.mode):
+        return False
+    return not (vma.shared and vma.protection & WRITE) and not file.path.startswith(MEMORY_PLACE)
+
+
+def _opened(state: Snapshot) -> Iterator[Need]:
+    for held in state.resources:
+        facts = held.facts
+        if held.kind != OPEN_FILES or facts.get("deleted") or not facts.get("digest"):
+            continue
+        flags, mode, size = (_number(facts.get(name)) for name in ("flags", "mode", "size"))
+        digest = facts["digest"]
+        if stat.S_ISREG(mode) and not flags & (ACCESS_MODE | PATH_ONLY) and isinstance(digest, bytes):
+            yield Need(str(facts["path"]), size, digest)
+
+
+def _number(fact: Fact) -> int:
+    return fact if isinstance(fact, int) else 0
