@@ -21,6 +21,7 @@ from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.tracking import Tracker
 from checkpoint.linux.write_protection import PagemapTracker
 from checkpoint.model import Rseq
+from checkpoint.resources import sockets
 
 LEAVE_TIMEOUT_S: Final = 0.5
 """How long a program may take to leave the code of a tracer that died in the middle: that waits 100 ms at most."""
@@ -75,6 +76,7 @@ def _try_to_enter(threads: Threads, interruptions: Interruptions, *, last: bool)
         for borrowed in left:
             if borrowed.state() == remote.ARMED:
                 borrowed.abandon()
+            _put_back(threads.pid, borrowed)
         free = [borrowed for borrowed in left if borrowed.state() != remote.ABANDONED]
         if free:
             entered = entry.reenter(tracee, free[0], registers, mask)
@@ -89,6 +91,16 @@ def _try_to_enter(threads: Threads, interruptions: Interruptions, *, last: bool)
 
 def _instruction_pointer(tracee: Tracee) -> int:
     return arch.decode_registers(tracee.registers())[arch.INSTRUCTION_POINTER]
+
+
+def _put_back(pid: int, borrowed: BorrowedPages) -> None:
+    """Put back where a socket's MSG_PEEK begins, where a tracer died that had moved it (`sockets.queue_of`)."""
+    note = borrowed.take_note()
+    if note is None:
+        return
+    number, offset = note
+    with contextlib.suppress(OSError), sockets.looked_into(pid, number) as looked:  # it has closed it since
+        sockets.set_peek_offset(looked, offset)
 
 
 def where_it_stands(tracee: Tracee, interruptions: Interruptions, rseq: Rseq | None) -> arch.Registers:

@@ -105,7 +105,7 @@ class Onlooker:
             special, _, _ = procfs.signal_sets(procfs.read_bytes(self._tracee.pid, "status"))
             self._questions(special)
             with contextlib.suppress(CaptureError):  # it runs: one of its threads has just closed something
-                with_contents(gather(self._tracee.pid))
+                with_contents(gather(self._tracee.pid), None)
         self._others.prepare()
 
     def place(self) -> Place:
@@ -146,7 +146,7 @@ class Onlooker:
             inquiry=inquiry,
             answers=answers,
             waiting=waiting,
-            opened=with_contents(gather(tracee.pid)),
+            opened=with_contents(gather(tracee.pid), self._borrowed.noted),
             totals=outputs.totals() if outputs else NOTHING_WRITTEN,
         )
 

@@ -67,6 +67,8 @@ _HEAD: Final = struct.Struct("<32sQQQQQQQQ")  # magic, state, done, serial, mask
 _HEAD_SIZE: Final = _HEAD.size + 8 * len(arch.CLOBBERED)
 _OUTPUT_ALIGNMENT: Final = 16
 _STATE_OFFSET: Final = 32
+_NOTE: Final = struct.Struct("<Ii")
+"""At the end of the large desk's table: a descriptor and one more (0: there is no note), and a number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +90,7 @@ class Plan:
 
     @property
     def outputs(self) -> int:
-        """Offset of the outputs."""
+        """Offset of the outputs, which end before the note."""
         return self.results + -(-8 * self.call_limit // _OUTPUT_ALIGNMENT) * _OUTPUT_ALIGNMENT
 
 
@@ -134,7 +136,7 @@ class Batch:
         """Reserve room for what a call writes; answers with its address in the tracee."""
         address = self._table + self._plan.outputs + self.output_size
         self.output_size += -(-size // _OUTPUT_ALIGNMENT) * _OUTPUT_ALIGNMENT
-        if self.end > self._plan.size:
+        if self.end > self._plan.size - _NOTE.size:
             raise CaptureError(f"too much to ask of a process at once: {self.output_size} bytes of answers")
         return address
 
@@ -244,6 +246,7 @@ class BorrowedPages:
         self.address = address
         self.table = address + CODE_SIZE
         self._memory = memory
+        self._note = self.table + LARGE_DESK - _NOTE.size
         self._large = Desk(memory, address, self.table, LARGE)
         offsets = range(LARGE_DESK, CODE_SIZE, SMALL_DESK)
         self.desks = tuple(Desk(memory, address + offset, self.table + offset, SMALL) for offset in offsets)
@@ -267,6 +270,23 @@ class BorrowedPages:
     def abandon(self) -> None:
         """Leave the pages to the program as ordinary memory: something of its own may still lead there."""
         self._large.set_state(ABANDONED)
+
+    @contextlib.contextmanager
+    def noted(self, descriptor: int, value: int) -> Iterator[None]:
+        """Write down for the body what of a descriptor is to be put back: for the next tracer, should we die in it."""
+        self._memory.write(self._note, _NOTE.pack(descriptor + 1, value))
+        try:
+            yield
+        finally:
+            self._memory.write(self._note, bytes(_NOTE.size))
+
+    def take_note(self) -> tuple[int, int] | None:
+        """What an earlier tracer had written down and could not put back: a descriptor and a number; it is forgotten here."""
+        descriptor, value = _NOTE.unpack(self._memory.read(self._note, _NOTE.size))
+        if not descriptor:
+            return None
+        self._memory.write(self._note, bytes(_NOTE.size))
+        return descriptor - 1, value
 
     def run(self, tracee: Tracee, batch: Batch, registers: bytes, mask: int) -> Answers:
         """Make the calls of a batch; afterwards the thread stands exactly as before.

@@ -10,13 +10,16 @@ import contextlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from checkpoint.engine import KEPT, REFUSED, Finding
 from checkpoint.errors import CaptureError
 from checkpoint.linux import abi, entry
 from checkpoint.linux.descriptors import Descriptor, descriptors
 from checkpoint.model import Fact, Resource
+
+if TYPE_CHECKING:
+    from checkpoint.resources.sockets import Noted
 
 STREAM_NUMBERS: Final = (1, 2)
 
@@ -130,8 +133,11 @@ def _place_among(pid: int, ordered: Sequence[Sequence[Descriptor]], one: Descrip
     return low, False
 
 
-def with_contents(opened: Sequence[OpenFile]) -> tuple[OpenFile, ...]:
+def with_contents(opened: Sequence[OpenFile], noted: Noted | None) -> tuple[OpenFile, ...]:
     """Add the content of every deleted file and of every pipe that is kept, and what else must be asked while it stands still.
+
+    Args:
+        noted: see `checkpoint.resources.sockets.queue_of`; None for a process that runs.
 
     Raises:
         CaptureError: one of them cannot be looked into.
@@ -140,7 +146,7 @@ def with_contents(opened: Sequence[OpenFile]) -> tuple[OpenFile, ...]:
 
     found = []
     for held in opened:
-        if observe := kinds.observer_of(held.first):
+        if observe := kinds.observer_of(held.first, noted):
             held = replace(held, observed=observe(held, opened))
         elif files.must_carry(held):
             held = replace(held, content=files.content_of(held))
@@ -158,7 +164,7 @@ def glance(pid: int) -> tuple[OpenFile, ...]:
     opened = gather(pid)
     found = []
     for held in opened:
-        if observe := kinds.observer_of(held.first):
+        if observe := kinds.observer_of(held.first, None):
             with contextlib.suppress(CaptureError):  # closed meanwhile
                 held = replace(held, observed=observe(held, opened))
         found.append(held)

@@ -68,8 +68,11 @@ ADDRESS_SIZE: Final = 128
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
-def observe(held: OpenFile, looked: socket.socket) -> dict[str, Fact]:
+def observe(held: OpenFile, looked: socket.socket, noted: sockets.Noted | None) -> dict[str, Fact]:
     """Its state, its addresses and what waits in it.
+
+    Args:
+        noted: see `sockets.queue_of`.
 
     Raises:
         OSError: it cannot be looked into.
@@ -79,15 +82,15 @@ def observe(held: OpenFile, looked: socket.socket) -> dict[str, Fact]:
     if looked.proto == socket.IPPROTO_TCP:
         state, *_, waiting, backlog = _TCP_INFO.unpack(looked.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size))
     is_datagram = looked.proto == socket.IPPROTO_UDP
-    messages, sources = sockets.datagrams_of(looked) if is_datagram else ((), ())
+    queue = sockets.queue_of(looked, held.first.number, noted) if is_datagram else sockets.NOTHING
     return facts | {
         "state": state,
         "address": _bound(looked.getsockname()),
         "peer": _peer(looked),
         "backlog": backlog if state == LISTENING else 0,
         "waiting": waiting if state == LISTENING else 0,
-        "queue": list(messages),
-        "sources": [list(source) for source in sources],
+        "queue": list(queue.messages),
+        "sources": [list(source) for source in queue.sources if isinstance(source, tuple)],
         "groups": list(_groups(held.pid, looked)) if is_datagram else [],
     }
 

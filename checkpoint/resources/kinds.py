@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, Protocol
@@ -76,16 +77,20 @@ _OBSERVED: Final[Mapping[str, Observer]] = {
 """By the kernel's name for an open file."""
 
 
-def observer_of(one: Descriptor) -> Observer | None:
-    """What asks an open file for what only a process that stands still can tell."""
+def observer_of(one: Descriptor, noted: sockets.Noted | None) -> Observer | None:
+    """What asks an open file for what only a process that stands still can tell.
+
+    Args:
+        noted: see `sockets.queue_of`; None for a process that runs.
+    """
     if sockets.is_socket(one):
-        return _observe_socket
+        return functools.partial(_observe_socket, noted=noted)
     if memory_files.is_memory_file(one):
         return memory_files.observe
     return fifos.observe if fifos.is_fifo(one) else _OBSERVED.get(one.target)
 
 
-def _observe_socket(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
+def _observe_socket(held: OpenFile, opened: Sequence[OpenFile], *, noted: sockets.Noted | None) -> Mapping[str, Fact]:
     """A socket of a family that is kept; nothing of another.
 
     Raises:
@@ -94,16 +99,16 @@ def _observe_socket(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, 
     try:
         with sockets.looked_into(held.pid, held.first.number) as looked:
             if looked.family == socket.AF_UNIX:
-                return unix_sockets.observe(held, looked, opened)
+                return unix_sockets.observe(held, looked, opened, noted)
             if looked.family in internet_sockets.FAMILIES and looked.proto in internet_sockets.PROTOCOLS:
-                return _observe_internet_socket(held, looked)
+                return _observe_internet_socket(held, looked, noted)
     except OSError as error:
         raise CaptureError(f"cannot look into the socket {held.name} of pid {held.pid}: {error.strerror}; try again") from error
     return {}
 
 
-def _observe_internet_socket(held: OpenFile, looked: socket.socket) -> Mapping[str, Fact]:
-    facts = internet_sockets.observe(held, looked)
+def _observe_internet_socket(held: OpenFile, looked: socket.socket, noted: sockets.Noted | None) -> Mapping[str, Fact]:
+    facts = internet_sockets.observe(held, looked, noted)
     if looked.proto == socket.IPPROTO_TCP and facts["state"] == internet_sockets.CLOSED:
         facts["ends"] = tcp_connections.ends_of(looked)
     return facts | tcp_connections.observe(held, looked, facts) if tcp_connections.is_connection(facts) else facts

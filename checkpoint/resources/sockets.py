@@ -12,12 +12,16 @@ Source: socket(7), ip(7), ipv6(7), tcp(7), udp(7).
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
+import select
 import socket
 import stat
 import struct
-from collections.abc import Iterator, Mapping
+import termios
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -77,13 +81,21 @@ class Queue:
 
     Attributes:
         rights: descriptors are on their way in one of the messages.
+        sources: of each message its sender's address, as recvmsg(2) tells it.
         too_long: more than `QUEUE_LIMIT` bytes.
     """
 
-    messages: tuple[bytes, ...]
-    sources: tuple[bytes, ...]
-    rights: bool
-    too_long: bool
+    messages: tuple[bytes, ...] = ()
+    sources: tuple[object, ...] = ()
+    rights: bool = False
+    too_long: bool = False
+
+
+NOTHING: Final = Queue()
+
+Noted = Callable[[int, int], AbstractContextManager[None]]
+"""Given a descriptor of the program and its socket's SO_PEEK_OFF: writes both down for the body, for whoever comes after us if we
+die in it."""
 
 
 def is_socket(one: Descriptor) -> bool:
@@ -156,26 +168,65 @@ def _option(looked: socket.socket, level: int, number: int) -> bytes | None:
         return None
 
 
-def queue_of(looked: socket.socket) -> Queue:
+def queue_of(looked: socket.socket, number: int, noted: Noted | None) -> Queue:
     """What waits to be read; it stays there.
 
+    Only where several messages wait must the kernel be told to look behind the first (SO_PEEK_OFF). That is told to the program's
+    own socket: never while the program runs, for it would look there, too.
+
+    Args:
+        number: its descriptor in the program.
+        noted: None of a program that runs: then nothing is found behind the first message.
+
     Raises:
-        OSError: this socket cannot be looked into.
+        OSError: this socket cannot be looked into, or an error waits in it, which our look would take away.
     """
+    ready = _readiness(looked)
+    if looked.type != socket.SOCK_STREAM and ready & select.POLLERR:
+        if looked.family == socket.AF_UNIX:
+            raise OSError(errno.EBUSY, "an error waits in it, which the program has not been told yet")
+        return NOTHING  # datagrams of UDP may be lost, the error may not
+    if not ready & select.POLLIN:
+        return NOTHING
     before = looked.getsockopt(socket.SOL_SOCKET, SO_PEEK_OFF)
-    looked.setsockopt(socket.SOL_SOCKET, SO_PEEK_OFF, 0)
-    try:
-        return _peeked(looked)
-    finally:
-        looked.setsockopt(socket.SOL_SOCKET, SO_PEEK_OFF, before)
+    if before < 0 and (noted is None or looked.type != socket.SOCK_DGRAM):
+        first = _peeked(looked, 1)
+        if noted is None or _is_all(looked, first):
+            return first
+    if noted is None:
+        return NOTHING
+    with noted(number, before):
+        looked.setsockopt(socket.SOL_SOCKET, SO_PEEK_OFF, 0)
+        try:
+            return _peeked(looked, MESSAGES_MAX)
+        finally:
+            set_peek_offset(looked, before)
 
 
-def _peeked(looked: socket.socket) -> Queue:
+def set_peek_offset(looked: socket.socket, offset: int) -> None:
+    """Set where MSG_PEEK begins to look, -1 for the first message each time."""
+    looked.setsockopt(socket.SOL_SOCKET, SO_PEEK_OFF, offset)
+
+
+def _readiness(looked: socket.socket) -> int:
+    poll = select.poll()
+    poll.register(looked, select.POLLIN)
+    return next((events for _, events in poll.poll(0)), 0)
+
+
+def _is_all(looked: socket.socket, first: Queue) -> bool:
+    """Whether nothing waits behind the first message, which is no datagram. Source: unix(7), SIOCINQ."""
+    waiting = int.from_bytes(fcntl.ioctl(looked.fileno(), termios.FIONREAD, bytes(4)), "little")
+    return waiting <= sum(map(len, first.messages))
+
+
+def _peeked(looked: socket.socket, count: int) -> Queue:
+    """At most so many messages, or pieces of a stream."""
     messages: list[bytes] = []
-    sources: list[bytes] = []
+    sources: list[object] = []
     size, rights = 0, False
     is_datagram = looked.type == socket.SOCK_DGRAM
-    while size <= QUEUE_LIMIT and len(messages) < MESSAGES_MAX:
+    while size <= QUEUE_LIMIT and len(messages) < count:
         try:
             content, ancillary, _, source = looked.recvmsg(PIECE_SIZE, RIGHTS_SPACE, socket.MSG_PEEK | socket.MSG_DONTWAIT)
         except BlockingIOError:
@@ -183,32 +234,14 @@ def _peeked(looked: socket.socket) -> Queue:
         for level, kind, carried in ancillary:
             if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
                 rights = True
-                for (number,) in struct.iter_unpack("<i", carried[: len(carried) // 4 * 4]):
-                    os.close(number)
+                for (descriptor,) in struct.iter_unpack("<i", carried[: len(carried) // 4 * 4]):
+                    os.close(descriptor)
         if not content and not is_datagram:  # its peer has shut it down
             break
         messages.append(content)
-        sources.append(source if isinstance(source, bytes) else os.fsencode(source) if isinstance(source, str) else b"")
+        sources.append(source)
         size += len(content)
     return Queue(tuple(messages), tuple(sources), rights, size > QUEUE_LIMIT)
-
-
-def datagrams_of(looked: socket.socket) -> tuple[tuple[bytes, ...], tuple[tuple[Fact, ...], ...]]:
-    """Datagrams of UDP that wait to be read, and where each came from; they stay there."""
-    before = looked.getsockopt(socket.SOL_SOCKET, SO_PEEK_OFF)
-    looked.setsockopt(socket.SOL_SOCKET, SO_PEEK_OFF, 0)
-    messages: list[bytes] = []
-    sources = []
-    try:
-        while len(messages) < MESSAGES_MAX:
-            content, source = looked.recvfrom(PIECE_SIZE, socket.MSG_PEEK | socket.MSG_DONTWAIT)
-            messages.append(content)
-            sources.append(tuple(source))
-    except (BlockingIOError, ConnectionError):
-        pass
-    finally:
-        looked.setsockopt(socket.SOL_SOCKET, SO_PEEK_OFF, before)
-    return tuple(messages), tuple(sources)
 
 
 # --- Restore -----------------------------------------------------------------------------------------------------------

@@ -75,8 +75,11 @@ BOTH_DIRECTIONS: Final = 3
 _SHUTDOWN_HOW: Final = {1: socket.SHUT_RD, 2: socket.SHUT_WR, 3: socket.SHUT_RDWR}
 
 
-def observe(held: OpenFile, looked: socket.socket, opened: Sequence[OpenFile]) -> dict[str, Fact]:
+def observe(held: OpenFile, looked: socket.socket, opened: Sequence[OpenFile], noted: sockets.Noted | None) -> dict[str, Fact]:
     """Its state, its peer and what waits in it.
+
+    Args:
+        noted: see `sockets.queue_of`.
 
     Raises:
         OSError: it cannot be looked into.
@@ -87,7 +90,7 @@ def observe(held: OpenFile, looked: socket.socket, opened: Sequence[OpenFile]) -
         raise CaptureError(f"cannot ask the kernel about the unix socket {held.name} (sock_diag): load the module unix_diag")
     facts = sockets.general_facts(held.first, looked)
     has_queue = told.state == ESTABLISHED or told.type == socket.SOCK_DGRAM
-    queue = sockets.queue_of(looked) if has_queue else sockets.Queue((), (), False, False)
+    queue = sockets.queue_of(looked, held.first.number, noted) if has_queue else sockets.NOTHING
     ours = {one.first.inode for one in opened}
     path = _path_of(held.pid, told.name)
     return facts | {
