@@ -57,6 +57,7 @@ class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
     user: str = ""
     engine: Literal["auto", "ptrace", "cooperative"] = "auto"
     output: Literal["immediate", "committed"] = "immediate"
+    portable: Literal["", "no", "x86-64-v1", "x86-64-v2", "x86-64-v3", "x86-64-v4"] = ""
     hooks: dict[HookName, list[Text]] = {}
 
 

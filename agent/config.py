@@ -30,6 +30,9 @@ HOOK_S_MAX: Final = 50
 """The rules give a restore a minute."""
 
 
+Portable = bool | Literal["", "x86-64-v1", "x86-64-v2", "x86-64-v3", "x86-64-v4"]
+
+
 @dataclass(frozen=True, slots=True)
 class HooksConfig:
     """This robot's own commands around one component, see `agent.hooks`; () for none.
@@ -66,6 +69,8 @@ class ComponentConfig:
         standby: the robot that keeps its snapshots; "" lets the team choose.
         prefer: the robot that should run it; "" for wherever it is.
         snapshot_period_ms: 0 for the agent's own.
+        portable: a level of processors that it must be able to go on at, see ``checkpoint.portable``; true for the usual one;
+            "" for the agent's own.
         warm: a program that keeps its state itself is started here in advance, where this robot is its standby, and waits.
         command: a program that keeps its state itself is started here again by this; () for the command line of `failover run`.
         directory: and in this one, an absolute path; "" for that of `failover run`.
@@ -79,6 +84,7 @@ class ComponentConfig:
     standby: str = ""
     prefer: str = ""
     snapshot_period_ms: int = 0
+    portable: Portable = ""
     warm: bool = True
     command: tuple[str, ...] = field(default_factory=tuple)
     directory: str = ""
@@ -108,6 +114,7 @@ class Config:
         snapshots_over: wired: they never leave over a wireless link; any: over whichever has the bulk address.
         bring: files of programs that this robot lacks, or has in another version, are brought here and kept, by content.
         bring_size: of all that is brought for one component; beyond it its checkpoints are refused.
+        portable: a level of processors that programs which are started here must be able to go on at.
         keep_checkpoints: older ones of each component that are kept for people, besides those that the team needs.
         keep_for: spread over this span; older ones go.
         keep_size: of the whole store; beyond it the oldest of those go. "": as much as there is.
@@ -132,6 +139,7 @@ class Config:
     wireless: list[str] = field(default_factory=list)
     bring: bool = True
     bring_size: str = "1GB"
+    portable: Portable = False
     keep_checkpoints: int = 0
     keep_for: str = "7d"
     keep_size: str = ""

@@ -78,6 +78,8 @@ class Figures:
     outage_ms: float | None = None
     reasons: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    lacking: tuple[str, ...] = ()
+    """Of a standby: instruction sets that the program may use and this processor has not."""
     hooks: dict[str, str] = field(default_factory=dict)
     """By occasion: what the last run of a hook had to complain of."""
     bringing: dict[str, str] = field(default_factory=dict)
@@ -93,6 +95,13 @@ class Figures:
         self.snapshot_size, self.dirty_bytes = captured.size, captured.dirty_bytes
         self.newest = captured.position
         self.notes = captured.notes
+
+    def narrower(self) -> str:
+        """What this robot, a standby, would refuse in a takeover, while there is time to do something about it."""
+        return (
+            f"it could not go on here: this processor lacks {', '.join(self.lacking)}, by which it may have chosen its code; "
+            "start it with failover run --portable, see docs/configuration.md"
+        )
 
     def stored(self, position: Position, size: int, engine: str) -> None:
         """Count one snapshot that came from the primary."""

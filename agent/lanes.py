@@ -35,11 +35,12 @@ from agent.switchboard import Switchboard, live, make_directory
 from agent.units import starter
 from agent.verbs import Verbs
 from agent.view import team_view
-from checkpoint import channel, format
+from checkpoint import channel, format, portable
 from checkpoint.channel import Channel, close_all
 from checkpoint.contents import FOLDER as CONTENTS_FOLDER
-from checkpoint.engine import COOPERATIVE
+from checkpoint.engine import COOPERATIVE, PTRACE
 from checkpoint.errors import CheckpointError, StoreError
+from checkpoint.linux import processor
 from checkpoint.model import Snapshot
 from checkpoint.needs import Need
 from checkpoint.store import Store, open_store
@@ -255,7 +256,10 @@ class Lanes(Switchboard):
         task.add_done_callback(end_lanes_on_mistake)
 
     def _stored(self, component: str, snapshot: Snapshot, size: int) -> None:
-        self.charge(component).figures.stored(snapshot.position, size, snapshot.engine)
+        figures = self.charge(component).figures
+        figures.stored(snapshot.position, size, snapshot.engine)
+        if snapshot.engine == PTRACE:
+            figures.lacking = portable.lacking(snapshot.machine.features, processor.features())
 
     async def _silence_ns(self, component: str) -> int:
         """For how long the robot that last sent this component's snapshots has been silent; 0 if there is none."""

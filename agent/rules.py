@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from agent.config import ComponentConfig, Config, Settings
+from checkpoint import portable
 from checkpoint.history import Retention
 from failover.client.quantities import size_bytes, span_ms
 from failover.core import types
@@ -57,6 +58,18 @@ def rules_for(config: Config, component: ComponentConfig) -> Rules:
         prefer=component.prefer,
         standby=component.standby,
     )
+
+
+def level_of(wanted: str, config: Config, component: ComponentConfig) -> str:
+    """The level of processors that a program is started for; "" for whatever this one has.
+
+    Args:
+        wanted: of ``failover run``: a level, "no", or "" for what this robot's operator says.
+    """
+    said: bool | str = wanted or (config.portable if component.portable == "" else component.portable)
+    if isinstance(said, bool):
+        return portable.DEFAULT if said else ""
+    return said if said in portable.LEVELS else ""
 
 
 def started_here(launch: Launch, component: ComponentConfig) -> Launch:

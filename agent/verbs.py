@@ -30,7 +30,8 @@ from agent.errors import RefusedError
 from agent.outflow import Outflow
 from agent.places import Places
 from agent.questions import Lines, Questions
-from agent.rules import rules_for
+from agent.rules import level_of, rules_for
+from checkpoint import portable
 from failover.core import acts, events
 from failover.core.names import check_component, weight
 from failover.core.types import COMMITTED, ComponentSpec, Launch, State
@@ -117,7 +118,7 @@ class Verbs(Questions):
         name = await self._fresh_name(wanted.name, wanted.argv[0], say.caller.uid)
         launch = Launch(
             tuple(wanted.argv),
-            tuple(wanted.env.items()),
+            tuple(self._environment(name, wanted).items()),
             wanted.cwd,
             wanted.umask,
             isolate=wanted.isolate,
@@ -141,6 +142,12 @@ class Verbs(Questions):
             return {"name": name, "exit_status": report.status, "failed": report.failed, "reason": report.reason}
         view = await self._view(name)  # it ended on another robot
         return {"name": name, "exit_status": view.get("exit_status"), "failed": view["state"] == "failed", "reason": ""}
+
+    def _environment(self, name: str, wanted: RunArguments) -> dict[str, str]:
+        """The program's variables, also those that have libraries choose code for a mixed fleet."""
+        settings = self._lanes.settings
+        level = level_of(wanted.portable, settings.config, settings.component(name))
+        return portable.environment(wanted.env, level) if level else wanted.env
 
     async def protect(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """Take a running process under protection."""

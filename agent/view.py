@@ -115,7 +115,8 @@ def _own_notes(view: ComponentView, figures: Figures | None) -> tuple[str, ...]:
     """What this robot's own work on it found out."""
     if figures is None:
         return ()
-    return (*figures.notes, *_overdue(view, figures), *figures.hooks.values(), *figures.bringing.values())
+    narrower = (figures.narrower(),) if figures.lacking and view.state is State.STANDBY else ()
+    return (*figures.notes, *_overdue(view, figures), *narrower, *figures.hooks.values(), *figures.bringing.values())
 
 
 def _waiting_output(view: ComponentView, waiting: int) -> tuple[str, ...]:

@@ -287,7 +287,8 @@ class Machine:
 
     Attributes:
         architecture: as uname(2) says ("x86_64").
-        features: processor features that the program may have chosen code by (see ``checkpoint.arch``).
+        features: processor features that the program may have chosen code by: all that there were, or those of the level that it
+            was started for (see ``checkpoint.portable``).
         vdso_digest: blake3 of the vdso image, 32 bytes.
         robot: name of the robot, "" for a one-shot capture.
     """

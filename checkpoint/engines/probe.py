@@ -6,9 +6,10 @@ import os
 from collections.abc import Iterator
 from typing import Final
 
-from checkpoint.engine import NOTED, REFUSED, Finding, Report, Streams
+from checkpoint import portable
+from checkpoint.engine import KEPT, NOTED, REFUSED, Finding, Report, Streams
 from checkpoint.errors import ProbeError, ProcessGoneError
-from checkpoint.linux import dirty, procfs
+from checkpoint.linux import dirty, processor, procfs
 from checkpoint.linux.procfs import Status
 from checkpoint.resources import Surroundings, glance, look, pipes_of, unsupported
 
@@ -39,6 +40,7 @@ def _probe(pid: int, surroundings: Surroundings) -> Report:
     _require_permission(pid, status)
     findings = (
         *_process_findings(pid, status),
+        *_processor_findings(pid),
         *_memory_findings(pid),
         *look(glance(pid), surroundings).findings,
     )
@@ -74,6 +76,16 @@ def _process_findings(pid: int, status: Status) -> Iterator[Finding]:
     if status.ppid and len(status.pids) == 1:
         text = "its PID is kept where it is free on the other side: failover run gives a program a PID namespace of its own"
         yield Finding("process", f"pid {pid}", NOTED, text)
+
+
+def _processor_findings(pid: int) -> Iterator[Finding]:
+    """What another robot's processor must have."""
+    level = portable.level_in(procfs.read_bytes(pid, "environ"))
+    if level:
+        yield Finding("process", "processor", KEPT, f"started for {level}: it can go on where that is")
+        return
+    needed = ", ".join(portable.lacking(processor.features(), ())) or "nothing special"
+    yield Finding("process", "processor", KEPT, f"not started with failover run --portable: it may have chosen {needed}")
 
 
 def _memory_findings(pid: int) -> Iterator[Finding]:

@@ -23,7 +23,7 @@ import time
 from dataclasses import dataclass, replace
 from typing import Final
 
-from checkpoint import pages
+from checkpoint import pages, portable
 from checkpoint.arch import x86_64_xstate
 from checkpoint.chain import position_of
 from checkpoint.engine import PTRACE, CaptureOrder, Streams
@@ -86,6 +86,7 @@ class PtraceSession:
         self._threads = threads
         self._onlooker = Onlooker(threads, entered)
         self._memory = MemoryCapture(threads.leader.memory, entered.tracker, entered.pages)
+        self._level = portable.level_in(procfs.read_bytes(pid, "environ"))
         self._flags: dict[int, tuple[str, ...]] = {}
         self._flags_of: tuple[MapsLine, ...] = ()
         self._identities = Identities(pid)
@@ -268,7 +269,12 @@ class PtraceSession:
             engine=PTRACE,
             position=Position(order.generation, order.sequence, bytes(16)),
             parent=parent,
-            machine=replace(description.this_machine(), robot=order.robot, xstate_mask=_xstate_mask(standing)),
+            machine=replace(
+                description.this_machine(),
+                robot=order.robot,
+                xstate_mask=_xstate_mask(standing),
+                features=portable.features_used(description.this_machine().features, self._level),
+            ),
             clocks=standing.told.clocks,
             process=process_state(self.pid, standing, self._identities),
             threads=thread_states(self.pid, standing),

@@ -13,9 +13,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from checkpoint.arch import x86_64, x86_64_stub, x86_64_xstate
+from checkpoint import portable
+from checkpoint.arch import x86_64, x86_64_xstate
 from checkpoint.arch.x86_64_xstate import Layout
-from checkpoint.capability import Area, refused
+from checkpoint.capability import Area, by_rule, refused
 from checkpoint.contents import DIGEST_SIZE, digest_of_file, path_in
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import restore_vdso
@@ -50,10 +51,15 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.THERE,
-        "another architecture, page size, or a processor without the instructions (AVX-512 …)",
+        "another architecture or page size",
         "processors of the same kind",
         "it was taken on {}, this machine is",
         "its pages are {} bytes",
+    ),
+    by_rule(
+        Area.THERE,
+        "a processor without instructions that the other one has (AVX-512 …)",
+        "a program that was started with `--portable`; of another it is not known what it chose: processors alike",
         "this processor lacks",
     ),
     refused(
@@ -138,9 +144,9 @@ def _of_machine(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
     ours = kernel_pages(procfs.parse_maps(procfs.read_text(os.getpid(), "maps")))
     if not restore_vdso.fits(state, ours):
         yield from restore_vdso.refuse(state)
-    if lacking := set(machine.features) & x86_64_stub.INSTRUCTION_SETS - set(here.features):
-        listed = ", ".join(sorted(lacking))
-        yield f"this processor lacks {listed}, by which the program may have chosen its code: use one that has them"
+    if listed := ", ".join(portable.lacking(machine.features, here.features)):
+        cure = "use one that has them, or start it with failover run --portable"
+        yield f"this processor lacks {listed}, by which the program may have chosen its code: {cure}"
     if any(vma.guards for vma in state.vmas) and not can_install_guards():
         yield f"it has guard pages of madvise(2), which our kernel ({here.kernel}) does not know: boot Linux 6.13 or later"
     if state.process.root_directory != "/":

@@ -10,6 +10,7 @@ import shlex
 from textwrap import dedent
 from typing import Any, Final
 
+from checkpoint import portable
 from failover.client.quantities import span_ms
 
 EXIT_STATUSES: Final = "Exit status: 0 healthy, 1 failed or degraded, 2 usage, 3 no agent."
@@ -84,6 +85,16 @@ def run(room: argparse.ArgumentParser) -> None:
         default="auto",
         help="ptrace: captured from outside, for a program that nobody prepared; cooperative: the program says by itself what "
         "must survive (failover.resume, failover.component), and is started again from that (default: auto, as it turns out)",
+    )
+    room.add_argument(
+        "--portable",
+        nargs="?",
+        choices=("no", *portable.LEVELS),
+        const=portable.DEFAULT,
+        default="",
+        metavar="LEVEL",
+        help="have libraries choose code that every processor of a level can run, so that it can go on at robots with less: "
+        f"x86-64-v1 to v4, or no (default: as agent.toml says; without LEVEL: {portable.DEFAULT})",
     )
     room.add_argument(
         "--output",

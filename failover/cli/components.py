@@ -33,6 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     wanted: dict[str, Any] = {"argv": arguments.command, "env": dict(os.environ), "cwd": os.getcwd(), "umask": _umask()}
     wanted |= {"engine": arguments.engine, "isolate": arguments.isolate, "wait": not arguments.detach}
     wanted |= {"output": arguments.output, "hooks": {kind: getattr(arguments, kind) for kind in HOOKS}}
+    wanted["portable"] = arguments.portable
     if arguments.name:
         wanted["name"] = arguments.name
     if arguments.user:

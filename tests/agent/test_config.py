@@ -14,7 +14,7 @@ from agent import config as configuration
 from agent.config import ComponentConfig, Config
 from agent.errors import ConfigError
 from agent.main import main as agent_main
-from agent.rules import node_config, started_here
+from agent.rules import level_of, node_config, started_here
 from agent.transport import new_keys
 from failover.client import team
 from failover.client.team import Robot, Role, Team
@@ -66,6 +66,18 @@ def test_a_program_is_started_again_by_this_robots_own_command(directory: Path) 
     environment = (("LANG", "C"), ("MAPS", "/srv/maps"))
     assert told == Launch(("/opt/mapper", "--small"), environment, "/home/ann", umask=0o077)
     assert started_here(launch, settings.component("/lab/robot1/other")) == launch
+
+
+def test_the_level_of_processors_is_the_callers_then_the_components_then_the_robots(directory: Path) -> None:
+    lines = ("portable = true", '[components."/lab/robot1/mapper"]', 'portable = "x86-64-v3"')
+    settings = configuration.load(written(directory, *lines))
+    other, mapper = settings.component("/lab/robot1/other"), settings.component("/lab/robot1/mapper")
+    assert level_of("", settings.config, other) == "x86-64-v2"
+    assert level_of("", settings.config, mapper) == "x86-64-v3"
+    assert level_of("x86-64-v1", settings.config, mapper) == "x86-64-v1"
+    assert level_of("no", settings.config, mapper) == ""
+    assert level_of("", Config("robot1"), ComponentConfig()) == ""
+    assert level_of("", settings.config, ComponentConfig(portable=False)) == ""
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from checkpoint import portable
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 
@@ -86,3 +87,18 @@ def test_a_program_stands_still_while_its_robot_is_alone(pair: Pair) -> None:
 def test_snapshots_are_as_far_apart_as_the_operator_says(pair: Pair) -> None:
     robots.until_protected(pair[0])
     assert robots.component(pair[0], "count")["period_ms"] == 1000
+
+
+@settings("portable = true\n")
+def test_a_portable_program_stays_so_wherever_it_goes(pair: Pair) -> None:
+    """What its libraries were told is a part of its memory."""
+    robots.until_protected(pair[0])
+    assert level(pair[0]) == "x86-64-v2"
+    assert robots.failover(pair[0], "handover", "count").returncode == 0
+    robots.until(lambda: robots.component(pair[1], "count").get("role") == "primary", "it to run at robot2")
+    assert level(pair[1]) == "x86-64-v2"
+
+
+def level(robot: RobotMachine) -> str:
+    pid = robots.host_pid(robot, robots.component(robot, "count")["pid"])
+    return portable.level_in(Path(f"/proc/{pid}/environ").read_bytes())

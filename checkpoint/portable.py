@@ -1,0 +1,52 @@
+"""Programs that may move between different processors: started so that libraries choose code for a level that all of them have.
+
+`environment` says so to the C library and others; what was agreed stays in the program's environment, where a capture finds it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+from checkpoint.arch import x86_64_levels as arch
+from checkpoint.arch import x86_64_stub
+
+VARIABLE: Final = "FAILOVER_PORTABLE"
+"""Holds the level, for whoever looks at the program later."""
+TUNABLES: Final = "GLIBC_TUNABLES"
+HWCAPS: Final = "glibc.cpu.hwcaps"
+LEVELS: Final = arch.LEVELS
+DEFAULT: Final = arch.DEFAULT
+
+
+def environment(given: Mapping[str, str], level: str) -> dict[str, str]:
+    """Variables of a program that is to move between processors of a level and above.
+
+    What is set already stays; of the C library's tunables, which are many in one, ours come besides.
+    """
+    tunables = [one for one in given.get(TUNABLES, "").split(":") if one]
+    others = [one for one in tunables if not one.startswith(f"{HWCAPS}=")]
+    chosen = [one.partition("=")[2] for one in tunables if one.startswith(f"{HWCAPS}=")]
+    hwcaps = ",".join((*filter(None, chosen), arch.glibc_hwcaps(level)))
+    ours = {TUNABLES: ":".join((*others, f"{HWCAPS}={hwcaps}")), VARIABLE: level}
+    return {**arch.variables(level), **given, **ours}
+
+
+def level_in(environ: bytes) -> str:
+    """The level that a program was started for, by its /proc/PID/environ; "" where none was agreed."""
+    marks = (one.partition(b"=")[2] for one in environ.split(b"\0") if one.startswith(VARIABLE.encode() + b"="))
+    level = next(marks, b"").decode(errors="replace")
+    return level if level in LEVELS else ""
+
+
+def features_used(features: tuple[str, ...], level: str) -> tuple[str, ...]:
+    """Of a processor's features those that a program may have chosen its code by."""
+    if not level:
+        return features
+    beyond = x86_64_stub.INSTRUCTION_SETS - arch.flags_of(level)
+    return tuple(feature for feature in features if feature not in beyond)
+
+
+def lacking(needed: tuple[str, ...], here: tuple[str, ...]) -> tuple[str, ...]:
+    """Instruction sets that a program may use and a processor has not, in alphabetical order."""
+    return tuple(sorted(set(needed) & x86_64_stub.INSTRUCTION_SETS - set(here)))
