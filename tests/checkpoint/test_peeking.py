@@ -19,8 +19,6 @@ from tests.checkpoint.round_trip import Program, captured_at_last, ended, expect
 
 pytestmark = [pytest.mark.root]
 
-GLANCES = 300
-
 PEEKING = """
 import os, socket, sys
 pairs = [socket.socketpair(socket.AF_UNIX, kind) for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM, socket.SOCK_SEQPACKET)]
@@ -59,13 +57,25 @@ def offsets(program: Program) -> set[int]:
     return found
 
 
-def test_a_program_that_looks_at_what_waits_finds_the_same_while_it_is_looked_at(tmp_path: Path) -> None:
+def test_a_program_that_runs_finds_what_it_would_find_while_its_sockets_are_looked_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    look, seen = sockets._peeked, set()
+
+    def watched(looked: socket.socket, count: int) -> sockets.Queue:
+        seen.add(looked.getsockopt(socket.SOL_SOCKET, sockets.SO_PEEK_OFF))
+        return look(looked, count)
+
     with peeking(tmp_path) as program:
-        for _ in range(GLANCES):
+        with monkeypatch.context() as patch:
+            patch.setattr(sockets, "_peeked", watched)
             glance(program.pid)
+        assert seen == {-1}, "set while it runs"
         for _ in range(3):
             with protected(program) as session:
-                captured_at_last(session, CaptureOrder())
+                snapshot = captured_at_last(session, CaptureOrder())
+        queues = [queue for held in snapshot.resources if (queue := held.facts.get("queue"))]
+        assert queues == [[b"firstsecondthird"], *3 * [[b"first", b"second", b"third"]]]
         assert offsets(program) == {-1}
         program.tell()
         expect_ok(program)
