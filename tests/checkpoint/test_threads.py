@@ -182,6 +182,52 @@ def test_without_its_pid_a_program_of_many_threads_is_refused(compiled: Compiled
         restored(snapshot, tmp_path, keep_pid=False)
 
 
+LOCKS = """
+import fcntl, sys, time
+file = open(sys.argv[1], "w+b")
+fcntl.lockf(file, fcntl.LOCK_EX)
+print("locked", flush=True)
+time.sleep(600)
+"""
+"""In a process of its own: whoever closes a file loses its locks on it, and restores open and close files here."""
+
+
+def test_threads_that_wait_at_descriptors_answer_in_turn_after_three_restores(compiled: Compiled, tmp_path: Path) -> None:
+    (tmp_path / "locker").mkdir()
+    with ended(start([sys.executable, "-c", LOCKS, tmp_path / "locked"], tmp_path / "locker")) as locker:
+        locker.wait_for_line("locked")
+        tracee = start_tracee(compiled("workers", "-O2", "-pthread"), tmp_path)
+        for _ in range(3):
+            with ended(tracee):
+                captured(tracee)
+                snapshot = captured_and_killed(tracee)
+            tracee = restored(snapshot, tmp_path)
+        with ended(tracee):
+            captured(tracee)
+            tracee.tell()
+            tracee.wait_for_line("unlock")
+            locker.kill()
+            expect_ok(tracee)
+
+
+OPENS_A_THREAD = """
+import os, sys, threading, time
+thread = threading.Thread(target=time.sleep, args=(600,), daemon=True)
+thread.start()
+os.open(f"/proc/self/task/{thread.native_id}/stat", getattr(os, sys.argv[1]))
+print("ready", flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("way", ["O_PATH", "O_RDONLY"])
+def test_a_descriptor_that_shows_one_of_its_threads_is_refused(way: str, tmp_path: Path) -> None:
+    with ended(start([sys.executable, "-c", OPENS_A_THREAD, way], tmp_path)) as program:
+        program.wait_for_line("ready")
+        with pytest.raises(UnsupportedError, match=r"of one of its threads: let the program close it"):
+            ENGINE.protect(program.pid, "/test/thread", None)
+
+
 QUEUES = """
 import queue, threading, time
 first, second, third = queue.Queue(8), queue.Queue(8), queue.Queue(8)
