@@ -24,7 +24,8 @@ from agent.nursery import KeeperLink, connect
 from agent.places import Places, complete_logs, log_directory
 from agent.streams import discard, total_of
 from checkpoint import channel, epoch_variable, format
-from checkpoint.engine import COOPERATIVE, PTRACE
+from checkpoint.carried import paths_of
+from checkpoint.engine import CARRIED_SIZE_MAX, COOPERATIVE, PTRACE, Carry
 from checkpoint.engines.cooperative import age_ns as commit_age_ns
 from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
@@ -113,6 +114,7 @@ async def restore(
     laps: Laps | None = None,
     task: guard_messages.Task | None = None,
     epoch: int = 0,
+    carry_limit: int = CARRIED_SIZE_MAX,
 ) -> Component:
     """Rebuild a component from a chain (descriptors of encoded snapshots, oldest first), stopped, committed to nothing.
 
@@ -123,6 +125,7 @@ async def restore(
         outage_ns: added to the program's monotonic and boot time: how long ago the newest snapshot was taken.
         task: for a program that may still say that it keeps its state.
         owner: uid; None: whoever it ran as. What is not root's opens its files with its owner's rights, and gets no others.
+        carry_limit: bytes that its carried files may hold here.
 
     Raises:
         checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
@@ -148,6 +151,7 @@ async def restore(
         task=task,
     )
     component.engine_wanted = task.engine if task is not None else PTRACE
+    component.keeper.carry = Carry(paths_of(outline), carry_limit)
     try:
         keeper = await component.keeper.give()
         laps.lap("guard and keeper")
@@ -162,6 +166,7 @@ async def restore(
             own_eyes=owner != ROOT,
             epoch=epoch,
             contents=places.contents,
+            carry=component.keeper.carry,
         )
         restored, _ = await component.keeper.ask(order, (*chain, *component.streams))
         laps.lap("restore")
@@ -183,6 +188,7 @@ async def begin_again(
     epoch: int,
     why: str,
     waiting: Component | None = None,
+    carry_limit: int = CARRIED_SIZE_MAX,
 ) -> Component:
     """Prepare a program that keeps its state to go on from a chain of the cooperative engine; `resume` lets it.
 
@@ -191,6 +197,7 @@ async def begin_again(
     Args:
         why: one of `checkpoint.task_channel.REASONS`.
         waiting: the program, started to wait (`start_to_wait`); None: `resume` starts it.
+        carry_limit: bytes that its carried files may hold here.
 
     Raises:
         checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
@@ -200,12 +207,14 @@ async def begin_again(
     await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
     component = waiting or Component(name, await places.nursery.guard(), places)
     component.engine_wanted = COOPERATIVE  # what another engine took before it says Hello would be older than its state
+    component.keeper.carry = Carry(paths_of(outline), carry_limit)
     try:
         await component.keeper.give()
-        filled, (segment,) = await component.keeper.ask(channel.Fill(name), tuple(chain))
+        filled, (segment,) = await component.keeper.ask(channel.Fill(name, owner != ROOT), tuple(chain))
     except (CheckpointError, GuardError, KeeperLostError):
         await component.undo()
         raise
+    component.notes = (*component.notes, *filled.notes)
     age_ns = outage_ns + commit_age_ns(outline)
     origin = Origin(outline.machine.robot, filled.position.generation, why, age_ns)
     totals = total_of(outline.output)

@@ -16,6 +16,7 @@ from agent.surroundings import Surroundings, program_of
 from checkpoint import format
 from checkpoint.engine import AUTO, COOPERATIVE
 from checkpoint.errors import RestoreError
+from failover.client.quantities import size_bytes
 from failover.core import acts
 
 LINE_LIMIT: Final = 300
@@ -41,13 +42,24 @@ async def brought_back(
         CheckpointError, AgentError: as `births.restore` and `births.begin_again`; nothing of it is left.
     """
     name, places, spec = act.component, around.places, act.spec
+    carry_limit = size_bytes(around.here(name).carry_limit)
     newest = await asyncio.to_thread(format.read_outline, chain[-1])
     if newest.engine != COOPERATIVE:
         if waiting is not None:
             await waiting.undo()
         owner = spec.owner if spec is not None else None
         task = Task(act.epoch, engine=AUTO) if spec is not None and spec.launch.engine == AUTO else None
-        return await births.restore(name, chain, places, outage_ns=outage_ns, owner=owner, laps=laps, task=task, epoch=act.epoch)
+        return await births.restore(
+            name,
+            chain,
+            places,
+            outage_ns=outage_ns,
+            owner=owner,
+            laps=laps,
+            task=task,
+            epoch=act.epoch,
+            carry_limit=carry_limit,
+        )
     if spec is None:
         raise RestoreError(f"cannot start {name} again: this robot was never told its command; start it by failover run")
     program = program_of(started_here(spec.launch, around.here(name)))
@@ -61,6 +73,7 @@ async def brought_back(
         epoch=act.epoch,
         why=act.why,
         waiting=waiting,
+        carry_limit=carry_limit,
     )
 
 

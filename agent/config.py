@@ -12,6 +12,7 @@ from typing import Final, Literal
 
 from agent.errors import ConfigError
 from agent.hooks import KINDS
+from checkpoint.engine import is_carriable
 from failover.client import strict_toml
 from failover.client import team as team_directory
 from failover.client.quantities import size_bytes, span_ms
@@ -76,6 +77,8 @@ class ComponentConfig:
         directory: and in this one, an absolute path; "" for that of `failover run`.
         environment: and with these variables besides, or instead.
         hooks: this robot's own commands around it.
+        carry: files and folders that travel with it when it is started here, besides those that `failover run` names.
+        carry_limit: what they may hold while it runs here.
     """
 
     on_loss: Literal["takeover", "hold"] = "takeover"
@@ -90,6 +93,8 @@ class ComponentConfig:
     directory: str = ""
     environment: dict[str, str] = field(default_factory=dict)
     hooks: HooksConfig = field(default_factory=HooksConfig)
+    carry: tuple[str, ...] = field(default_factory=tuple)
+    carry_limit: str = "256MB"
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,6 +267,7 @@ def _check_components(path: Path, config: Config, members: Team) -> None:
                 f"{where}: snapshot_period_ms is {component.snapshot_period_ms}; at most {PERIOD_MS_MAX}; 0 means the agent's own"
             )
         _check_command(where, component)
+        _check_carry(where, component)
 
 
 def _check_choice(where: str, key: str, chosen: str, members: Team, roles: set[str]) -> None:
@@ -272,6 +278,17 @@ def _check_choice(where: str, key: str, chosen: str, members: Team, roles: set[s
         able = ", ".join(sorted(name for name, member in members.robots.items() if member.role in roles)) or "nobody"
         what = "runs nothing" if key == "prefer" else "keeps no checkpoints"
         raise ConfigError(f"{where}: {key} = {chosen!r}: it is a {members.robots[chosen].role} and {what}; choose among {able}")
+
+
+def _check_carry(where: str, component: ComponentConfig) -> None:
+    """A path that names nothing in full would carry something else on another robot."""
+    for path in component.carry:
+        if not is_carriable(path):
+            raise ConfigError(f"{where}: carry holds {path!r}; name each file or folder by its whole path, without . and ..")
+    try:
+        size_bytes(component.carry_limit)
+    except ValueError as error:
+        raise ConfigError(f"{where}: carry_limit: {error}") from error
 
 
 def _check_command(where: str, component: ComponentConfig) -> None:

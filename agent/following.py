@@ -9,6 +9,7 @@ from agent.nursery import KeeperLink
 from agent.places import Places
 from checkpoint import channel, errors
 from checkpoint.channel import Failed
+from checkpoint.engine import NOTHING_CARRIED
 from checkpoint.errors import CheckpointError, RestoreError, UnsupportedError
 
 
@@ -17,10 +18,12 @@ class Following:
 
     Attributes:
         followed: engine and pid; None while nothing is followed.
+        carry: files that travel with it.
     """
 
     def __init__(self, name: str, places: Places) -> None:
         self.followed: tuple[str, int] | None = None
+        self.carry = NOTHING_CARRIED
         self._name = name
         self._places = places
         self._link: KeeperLink | None = None
@@ -47,7 +50,7 @@ class Following:
         Raises:
             UnsupportedError, CheckpointError; KeeperLostError.
         """
-        order = channel.Protect(pid, self._name, bool(streams), self._places.robot, engine)
+        order = channel.Protect(pid, self._name, bool(streams), self._places.robot, engine, self.carry)
         try:
             protected, _ = await self.ask(order, streams)
         except UnsupportedError:

@@ -1,4 +1,4 @@
-"""Under which epoch each program on this robot was let run: noted before it runs, read by the next agent.
+"""Under which epoch each program on this robot was let run, and what it carries: noted before it runs, read by the next agent.
 
 One small file a component in the runtime directory: it has to outlive the agent, not the robot.
 """
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import msgspec
 
+from checkpoint.engine import NOTHING_CARRIED, Carry
 from checkpoint.shelf import folder_name
 
 
@@ -18,6 +19,7 @@ class Running(msgspec.Struct, frozen=True):
 
     component: str
     epoch: int
+    carry: Carry = NOTHING_CARRIED
 
 
 class Records:
@@ -27,7 +29,7 @@ class Records:
         self._directory = directory
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
 
-    def note(self, component: str, epoch: int) -> None:
+    def note(self, component: str, epoch: int, carry: Carry = NOTHING_CARRIED) -> None:
         """From now on it runs under this epoch.
 
         Raises:
@@ -35,15 +37,24 @@ class Records:
         """
         path = self._path(component)
         aside = path.with_suffix(".new")
-        aside.write_bytes(msgspec.json.encode(Running(component, epoch)))
+        aside.write_bytes(msgspec.json.encode(Running(component, epoch, carry)))
         aside.replace(path)
 
     def epoch(self, component: str) -> int:
         """Under which it runs; 0 if nobody noted it."""
+        noted = self._noted(component)
+        return noted.epoch if noted else 0
+
+    def carry(self, component: str) -> Carry:
+        """Which files travel with it."""
+        noted = self._noted(component)
+        return noted.carry if noted else NOTHING_CARRIED
+
+    def _noted(self, component: str) -> Running | None:
         try:
-            return msgspec.json.decode(self._path(component).read_bytes(), type=Running).epoch
+            return msgspec.json.decode(self._path(component).read_bytes(), type=Running)
         except (OSError, msgspec.MsgspecError):
-            return 0
+            return None
 
     def forget(self, component: str) -> None:
         """It runs here no longer."""

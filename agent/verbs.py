@@ -32,6 +32,7 @@ from agent.places import Places
 from agent.questions import Lines, Questions
 from agent.rules import level_of, rules_for
 from checkpoint import portable
+from checkpoint.engine import is_carriable
 from failover.core import acts, events
 from failover.core.names import check_component, weight
 from failover.core.types import COMMITTED, ComponentSpec, Launch, State
@@ -126,6 +127,7 @@ class Verbs(Questions):
             engine=wanted.engine,
             output=wanted.output,
             hooks=tuple((occasion, tuple(command)) for occasion, command in wanted.hooks.items() if command),
+            carry=self._carried(name, wanted.carry),
         )
         charge = await self._begin(name, launch, inheritance.uid)
         started: dict[str, Any] = {"name": name, "notes": list(charge.figures.notes), "reasons": list(charge.figures.reasons)}
@@ -157,7 +159,7 @@ class Verbs(Questions):
             if known.component is not None and known.component.pid == wanted.pid:
                 raise RefusedError(f"pid {wanted.pid} is protected already, as {known.name}; failover release lets it go")
         name = await self._fresh_name(wanted.name, "", say.caller.uid)
-        charge = await self._begin(name, Launch(pid=wanted.pid), owner)
+        charge = await self._begin(name, Launch(pid=wanted.pid, carry=self._carried(name, wanted.carry)), owner)
         return {"name": name, "pid": wanted.pid, "notes": list(charge.figures.notes)}
 
     async def release(self, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -268,6 +270,18 @@ class Verbs(Questions):
         return {"name": name, "totals": list(totals), "exit_status": view.get("exit_status")}
 
     # --- what verbs share ---
+
+    def _carried(self, name: str, wanted: list[str]) -> tuple[str, ...]:
+        """What travels with a component: what was asked for, and what this robot's operator wants besides.
+
+        Raises:
+            RefusedError: it is no path that means the same on every robot.
+        """
+        paths = tuple(dict.fromkeys((*wanted, *self._lanes.settings.component(name).carry)))
+        for path in paths:
+            if not is_carriable(path):
+                raise RefusedError(f"cannot carry {path!r}: name the file or folder by its whole path, without . and ..")
+        return paths
 
     async def _begin(self, name: str, launch: Launch, owner: int) -> Charge:
         """Have a component started or taken in, and wait until it is.

@@ -11,6 +11,7 @@ from typing import Final
 from checkpoint.capability import Area, Capability, Verdict
 from checkpoint.engines import preserved, restore_checks, restore_vdso
 from checkpoint.resources import (
+    carried_trees,
     devices,
     elsewhere,
     epolls,
@@ -39,6 +40,7 @@ CARRIERS: Final[tuple[ModuleType, ...]] = (
     refused_threads,
     shared_objects,
     files,
+    carried_trees,
     kernel_files,
     memory_files,
     locks,

@@ -18,7 +18,7 @@ from typing import Any, Final, Generic, TypeVar
 import msgspec
 
 from checkpoint.capability import Capability
-from checkpoint.engine import PTRACE, Report
+from checkpoint.engine import NOTHING_CARRIED, PTRACE, Carry, Report
 from checkpoint.errors import UNDECODABLE, CheckpointError
 from checkpoint.model import Position
 
@@ -211,6 +211,7 @@ class Protect(msgspec.Struct, frozen=True, tag=True):
     streams: bool = False
     robot: str = ""
     engine: str = PTRACE
+    carry: Carry = NOTHING_CARRIED
 
 
 class Capture(msgspec.Struct, frozen=True, tag=True):
@@ -239,6 +240,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
     Attributes:
         streams: the last five descriptors are the streams, as with `Protect`.
         own_eyes, epoch, contents: see `checkpoint.engine.RestoreOptions`.
+        carry: what it carries from now on.
     """
 
     pid: int
@@ -249,6 +251,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
     robot: str = ""
     own_eyes: bool = False
     epoch: int = 0
+    carry: Carry = NOTHING_CARRIED
     contents: str = ""
 
 
@@ -264,9 +267,15 @@ class OpenFile(msgspec.Struct, frozen=True, tag=True):
 
 
 class Fill(msgspec.Struct, frozen=True, tag=True):
-    """Make a segment that holds the state of a cooperative chain; with descriptors: its files, oldest first. Answer: `Filled`."""
+    """Make a segment that holds the state of a cooperative chain, and lay its carried files down; with descriptors: the chain's
+    files, oldest first. Answer: `Filled`.
+
+    Attributes:
+        own_eyes: see `checkpoint.engine.RestoreOptions`.
+    """
 
     component: str
+    own_eyes: bool = False
 
 
 class Resume(msgspec.Struct, frozen=True, tag=True):
@@ -332,9 +341,10 @@ class Unchanged(msgspec.Struct, frozen=True, tag=True):
 
 
 class Filled(msgspec.Struct, frozen=True, tag=True):
-    """The segment, as a descriptor."""
+    """The segment, as a descriptor; ``notes`` tell of carried files."""
 
     position: Position
+    notes: tuple[str, ...] = ()
 
 
 class Opened(msgspec.Struct, frozen=True, tag=True):

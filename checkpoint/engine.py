@@ -6,6 +6,7 @@ from below this file.
 
 from __future__ import annotations
 
+import os.path
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -85,6 +86,31 @@ class Streams:
     counters: int
     outputs: tuple[int, int]
     logs: tuple[int, int]
+
+
+CARRIED_SIZE_MAX: Final = 256 << 20
+"""Bytes that the carried files of one component may hold, unless its operator says otherwise: the keeper holds a copy."""
+
+
+@dataclass(frozen=True, slots=True)
+class Carry:
+    """Which files travel with a component (rule ``carry``).
+
+    Attributes:
+        paths: of files, and of folders with all that is in them; absolute.
+        size_max: bytes that they may hold together.
+    """
+
+    paths: tuple[str, ...] = ()
+    size_max: int = CARRIED_SIZE_MAX
+
+
+NOTHING_CARRIED: Final = Carry()
+
+
+def is_carriable(path: str) -> bool:
+    """Whether a path names a file or folder in full: absolute, normal, and not the root of everything."""
+    return path.startswith("/") and path not in ("/", "//") and os.path.normpath(path) == path and "\0" not in path
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,10 +223,11 @@ class Engine(Protocol):
         """
         ...
 
-    def protect(self, pid: int, component: str, streams: Streams | None) -> Session:
+    def protect(self, pid: int, component: str, streams: Streams | None, carry: Carry = NOTHING_CARRIED) -> Session:
         """Begin to follow a process.
 
         Args:
+            carry: its files that travel with it.
             streams: the guard's ends of its standard streams, if it lives under a guard; the session owns them from now on.
 
         Raises:

@@ -98,7 +98,7 @@ class Keeper:
         self._robot = request.robot
         streams = streams_of(descriptors) if request.streams else None
         chosen = self._tracer if request.engine == self._tracer.name else engine.engine_named(request.engine)
-        self._session = chosen.protect(request.pid, request.component, streams)
+        self._session = chosen.protect(request.pid, request.component, streams, request.carry)
         return channel.Protected(self._session.notes), ()
 
     def _capture(self, request: channel.Capture, _: Descriptors) -> Answer:
@@ -148,9 +148,11 @@ class Keeper:
         finally:
             channel.close_all(descriptors)
         from checkpoint.engines.cooperative import fill_segment
+        from checkpoint.resources import laying
 
         segment = fill_segment(state)
-        return channel.Filled(state.position), (segment.descriptor,)
+        laid = laying.lay_down_for(state, os.getpid(), own_eyes=request.own_eyes)
+        return channel.Filled(state.position, laid.notes), (segment.descriptor,)
 
     def _open_file(self, request: channel.OpenFile, _: Descriptors) -> Answer:
         session = self._following("open a file of what is followed")
@@ -164,12 +166,12 @@ class Keeper:
         restored.resume()
         request, streams = revived
         self._robot = request.robot
-        return channel.Resumed(self._follow(restored.pid, request.component, streams)), ()
+        return channel.Resumed(self._follow(restored.pid, request, streams)), ()
 
-    def _follow(self, pid: int, component: str, streams: Streams | None) -> tuple[str, ...]:
+    def _follow(self, pid: int, request: channel.Restore, streams: Streams | None) -> tuple[str, ...]:
         """Protect what has just been let go; that it cannot be protected again must not end it."""
         try:
-            self._session = self._tracer.protect(pid, component, streams)
+            self._session = self._tracer.protect(pid, request.component, streams, request.carry)
         except CheckpointError as error:
             return (f"{channel.UNPROTECTED}: {error}",)
         return self._session.notes

@@ -27,6 +27,8 @@ class VmaKind(enum.StrEnum):
     VDSO = "vdso"
     VVAR = "vvar"
     VSYSCALL = "vsyscall"
+    CARRIED_FILE = "carried_file"
+    """None of the process's: the content of a file that travels with it, see `checkpoint.carried`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
+from checkpoint import carried
 from checkpoint.model import Fact, FileIdentity, Snapshot, Vma, VmaKind
 
 OPEN_FILES: Final = "files"
@@ -51,7 +52,13 @@ def needs(state: Snapshot, *, opened: bool = True) -> tuple[Need, ...]:
     found += [_need(vma.file) for vma in state.vmas if vma.file is not None and _is_run(vma)]
     if opened:
         found += _opened(state)
-    return tuple({need.path: need for need in found}.values())
+    carry = carried.paths_of(state)
+    return tuple({need.path: need for need in found if not _is_below(need.path, carry)}.values())
+
+
+def _is_below(path: str, folders: tuple[str, ...]) -> bool:
+    """Whether a file travels with the snapshot, as one of those that the program carries."""
+    return any(path == folder or path.startswith(folder + "/") for folder in folders)
 
 
 def _need(file: FileIdentity) -> Need:

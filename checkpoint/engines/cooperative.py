@@ -19,21 +19,23 @@ A delta is made against what was acknowledged, as everywhere: pages whose versio
 
 from __future__ import annotations
 
+import contextlib
 import os
 import secrets
 import socket
 import time
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from checkpoint import pages
+from checkpoint import carried, pages
 from checkpoint.chain import position_of
 from checkpoint.engine import COOPERATIVE, CaptureOrder
-from checkpoint.errors import CaptureError, NothingCommittedError, RestoreError, SegmentError
+from checkpoint.errors import CaptureError, NothingCommittedError, RestoreError, SegmentError, UnsupportedError
 from checkpoint.linux import abi, procfs
 from checkpoint.model import (
     Clocks,
@@ -58,6 +60,7 @@ from checkpoint.stream_counts import Totals
 
 if TYPE_CHECKING:
     from checkpoint.engines.outputs import Outputs  # which loads the keeper's library: a program that keeps its state has none
+    from checkpoint.resources.carried_trees import CarriedTrees, Parcel, Seen
 
 KIND: Final = "task"
 MAX_WAITING: Final = 64
@@ -88,7 +91,16 @@ class CooperativeSession:
 
     notes: tuple[str, ...] = ()
 
-    def __init__(self, reader: SegmentReader, pid: int, component: str, outputs: Outputs | None = None) -> None:
+    def __init__(
+        self,
+        reader: SegmentReader,
+        pid: int,
+        component: str,
+        outputs: Outputs | None = None,
+        trees: CarriedTrees | None = None,
+    ) -> None:
+        self._pid = pid
+        self._trees = trees
         self.totals: Totals = (0, 0)
         self._outputs = outputs
         self._reader = reader
@@ -120,16 +132,41 @@ class CooperativeSession:
         if parent is not None and parent.lineage != layout.lineage:
             parent = None
         until_now = self._outputs.totals() if self._outputs else (0, 0)
-        committed = self._reader.read(parent.commit if parent else 0)
+        committed, seen = self._look(parent, is_held=order.hold)
         if committed is None and parent is None:
             raise NothingCommittedError(f"cannot capture {self._component}: it has committed nothing yet")
         if committed is None or (parent is not None and self._outputs and committed.outputs is PENDING):
             committed = _nothing_since(parent, layout)
         totals = self._totals_of(committed, until_now) if self._outputs else (0, 0)
-        snapshot, table = self._snapshot(committed, parent, order, totals)
+        parcel = self._trees.parcel(seen, parent.position if parent else None) if self._trees and seen else None
+        snapshot, table = self._snapshot(committed, parent, order, totals, parcel)
+        if self._trees:
+            self._trees.settle(snapshot.position)
         self._waiting.append(_Mark(snapshot.position, committed.number, layout.lineage, committed.clocks, table, totals))
         self.totals = totals
         return snapshot
+
+    def _look(self, parent: _Mark | None, *, is_held: bool) -> tuple[Committed | None, Seen | None]:
+        """The newest commit, and the carried files of an instant at which it was the newest: the program stands still meanwhile.
+
+        Args:
+            is_held: it stands still already.
+
+        Raises:
+            UnsupportedError: what is to be carried cannot be.
+            CaptureError: it could not be made to stand still, or the files change all the same.
+        """
+        since = parent.commit if parent else 0
+        if self._trees is None:
+            return self._reader.read(since), None
+        self._trees.prepare()
+        with contextlib.nullcontext() if is_held else _standing_still(self._pid):
+            lines = procfs.parse_maps(procfs.read_text(self._pid, "maps"))
+            seen = self._trees.look(line.inode for line in lines if line.shared)
+            committed = self._reader.read(since)
+        if reasons := self._trees.reasons(seen):
+            raise UnsupportedError(f"cannot capture {self._component}: {'; '.join(reasons)}", reasons)
+        return committed, seen
 
     def _totals_of(self, committed: Committed, until_now: Totals) -> Totals:
         """Where the output of a commit ends.
@@ -159,6 +196,8 @@ class CooperativeSession:
         for mark in self._waiting:
             if mark.position == position:
                 self._acknowledged = mark
+                if self._trees:
+                    self._trees.keep((position, *(waiting.position for waiting in self._waiting)))
 
     def unchanged(self) -> Position | None:
         """The newest acknowledged position, if nothing was committed since; then a capture would say nothing new."""
@@ -186,11 +225,15 @@ class CooperativeSession:
         self._reader.close()
 
     def _snapshot(
-        self, committed: Committed, parent: _Mark | None, order: CaptureOrder, totals: Totals
+        self, committed: Committed, parent: _Mark | None, order: CaptureOrder, totals: Totals, parcel: Parcel | None
     ) -> tuple[Snapshot, PageTable]:
-        runs = pages.page_runs(pages.extents_of_addresses(committed.layout.addresses()[committed.pages.astype(np.int64)], PAGE))
-        vmas = tuple(_vma(region) for region in committed.layout.regions)
-        table = (parent.table if parent else PageTable.empty(PAGE)).apply((), runs, committed.contents, vmas)
+        addresses, contents = committed.layout.addresses()[committed.pages.astype(np.int64)], committed.contents
+        if parcel is not None and len(parcel.addresses):
+            addresses, contents = np.concatenate((addresses, parcel.addresses)), memoryview(b"".join((contents, parcel.content)))
+        runs = pages.page_runs(pages.extents_of_addresses(addresses, PAGE))
+        vmas = (*(_vma(region) for region in committed.layout.regions), *(parcel.vmas if parcel else ()))
+        cleared = parcel.cleared if parcel and parent else ()
+        table = (parent.table if parent else PageTable.empty(PAGE)).apply(cleared, runs, contents, vmas)
         made = Snapshot(
             component=self._component,
             engine=COOPERATIVE,
@@ -201,9 +244,10 @@ class CooperativeSession:
             process=self._process,
             threads=(),
             vmas=vmas,
-            resources=(Resource(KIND, self._component, self._facts(committed)),),
+            resources=(Resource(KIND, self._component, self._facts(committed)), *(parcel.resources if parcel else ())),
+            cleared=cleared,
             runs=runs,
-            contents=committed.contents,
+            contents=contents,
             page_sum=table.page_sum,
             epoch=order.epoch,
             output=self._outputs.pieces(parent.totals if parent else (0, 0), totals) if self._outputs else (),
@@ -218,6 +262,24 @@ class CooperativeSession:
             "directory": self._directory,
             "regions": [[region.kind, region.size] for region in committed.layout.regions],
         }
+
+
+@contextlib.contextmanager
+def _standing_still(pid: int) -> Iterator[None]:
+    """Hold all threads of a program for the body.
+
+    Raises:
+        CaptureError: it cannot be held.
+    """
+    from checkpoint.linux.threads import Threads
+    from checkpoint.linux.tracee import Tracee
+
+    threads = Threads(Tracee(pid))
+    threads.freeze()
+    try:
+        yield
+    finally:
+        threads.thaw()
 
 
 def _nothing_since(parent: _Mark | None, layout: Layout) -> Committed:
@@ -312,6 +374,7 @@ def regions_of(state: Snapshot) -> tuple[tuple[Region, NDArray[np.uint8]], ...]:
         raise RestoreError(
             f"cannot restore {state.component}: it is no whole snapshot of the {COOPERATIVE} engine but of {state.engine}"
         )
+    state = carried.without(state)
     regions = tuple(_region(vma, kind, size) for vma, (kind, size) in zip(state.vmas, _sizes(state), strict=True))
     try:
         Layout(regions, bytes(16)).check()

@@ -6,12 +6,26 @@ nothing, and each capture looks where its commits go now.
 
 from __future__ import annotations
 
-from checkpoint.engine import COOPERATIVE, NOTED, CaptureOrder, Finding, Report, Restored, RestoreOptions, Session, Streams
+from checkpoint.engine import (
+    COOPERATIVE,
+    NOTED,
+    NOTHING_CARRIED,
+    CaptureOrder,
+    Carry,
+    Finding,
+    Report,
+    Restored,
+    RestoreOptions,
+    Session,
+    Streams,
+)
 from checkpoint.engines.cooperative import CooperativeSession, now, open_segment
 from checkpoint.engines.outputs import Outputs
-from checkpoint.errors import CaptureError, ProcessGoneError, RestoreError
+from checkpoint.errors import CaptureError, ProcessGoneError, RestoreError, UnsupportedError
 from checkpoint.linux import procfs
 from checkpoint.model import Position, Snapshot
+from checkpoint.resources import carried_trees
+from checkpoint.resources.carried_trees import CarriedTrees
 
 
 class GuardedTask:
@@ -19,11 +33,13 @@ class GuardedTask:
 
     notes: tuple[str, ...] = ()
 
-    def __init__(self, pid: int, component: str, streams: Streams | None) -> None:
+    def __init__(self, pid: int, component: str, streams: Streams | None, carry: Carry = NOTHING_CARRIED) -> None:
         self.pid = pid
         self.component = component
         self._outputs = Outputs(streams) if streams else None
         self._session: CooperativeSession | None = None
+        self._carry = carry
+        self._trees: CarriedTrees | None = None
 
     @property
     def totals(self) -> tuple[int, int]:
@@ -65,7 +81,9 @@ class GuardedTask:
             self._session.close()
         if self._outputs:
             self._outputs.close()
-        self._session = self._outputs = None
+        if self._trees:
+            self._trees.close()
+        self._session = self._outputs = self._trees = None
 
     def _following(self) -> CooperativeSession:
         """The session, on the segment that commits go to now.
@@ -74,10 +92,26 @@ class GuardedTask:
             CaptureError: there is none.
         """
         if self._session is None:
-            self._session = CooperativeSession(open_segment(self.pid), self.pid, self.component, self._outputs)
+            reader, trees = open_segment(self.pid), self._follow_files()
+            self._session = CooperativeSession(reader, self.pid, self.component, self._outputs, trees)
         elif self._session.reader.is_superseded:
             self._session.go_on_in(open_segment(self.pid))
         return self._session
+
+    def _follow_files(self) -> CarriedTrees | None:
+        """What follows the carried files, if there are any.
+
+        Raises:
+            UnsupportedError: they cannot be carried.
+        """
+        if self._trees is None and self._carry.paths:
+            trees = carried_trees.followed(self.pid, self._carry)
+            assert trees is not None, "it has paths"
+            if reasons := trees.refuse():
+                trees.close()
+                raise UnsupportedError(f"cannot capture {self.component}: {'; '.join(reasons)}", reasons)
+            self._trees = trees
+        return self._trees
 
 
 class CooperativeEngine:
@@ -92,9 +126,9 @@ class CooperativeEngine:
         text = "only what it commits comes back; the program is started again and resumes from that"
         return Report(pid, command, 0, "versions", (Finding("process", f"pid {pid}", NOTED, text),))
 
-    def protect(self, pid: int, component: str, streams: Streams | None) -> Session:
+    def protect(self, pid: int, component: str, streams: Streams | None, carry: Carry = NOTHING_CARRIED) -> Session:
         """See `checkpoint.engine.Engine.protect`."""
-        return GuardedTask(pid, component, streams)
+        return GuardedTask(pid, component, streams, carry)
 
     def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
         """Refused: see the class."""

@@ -5,7 +5,7 @@ Imported by the keeper alone, and at once: a keeper that waits in advance must n
 
 from __future__ import annotations
 
-from checkpoint.engine import PTRACE, Report, Restored, RestoreOptions, Session, Streams
+from checkpoint.engine import NOTHING_CARRIED, PTRACE, Carry, Report, Restored, RestoreOptions, Session, Streams
 from checkpoint.engines.probe import probe
 from checkpoint.engines.ptrace_capture import PtraceSession
 from checkpoint.engines.ptrace_restore import restore
@@ -21,9 +21,9 @@ class PtraceEngine:
         """See ``checkpoint.engine.Engine.probe``."""
         return probe(pid)
 
-    def protect(self, pid: int, component: str, streams: Streams | None) -> Session:
+    def protect(self, pid: int, component: str, streams: Streams | None, carry: Carry = NOTHING_CARRIED) -> Session:
         """See ``checkpoint.engine.Engine.protect``."""
-        return PtraceSession.open(pid, component, streams)
+        return PtraceSession.open(pid, component, streams, carry)
 
     def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
         """See ``checkpoint.engine.Engine.restore``."""

@@ -20,13 +20,15 @@ import functools
 import gc
 import operator
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
+
+import numpy as np
 
 from checkpoint import pages, portable
 from checkpoint.arch import x86_64_xstate
 from checkpoint.chain import position_of
-from checkpoint.engine import PTRACE, CaptureOrder, Streams
+from checkpoint.engine import NOTHING_CARRIED, PTRACE, CaptureOrder, Carry, Streams
 from checkpoint.engines import description, entering
 from checkpoint.engines import probe as probing
 from checkpoint.engines.capture_memory import MemoryCapture, RunningCopy, Taken
@@ -44,7 +46,8 @@ from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.tracking import NONE
 from checkpoint.model import Position, Snapshot
 from checkpoint.pages import PageTable
-from checkpoint.resources import Surroundings, glance, look, unsupported
+from checkpoint.resources import Surroundings, carried_trees, glance, look, unsupported
+from checkpoint.resources.carried_trees import NO_PARCEL, CarriedTrees, Parcel, Seen
 from checkpoint.stream_counts import Totals
 
 NS_PER_US: Final = 1000
@@ -56,11 +59,13 @@ class Frozen:
 
     Attributes:
         freeze_us: how long the program stood still.
+        seen: its carried files.
     """
 
     standing: Standing
     taken: Taken
     freeze_us: int
+    seen: Seen = field(default_factory=Seen)
 
 
 def _xstate_mask(standing: Standing) -> int:
@@ -77,7 +82,7 @@ class PtraceSession:
         frozen_size: bytes of pages that the last capture copied while the program stood still.
     """
 
-    def __init__(self, pid: int, component: str, threads: Threads, entered: Entered) -> None:
+    def __init__(self, pid: int, component: str, threads: Threads, entered: Entered, trees: CarriedTrees | None = None) -> None:
         self.pid = pid
         self.component = component
         self.notes = entered.notes
@@ -91,6 +96,7 @@ class PtraceSession:
         self._flags_of: tuple[MapsLine, ...] = ()
         self._identities = Identities(pid)
         self._outputs: Outputs | None = None
+        self._carried = trees
         self._table = PageTable.empty(abi.PAGE_SIZE)
         self._totals_at: dict[Position, Totals] = {}
         self._refused = False
@@ -101,20 +107,24 @@ class PtraceSession:
     # Opening and closing
 
     @classmethod
-    def open(cls, pid: int, component: str, streams: Streams | None) -> PtraceSession:
+    def open(cls, pid: int, component: str, streams: Streams | None, carry: Carry = NOTHING_CARRIED) -> PtraceSession:
         """See ``checkpoint.engine.Engine.protect``."""
         outputs = Outputs(streams) if streams else None
+        trees = None
         try:
             report = probing.probe(pid, streams)
-            if not report.supported:
-                listed = "; ".join(report.reasons)
-                raise UnsupportedError(f"cannot protect pid {pid} ({report.command}): {listed}", report.reasons)
+            trees = carried_trees.followed(pid, carry)
+            reasons = (*report.reasons, *(trees.refuse() if trees else ()))
+            if reasons:
+                raise UnsupportedError(f"cannot protect pid {pid} ({report.command}): {'; '.join(reasons)}", reasons)
             interruptions = Interruptions()
             threads = Threads(Tracee(pid), interruptions.mend)
-            session = cls(pid, component, threads, entering.enter(threads, interruptions))
+            session = cls(pid, component, threads, entering.enter(threads, interruptions), trees)
         except BaseException:
             if outputs:
                 outputs.close()
+            if trees:
+                trees.close()
             raise
         session._outputs = outputs
         session.notes += report.notes
@@ -130,6 +140,8 @@ class PtraceSession:
         self._memory.close()
         if self._outputs:
             self._outputs.close()
+        if self._carried:
+            self._carried.close()
 
     def acknowledge(self, position: Position) -> None:
         """See ``checkpoint.engine.Session.acknowledge``. A position that is not known (any more) changes nothing."""
@@ -144,6 +156,8 @@ class PtraceSession:
         """Of positions that no delta can be relative to any more."""
         known = self._memory.positions()
         self._totals_at = {position: totals for position, totals in self._totals_at.items() if position in known}
+        if self._carried:
+            self._carried.keep(known)
 
     # Capturing
 
@@ -154,6 +168,8 @@ class PtraceSession:
             self._look_from_outside()
         try:
             self._onlooker.prepare()
+            if self._carried:
+                self._carried.prepare()
             copied = self._copy_running(base=parent is None)
             frozen = self._frozen_look(copied, base=parent is None, hold=order.hold)
         except ProcessGoneError as error:
@@ -176,7 +192,8 @@ class PtraceSession:
         """What was refused once is looked at without stopping it: a program that has an epoll for a week is left in peace."""
         with contextlib.suppress(ProcessGoneError, ProbeError):
             held = look(glance(self.pid), self._outputs.surroundings if self._outputs else Surroundings())
-            self._refuse((*held.reasons, *unsupported.refuse_process(self.pid, procfs.status(self.pid))))
+            of_files = self._carried.refuse() if self._carried else ()
+            self._refuse((*held.reasons, *unsupported.refuse_process(self.pid, procfs.status(self.pid)), *of_files))
 
     def _refuse(self, reasons: tuple[str, ...]) -> None:
         self._refused = bool(reasons)
@@ -201,6 +218,7 @@ class PtraceSession:
             place = self._onlooker.place()
             taken = self._memory.take(copied, base=base)
             standing = self._onlooker.ask(place, self._outputs)
+            seen = self._carried.look(line.inode for line in taken.lines if line.shared) if self._carried else Seen()
         except BaseException:
             self._thaw()
             raise
@@ -208,7 +226,7 @@ class PtraceSession:
             self._hold()
         else:
             self._thaw()
-        return Frozen(standing, taken, (time.perf_counter_ns() - began) // NS_PER_US)
+        return Frozen(standing, taken, (time.perf_counter_ns() - began) // NS_PER_US, seen)
 
     def _freeze(self) -> int:
         """Stop it, nothing of ours half done inside; answers when that began."""
@@ -244,15 +262,19 @@ class PtraceSession:
         """The snapshot of what a freeze brought home."""
         standing, taken = frozen.standing, frozen.taken
         held = look(standing.opened, self._outputs.surroundings if self._outputs else Surroundings())
-        reasons = (*held.reasons, *self._reasons_of(standing.status, taken.lines))
+        of_files = self._carried.reasons(frozen.seen) if self._carried else ()
+        reasons = (*held.reasons, *self._reasons_of(standing.status, taken.lines), *of_files)
         self._refuse(reasons)
+        parcel = self._carried.parcel(frozen.seen, parent) if self._carried else NO_PARCEL
         snapshot = replace(
-            self._with_pages(self._outline(order, parent, frozen), taken),
-            resources=held.resources,
+            self._with_pages(self._outline(order, parent, frozen, parcel), taken, parcel),
+            resources=(*held.resources, *parcel.resources),
             output=self._outputs.pieces(self._output_since(parent), standing.totals) if self._outputs else (),
         )
         snapshot = replace(snapshot, position=position_of(snapshot, order.generation, order.sequence))
         self._memory.settle(snapshot.position)
+        if self._carried:
+            self._carried.settle(snapshot.position)
         self._totals_at[snapshot.position] = self.totals = standing.totals
         self._forget_totals()
         return snapshot
@@ -261,7 +283,7 @@ class PtraceSession:
         """Where a snapshot's output begins: a base may go to a robot that has nothing yet."""
         return self._totals_at.get(parent, (0, 0)) if parent else (0, 0)
 
-    def _outline(self, order: CaptureOrder, parent: Position | None, frozen: Frozen) -> Snapshot:
+    def _outline(self, order: CaptureOrder, parent: Position | None, frozen: Frozen, parcel: Parcel) -> Snapshot:
         """A snapshot without pages, descriptors and output."""
         standing, taken = frozen.standing, frozen.taken
         return Snapshot(
@@ -278,18 +300,20 @@ class PtraceSession:
             clocks=standing.told.clocks,
             process=process_state(self.pid, standing, self._identities),
             threads=thread_states(self.pid, standing),
-            vmas=self._identities.vmas(taken.lines, self._flags, taken.guards),
+            vmas=(*self._identities.vmas(taken.lines, self._flags, taken.guards), *parcel.vmas),
             epoch=order.epoch,
             freeze_us=frozen.freeze_us,
             notes=self.notes,
         )
 
-    def _with_pages(self, outline: Snapshot, taken: Taken) -> Snapshot:
-        """Add the pages: zero pages of anonymous memory are told, not carried."""
+    def _with_pages(self, outline: Snapshot, taken: Taken, parcel: Parcel) -> Snapshot:
+        """Add the pages: zero pages of anonymous memory are told, not carried. Carried files have the highest addresses."""
         addresses, content, zero = taken.contents()
+        if len(parcel.addresses):
+            addresses, content = np.concatenate((addresses, parcel.addresses)), memoryview(b"".join((content, parcel.content)))
         runs = pages.page_runs(pages.extents_of_addresses(addresses, abi.PAGE_SIZE))
         is_base = outline.parent is None
-        forgotten = () if is_base else pages.page_runs(pages.union(taken.cleared, zero))
+        forgotten = () if is_base else (*pages.page_runs(pages.union(taken.cleared, zero)), *parcel.cleared)
         before = PageTable.empty(abi.PAGE_SIZE) if is_base else self._table
         self._table = before.apply(forgotten, runs, content, outline.vmas)
         return replace(outline, cleared=forgotten, runs=runs, contents=content, page_sum=self._table.page_sum)

@@ -3,6 +3,7 @@
 ::
 
     checks                       this machine has what the snapshot needs (`restore_checks`); nothing is touched before
+    carried files                laid down at their paths (`resources.laying`)
     seize, stand in a hole       the vessel is ours and dies with us; loop and tables lie where neither has a mapping
     first table                  its own mappings go, the vdso moves, everything the program had is mapped
     pages                        written from outside
@@ -26,7 +27,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from checkpoint import epoch_variable
+from checkpoint import carried, epoch_variable
 from checkpoint.arch import x86_64, x86_64_stub, x86_64_xstate
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import restore_checks, restore_memory, restore_process, restore_threads, restore_vdso, switches
@@ -38,7 +39,7 @@ from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee
 from checkpoint.model import Credentials, Position, Snapshot, ThreadState, Vma
-from checkpoint.resources import files
+from checkpoint.resources import files, laying, remembered
 from checkpoint.resources.rebuild import rebuild_all, rebuild_last
 from checkpoint.resources.rebuilding import number_of
 
@@ -85,9 +86,16 @@ def restore(vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restor
     """See ``checkpoint.engine.Engine.restore``."""
     if not state.is_base:
         raise RestoreError("cannot restore a delta by itself: fold its chain first")
-    brought = restore_checks.require(state, options, vessel_pid)
+    program = carried.without(state)
+    if program is not state:
+        options = replace(options, accept_changed=(*options.accept_changed, *carried.every_path(state)))
+    brought = restore_checks.require(program, options, vessel_pid)
+    laid = laying.lay_down_for(state, vessel_pid, own_eyes=options.own_eyes)
+    program, _ = remembered.renewed(program, laid.identities)
     try:
-        return _Restore(vessel_pid, state, options, brought).run()
+        restored = _Restore(vessel_pid, program, options, brought).run()
+        restored.notes += laid.notes
+        return restored
     except RestoreError:
         raise
     except CheckpointError as error:

@@ -151,8 +151,10 @@ def _of_machine(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
         yield f"it has guard pages of madvise(2), which our kernel ({here.kernel}) does not know: boot Linux 6.13 or later"
     if state.process.root_directory != "/":
         yield f"its root directory is {state.process.root_directory}: programs in a chroot are not supported"
-    if not os.path.isdir(state.process.working_directory) and not (options.contents and missing_directories(state)):
-        yield f"its working directory {state.process.working_directory} is missing: make it"
+    directory = state.process.working_directory
+    is_made = directory in options.accept_changed or (options.contents and missing_directories(state))
+    if not os.path.isdir(directory) and not is_made:
+        yield f"its working directory {directory} is missing: make it"
 
 
 def missing_directories(state: Snapshot) -> tuple[str, ...]:

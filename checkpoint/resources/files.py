@@ -141,9 +141,15 @@ def _is_found(held: OpenFile) -> bool:
 
 
 def _has_just_lost_its_name(held: OpenFile) -> bool:
-    """Whether it was deleted since we looked, by a program that runs meanwhile: the next look finds it deleted."""
+    """Whether it was deleted or closed since we looked, by a program that runs meanwhile: the next look finds it otherwise."""
+    through = f"/proc/{held.pid}/fd/{held.first.number}"
     try:
-        return os.readlink(f"/proc/{held.pid}/fd/{held.first.number}") == held.first.target + procfs.DELETED
+        about = os.stat(through)
+        if (about.st_dev, about.st_ino) != (held.first.device, held.first.inode):
+            return True  # closed, and another one opened under its number, as a database does with its journals
+        return os.readlink(through) == held.first.target + procfs.DELETED
+    except FileNotFoundError:
+        return True
     except OSError:
         return False
 

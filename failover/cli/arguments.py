@@ -106,15 +106,28 @@ def run(room: argparse.ArgumentParser) -> None:
     for hook, when in HOOKS.items():
         option = f"--{hook.replace('_', '-')}"
         room.add_argument(option, metavar="CMD", type=shlex.split, default=[], help=f"run this, as you, {when}")
+    _carry(room)
     room.add_argument("--user", metavar="USER", help="run it as this user, by name or number (only root may; default: as you)")
     room.add_argument("command", metavar="CMD", nargs="+", help="the program and its arguments, after --")
     _agent(room)
+
+
+def _carry(room: argparse.ArgumentParser) -> None:
+    room.add_argument(
+        "--carry",
+        metavar="PATH",
+        action="append",
+        default=[],
+        help="let this file, or folder with all that is in it, travel with the program, as it was at each checkpoint; may be "
+        "given again (see docs/files.md)",
+    )
 
 
 def protect(room: argparse.ArgumentParser) -> None:
     """Of ``failover protect``."""
     _pid(room)
     room.add_argument("--name", metavar="NAME", help="its name (default: /TEAM/ROBOT/pid-PID)")
+    _carry(room)
     _agent(room)
 
 

@@ -34,6 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     wanted |= {"engine": arguments.engine, "isolate": arguments.isolate, "wait": not arguments.detach}
     wanted |= {"output": arguments.output, "hooks": {kind: getattr(arguments, kind) for kind in HOOKS}}
     wanted["portable"] = arguments.portable
+    wanted |= {"carry": [os.path.realpath(path) for path in arguments.carry]}
     if arguments.name:
         wanted["name"] = arguments.name
     if arguments.user:
@@ -179,7 +180,7 @@ def protect(arguments: argparse.Namespace) -> int:
     """Protect a process that runs already."""
     name = arguments.name or f"pid-{arguments.pid}"
     with connect(arguments) as agent:
-        answer = agent.ask("protect", pid=arguments.pid, name=name)
+        answer = agent.ask("protect", pid=arguments.pid, name=name, carry=[os.path.realpath(path) for path in arguments.carry])
     return _tell(arguments, answer, f"pid {answer['pid']} is protected as {answer['name']}")
 
 

@@ -125,6 +125,7 @@ class Launch:
         hooks: (occasion, command) pairs that came with the program and are run as its user, see `agent.hooks`.
         output: `IMMEDIATE` or `COMMITTED`: when what it writes is shown.
         inheritance: whose rights, limits and priorities it gets, packed (`checkpoint.linux.inheritance`); b"": the agent's own.
+        carry: files and folders that travel with it, as absolute paths.
     """
 
     argv: tuple[str, ...] = ()
@@ -138,6 +139,7 @@ class Launch:
     inheritance: bytes = b""
     output: str = IMMEDIATE
     hooks: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    carry: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
