@@ -11,6 +11,7 @@ from typing import Final
 from checkpoint.capability import Area, Capability, Verdict
 from checkpoint.engines import preserved, restore_checks, restore_vdso
 from checkpoint.resources import (
+    attached_devices,
     carried_trees,
     devices,
     elsewhere,
@@ -23,6 +24,7 @@ from checkpoint.resources import (
     locks,
     memory_files,
     pipes,
+    refused_devices,
     refused_threads,
     shared_objects,
     signalfds,
@@ -58,6 +60,8 @@ CARRIERS: Final[tuple[ModuleType, ...]] = (
     internet_sockets,
     streams,
     devices,
+    attached_devices,
+    refused_devices,
     unsupported,
     restore_checks,
     restore_vdso,

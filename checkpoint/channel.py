@@ -18,6 +18,7 @@ from typing import Any, Final, Generic, TypeVar
 import msgspec
 
 from checkpoint.capability import Capability
+from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import NOTHING_CARRIED, PTRACE, Carry, Report
 from checkpoint.errors import UNDECODABLE, CheckpointError
 from checkpoint.model import Position
@@ -212,6 +213,7 @@ class Protect(msgspec.Struct, frozen=True, tag=True):
     robot: str = ""
     engine: str = PTRACE
     carry: Carry = NOTHING_CARRIED
+    devices: tuple[DeviceRule, ...] = ()
 
 
 class Capture(msgspec.Struct, frozen=True, tag=True):
@@ -239,7 +241,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
 
     Attributes:
         streams: the last five descriptors are the streams, as with `Protect`.
-        own_eyes, epoch, contents: see `checkpoint.engine.RestoreOptions`.
+        own_eyes, epoch, contents, devices: see `checkpoint.engine.RestoreOptions`.
         carry: what it carries from now on.
     """
 
@@ -253,6 +255,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
     epoch: int = 0
     carry: Carry = NOTHING_CARRIED
     contents: str = ""
+    devices: tuple[DeviceRule, ...] = ()
 
 
 class OpenFile(msgspec.Struct, frozen=True, tag=True):

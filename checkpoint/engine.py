@@ -10,6 +10,7 @@ import os.path
 from dataclasses import dataclass
 from typing import Final, Protocol
 
+from checkpoint.device_rules import DeviceRule
 from checkpoint.errors import ProbeError
 from checkpoint.model import Position, Snapshot
 
@@ -140,6 +141,7 @@ class RestoreOptions:
         elapsed_ns: time between the snapshot and now, as far as known; the program's clocks go on by this much.
         accept_changed: paths of files that may differ from what the snapshot recorded (rule ``shared``).
         epoch: of the primacy under which it goes on; a program that was born with one finds it in its environment. 0: none.
+        devices: this robot's rules for its devices.
         own_eyes: open its files with its own user's rights, not with ours: that user could have put other files in their place.
         contents: directory of files that were brought along (`checkpoint.contents`), for what this machine lacks or has in
             another version; "": there are none.
@@ -150,6 +152,7 @@ class RestoreOptions:
     own_eyes: bool = False
     epoch: int = 0
     contents: str = ""
+    devices: tuple[DeviceRule, ...] = ()
 
 
 class Session(Protocol):
@@ -223,12 +226,20 @@ class Engine(Protocol):
         """
         ...
 
-    def protect(self, pid: int, component: str, streams: Streams | None, carry: Carry = NOTHING_CARRIED) -> Session:
+    def protect(
+        self,
+        pid: int,
+        component: str,
+        streams: Streams | None,
+        carry: Carry = NOTHING_CARRIED,
+        devices: tuple[DeviceRule, ...] = (),
+    ) -> Session:
         """Begin to follow a process.
 
         Args:
             carry: its files that travel with it.
             streams: the guard's ends of its standard streams, if it lives under a guard; the session owns them from now on.
+            devices: what its operator wants to become of devices that it has open.
 
         Raises:
             ProbeError: it cannot be looked into at all.

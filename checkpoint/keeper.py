@@ -98,7 +98,7 @@ class Keeper:
         self._robot = request.robot
         streams = streams_of(descriptors) if request.streams else None
         chosen = self._tracer if request.engine == self._tracer.name else engine.engine_named(request.engine)
-        self._session = chosen.protect(request.pid, request.component, streams, request.carry)
+        self._session = chosen.protect(request.pid, request.component, streams, request.carry, request.devices)
         return channel.Protected(self._session.notes), ()
 
     def _capture(self, request: channel.Capture, _: Descriptors) -> Answer:
@@ -137,7 +137,14 @@ class Keeper:
             state = folded(files)
         finally:
             channel.close_all(files)
-        options = RestoreOptions(request.elapsed_ns, request.accept_changed, request.own_eyes, request.epoch, request.contents)
+        options = RestoreOptions(
+            request.elapsed_ns,
+            request.accept_changed,
+            request.own_eyes,
+            request.epoch,
+            request.contents,
+            devices=request.devices,
+        )
         self._restored = self._tracer.restore(request.pid, state, options)
         self._revived = request, ends
         return channel.Restored(self._restored.pid, self._restored.position, self._restored.notes), ()
@@ -171,7 +178,7 @@ class Keeper:
     def _follow(self, pid: int, request: channel.Restore, streams: Streams | None) -> tuple[str, ...]:
         """Protect what has just been let go; that it cannot be protected again must not end it."""
         try:
-            self._session = self._tracer.protect(pid, request.component, streams, request.carry)
+            self._session = self._tracer.protect(pid, request.component, streams, request.carry, request.devices)
         except CheckpointError as error:
             return (f"{channel.UNPROTECTED}: {error}",)
         return self._session.notes

@@ -6,6 +6,7 @@ nothing, and each capture looks where its commits go now.
 
 from __future__ import annotations
 
+from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import (
     COOPERATIVE,
     NOTED,
@@ -126,7 +127,14 @@ class CooperativeEngine:
         text = "only what it commits comes back; the program is started again and resumes from that"
         return Report(pid, command, 0, "versions", (Finding("process", f"pid {pid}", NOTED, text),))
 
-    def protect(self, pid: int, component: str, streams: Streams | None, carry: Carry = NOTHING_CARRIED) -> Session:
+    def protect(
+        self,
+        pid: int,
+        component: str,
+        streams: Streams | None,
+        carry: Carry = NOTHING_CARRIED,
+        devices: tuple[DeviceRule, ...] = (),
+    ) -> Session:
         """See `checkpoint.engine.Engine.protect`."""
         return GuardedTask(pid, component, streams, carry)
 

@@ -13,7 +13,6 @@ from typing import Final
 from checkpoint.engine import Streams
 from checkpoint.errors import CaptureError
 from checkpoint.model import OutputPiece
-from checkpoint.resources import Surroundings, pipes_of
 from checkpoint.resources.pipes import peek
 from checkpoint.stream_counts import StreamCounts, Totals
 
@@ -30,7 +29,6 @@ class Outputs:
         self._streams = streams
         self._counts = StreamCounts(streams.counters, streams.outputs)
         self._firsts = self._counts.firsts
-        self.surroundings = Surroundings(pipes_of(streams.outputs))
 
     def totals(self) -> Totals:
         """Bytes written until now, taken or still in the pipe. The component stands still.

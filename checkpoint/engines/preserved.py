@@ -37,6 +37,7 @@ CAPABILITIES: Final = (
         Area.THERE,
         "a PID or thread id that is taken, of a program of several threads or one whose lock names it",
         "free it, or start the program with `failover run`, in PIDs of its own",
+        "by which they know it, cannot be had",
         "it holds a lock that names its own pid",
         "and a lock that the program holds names it",
         "that id is in use",

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from checkpoint import portable
+from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import KEPT, NOTED, REFUSED, Finding, Report, Streams
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import dirty, processor, procfs
@@ -17,17 +18,17 @@ COMMAND_LENGTH: Final = 200
 """Characters of a command line that a report shows."""
 
 
-def probe(pid: int, streams: Streams | None = None) -> Report:
+def probe(pid: int, surroundings: Surroundings | None = None) -> Report:
     """Look at a process.
 
     Args:
-        streams: the guard's ends of its standard streams, if it has a guard.
+        surroundings: of a process that lives under a guard, see `surroundings_of`.
 
     Raises:
         ProbeError: there is no such process, it is no program, somebody traces it, or we may not look.
     """
     try:
-        return _probe(pid, surroundings_of(pid, streams))
+        return _probe(pid, surroundings or surroundings_of(pid, None))
     except ProcessGoneError as error:
         raise ProbeError(f"cannot look at pid {pid}: there is no such process (any more)") from error
 
@@ -47,11 +48,15 @@ def _probe(pid: int, surroundings: Surroundings) -> Report:
     return Report(pid, _command(pid, status), status.resident_size, dirty.best_tracking(), findings)
 
 
-def surroundings_of(pid: int, streams: Streams | None) -> Surroundings:
-    """What the kinds of resources must know about a process and its guard."""
+def surroundings_of(pid: int, streams: Streams | None, devices: tuple[DeviceRule, ...] = ()) -> Surroundings:
+    """What the kinds of resources must know about a process, its guard and its operator's rules.
+
+    Raises:
+        ProbeError: that is no process.
+    """
     if not 0 < pid <= _largest_pid():
         raise ProbeError(f"cannot look at pid {pid}: that is not the number of a process")
-    return Surroundings(pipes_of(streams.outputs) if streams else {})
+    return Surroundings(pipes_of(streams.outputs) if streams else {}, devices)
 
 
 def _largest_pid() -> int:

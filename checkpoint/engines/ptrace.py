@@ -5,6 +5,7 @@ Imported by the keeper alone, and at once: a keeper that waits in advance must n
 
 from __future__ import annotations
 
+from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import NOTHING_CARRIED, PTRACE, Carry, Report, Restored, RestoreOptions, Session, Streams
 from checkpoint.engines.probe import probe
 from checkpoint.engines.ptrace_capture import PtraceSession
@@ -21,9 +22,16 @@ class PtraceEngine:
         """See ``checkpoint.engine.Engine.probe``."""
         return probe(pid)
 
-    def protect(self, pid: int, component: str, streams: Streams | None, carry: Carry = NOTHING_CARRIED) -> Session:
+    def protect(
+        self,
+        pid: int,
+        component: str,
+        streams: Streams | None,
+        carry: Carry = NOTHING_CARRIED,
+        devices: tuple[DeviceRule, ...] = (),
+    ) -> Session:
         """See ``checkpoint.engine.Engine.protect``."""
-        return PtraceSession.open(pid, component, streams, carry)
+        return PtraceSession.open(pid, component, streams, carry, devices)
 
     def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
         """See ``checkpoint.engine.Engine.restore``."""

@@ -28,6 +28,7 @@ import numpy as np
 from checkpoint import pages, portable
 from checkpoint.arch import x86_64_xstate
 from checkpoint.chain import position_of
+from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import NOTHING_CARRIED, PTRACE, CaptureOrder, Carry, Streams
 from checkpoint.engines import description, entering
 from checkpoint.engines import probe as probing
@@ -82,14 +83,23 @@ class PtraceSession:
         frozen_size: bytes of pages that the last capture copied while the program stood still.
     """
 
-    def __init__(self, pid: int, component: str, threads: Threads, entered: Entered, trees: CarriedTrees | None = None) -> None:
+    def __init__(
+        self,
+        pid: int,
+        component: str,
+        threads: Threads,
+        entered: Entered,
+        surroundings: Surroundings,
+        trees: CarriedTrees | None = None,
+    ) -> None:
         self.pid = pid
         self.component = component
         self.notes = entered.notes
         self.totals: Totals = (0, 0)
         self.frozen_size = 0
         self._threads = threads
-        self._onlooker = Onlooker(threads, entered)
+        self._surroundings = surroundings
+        self._onlooker = Onlooker(threads, entered, surroundings.devices)
         self._memory = MemoryCapture(threads.leader.memory, entered.tracker, entered.pages)
         self._level = portable.level_in(procfs.read_bytes(pid, "environ"))
         self._flags: dict[int, tuple[str, ...]] = {}
@@ -107,19 +117,27 @@ class PtraceSession:
     # Opening and closing
 
     @classmethod
-    def open(cls, pid: int, component: str, streams: Streams | None, carry: Carry = NOTHING_CARRIED) -> PtraceSession:
+    def open(
+        cls,
+        pid: int,
+        component: str,
+        streams: Streams | None,
+        carry: Carry = NOTHING_CARRIED,
+        devices: tuple[DeviceRule, ...] = (),
+    ) -> PtraceSession:
         """See ``checkpoint.engine.Engine.protect``."""
         outputs = Outputs(streams) if streams else None
         trees = None
         try:
-            report = probing.probe(pid, streams)
+            surroundings = probing.surroundings_of(pid, streams, devices)
+            report = probing.probe(pid, surroundings)
             trees = carried_trees.followed(pid, carry)
             reasons = (*report.reasons, *(trees.refuse() if trees else ()))
             if reasons:
                 raise UnsupportedError(f"cannot protect pid {pid} ({report.command}): {'; '.join(reasons)}", reasons)
             interruptions = Interruptions()
             threads = Threads(Tracee(pid), interruptions.mend)
-            session = cls(pid, component, threads, entering.enter(threads, interruptions), trees)
+            session = cls(pid, component, threads, entering.enter(threads, interruptions), surroundings, trees)
         except BaseException:
             if outputs:
                 outputs.close()
@@ -191,7 +209,7 @@ class PtraceSession:
     def _look_from_outside(self) -> None:
         """What was refused once is looked at without stopping it: a program that has an epoll for a week is left in peace."""
         with contextlib.suppress(ProcessGoneError, ProbeError):
-            held = look(glance(self.pid), self._outputs.surroundings if self._outputs else Surroundings())
+            held = look(glance(self.pid), self._surroundings)
             of_files = self._carried.refuse() if self._carried else ()
             self._refuse((*held.reasons, *unsupported.refuse_process(self.pid, procfs.status(self.pid)), *of_files))
 
@@ -261,7 +279,7 @@ class PtraceSession:
     def _described(self, order: CaptureOrder, parent: Position | None, frozen: Frozen) -> Snapshot:
         """The snapshot of what a freeze brought home."""
         standing, taken = frozen.standing, frozen.taken
-        held = look(standing.opened, self._outputs.surroundings if self._outputs else Surroundings())
+        held = look(standing.opened, self._surroundings)
         of_files = self._carried.reasons(frozen.seen) if self._carried else ()
         reasons = (*held.reasons, *self._reasons_of(standing.status, taken.lines), *of_files)
         self._refuse(reasons)

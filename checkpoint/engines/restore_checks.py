@@ -26,7 +26,7 @@ from checkpoint.engines.restore_memory import is_file_mapping, kernel_pages, mak
 from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux import abi, processor, procfs
 from checkpoint.model import FileIdentity, Resource, Snapshot
-from checkpoint.resources import rebuild, writers
+from checkpoint.resources import attached_devices, rebuild, writers
 from checkpoint.resources.rebuilding import number_of
 
 CAPABILITIES: Final = (
@@ -41,6 +41,7 @@ CAPABILITIES: Final = (
         "is of another type here",
         "bytes here and {} there",
         "has another content here",
+        "what was brought of it ({}) is damaged",
     ),
     refused(
         Area.THERE,
@@ -268,6 +269,8 @@ def _of_descriptors(state: Snapshot, options: RestoreOptions, brought: dict[str,
                 brought[path] = content
             else:
                 yield from (reason + damage for reason in reasons)
+        elif held.kind == attached_devices.KIND:
+            yield from attached_devices.mismatches(held, options.devices)
         elif held.kind in rebuild.NEEDED:
             yield from rebuild.NEEDED[held.kind](held)
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from checkpoint.arch import x86_64 as arch
+from checkpoint.device_rules import DeviceRule
 from checkpoint.engines.entering import Entered, where_it_stands
 from checkpoint.engines.inquiry import Inquiry, Told, rearmed
 from checkpoint.engines.outputs import Outputs
@@ -90,7 +91,8 @@ class Standing:
 class Onlooker:
     """Asks one process, again and again; the questions stay the same while its signals and timers do."""
 
-    def __init__(self, threads: Threads, entered: Entered) -> None:
+    def __init__(self, threads: Threads, entered: Entered, devices: tuple[DeviceRule, ...]) -> None:
+        self._devices = devices
         self._tracee = threads.leader
         self._threads = threads
         self._others = ThreadOnlooker(threads, entered)
@@ -105,7 +107,7 @@ class Onlooker:
             special, _, _ = procfs.signal_sets(procfs.read_bytes(self._tracee.pid, "status"))
             self._questions(special)
             with contextlib.suppress(CaptureError):  # it runs: one of its threads has just closed something
-                with_contents(gather(self._tracee.pid), None)
+                with_contents(gather(self._tracee.pid), None, self._devices)
         self._others.prepare()
 
     def place(self) -> Place:
@@ -146,7 +148,7 @@ class Onlooker:
             inquiry=inquiry,
             answers=answers,
             waiting=waiting,
-            opened=with_contents(gather(tracee.pid), self._borrowed.noted),
+            opened=with_contents(gather(tracee.pid), self._borrowed.noted, self._devices),
             totals=outputs.totals() if outputs else NOTHING_WRITTEN,
         )
 

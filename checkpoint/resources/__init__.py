@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
+from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import KEPT, REFUSED, Finding
 from checkpoint.errors import CaptureError
 from checkpoint.linux import abi, entry
@@ -65,9 +66,11 @@ class Surroundings:
 
     Attributes:
         pipes: "pipe:[123]" or a terminal's path → stream 1 or 2, of a component under a guard.
+        devices: what the operator wants to become of devices.
     """
 
     pipes: Mapping[str, int] = field(default_factory=dict)
+    devices: tuple[DeviceRule, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,20 +136,23 @@ def _place_among(pid: int, ordered: Sequence[Sequence[Descriptor]], one: Descrip
     return low, False
 
 
-def with_contents(opened: Sequence[OpenFile], noted: Noted | None) -> tuple[OpenFile, ...]:
+def with_contents(opened: Sequence[OpenFile], noted: Noted | None, rules: tuple[DeviceRule, ...] = ()) -> tuple[OpenFile, ...]:
     """Add the content of every deleted file and of every pipe that is kept, and what else must be asked while it stands still.
 
     Args:
         noted: see `checkpoint.resources.sockets.queue_of`; None for a process that runs.
+        rules: of devices; others are not asked.
 
     Raises:
         CaptureError: one of them cannot be looked into.
     """
-    from checkpoint.resources import files, kinds, pipes
+    from checkpoint.resources import attached_devices, files, kinds, pipes
 
     found = []
     for held in opened:
-        if observe := kinds.observer_of(held.first, noted):
+        if rules and attached_devices.is_ruled(held.first, rules):
+            held = replace(held, observed=attached_devices.observe(held, opened))
+        elif observe := kinds.observer_of(held.first, noted):
             held = replace(held, observed=observe(held, opened))
         elif files.must_carry(held):
             held = replace(held, content=files.content_of(held))

@@ -14,6 +14,7 @@ from checkpoint.model import Fact, Resource
 from checkpoint.resources import (
     OpenFile,
     Surroundings,
+    attached_devices,
     devices,
     epolls,
     eventfds,
@@ -23,6 +24,7 @@ from checkpoint.resources import (
     kernel_files,
     memory_files,
     pipes,
+    refused_devices,
     signalfds,
     sockets,
     streams,
@@ -50,6 +52,7 @@ class Kind(Protocol):
 
 
 ASKED: Final[tuple[Kind, ...]] = (
+    attached_devices,
     streams,
     kernel_files,
     memory_files,
@@ -65,6 +68,7 @@ ASKED: Final[tuple[Kind, ...]] = (
     unix_sockets,
     tcp_connections,
     internet_sockets,
+    refused_devices,
     unsupported,
 )
 """The last one refuses whatever no other took."""

@@ -23,6 +23,7 @@ from checkpoint.errors import RestoreError
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource, Snapshot
 from checkpoint.resources import (
+    attached_devices,
     devices,
     epolls,
     eventfds,
@@ -59,6 +60,7 @@ MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
     fifos.KIND: fifos.rebuild,
     kernel_files.KIND: kernel_files.rebuild,
     memory_files.KIND: memory_files.rebuild,
+    attached_devices.KIND: attached_devices.rebuild,
 }
 """Kinds that are made anew: each adds its calls and answers with a descriptor."""
 NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {

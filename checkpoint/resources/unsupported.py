@@ -45,12 +45,6 @@ CAPABILITIES: Final = (
         "open it for a moment and close it again; captures are taken in between",
         "a socket ({}, {})",
     ),
-    refused(
-        Area.DEVICES,
-        "all other devices, and terminals that are not the standard streams",
-        "a driver process of its own holds the device, the protected program holds none",
-        "the device {}{}",
-    ),
     refused(Area.DEVICES, "memory of a device", "the driver process maps it", "memory of a device"),
     refused(Area.MEMORY, "System V shared memory", "use a file in /dev/shm", "System V shared memory"),
     refused(Area.MEMORY, "secret memory that is mapped", "run it without", "secret memory"),
@@ -188,9 +182,6 @@ def _called(held: OpenFile) -> str:
         return f"a socket ({socket_family(held)}, {target})"
     if stat.S_ISFIFO(mode):
         return f"a pipe ({target})" if target.startswith("pipe:") else f"a named pipe (fifo {target})"
-    if stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
-        terminal = " (a terminal)" if target.startswith(("/dev/pt", "/dev/tty")) else ""
-        return f"the device {target}{terminal}"
     match = re.fullmatch(r"anon_inode:\[?([a-z_-]+)\]?", target)
     if match:
         return ANONYMOUS_INODES.get(match[1], f"an open {match[1]}")

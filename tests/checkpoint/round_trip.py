@@ -18,6 +18,7 @@ from typing import NoReturn
 import pytest
 
 from checkpoint import chain, format
+from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import CaptureOrder, RestoreOptions, Session, engine_named
 from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
 from checkpoint.linux.namespaces import prctl
@@ -160,9 +161,9 @@ def ended(program: Program) -> Iterator[Program]:
 
 
 @contextlib.contextmanager
-def protected(program: Program, component: str = "/test/tracee") -> Iterator[Session]:
+def protected(program: Program, component: str = "/test/tracee", devices: tuple[DeviceRule, ...] = ()) -> Iterator[Session]:
     """Hold a program under protection for the body."""
-    session = ENGINE.protect(program.pid, component, None)
+    session = ENGINE.protect(program.pid, component, None, devices=devices)
     try:
         yield session
     finally:
@@ -193,9 +194,9 @@ def captured_at_last(session: Session, order: CaptureOrder) -> Snapshot:
                 raise
 
 
-def captured_and_killed(program: Program) -> Snapshot:
+def captured_and_killed(program: Program, devices: tuple[DeviceRule, ...] = ()) -> Snapshot:
     """One base, then the power cut. What the program wrote in between must be undone by the restore."""
-    with protected(program) as session:
+    with protected(program, devices=devices) as session:
         snapshot = transported(session.capture(CaptureOrder()))
         program.kill()
     return snapshot
@@ -209,6 +210,7 @@ def restored(
     accept_changed: tuple[str, ...] = (),
     contents: Path | str = "",
     own_eyes: bool = False,
+    devices: tuple[DeviceRule, ...] = (),
 ) -> Program:
     """Bring a base, or a base with its deltas, back as a child of ours and let it run."""
     snapshots = [state] if isinstance(state, Snapshot) else list(state)
@@ -217,7 +219,7 @@ def restored(
     with _stdio(directory) as stdio:
         born = spawn_vessel(Birth(inner_pid=whole.process.pid if keep_pid else 0, stdio=stdio))
     try:
-        options = RestoreOptions(elapsed_ns, accept_changed, own_eyes, contents=str(contents))
+        options = RestoreOptions(elapsed_ns, accept_changed, own_eyes, contents=str(contents), devices=devices)
         program = ENGINE.restore(born.pid, whole, options)
         program.resume()
     except BaseException:

@@ -40,7 +40,7 @@ GLUE = {"is", "which", "of", "with", "port"}
 
 
 def sentences(source: str) -> Iterator[str]:
-    """What a file may say of a kind: strings that functions return, yield or refuse with, and its tables; ``{}`` for fields."""
+    """What a file may say of a kind: strings that functions return, yield, refuse with or call a reason; ``{}`` for fields."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
         if isinstance(node, ast.Return | ast.Yield):
@@ -48,6 +48,8 @@ def sentences(source: str) -> Iterator[str]:
         elif isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and getattr(node.exc.func, "id", "") in REFUSING:
             for argument in node.exc.args:
                 yield from _strings(argument)
+        elif isinstance(node, ast.Assign) and any(getattr(target, "id", "") == "reason" for target in node.targets):
+            yield from _strings(node.value)
     for statement in tree.body:
         if isinstance(statement, ast.AnnAssign) and isinstance(statement.value, ast.Dict | ast.Tuple):
             for cell in statement.value.values if isinstance(statement.value, ast.Dict) else statement.value.elts:

@@ -1,0 +1,95 @@
+"""What an operator wants to become of the devices that a component has open."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from checkpoint.model import Resource
+
+KIND: Final = "attached_devices"
+"""Of resources that are kept by these rules."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceRule:
+    """One device.
+
+    Attributes:
+        path: as the operator names it, on every robot; a name that stays, such as one of /dev/serial/by-id, is best.
+        action: reopen: it is opened again; hook: the program finds its descriptor hung up, as after unplugging, and opens it
+            anew.
+        there: what is opened on this robot in its place; "" for ``path``.
+        optional: where it is missing the program finds it hung up; otherwise it does not run there.
+    """
+
+    path: str
+    action: Literal["reopen", "hook"] = "reopen"
+    there: str = ""
+    optional: bool = False
+
+    @property
+    def place(self) -> str:
+        """What is opened on this robot."""
+        return self.there or self.path
+
+    def leads_to(self, target: str) -> bool:
+        """Whether it speaks of the device at a path; its own may be links to it."""
+        return any(target in (name, os.path.realpath(name)) for name in (self.path, self.there) if name)
+
+
+def rule_of(held: Resource) -> DeviceRule:
+    """The rule by which a device of a snapshot was kept, without its place on the robot where that was."""
+    action: Literal["reopen", "hook"] = "hook" if held.facts["action"] == "hook" else "reopen"
+    return DeviceRule(str(held.facts["path"]), action, optional=bool(held.facts["optional"]))
+
+
+def rules_of(resources: Iterable[Resource]) -> tuple[DeviceRule, ...]:
+    """The rules of all devices of a snapshot."""
+    return tuple(rule_of(held) for held in resources if held.kind == KIND)
+
+
+def rule_from(path: str, said: str) -> DeviceRule:
+    """A rule as it is typed: ``reopen``, ``hook``, ``optional``, or the path of what is opened in its place.
+
+    Raises:
+        ValueError: it is none, or names no file.
+    """
+    if said.startswith("/"):
+        return checked(DeviceRule(path, there=said))
+    if said not in ("reopen", "hook", "optional"):
+        raise ValueError(f"the rule for {path} is {said!r}; say reopen, hook, optional, or the path of a device")
+    return checked(DeviceRule(path, "hook" if said == "hook" else "reopen", optional=said == "optional"))
+
+
+def checked(rule: DeviceRule) -> DeviceRule:
+    """The rule itself.
+
+    Raises:
+        ValueError: a path of it is not absolute.
+    """
+    for path in (rule.path, rule.place):
+        if not path.startswith("/") or "\0" in path:
+            raise ValueError(f"{path!r} is not the absolute path of a device")
+    return rule
+
+
+def merged(carried: Iterable[DeviceRule], own: Iterable[DeviceRule]) -> tuple[DeviceRule, ...]:
+    """The rules that came with a component, and this robot's own for it, which come in their place."""
+    return tuple({rule.path: rule for rule in (*carried, *own)}.values())
+
+
+def rule_for(target: str, rules: Iterable[DeviceRule]) -> DeviceRule | None:
+    """The rule of the device at a path; None where there is none."""
+    return next((rule for rule in rules if rule.leads_to(target)), None)
+
+
+def missing(rules: Iterable[DeviceRule]) -> tuple[str, ...]:
+    """Which devices this machine lacks, and what would come of it, one sentence each."""
+    return tuple(_lack(rule) for rule in rules if rule.action == "reopen" and not os.path.exists(rule.place))
+
+
+def _lack(rule: DeviceRule) -> str:
+    return f"lacks {rule.place}: " + ("it would be found hung up" if rule.optional else "the program could not go on here")
