@@ -91,3 +91,58 @@ def test_a_program_that_only_its_robot_has_goes_on_at_the_other(pair: Pair, plac
     goes_on(second, first.cut_power)
     assert not list(seen_by(second, place.parent).rglob("count")), "no file was put in place"
     assert len(contents_of(second)) == 2, "the program and its library; all else is the same here"
+
+
+def test_a_second_program_with_the_same_files_sends_nothing(pair: Pair, place: Path) -> None:
+    first, second = pair
+    start(first, place)
+    robots.until_protected(first)
+    before = contents_of(second)
+    start(first, place, "again")
+    robots.until_protected(first, "again")
+    assert contents_of(second) == before
+    assert first.log.read_text().count("lacks") == 1, "the second was asked about, and lacked nothing"
+
+
+def test_a_program_returns_to_its_own_files(pair: Pair, place: Path) -> None:
+    first, second = pair
+    start(first, place)
+    robots.until_protected(first)
+    goes_on(second, lambda: robots.failover(first, "handover", "count", "--to", second.name))
+    robots.until_protected(second)
+    goes_on(first, lambda: robots.failover(second, "failback", "count"))
+    running = seen_by(first, Path(f"/proc/{robots.component(first, 'count')['pid']}/exe"))
+    assert os.readlink(running) == str(place / "count")
+    assert not contents_of(first)
+
+
+CPYTHON = "import time\nfor i in range(1_000_000):\n    print(i, flush=True)\n    time.sleep(0.01)\n"
+
+
+def test_cpython_goes_on_where_the_interpreter_and_the_c_library_are_other_versions(tmp_path: Path) -> None:
+    with robots.two_robots(tmp_path) as (first, second):
+        libraries = {str(Path(path).resolve()) for path in mapped_by("/usr/bin/python3", "-S", "-c", "")}
+        for path in sorted(libraries):
+            other = tmp_path / ("other-" + Path(path).name)
+            shutil.copy(path, other)
+            with other.open("ab") as file:
+                file.write(b"another release")
+            over(second, other, Path(path))
+        robots.run(first, "count", "/usr/bin/python3", "-S", "-c", CPYTHON)
+        robots.until_protected(first)
+        assert len(contents_of(second)) >= len(libraries)
+        goes_on(second, first.cut_power)
+
+
+def mapped_by(*argv: str) -> set[str]:
+    """The executable and libraries that a program maps."""
+    script = "import os,sys; print(open('/proc/self/maps').read())"
+    shown = subprocess.run([*argv[:-1], script], check=True, capture_output=True, text=True).stdout
+    names = (line.split()[5] for line in shown.splitlines() if len(line.split()) > 5)
+    return {name for name in names if (name.startswith("/") and ".so" in name) or "python" in name}
+
+
+def over(robot: RobotMachine, other: Path, place: Path) -> None:
+    """From now on this robot has another file at a path."""
+    pid = robot.processes()[-1]
+    subprocess.run(["nsenter", "--mount", f"--target={pid}", "mount", "--bind", str(other), str(place)], check=True)
