@@ -18,6 +18,7 @@ from typing import Final
 from agent.shipping import Refusal
 from checkpoint.contents import DIGEST_SIZE, digest_of_file
 from checkpoint.errors import StoreError
+from checkpoint.needs import Need
 from checkpoint.store import Store
 from failover.core.messages import Belonging, Belongings, Content, Lacking
 
@@ -135,7 +136,7 @@ def is_plausible(file: Belonging) -> bool:
     return is_path and file.size >= 0 and len(file.digest) in (0, DIGEST_SIZE)
 
 
-def is_in_place(file: Belonging) -> bool:
+def is_in_place(file: Belonging | Need) -> bool:
     """Whether the file at the path here has the content; where that is not known, whether it is as long."""
     try:
         about = os.stat(file.path)

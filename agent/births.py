@@ -30,6 +30,7 @@ from checkpoint.engines.cooperative import age_ns as commit_age_ns
 from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Credentials
+from checkpoint.needs import names_of_contents, needs
 from checkpoint.task_channel import Origin
 
 
@@ -152,6 +153,7 @@ async def restore(
     )
     component.engine_wanted = task.engine if task is not None else PTRACE
     component.keeper.carry = Carry(paths_of(outline), carry_limit)
+    component.keeper.names = names_of_contents(needs(outline), places.contents)
     try:
         keeper = await component.keeper.give()
         laps.lap("guard and keeper")

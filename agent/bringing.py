@@ -16,7 +16,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from agent.belongings import is_plausible, named, size_told
+from agent.belongings import is_in_place, is_plausible, named, size_told
 from agent.errors import LaneError
 from agent.shipping import Shipper
 from checkpoint.contents import digest_of_descriptor
@@ -221,6 +221,23 @@ class Sources:
             return self._store.contents.open(need.digest)
         descriptor = await asyncio.to_thread(_open_if_same, need)
         return descriptor if descriptor is not None else await self._from_keeper(component, need)
+
+    async def keep_what_goes(self, component: str, files: tuple[Need, ...]) -> None:
+        """Keep by content what its path does not lead to any more: the program was upgraded, or removed, while it runs.
+
+        Raises:
+            CheckpointError, AgentError, OSError: it cannot be had (any more), or kept.
+        """
+        gone = await asyncio.to_thread(lambda: [need for need in files if not is_in_place(need)])
+        for need in gone:
+            if not need.digest or self._store.contents.has(need.digest, need.size):
+                continue
+            descriptor = await self._from_keeper(component, need)
+            try:
+                await asyncio.to_thread(self._store.contents.put, descriptor, need.digest)
+            finally:
+                os.close(descriptor)
+            log.info("%s: kept %s as the program has it; its path leads to it no more", component, need.path)
 
     async def _from_keeper(self, component: str, need: Need) -> int:
         descriptor = await self._ask(component, need)

@@ -19,11 +19,13 @@ class Following:
     Attributes:
         followed: engine and pid; None while nothing is followed.
         carry: files that travel with it.
+        names: by which the program knows those of its files that were brought here, by their paths here.
     """
 
     def __init__(self, name: str, places: Places) -> None:
         self.followed: tuple[str, int] | None = None
         self.carry = NOTHING_CARRIED
+        self.names: dict[str, str] = {}
         self._name = name
         self._places = places
         self._link: KeeperLink | None = None
@@ -50,7 +52,7 @@ class Following:
         Raises:
             UnsupportedError, CheckpointError; KeeperLostError.
         """
-        order = channel.Protect(pid, self._name, bool(streams), self._places.robot, engine, self.carry)
+        order = channel.Protect(pid, self._name, bool(streams), self._places.robot, engine, self.carry, names=self.names)
         try:
             protected, _ = await self.ask(order, streams)
         except UnsupportedError:

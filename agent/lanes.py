@@ -22,7 +22,7 @@ from agent.config import Settings
 from agent.deposit import Deposit
 from agent.dispatch import Dispatch
 from agent.door import Inventory, ToLanes, Told
-from agent.errors import GuardLostError, LaneError
+from agent.errors import TROUBLE, GuardLostError, LaneError
 from agent.hooks import Hooks
 from agent.mistake import end_lanes_on_mistake
 from agent.nursery import Nursery
@@ -42,7 +42,7 @@ from checkpoint.engine import COOPERATIVE, PTRACE
 from checkpoint.errors import CheckpointError, StoreError
 from checkpoint.linux import processor
 from checkpoint.model import Snapshot
-from checkpoint.needs import Need
+from checkpoint.needs import Need, names_of_contents, needs
 from checkpoint.store import Store, open_store
 from failover.client.quantities import size_bytes
 from failover.core import acts
@@ -63,6 +63,9 @@ from failover.core.types import HISTORY_MAX, Found, Held
 BYTES_A_MEGABIT: Final = 125_000
 TIDY_S: Final = 900.0
 """Between two looks for brought files that nobody needs any more."""
+
+LOOK_S: Final = 3.0
+"""Between two looks whether the files of running programs are still there."""
 
 STORE_TRIES: Final = 50
 STORE_PAUSE_S: Final = 0.1
@@ -98,12 +101,16 @@ class Lanes(Switchboard):
         self._deposit = Deposit(store, self.places, self.tell, self._stored)
         settled = self._deposit.settled
         self._around = Surroundings(self.places, store, records, self.tell, self._silence_ns, settled, here, hooks)
-        self._bringing = Bringing(self._shipper, self._lane.say, Sources(store, self._from_program).open, self._note_bringing)
+        self._sources = Sources(store, self._from_program)
+        self._bringing = Bringing(self._shipper, self._lane.say, self._sources.open, self._note_bringing)
         self._dispatch = Dispatch(store, self._shipper, self.tell, self._links.hindrance, self._bringing)
         self._receiver = Receiver(self._lane, self._store_path, self._deposit)
         self._stock = Stock(store, self._limits(), self.settings.config.robot, self._deposit.hindrance)
         self._contents = Receiver(self._lane, self._store_path, self._stock)
-        self._tasks = {asyncio.create_task(self._tidy_contents())}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._task(self._tidy_contents())
+        if self.settings.config.bring:
+            self._task(self._keep_what_goes())
         found = await self._find_guards(records)
         await self._mend_logs(found)
         self._nursery.prepare()
@@ -165,11 +172,29 @@ class Lanes(Switchboard):
                 log.info("%s", error)
                 continue
             epoch = records.epoch(component.name)
+            component.keeper.names = self._names_of_brought(component.name)
             self.charge(component.name).adopt(component, epoch)
             running = standing.state in ("running", "frozen")
             found.append(Found(component.name, epoch, running, standing.exit_status or 0))
             log.info("%s: found again, pid %d, %s", component.name, component.pid, standing.state)
         return tuple(found)
+
+    def _names_of_brought(self, name: str) -> dict[str, str]:
+        """By which a program that was restored here knows its files: its newest snapshot says it."""
+        outline = self._newest(name)
+        return names_of_contents(needs(outline), self.places.contents) if outline is not None else {}
+
+    def _newest(self, name: str) -> Snapshot | None:
+        """The newest snapshot of a component here, without its pages; None where there is none that can be read."""
+        chain: list[int] = []
+        try:
+            chain = self._around.store.open_chain(name)
+            return format.read_outline(chain[-1])
+        except (CheckpointError, OSError) as error:
+            log.info("%s: its newest checkpoint cannot be read: %s", name, error)
+            return None
+        finally:
+            close_all(tuple(chain))
 
     async def _mend_logs(self, found: tuple[Found, ...]) -> None:
         try:
@@ -236,6 +261,22 @@ class Lanes(Switchboard):
         on_its_way.pop(peer, None)
         if sentence:
             on_its_way[peer] = sentence
+
+    async def _keep_what_goes(self) -> None:
+        """Now and then look whether the files of what runs here are still where they were; what is not is kept by content."""
+        said: dict[str, str] = {}
+        while True:
+            await asyncio.sleep(LOOK_S)
+            for name, charge in list(self.charges.items()):
+                if charge.component is None or charge.component.engine == COOPERATIVE:
+                    continue
+                outline = await asyncio.to_thread(self._newest, name)
+                try:
+                    await self._sources.keep_what_goes(name, needs(outline) if outline is not None else ())
+                except TROUBLE as error:
+                    if said.get(name) != str(error):
+                        log.warning("%s: %s", name, error)
+                    said[name] = str(error)
 
     async def _tidy_contents(self) -> None:
         """Now and then remove what no snapshot names any more."""

@@ -205,6 +205,9 @@ class Protect(msgspec.Struct, frozen=True, tag=True):
     """Begin to follow a process. Answer: `Protected`.
 
     With descriptors, if ``streams``: the counters' memfd, two pipe read ends, two log files.
+
+    Attributes:
+        names: see `checkpoint.engine.Engine.protect`, which is told them if ``robot`` is one: its agent keeps files by content.
     """
 
     pid: int
@@ -214,6 +217,7 @@ class Protect(msgspec.Struct, frozen=True, tag=True):
     engine: str = PTRACE
     carry: Carry = NOTHING_CARRIED
     devices: tuple[DeviceRule, ...] = ()
+    names: dict[str, str] = {}
 
 
 class Capture(msgspec.Struct, frozen=True, tag=True):

@@ -7,6 +7,7 @@ from below this file.
 from __future__ import annotations
 
 import os.path
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -233,6 +234,7 @@ class Engine(Protocol):
         streams: Streams | None,
         carry: Carry = NOTHING_CARRIED,
         devices: tuple[DeviceRule, ...] = (),
+        names: Mapping[str, str] | None = None,
     ) -> Session:
         """Begin to follow a process.
 
@@ -240,6 +242,8 @@ class Engine(Protocol):
             carry: its files that travel with it.
             streams: the guard's ends of its standard streams, if it lives under a guard; the session owns them from now on.
             devices: what its operator wants to become of devices that it has open.
+            names: of somebody who keeps the program's files by content (`checkpoint.contents`): the paths by which the program
+                knows those that it has from there; snapshots name them so. None: nobody keeps them.
 
         Raises:
             ProbeError: it cannot be looked into at all.

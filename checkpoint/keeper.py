@@ -24,6 +24,7 @@ from checkpoint.engine import CaptureOrder, Engine, Restored, RestoreOptions, Se
 from checkpoint.errors import CaptureError, CheckpointError, RestoreError
 from checkpoint.linux.address import address_of
 from checkpoint.model import Position, Snapshot
+from checkpoint.needs import names_of_contents, needs
 
 USAGE: Final = "usage: python -m checkpoint keeper FD|PATH\n"
 CALL_S: Final = 30.0
@@ -46,6 +47,7 @@ class Keeper:
         self._restored: Restored | None = None
         self._revived: tuple[channel.Restore, Streams | None] | None = None
         self._robot = ""
+        self._names: dict[str, str] | None = None
         self._verbs: dict[type[msgspec.Struct], Callable[..., Answer | None]] = {
             channel.Probe: self._probe,
             channel.Tabulate: self._tabulate,
@@ -98,7 +100,8 @@ class Keeper:
         self._robot = request.robot
         streams = streams_of(descriptors) if request.streams else None
         chosen = self._tracer if request.engine == self._tracer.name else engine.engine_named(request.engine)
-        self._session = chosen.protect(request.pid, request.component, streams, request.carry, request.devices)
+        names = request.names if request.robot else None
+        self._session = chosen.protect(request.pid, request.component, streams, request.carry, request.devices, names)
         return channel.Protected(self._session.notes), ()
 
     def _capture(self, request: channel.Capture, _: Descriptors) -> Answer:
@@ -147,6 +150,7 @@ class Keeper:
         )
         self._restored = self._tracer.restore(request.pid, state, options)
         self._revived = request, ends
+        self._names = names_of_contents(needs(state), request.contents) if request.robot else None
         return channel.Restored(self._restored.pid, self._restored.position, self._restored.notes), ()
 
     def _fill(self, request: channel.Fill, descriptors: Descriptors) -> Answer:
@@ -178,7 +182,7 @@ class Keeper:
     def _follow(self, pid: int, request: channel.Restore, streams: Streams | None) -> tuple[str, ...]:
         """Protect what has just been let go; that it cannot be protected again must not end it."""
         try:
-            self._session = self._tracer.protect(pid, request.component, streams, request.carry, request.devices)
+            self._session = self._tracer.protect(pid, request.component, streams, request.carry, request.devices, self._names)
         except CheckpointError as error:
             return (f"{channel.UNPROTECTED}: {error}",)
         return self._session.notes

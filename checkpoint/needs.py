@@ -6,7 +6,7 @@ Pure: told by the snapshot alone. What is there of it on a machine, and where th
 from __future__ import annotations
 
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -59,6 +59,17 @@ def needs(state: Snapshot, *, opened: bool = True) -> tuple[Need, ...]:
 def _is_below(path: str, folders: tuple[str, ...]) -> bool:
     """Whether a file travels with the snapshot, as one of those that the program carries."""
     return any(path == folder or path.startswith(folder + "/") for folder in folders)
+
+
+def names_of_contents(files: Iterable[Need], contents: str) -> dict[str, str]:
+    """The paths by which a program knows its files, by those that they have as contents (`checkpoint.contents`).
+
+    Args:
+        contents: directory of the contents, "" if there is none.
+    """
+    if not contents:
+        return {}
+    return {f"{contents}/{need.digest.hex()}": need.path for need in files if need.digest}
 
 
 def _need(file: FileIdentity) -> Need:

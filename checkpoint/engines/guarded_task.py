@@ -6,6 +6,8 @@ nothing, and each capture looks where its commits go now.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import (
     COOPERATIVE,
@@ -134,6 +136,7 @@ class CooperativeEngine:
         streams: Streams | None,
         carry: Carry = NOTHING_CARRIED,
         devices: tuple[DeviceRule, ...] = (),
+        names: Mapping[str, str] | None = None,
     ) -> Session:
         """See `checkpoint.engine.Engine.protect`."""
         return GuardedTask(pid, component, streams, carry)

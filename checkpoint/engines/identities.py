@@ -35,8 +35,13 @@ KINDS: Final = {
 class Identities:
     """Identities of one process's files; each file is looked at once while it stays mapped."""
 
-    def __init__(self, pid: int) -> None:
+    def __init__(self, pid: int, names: Mapping[str, str]) -> None:
+        """
+        Args:
+            names: of files that it has from elsewhere: by the path that the kernel shows, the one that the program knows.
+        """
         self._pid = pid
+        self._names = names
         self._known: dict[tuple[int, int, str], FileIdentity] = {}
 
     def vmas(self, lines: Sequence[MapsLine], flags: Mapping[int, tuple[str, ...]], guards: Words) -> tuple[Vma, ...]:
@@ -62,7 +67,7 @@ class Identities:
             shared=line.shared,
             kind=VmaKind.FILE if is_file else KINDS.get(line.name, VmaKind.ANONYMOUS),
             offset=line.offset,
-            name=line.name,
+            name=self._names.get(line.name, line.name),
             file=self.of_mapping(line) if is_file else None,
             flags=tuple(flag for flag in flags if flag in KEPT_FLAGS),
         )
@@ -115,7 +120,7 @@ class Identities:
         except OSError:
             return FileIdentity(path, deleted=deleted)
         return FileIdentity(
-            path=path,
+            path=self._names.get(path, path),
             device=about.st_dev,
             inode=about.st_ino,
             mode=about.st_mode,

@@ -18,7 +18,7 @@ COMMAND_LENGTH: Final = 200
 """Characters of a command line that a report shows."""
 
 
-def probe(pid: int, surroundings: Surroundings | None = None) -> Report:
+def probe(pid: int, surroundings: Surroundings | None = None, *, files_kept: bool = False) -> Report:
     """Look at a process.
 
     Args:
@@ -28,19 +28,19 @@ def probe(pid: int, surroundings: Surroundings | None = None) -> Report:
         ProbeError: there is no such process, it is no program, somebody traces it, or we may not look.
     """
     try:
-        return _probe(pid, surroundings or surroundings_of(pid, None))
+        return _probe(pid, surroundings or surroundings_of(pid, None), files_kept)
     except ProcessGoneError as error:
         raise ProbeError(f"cannot look at pid {pid}: there is no such process (any more)") from error
 
 
-def _probe(pid: int, surroundings: Surroundings) -> Report:
+def _probe(pid: int, surroundings: Surroundings, files_kept: bool) -> Report:
     if not 0 < pid <= _largest_pid():
         raise ProbeError(f"cannot look at pid {pid}: that is not the number of a process")
     status = procfs.status(pid)
     unsupported.require_traceable(pid, status)
     _require_permission(pid, status)
     findings = (
-        *_process_findings(pid, status),
+        *_process_findings(pid, status, files_kept),
         *_processor_findings(pid),
         *_memory_findings(pid),
         *look(glance(pid), surroundings).findings,
@@ -75,8 +75,8 @@ def _require_permission(pid: int, status: Status) -> None:
         ) from error
 
 
-def _process_findings(pid: int, status: Status) -> Iterator[Finding]:
-    for reason in unsupported.refuse_process(pid, status):
+def _process_findings(pid: int, status: Status, files_kept: bool) -> Iterator[Finding]:
+    for reason in unsupported.refuse_process(pid, status, files_kept=files_kept):
         yield Finding("process", f"pid {pid}", REFUSED, reason)
     if status.ppid and len(status.pids) == 1:
         text = "its PID is kept where it is free on the other side: failover run gives a program a PID namespace of its own"

@@ -5,6 +5,8 @@ Imported by the keeper alone, and at once: a keeper that waits in advance must n
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import NOTHING_CARRIED, PTRACE, Carry, Report, Restored, RestoreOptions, Session, Streams
 from checkpoint.engines.probe import probe
@@ -29,9 +31,10 @@ class PtraceEngine:
         streams: Streams | None,
         carry: Carry = NOTHING_CARRIED,
         devices: tuple[DeviceRule, ...] = (),
+        names: Mapping[str, str] | None = None,
     ) -> Session:
         """See ``checkpoint.engine.Engine.protect``."""
-        return PtraceSession.open(pid, component, streams, carry, devices)
+        return PtraceSession.open(pid, component, streams, carry, devices, names)
 
     def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
         """See ``checkpoint.engine.Engine.restore``."""

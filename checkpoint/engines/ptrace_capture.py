@@ -20,6 +20,7 @@ import functools
 import gc
 import operator
 import time
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -91,6 +92,7 @@ class PtraceSession:
         entered: Entered,
         surroundings: Surroundings,
         trees: CarriedTrees | None = None,
+        names: Mapping[str, str] | None = None,
     ) -> None:
         self.pid = pid
         self.component = component
@@ -104,7 +106,8 @@ class PtraceSession:
         self._level = portable.level_in(procfs.read_bytes(pid, "environ"))
         self._flags: dict[int, tuple[str, ...]] = {}
         self._flags_of: tuple[MapsLine, ...] = ()
-        self._identities = Identities(pid)
+        self._identities = Identities(pid, names or {})
+        self._files_kept = names is not None
         self._outputs: Outputs | None = None
         self._carried = trees
         self._table = PageTable.empty(abi.PAGE_SIZE)
@@ -124,20 +127,21 @@ class PtraceSession:
         streams: Streams | None,
         carry: Carry = NOTHING_CARRIED,
         devices: tuple[DeviceRule, ...] = (),
+        names: Mapping[str, str] | None = None,
     ) -> PtraceSession:
         """See ``checkpoint.engine.Engine.protect``."""
         outputs = Outputs(streams) if streams else None
         trees = None
         try:
             surroundings = probing.surroundings_of(pid, streams, devices)
-            report = probing.probe(pid, surroundings)
+            report = probing.probe(pid, surroundings, files_kept=names is not None)
             trees = carried_trees.followed(pid, carry)
             reasons = (*report.reasons, *(trees.refuse() if trees else ()))
             if reasons:
                 raise UnsupportedError(f"cannot protect pid {pid} ({report.command}): {'; '.join(reasons)}", reasons)
             interruptions = Interruptions()
             threads = Threads(Tracee(pid), interruptions.mend)
-            session = cls(pid, component, threads, entering.enter(threads, interruptions), surroundings, trees)
+            session = cls(pid, component, threads, entering.enter(threads, interruptions), surroundings, trees, names)
         except BaseException:
             if outputs:
                 outputs.close()
@@ -211,7 +215,10 @@ class PtraceSession:
         with contextlib.suppress(ProcessGoneError, ProbeError):
             held = look(glance(self.pid), self._surroundings)
             of_files = self._carried.refuse() if self._carried else ()
-            self._refuse((*held.reasons, *unsupported.refuse_process(self.pid, procfs.status(self.pid)), *of_files))
+            self._refuse((*held.reasons, *self._reasons_of_process(procfs.status(self.pid)), *of_files))
+
+    def _reasons_of_process(self, status: Status) -> Iterator[str]:
+        return unsupported.refuse_process(self.pid, status, files_kept=self._files_kept)
 
     def _refuse(self, reasons: tuple[str, ...]) -> None:
         self._refused = bool(reasons)
@@ -347,7 +354,7 @@ class PtraceSession:
         try:
             self._read_flags()
             of_mappings = (unsupported.refuse_mapping(line, self._foreign_flags(line)) for line in lines)
-            return (*unsupported.refuse_process(self.pid, status), *(reason for reason in of_mappings if reason))
+            return (*self._reasons_of_process(status), *(reason for reason in of_mappings if reason))
         except ProcessGoneError:
             return ()  # the picture was taken before it ended
 

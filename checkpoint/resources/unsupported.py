@@ -285,8 +285,12 @@ def require_traceable(pid: int, status: Status) -> None:
         )
 
 
-def refuse_process(pid: int, status: Status) -> Iterator[str]:
-    """Why a process as a whole cannot be captured."""
+def refuse_process(pid: int, status: Status, *, files_kept: bool = False) -> Iterator[str]:
+    """Why a process as a whole cannot be captured.
+
+    Args:
+        files_kept: somebody keeps its program file by content, so that it need not be there any more.
+    """
     yield from refused_threads.refuse(pid, status)
     children = refused_threads.children(pid)
     if children:
@@ -294,14 +298,14 @@ def refuse_process(pid: int, status: Status) -> Iterator[str]:
     if status.seccomp:
         yield "it runs under a seccomp filter, which forbids what a capture asks of it: run it without the filter"
     yield from shared_objects.refuse(pid)
-    yield from _refuse_image(pid)
+    yield from _refuse_image(pid, files_kept)
     yield from _refuse_places(pid)
     yield from _refuse_namespaces(pid)
 
 
-def _refuse_image(pid: int) -> Iterator[str]:
+def _refuse_image(pid: int, files_kept: bool) -> Iterator[str]:
     executable = procfs.read_link(pid, "exe")
-    if executable.endswith(procfs.DELETED):
+    if executable.endswith(procfs.DELETED) and not files_kept:
         yield f"its program file {executable} is no longer there: restart the program, then protect it"
         return
     with open(f"/proc/{pid}/exe", "rb") as file:

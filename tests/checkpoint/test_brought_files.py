@@ -13,11 +13,22 @@ import pytest
 
 from checkpoint.contents import Contents
 from checkpoint.disk import Disk
-from checkpoint.errors import MismatchError
+from checkpoint.engine import CaptureOrder
+from checkpoint.errors import MismatchError, UnsupportedError
 from checkpoint.model import Snapshot
 from checkpoint.needs import Need, needs
 from checkpoint.whole_files import WholeFiles
-from tests.checkpoint.round_trip import NOBODY, Program, captured_and_killed, ended, expect_ok, restored, start
+from tests.checkpoint.round_trip import (
+    ENGINE,
+    NOBODY,
+    Program,
+    captured_and_killed,
+    ended,
+    expect_ok,
+    restored,
+    start,
+    transported,
+)
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
@@ -91,6 +102,17 @@ def stage() -> Iterator[Stage]:
         yield Stage(Path(directory))
 
 
+def captured_by_an_agent(program: Program) -> Snapshot:
+    """As by one that keeps its files: those need not be there any more."""
+    session = ENGINE.protect(program.pid, "/test/tracee", None, names={})
+    try:
+        snapshot = transported(session.capture(CaptureOrder()))
+    finally:
+        program.kill()
+        session.close()
+    return snapshot
+
+
 def mapped(pid: int) -> set[str]:
     """The files behind its mappings."""
     lines = (line.split() for line in Path(f"/proc/{pid}/maps").read_text().splitlines())
@@ -134,6 +156,37 @@ def test_what_was_brought_is_named_by_its_content_when_it_is_captured_again(stag
     (stage.work / "go").touch()
     with ended(stage.back(again)) as program:
         expect_ok(program)
+
+
+def test_a_program_that_was_replaced_while_it_ran_is_needed_as_it_ran(stage: Stage) -> None:
+    words = [str(stage.program), str(stage.work / "go")]
+    was = stage.program.read_bytes()
+    program = start(words, stage.work)
+    with ended(program):
+        program.wait_for_line("ready")
+        stage.program.unlink()
+        stage.program.write_bytes(was + b"upgraded")
+        held = os.open(f"/proc/{program.pid}/exe", os.O_RDONLY)
+        snapshot = captured_by_an_agent(program)
+    try:
+        need = next(need for need in needs(snapshot) if need.path == str(stage.program))
+        stage.contents.put(held, need.digest)
+        assert os.pread(held, len(was) + 1, 0) == was
+    finally:
+        os.close(held)
+    (stage.work / "go").touch()
+    with ended(stage.back(snapshot)) as back:
+        expect_ok(back)
+    assert stage.program.read_bytes() == was + b"upgraded"
+
+
+def test_without_somebody_who_keeps_its_files_a_program_that_was_deleted_is_refused(stage: Stage) -> None:
+    program = start([str(stage.program), str(stage.work / "go")], stage.work)
+    with ended(program):
+        program.wait_for_line("ready")
+        stage.program.unlink()
+        with pytest.raises(UnsupportedError, match=str(stage.program)):
+            captured_and_killed(program)
 
 
 def test_a_content_that_was_damaged_is_not_run_and_is_named(stage: Stage) -> None:

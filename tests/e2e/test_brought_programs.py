@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -59,11 +60,6 @@ def hide(robot: RobotMachine, place: Path) -> None:
     subprocess.run(["nsenter", "--mount", f"--target={pid}", "mount", "-t", "tmpfs", "tmpfs", str(place)], check=True)
 
 
-def seen_by(robot: RobotMachine, path: Path) -> Path:
-    """A path as that robot has it."""
-    return Path(f"/proc/{robot.processes()[-1]}/root{path}")
-
-
 def start(robot: RobotMachine, place: Path, name: str = "count") -> None:
     robots.run(robot, name, str(place / "count"), env={"LD_LIBRARY_PATH": str(place)}, cwd=str(place))
 
@@ -89,7 +85,8 @@ def test_a_program_that_only_its_robot_has_goes_on_at_the_other(pair: Pair, plac
     start(first, place)
     robots.until_protected(first)
     goes_on(second, first.cut_power)
-    assert not list(seen_by(second, place.parent).rglob("count")), "no file was put in place"
+    running = robots.host_pid(second, robots.component(second, "count")["pid"])
+    assert not list(Path(f"/proc/{running}/root{place.parent}").rglob("count")), "no file was put in place"
     assert len(contents_of(second)) == 2, "the program and its library; all else is the same here"
 
 
@@ -111,9 +108,25 @@ def test_a_program_returns_to_its_own_files(pair: Pair, place: Path) -> None:
     goes_on(second, lambda: robots.failover(first, "handover", "count", "--to", second.name))
     robots.until_protected(second)
     goes_on(first, lambda: robots.failover(second, "failback", "count"))
-    running = seen_by(first, Path(f"/proc/{robots.component(first, 'count')['pid']}/exe"))
-    assert os.readlink(running) == str(place / "count")
+    running = robots.host_pid(first, robots.component(first, "count")["pid"])
+    assert os.readlink(f"/proc/{running}/exe") == str(place / "count")
     assert not contents_of(first)
+
+
+def test_a_program_that_is_upgraded_while_it_runs_goes_on_as_it_was(pair: Pair, place: Path) -> None:
+    """Here, after a crash, and there."""
+    first, second = pair
+    start(first, place)
+    robots.until_protected(first)
+    program = place / "count"  # robot1 sees our files
+    other = program.read_bytes() + b"a later release"
+    program.unlink()
+    program.write_bytes(other)
+    robots.until(lambda: contents_of(first), "robot1 to keep what runs there")
+    goes_on(first, lambda: os.kill(robots.host_pid(first, robots.component(first, "count")["pid"]), signal.SIGSEGV))
+    robots.until_protected(first)
+    assert program.read_bytes() == other
+    goes_on(second, first.cut_power)
 
 
 CPYTHON = "import time\nfor i in range(1_000_000):\n    print(i, flush=True)\n    time.sleep(0.01)\n"
