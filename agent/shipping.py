@@ -41,6 +41,9 @@ PATIENCE_S: Final = 5.0
 WINDOW: Final = WINDOW_CHUNKS * CHUNK_SIZE_MAX
 """Bytes under way without credit for more: keeps a 1 Gbit/s link with 10 ms of delay busy."""
 
+STORED_S: Final = 60.0
+"""A file counts as taken once it is durable, and a slow disk may take its time for the last 256 MB of it."""
+
 GIVE_WAY_S: Final = 0.02
 """How long a chunk of a file waits for snapshots at most: they have the link to themselves, and a file arrives all the same."""
 
@@ -109,7 +112,7 @@ class Shipper:
                     await self._give_way()
                 await self._pace.wait(size)
                 await self._lane.ship(peer, Chunk(number, offset, os.pread(descriptor, size, offset)))
-            await self._until(transfer, lambda: transfer.taken)
+            await self._until(transfer, lambda: transfer.taken, PATIENCE_S if isinstance(offer, Offer) else STORED_S)
         except (LaneError, asyncio.CancelledError):
             self._lane.say(peer, Cancel(number))
             raise
@@ -143,14 +146,15 @@ class Shipper:
                 transfer.refused = "the connection was lost"
                 transfer.moved.set()
 
-    async def _until(self, transfer: _Outgoing, reached: Callable[[], bool]) -> None:
+    async def _until(self, transfer: _Outgoing, reached: Callable[[], bool], patience_s: float | None = None) -> None:
+        patience_s = PATIENCE_S if patience_s is None else patience_s
         while not transfer.refused and not reached():
             transfer.moved.clear()
             try:
-                await asyncio.wait_for(transfer.moved.wait(), PATIENCE_S)
+                await asyncio.wait_for(transfer.moved.wait(), patience_s)
             except TimeoutError:
                 raise LaneError(
-                    f"{transfer.peer} took nothing for {PATIENCE_S:.0f} s in the middle of a {transfer.what}"
+                    f"{transfer.peer} took nothing for {patience_s:.0f} s in the middle of a {transfer.what}"
                 ) from None
         if transfer.refused:
             raise LaneError(f"{transfer.peer} gave the {transfer.what} back: {transfer.refused}")
