@@ -10,10 +10,10 @@ from checkpoint.model import Position
 from failover.core import acts, majority
 from failover.core.component import Component, Flight, Turn
 from failover.core.consent import grants, state_of
-from failover.core.election import admit, placing, vacant
+from failover.core.election import admit, living_entries, placing, vacant
 from failover.core.events import ShipEnded
 from failover.core.membership import Peer
-from failover.core.messages import HOLDS, Entry
+from failover.core.messages import HOLDS, WANTS, Entry
 from failover.core.types import MS, PEERS_MAX, State
 
 _IDLE = (State.ABSENT, State.STANDBY)
@@ -83,7 +83,13 @@ def give_back(component: Component, turn: Turn) -> None:
 
 
 def _heir(component: Component, turn: Turn) -> str:
-    """Who is to run it: its primary. A server also turns to others, and waits for robots that may hold something newer."""
+    """Who is to run it: whom an operator chose, else its primary.
+
+    A server also turns to others, and waits for robots that may hold something newer.
+    """
+    chosen = next((robot for robot, entry in living_entries(component, turn) if entry.flags & WANTS), "")
+    if chosen:
+        return chosen
     if turn.config.runs(turn.me):
         return component.primary if component.waits else ""
     sure = component.open or majority.holds_all(component, turn, turn.me, component.newest)
@@ -104,23 +110,28 @@ def _lacks(component: Component, peer: Peer, mine: Position) -> bool:
 
 
 def admit_a_return(component: Component, turn: Turn) -> None:
-    """The checkpoint that a server, or (``on_loss = hold``) the standby, kept for us may come back."""
+    """The checkpoint that a server, or (``on_loss = hold``) the standby, kept for us may come back; or what an operator wants."""
     if not turn.config.runs(turn.me) or not vacant(component, turn):
         return
-    best: tuple[Position, bool, str] | None = None
-    for peer in turn.team.living(turn.now_ns):
-        entry = peer.entry(component.name)
-        if entry is None or entry.position is None or not _returns(component, turn, peer.robot, entry):
-            continue
-        offer = (entry.position, turn.config.runs(peer.robot), peer.robot)
-        best = max(best, offer) if best else offer
-    if best is not None and (component.newest is None or component.newest < best[0]):
-        admit(component, turn, best[2], best[0].generation // (PEERS_MAX + 1))
+    best = offer(component, turn, is_ordered=component.wanted is not None)
+    if best is not None and (component.newest is None or component.newest < best[1]):
+        admit(component, turn, best[0], best[1].generation // (PEERS_MAX + 1))
 
 
-def _returns(component: Component, turn: Turn, robot: str, entry: Entry) -> bool:
+def offer(component: Component, turn: Turn, *, is_ordered: bool) -> tuple[str, Position] | None:
+    """The newest checkpoint that somebody who lives would send this robot: who, and what. ``is_ordered``: by an operator."""
+    offers = [
+        (entry.position, turn.config.runs(robot), robot)
+        for robot, entry in living_entries(component, turn)
+        if entry.position is not None and _returns(component, turn, robot, entry, is_ordered=is_ordered)
+    ]
+    best = max(offers, default=None)
+    return (best[2], best[0]) if best else None
+
+
+def _returns(component: Component, turn: Turn, robot: str, entry: Entry, *, is_ordered: bool) -> bool:
     if state_of(entry) not in _IDLE:
         return False
-    if not turn.config.runs(robot):
+    if is_ordered or not turn.config.runs(robot):
         return True
     return bool(entry.flags & HOLDS) and entry.primary == turn.me and entry.epoch == component.epoch

@@ -114,6 +114,16 @@ class Handing:
     yielded: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """The checkpoint that a robot needs to carry out an operator's order; ``giver`` has at least ``position``."""
+
+    request: int
+    giver: str
+    position: Position
+    until_ns: int
+
+
 @dataclass(slots=True)
 class Component:
     """What one robot knows of one component. The first block survives a restart (``types.Record`` explains it).
@@ -133,6 +143,7 @@ class Component:
         stored_ns: on a standby, when its newest checkpoint was stored, -1 if it was before this life of the agent.
         elects: primaries are elected. free, open: then, what this robot would vote for (``majority.py``).
         ordered: the claim was, by an operator.
+        wanted: an operator promoted this robot, and a checkpoint is on its way here.
         seen: highest epoch that anybody told of; a claim goes above it. contested_ns: when this copy, which stands still, last
             met another that does.
         trail: the last acknowledged positions and their parents, for servers (``archive.py``); ``archives``: on their way there.
@@ -202,6 +213,7 @@ class Component:
     free: bool = False
     open: bool = False
     ordered: bool = False
+    wanted: Wanted | None = None
     elects: bool = False
     seen: int = 0
     contested_ns: int = 0

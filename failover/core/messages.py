@@ -38,7 +38,8 @@ class Entry(msgspec.Struct, frozen=True, array_like=True):
         standby: the robot that the primary has entrusted, "" if none; under majority its followers repeat what they have noted.
         yields_to: (primary, handing over) the robot that may claim now.
         flags: ``NEEDS_BASE`` (standby), ``UNPROTECTED`` (primary has stopped protecting), ``HOLDS`` (on_loss is hold),
-            ``WARM`` (standby: its program waits there, started already); ``FREE``, ``OPEN``, ``STARTS``, ``ORDERED`` (majority).
+            ``WARM`` (standby: its program waits there, started already); ``WANTS`` (a checkpoint, to run it);
+            ``FREE``, ``OPEN``, ``STARTS``, ``ORDERED`` (majority).
         status: of a finished component, waitpid's.
     """
 
@@ -75,6 +76,9 @@ STARTS = 64
 
 ORDERED = 128
 """An operator asked for this claim: a robot with an older checkpoint may have it."""
+
+WANTS = 256
+"""An operator wants the sender to run it, and it has no checkpoint: whoever keeps one sends it."""
 
 
 class Beat(msgspec.Struct, frozen=True, array_like=True):

@@ -17,6 +17,7 @@ from failover.core import (
     lease,
     majority,
     promise,
+    promotion,
     replication,
     view,
     warmth,
@@ -358,6 +359,8 @@ def _runs(component: Component, turn: Turn, event: Started | Restored) -> None:
 def _review(component: Component, turn: Turn) -> None:
     """What the passing of time, or what was just heard, makes due for one component."""
     endings.overdue(component, turn)
+    if component.wanted is not None:
+        promotion.advance(component, turn)
     if turn.config.by_majority:
         majority.look(component, turn)
     if component.state in (State.ABSENT, State.STANDBY):

@@ -7,8 +7,10 @@ Under ``pair`` the order stands for the consent of robots that are not heard: it
 
 from __future__ import annotations
 
+from checkpoint.model import Position
 from failover.core import acts, majority
-from failover.core.component import Component, Turn
+from failover.core.archive import offer
+from failover.core.component import Component, Turn, Wanted
 from failover.core.election import claim, living_entries, renew, vacant
 from failover.core.events import Promote
 from failover.core.types import MS, State
@@ -16,12 +18,13 @@ from failover.core.types import MS, State
 SKIPPED_EPOCHS = 1
 """Epochs left out under ``pair``: a silent robot that claims it too takes the next one, and no token is ever used by both."""
 
+_IDLE = frozenset({State.ABSENT, State.STANDBY})
 _ENDED_WELL = frozenset({State.FINISHED, State.RELEASED})
 
 
 def obey(component: Component, turn: Turn, command: Promote) -> None:
     """Carry the order out, or say what it would do, or why it cannot be done."""
-    refusal = _refusal(component, turn)
+    refusal = _on_its_way(component) or _refusal(component, turn)
     if refusal:
         turn.order(acts.Answer(command.request, False, f"cannot promote {turn.me} for {component.name}: {refusal}"))
     elif command.is_trial:
@@ -30,8 +33,24 @@ def obey(component: Component, turn: Turn, command: Promote) -> None:
         _go_on_with_the_claim(component, turn, command.request)
     elif component.state is State.FROZEN:
         _let_it_go_on(component, turn, command.request)
+    elif component.newest is None:
+        _want(component, turn, command.request)
     else:
         _claim(component, turn, command.request)
+
+
+def advance(component: Component, turn: Turn) -> None:
+    """A checkpoint was sent for, to carry out an order: it is here, or will not come any more."""
+    wanted = component.wanted
+    assert wanted is not None
+    came = component.newest is not None and component.newest >= wanted.position
+    if came and not _refusal(component, turn):
+        component.wanted = None
+        _claim(component, turn, wanted.request)
+    elif why := _in_vain(component, turn, wanted):
+        component.wanted = None
+        sentence = f"cannot promote {turn.me} for {component.name}: its checkpoint was to come from {wanted.giver}: {why}"
+        turn.order(acts.Answer(wanted.request, False, sentence))
 
 
 def risks(component: Component, turn: Turn) -> tuple[str, ...]:
@@ -52,8 +71,8 @@ def _refusal(component: Component, turn: Turn) -> str:
     waits = not turn.config.by_majority and component.state in (State.CLAIMING, State.FROZEN)
     if (component.holding and not waits) or component.state is State.STOPPING:
         return f"here it is {component.state}"
-    if component.state is not State.FROZEN and component.newest is None and component.state is not State.CLAIMING:
-        return f"{me} holds no checkpoint of it" + (f": {component.unable}" if component.unable else "")
+    if component.state not in (State.CLAIMING, State.FROZEN) and _best(component, turn) is None:
+        return f"neither {me} nor who is heard holds a checkpoint of it" + (f": {component.unable}" if component.unable else "")
     if not vacant(component, turn):
         holder = _holder(component, turn)
         return (
@@ -73,6 +92,38 @@ def _no_majority(component: Component, turn: Turn) -> str:
     if heard < turn.config.quorum:
         return f"of {voters} that vote {turn.me} hears {heard} and needs {turn.config.quorum}; start the others"
     return "" if majority.is_free(component, turn) else f"{component.primary} was heard until just now; try again"
+
+
+def _best(component: Component, turn: Turn) -> tuple[str, Position] | None:
+    """What this robot would go on from, and where that is: its own checkpoint, else the newest that another one would send."""
+    if component.newest is not None:
+        return turn.me, component.newest
+    return offer(component, turn, is_ordered=True) if component.state in _IDLE else None
+
+
+def _on_its_way(component: Component) -> str:
+    wanted = component.wanted
+    return f"its checkpoint is on the way from {wanted.giver}, for an order given before; wait for it" if wanted else ""
+
+
+def _want(component: Component, turn: Turn, request: int) -> None:
+    """Have the newest checkpoint sent here first; the claim follows when it is stored."""
+    best = offer(component, turn, is_ordered=True)
+    assert best is not None
+    component.unstored = ""
+    component.wanted = Wanted(request, *best, turn.now_ns + turn.config.ship_ms * MS)
+    turn.say(component, f"{turn.me} sends to {best[0]} for its checkpoint: an operator promoted {turn.me}")
+
+
+def _in_vain(component: Component, turn: Turn, wanted: Wanted) -> str:
+    """Why the checkpoint is waited for no longer; "" while it may still come."""
+    if component.state not in _IDLE:
+        return f"here it is {component.state} now"
+    if component.unstored:
+        return f"it could not be stored: {component.unstored}"
+    if not turn.alive(wanted.giver):
+        return f"{wanted.giver} is not heard any more; try again"
+    return "it did not come in time; try again" if turn.now_ns >= wanted.until_ns else ""
 
 
 def _claim(component: Component, turn: Turn, request: int) -> None:
@@ -121,24 +172,30 @@ def _double(turn: Turn, robot: str) -> str:
 
 
 def _newer(component: Component, turn: Turn) -> list[str]:
-    mine = component.newest
-    if component.holding or mine is None:
+    best = _best(component, turn)
+    if component.holding or best is None:
         return []
-    seen = [robot for robot, entry in living_entries(component, turn) if entry.position is not None and mine < entry.position]
-    if seen or not turn.config.by_majority or majority.holds_all(component, turn, turn.me, mine):
+    keeper, newest = best
+    seen = [robot for robot, entry in living_entries(component, turn) if entry.position is not None and newest < entry.position]
+    if seen or not turn.config.by_majority or majority.holds_all(component, turn, keeper, newest):
         return seen
-    return [robot for robot in dict.fromkeys((*component.entrusted, component.primary)) if robot and robot != turn.me]
+    return [robot for robot in dict.fromkeys((*component.entrusted, component.primary)) if robot not in ("", turn.me, keeper)]
 
 
 def _loss(component: Component, turn: Turn) -> str:
     where = f"{component.name} would go on at {turn.me}"
     if component.state is State.FROZEN:
         return f"{where}, where it stands still"
-    plan = component.plan if component.state is State.CLAIMING else component.newest
-    if plan is None:
+    best = _best(component, turn)
+    if component.state is State.CLAIMING:
+        best = (turn.me, component.plan) if component.plan else None
+    if best is None:
         return f"{where} from the beginning"
+    keeper, position = best
+    if keeper != turn.me:
+        return f"{where} from checkpoint {position.sequence}, which {keeper} keeps and sends first; what was done since is lost"
     age = f", {(turn.now_ns - component.stored_ns) / (1_000 * MS):.1f} s old" if component.stored_ns >= 0 else ""
-    return f"{where} from checkpoint {plan.sequence}{age}; what was done since is lost"
+    return f"{where} from checkpoint {position.sequence}{age}; what was done since is lost"
 
 
 def _holder(component: Component, turn: Turn) -> str:

@@ -4,7 +4,21 @@ from __future__ import annotations
 
 from failover.core.component import Component
 from failover.core.consent import STATES
-from failover.core.messages import FREE, HOLDS, NEEDS_BASE, OPEN, ORDERED, RULES, STARTS, UNPROTECTED, WARM, Beat, Echo, Entry
+from failover.core.messages import (
+    FREE,
+    HOLDS,
+    NEEDS_BASE,
+    OPEN,
+    ORDERED,
+    RULES,
+    STARTS,
+    UNPROTECTED,
+    WANTS,
+    WARM,
+    Beat,
+    Echo,
+    Entry,
+)
 from failover.core.types import HOLDING, Rule, State
 from failover.core.wire import BODY_SIZE_MAX, beat_size, entry_size
 
@@ -22,6 +36,7 @@ def entry_of(component: Component, me: str) -> Entry:
     flags = NEEDS_BASE * component.needs_base | UNPROTECTED * component.unprotected
     flags |= HOLDS * component.waits | WARM * component.warm
     flags |= FREE * component.free | OPEN * component.open | ORDERED * component.ordered
+    flags |= WANTS * (component.wanted is not None)
     flags |= STARTS * (component.autostart and not component.held and not component.entrusted)
     return Entry(
         component.name,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.e2e import robots
+from tests.e2e import robots, teams
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_orders import COUNTING, MORE, counted
 
@@ -52,3 +52,19 @@ def test_a_frozen_component_goes_on_where_it_stands_when_it_is_promoted(tmp_path
         expect_one_history(first)
         shown = robots.component(first, "count")
         assert shown["pid"] == process and shown["epoch"] > epoch
+
+
+def test_a_robot_that_has_nothing_is_sent_the_server_s_checkpoint_when_it_is_promoted(tmp_path: Path) -> None:
+    with teams.acting(tmp_path, settings="patience_s = 1\n" + HOLD) as stage:
+        first, hall = stage.members["robot1"], stage.members["hall"]
+        robots.run(first, "count", *COUNTING)
+        robots.until_protected(first)
+        robots.until(lambda: robots.checkpoints(hall, "count") >= 2, "checkpoints at the server")
+        stage.cut_power("robot1", "robot2")
+        second = stage.switch_on("robot2", empty=True)
+        robots.until(lambda: robots.component(second, "count").get("primary") == "robot1", "robot2 to know of it again")
+        robots.until(lambda: "which hall keeps and sends first" in robots.failover(second, "promote", "count").stderr, "an offer")
+        assert robots.component(second, "count")["state"] == "held"
+        done = robots.failover(second, "promote", "count", "--yes")
+        assert done.returncode == 0 and "count runs on robot2 now" in done.stdout, done
+        expect_one_history(second)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from checkpoint.model import Position
 from failover.core import acts
-from failover.core.messages import Beat
+from failover.core.messages import ORDERED, Beat
 from failover.core.types import ENDED, Ballot, ComponentView, OnLoss, State, WhenAlone
 from tests.simulation.robots import KEEPS_STATE, NewDisk, ballot_of
 from tests.simulation.world import World
@@ -27,6 +27,7 @@ class Invariants:
         gone: positions that were on a disk that was lost.
         split: components that computed in two places at once (allowed under ``run``, after a cut).
         acknowledged: newest position that each component's primaries acknowledged while a standby held it.
+        ordered: components and the epochs that an operator's order claimed: it may cost what was acknowledged.
         last: components whose end was reported as acknowledged.
     """
 
@@ -40,6 +41,7 @@ class Invariants:
     acknowledged: dict[str, Position] = field(default_factory=dict)
     shipped: dict[str, Position] = field(default_factory=dict)
     owners: dict[tuple[str, int], str] = field(default_factory=dict)
+    ordered: set[tuple[str, int]] = field(default_factory=set)
     last: set[str] = field(default_factory=set)
     crashing: set[tuple[str, str]] = field(default_factory=set)
 
@@ -126,6 +128,8 @@ class Invariants:
     def _durable_before_said(self, world: World, robot: str, beat: Beat) -> None:
         durable = {record.name: record.epoch for record in ballot_of(world.robots[robot]).records}
         for entry in beat.entries:
+            if entry.flags & ORDERED:
+                self.ordered.add((entry.name, entry.epoch))
             if entry.epoch > durable.get(entry.name, 0):
                 raise _broken(world, f"{robot} says epoch {entry.epoch} of {entry.name} before its disk knows it")
 
@@ -144,6 +148,8 @@ class Invariants:
     def _not_older(self, world: World, robot: str, act: acts.Restore) -> None:
         if act.component in self.last:
             raise _broken(world, f"{robot} runs {act.component} again, whose end was reported")
+        if (act.component, act.epoch) in self.ordered:
+            self.acknowledged.pop(act.component, None)
         safe_from = self.acknowledged.get(act.component)
         in_place = (
             any(

@@ -118,3 +118,48 @@ def test_without_a_majority_nobody_can_be_promoted() -> None:
     assert later(world) == []
     world.power_on("server1")
     assert later(world, 3_000) == ["robot2"]
+
+
+def three_with_a_server(rules: Rules) -> World:
+    """It ran at robot1; its standby is lost with it, so that only the server has a checkpoint."""
+    world = World(1, elective(3, (ComponentSpec(PART, launch=Launch(("part",)), rules=rules),), servers=1, witnesses=1))
+    for name in world.robots:
+        world.power_on(name)
+    later(world, 2_000)
+    (primary,) = world.acting(PART)
+    standby = seen_at(world, primary, PART).standby
+    world.power_off(primary)
+    world.power_off(standby)
+    assert later(world) == []
+    return world
+
+
+def test_a_robot_without_a_checkpoint_gets_it_from_the_server_when_it_is_promoted() -> None:
+    world = three_with_a_server(HOLD)
+    (last,) = [name for name, robot in world.robots.items() if robot.node and name.startswith("robot")]
+    kept = world.robots["server1"].store[PART][-1]
+    assert not world.robots[last].store.get(PART)
+    assert f"from checkpoint {kept.sequence}, which server1 keeps and sends first" in told(world, last, is_trial=True)
+    assert later(world, 3_000) == [], "nobody asked for it yet"
+    assert f"{PART} runs at {last}" in told(world, last)
+    assert later(world) == [last] and world.robots[last].programs[PART].value >= world.values[kept]
+
+
+def test_who_waits_for_a_checkpoint_is_told_when_it_cannot_be_stored() -> None:
+    world = three_with_a_server(HOLD)
+    (last,) = [name for name, robot in world.robots.items() if robot.node and name.startswith("robot")]
+    world.robots[last].broken_store = True
+    assert "it could not be stored: no space left" in told(world, last)
+    world.robots[last].broken_store = False
+    told(world, last)
+    assert later(world) == [last]
+
+
+def test_who_waits_for_a_checkpoint_is_told_when_its_keeper_is_lost() -> None:
+    world = three_with_a_server(HOLD)
+    (last,) = [name for name, robot in world.robots.items() if robot.node and name.startswith("robot")]
+    world.command(last, Promote(world.request(), PART))
+    world.power_off("server1")
+    later(world)
+    assert "server1 is not heard any more; try again" in world.log[-1]
+    assert "holds a checkpoint of it" in told(world, last)

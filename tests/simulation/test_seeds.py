@@ -14,7 +14,7 @@ SEEDS = int(os.environ.get("FAILOVER_SEEDS", "400"))
 BLOCK = 50
 """Seeds a test, so that a failure names a narrow range and the story names the seed."""
 
-SEEDS_TO_CATCH = 300
+SEEDS_TO_CATCH = 450
 
 PAIR = TEAMS[0]
 VOTERS = tuple(team for team in TEAMS if team != PAIR)

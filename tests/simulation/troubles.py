@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from random import Random
 
-from failover.core.events import Handover, Prefer
+from failover.core.events import Handover, Prefer, Promote
 from failover.core.types import MS, ComponentSpec
 from tests.simulation.invariants import Invariants
 from tests.simulation.world import World
@@ -16,6 +16,10 @@ FINISHES = 0.3
 
 PAUSES_MS = (30, 100, 200, 400, 900)
 """Around a lease, and far longer."""
+
+
+PROMOTED_MS = 300
+"""After the loss, and again after as long, an operator gives his order: with short leases the first one is in time."""
 
 
 class Trouble:
@@ -59,6 +63,7 @@ class Trouble:
         if len(self._names) > 2:
             kinds += [self._partition, self._shut_out, self._deaf, self._mute, self._storm, self._slow, self._blink, self._prefer]
             kinds += [self._mute_primary, self._stall_primary, self._stall_primary, self._standby_out, self._worst, self._worst]
+            kinds += [self._promote]
         return kinds
 
     # The network
@@ -182,6 +187,14 @@ class Trouble:
 
     def _handover(self) -> None:
         self._world.command(self._name, Handover(self._world.request(), self._spec.name))
+
+    def _promote(self) -> None:
+        """The primary is lost and its standby out of reach: an operator has another robot run it, as soon as that may be."""
+        self._pause_ns = max(self._pause_ns, PROMOTED_MS * MS)
+        self._worst()
+        for after_ms in PROMOTED_MS, 2 * PROMOTED_MS:
+            order = Promote(self._world.request(), self._spec.name)
+            self._world.after(after_ms * MS, lambda order=order: self._world.command(self._other, order))
 
     def _prefer(self) -> None:
         self._world.command(self._name, Prefer(self._world.request(), self._spec.name, self._other))
