@@ -88,6 +88,7 @@ SYSTEM_CALLS: Final = {
     "inotify_add_watch": 254,
     "inotify_init1": 294,
     "inotify_rm_watch": 255,
+    "futex": 202,
     "getsockname": 51,
     "ioctl": 16,
     "ioprio_set": 251,

@@ -48,9 +48,9 @@ def holder_of(held: OpenFile) -> int | None:
     return None
 
 
-def opener_of(held: OpenFile) -> int | None:
-    """Another process that has a file of the same name open; what was opened in the last second may be missed."""
-    return next((other for other, _ in _holders(held.pid, _second()).get(held.first.target, ())), None)
+def opener_of(held: OpenFile, name: str = "") -> int | None:
+    """Another process that has a file of the same name, or of another, open; what was opened in the last second may be missed."""
+    return next((other for other, _ in _holders(held.pid, _second()).get(name or held.first.target, ())), None)
 
 
 def refuse(held: OpenFile, what: str) -> str | None:

@@ -29,6 +29,7 @@ from checkpoint.resources import (
     sockets,
     streams,
     tcp_connections,
+    terminals,
     timerfds,
     unix_sockets,
     unsupported,
@@ -53,6 +54,7 @@ class Kind(Protocol):
 
 ASKED: Final[tuple[Kind, ...]] = (
     attached_devices,
+    terminals,
     streams,
     kernel_files,
     memory_files,
@@ -89,6 +91,8 @@ def observer_of(one: Descriptor, noted: sockets.Noted | None) -> Observer | None
     """
     if sockets.is_socket(one):
         return functools.partial(_observe_socket, noted=noted)
+    if terminals.is_terminal(one):
+        return terminals.observe
     if memory_files.is_memory_file(one):
         return memory_files.observe
     return fifos.observe if fifos.is_fifo(one) else _OBSERVED.get(one.target)

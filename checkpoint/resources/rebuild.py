@@ -38,6 +38,7 @@ from checkpoint.resources import (
     signalling,
     streams,
     tcp_connections,
+    terminals,
     timerfds,
     unix_sockets,
     watches,
@@ -72,7 +73,7 @@ NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
 }
 """Kinds that need something of this machine: why it does not have that, one sentence each."""
 SOCKETS: Final = (unix_sockets.KIND, tcp_connections.KIND, internet_sockets.KIND)
-KINDS: Final = (files.KIND, devices.KIND, streams.KIND, pipes.KIND, *MADE, *SOCKETS)
+KINDS: Final = (files.KIND, devices.KIND, streams.KIND, pipes.KIND, terminals.KIND, *MADE, *SOCKETS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +110,9 @@ def rebuild_all(
     moved = _move_streams_away(table, max(wanted[-1].number, *objects.values(), 0) + 1)
     piped = pipes.rebuild(table, [held for held in state.resources if held.kind == pipes.KIND], moved[-1] + 1)
     connected = _prepare_sockets(table, state, moved[-1] + 1 + len(piped))
-    rebuilding = Rebuilding(options, state.clocks, inner_pid, max((moved[-1] + len(piped), *connected.values())) + 1)
+    last = max((moved[-1] + len(piped), *connected.values()))
+    lines = terminals.prepare(table, [held for held in state.resources if held.kind == terminals.KIND], last + 1)
+    rebuilding = Rebuilding(options, state.clocks, inner_pid, max((last, *lines.values())) + 1)
     for key, number in objects.items():
         rebuilding.keep(table, key, number)
     holders: dict[int, int] = {}  # which number already stands for an open file description
@@ -117,11 +120,14 @@ def rebuild_all(
         if id(one.resource) in holders:
             _duplicate(table, holders[id(one.resource)], one)
         else:
-            _obtain(table, one, moved, piped, connected, rebuilding)
+            if id(one.resource) in lines:
+                _duplicate(table, lines[id(one.resource)], one)
+            else:
+                _obtain(table, one, moved, piped, connected, rebuilding)
             holders[id(one.resource)] = one.number
             signalling.rebuild(table, one.number, one.resource, inner_pid)
     memory_files.seal(table, [held for held in state.resources if held.kind == memory_files.KIND], rebuilding)
-    for number in (*moved, *piped.values(), *connected.values(), *rebuilding.objects.values()):
+    for number in (*moved, *piped.values(), *connected.values(), *lines.values(), *rebuilding.objects.values()):
         table.close(number)
     _settle(table, wanted, holders)
     return tcp_connections.notes(state.resources)
@@ -153,6 +159,7 @@ def _settle(table: CallTable, wanted: list[Wanted], holders: Mapping[int, int]) 
 
 def rebuild_last(table: CallTable, state: Snapshot) -> None:
     """Add the calls that must come after everything else of a restore: watches would tell of it, locks would be lost."""
+    terminals.settle(table, state.resources, state.process.pid)
     for held in state.resources:
         first = number_of(_pairs(held.facts["descriptors"])[0][0])
         locks.settle(table, held, first)

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
 import pytest
 
@@ -33,6 +33,9 @@ PR_SET_DUMPABLE = 4
 
 CANNOT = 77
 """Exit status of a tracee that this machine does not let set its stage."""
+
+
+Answer = TypeVar("Answer")
 
 
 class EndedError(AssertionError):
@@ -163,7 +166,7 @@ def ended(program: Program) -> Iterator[Program]:
 @contextlib.contextmanager
 def protected(program: Program, component: str = "/test/tracee", devices: tuple[DeviceRule, ...] = ()) -> Iterator[Session]:
     """Hold a program under protection for the body."""
-    session = ENGINE.protect(program.pid, component, None, devices=devices)
+    session = at_last(lambda: ENGINE.protect(program.pid, component, None, devices=devices))
     try:
         yield session
     finally:
@@ -178,15 +181,20 @@ def transported(snapshot: Snapshot) -> Snapshot:
 def captured(program: Program) -> Snapshot:
     """One base; the program runs on."""
     with protected(program) as session:
-        return transported(session.capture(CaptureOrder()))
+        return transported(captured_at_last(session, CaptureOrder()))
 
 
 def captured_at_last(session: Session, order: CaptureOrder) -> Snapshot:
     """A capture that is made again where a busy machine left us no processor in time: it says so, and harms nothing."""
+    return at_last(lambda: session.capture(order))
+
+
+def at_last(act: Callable[[], Answer]) -> Answer:
+    """What an act answers that is made again while the machine is too busy for it."""
     deadline = time.monotonic() + PATIENCE_S
     while True:
         try:
-            return session.capture(order)
+            return act()
         except ProcessGoneError:
             raise
         except CaptureError:
@@ -197,7 +205,7 @@ def captured_at_last(session: Session, order: CaptureOrder) -> Snapshot:
 def captured_and_killed(program: Program, devices: tuple[DeviceRule, ...] = ()) -> Snapshot:
     """One base, then the power cut. What the program wrote in between must be undone by the restore."""
     with protected(program, devices=devices) as session:
-        snapshot = transported(session.capture(CaptureOrder()))
+        snapshot = transported(captured_at_last(session, CaptureOrder()))
         program.kill()
     return snapshot
 

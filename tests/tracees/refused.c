@@ -13,7 +13,6 @@
 #include <linux/userfaultfd.h>
 #include <mqueue.h>
 #include <pthread.h>
-#include <pty.h>
 #include <sys/fanotify.h>
 #include <sys/file.h>
 #include <sys/ioctl.h>
@@ -184,11 +183,6 @@ static void take_userfaultfd_registered(void) {
     if (ioctl(opened, UFFDIO_REGISTER, &range)) cannot("register memory");
 }
 
-static void take_pseudo_terminal(void) {
-    int other;
-    if (openpty(&opened, &other, NULL, NULL, NULL)) cannot("open a pseudo-terminal");
-}
-
 static void take_seccomp(void) {
     struct sock_filter allow[] = {BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW)};
     struct sock_fprog program = {1, allow};
@@ -221,7 +215,6 @@ static void take_lease(void) {
 static void take_kernel_log(void) { keep(open("/dev/kmsg", O_RDONLY), "/dev/kmsg"); }
 static void take_tun(void) { keep(open("/dev/net/tun", O_RDWR), "/dev/net/tun"); }
 static void take_fuse(void) { keep(open("/dev/fuse", O_RDWR), "/dev/fuse"); }
-static void take_terminal_multiplexer(void) { keep(open("/dev/ptmx", O_RDWR | O_NOCTTY), "/dev/ptmx"); }
 
 static void take_device_memory(void) {
     int memory = open("/dev/mem", O_RDONLY);
@@ -341,14 +334,12 @@ static const struct kind {
              {"aio", take_aio},
              {"userfaultfd", take_userfaultfd},
              {"userfaultfd_registered", take_userfaultfd_registered},
-             {"pseudo_terminal", take_pseudo_terminal},
              {"seccomp", take_seccomp},
              {"huge_pages", take_huge_pages},
              {"lease", take_lease},
              {"kernel_log", take_kernel_log},
              {"tun", take_tun},
              {"fuse", take_fuse},
-             {"terminal_multiplexer", take_terminal_multiplexer},
              {"device_memory", take_device_memory},
              {"system_v_memory", take_system_v_memory},
              {"message_queue", take_message_queue},

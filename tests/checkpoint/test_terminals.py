@@ -1,0 +1,65 @@
+"""Pseudo-terminals of a program's own: three restores in a row, then it looks at what it has."""
+
+from __future__ import annotations
+
+import os
+import pty
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from checkpoint.engine import RestoreOptions
+from checkpoint.errors import UnsupportedError
+from checkpoint.linux.vessel import Birth, discard, spawn_vessel
+from tests.checkpoint.round_trip import ENGINE, captured, captured_and_killed, ended, expect_ok, restored, start_tracee
+
+pytestmark = [pytest.mark.compiler, pytest.mark.root]
+
+Compiled = Callable[..., Path]
+
+ROUNDS = 3
+CASES = ["plain", "settings", "modes", "several", "controlling", "alone", "hung_up"]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_terminal_of_which_a_program_has_both_ends_comes_back(case: str, compiled: Compiled, tmp_path: Path) -> None:
+    tracee = start_tracee(compiled("terminals", "-O2", "-lutil"), tmp_path, case)
+    for _ in range(ROUNDS):
+        with ended(tracee):
+            captured(tracee)
+            snapshot = captured_and_killed(tracee)
+        tracee = restored(snapshot, tmp_path)
+    with ended(tracee):
+        captured(tracee)
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_a_terminal_whose_number_is_taken_gets_another_which_is_said(compiled: Compiled, tmp_path: Path) -> None:
+    tracee = start_tracee(compiled("terminals", "-O2", "-lutil"), tmp_path, "alone")
+    with ended(tracee):
+        number = next(held.facts["terminal"] for held in captured(tracee).resources if held.kind == "terminals")
+        snapshot = captured_and_killed(tracee)
+    taken: list[tuple[int, int]] = []
+    try:
+        while f"/dev/pts/{number}" not in [os.ttyname(slave) for _, slave in taken]:
+            taken.append(pty.openpty())
+        born = spawn_vessel(Birth(inner_pid=snapshot.process.pid))
+        try:
+            notes = ENGINE.restore(born.pid, snapshot, RestoreOptions()).notes
+        finally:
+            discard(born)
+        assert any(f"/dev/pts/{number}" in note and "another number" in note for note in notes), notes
+    finally:
+        for ends in taken:
+            for descriptor in ends:
+                os.close(descriptor)
+
+
+def test_a_terminal_in_which_something_waits_is_refused_until_it_is_read(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("terminals", "-O2", "-lutil"), tmp_path, "unread")) as tracee:
+        with pytest.raises(UnsupportedError, match="with 6 bytes that wait"):
+            ENGINE.protect(tracee.pid, "/test/unread", None)
+        tracee.tell()
+        expect_ok(tracee)
