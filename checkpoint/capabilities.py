@@ -9,7 +9,7 @@ from types import ModuleType
 from typing import Final
 
 from checkpoint.capability import Area, Capability, Verdict
-from checkpoint.engines import preserved, restore_checks, restore_vdso
+from checkpoint.engines import preserved, restore_checks, restore_kinds, restore_vdso
 from checkpoint.resources import (
     attached_devices,
     carried_trees,
@@ -23,6 +23,7 @@ from checkpoint.resources import (
     kernel_files,
     locks,
     memory_files,
+    memory_locks,
     pipes,
     refused_devices,
     refused_threads,
@@ -67,6 +68,8 @@ CARRIERS: Final[tuple[ModuleType, ...]] = (
     unsupported,
     restore_checks,
     restore_vdso,
+    restore_kinds,
+    memory_locks,
 )
 """In the order in which their rows stand within an area and a verdict."""
 

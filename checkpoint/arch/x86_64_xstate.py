@@ -121,6 +121,14 @@ def fitted(xstate: bytes, theirs: Layout, ours: Layout, example: bytes) -> bytes
     return bytes(made)
 
 
+def key_rights(xstate: bytes, layout: Layout) -> int | None:
+    """PKRU: two bits for each protection key, no access and no writing; None where it is not in use or not told."""
+    found = next((one for one in layout if one.number == PKRU), None)
+    if found is None or not in_use(xstate) >> PKRU & 1:
+        return None
+    return int.from_bytes(xstate[found.offset : found.offset + 4], "little")
+
+
 def _extended_in_use(xstate: bytes, layout: Layout) -> Iterator[Component]:
     """Those that are in use and inside what was told."""
     used = in_use(xstate)

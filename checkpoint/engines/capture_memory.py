@@ -114,16 +114,16 @@ class MemoryCapture:
     Attributes:
         lines: the mappings when they were last read, without our own.
         acknowledged: the newest acknowledged position; None if only a base can be captured.
+        borrowed: our own pages in the process, which belong to no snapshot.
 
     Args:
         tracker: owned from now on.
-        borrowed: our own pages in the process, which belong to no snapshot.
     """
 
     def __init__(self, memory: Memory, tracker: Tracker, borrowed: BorrowedPages) -> None:
         self._memory = memory
         self._tracker = tracker
-        self._borrowed = borrowed
+        self.borrowed = borrowed
         self._shared = SharedPages(memory.pid)
         self._page_tables = pagetables.existence(memory.pid)
         self._maps = MapsReader(memory.pid)
@@ -264,7 +264,7 @@ class MemoryCapture:
         if not self._maps.refresh():
             return
         self._has_moved = True
-        self.lines = tuple(line for line in self._maps.lines if not self._borrowed.holds(line.start))
+        self.lines = tuple(line for line in self._maps.lines if not self.borrowed.holds(line.start))
         self._private = [line for line in self.lines if tracking.is_private(line)]
         self._shared_lines = [line for line in self.lines if tracking.is_shared(line) or tracking.is_orphan(line)]
         self._followed = tracking.extents_of(self._private)

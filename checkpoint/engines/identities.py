@@ -12,15 +12,16 @@ from typing import Final
 
 from checkpoint import pages
 from checkpoint.errors import CaptureError
-from checkpoint.linux import procfs
+from checkpoint.linux import procfs, vm_flags
 from checkpoint.linux.procfs import DELETED, MapsLine
 from checkpoint.linux.tracking import NOT_CARRIED, is_shared_object
 from checkpoint.model import FileIdentity, Vma, VmaKind
 from checkpoint.pages import Words
 from checkpoint.resources import files
 
-KEPT_FLAGS: Final = frozenset(("gd", "dc", "dd", "wf", "hg", "nh", "lo", "lf", "nr", "sr", "rr", "mg"))
-"""VmFlags that a restore gives back."""
+_ADVICE: Final = frozenset(("gd", "dc", "dd", "wf", "hg", "nh", "lo", "lf", "nr", "sr", "rr", "mg"))
+KEPT_FLAGS: Final = _ADVICE | {vm_flags.HUGE, vm_flags.GIGANTIC, vm_flags.SEALED, vm_flags.DROPPABLE} | vm_flags.KEYS
+"""Codes that a restore gives back."""
 VSYSCALL: Final = "[vsyscall]"
 KINDS: Final = {
     "[heap]": VmaKind.HEAP,

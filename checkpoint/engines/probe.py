@@ -10,7 +10,7 @@ from checkpoint import portable
 from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import KEPT, NOTED, REFUSED, Finding, Report, Streams
 from checkpoint.errors import ProbeError, ProcessGoneError
-from checkpoint.linux import dirty, processor, procfs
+from checkpoint.linux import dirty, processor, procfs, vm_flags
 from checkpoint.linux.procfs import Status
 from checkpoint.resources import Surroundings, glance, look, pipes_of, unsupported
 
@@ -94,8 +94,7 @@ def _processor_findings(pid: int) -> Iterator[Finding]:
 
 
 def _memory_findings(pid: int) -> Iterator[Finding]:
-    smaps = procfs.read_text(pid, "smaps")
-    flags = procfs.parse_vm_flags(smaps)
+    flags = vm_flags.parse(procfs.read_text(pid, "smaps"))
     lines = procfs.parse_maps(procfs.read_text(pid, "maps"))
     for line in lines:
         reason = unsupported.refuse_mapping(line, flags.get(line.start, ()))
@@ -103,8 +102,6 @@ def _memory_findings(pid: int) -> Iterator[Finding]:
             yield Finding("memory", f"VMA {line.start:x}-{line.end:x}", REFUSED, reason)
     for path, note in unsupported.note_mappings(lines):
         yield Finding("memory", path, NOTED, note)
-    for reason in unsupported.refuse_protection_keys(smaps):
-        yield Finding("memory", "protection key", REFUSED, reason)
 
 
 def _command(pid: int, status: Status) -> str:

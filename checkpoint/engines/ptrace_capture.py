@@ -45,10 +45,11 @@ from checkpoint.linux import abi, procfs
 from checkpoint.linux.procfs import MapsLine, Status
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Tracee
-from checkpoint.linux.tracking import NONE
-from checkpoint.model import Position, Snapshot
+from checkpoint.linux.tracking import NONE, NOT_CARRIED
+from checkpoint.linux.vm_flags import FlagsReader
+from checkpoint.model import Position, Resource, Snapshot
 from checkpoint.pages import PageTable
-from checkpoint.resources import Surroundings, carried_trees, glance, look, unsupported
+from checkpoint.resources import Surroundings, carried_trees, glance, look, memory_locks, unsupported
 from checkpoint.resources.carried_trees import NO_PARCEL, CarriedTrees, Parcel, Seen
 from checkpoint.stream_counts import Totals
 
@@ -104,8 +105,7 @@ class PtraceSession:
         self._onlooker = Onlooker(threads, entered, surroundings.devices)
         self._memory = MemoryCapture(threads.leader.memory, entered.tracker, entered.pages)
         self._level = portable.level_in(procfs.read_bytes(pid, "environ"))
-        self._flags: dict[int, tuple[str, ...]] = {}
-        self._flags_of: tuple[MapsLine, ...] = ()
+        self._flags = FlagsReader(pid)
         self._identities = Identities(pid, names or {})
         self._files_kept = names is not None
         self._outputs: Outputs | None = None
@@ -206,8 +206,8 @@ class PtraceSession:
         """Copy beforehand what is worth it; for a base the files are looked at before, too, for that takes long."""
         if base:
             self._memory.refresh()
-            self._read_flags()
-            self._identities.vmas(self._memory.lines, self._flags, NONE)
+            self._flags.refresh(self._memory.lines, anew=True)
+            self._identities.vmas(self._memory.lines, self._flags.flags, NONE)
         return self._memory.copy_running(base=base)
 
     def _look_from_outside(self) -> None:
@@ -293,7 +293,7 @@ class PtraceSession:
         parcel = self._carried.parcel(frozen.seen, parent) if self._carried else NO_PARCEL
         snapshot = replace(
             self._with_pages(self._outline(order, parent, frozen, parcel), taken, parcel),
-            resources=(*held.resources, *parcel.resources),
+            resources=(*held.resources, *self._locks(taken.lines), *parcel.resources),
             output=self._outputs.pieces(self._output_since(parent), standing.totals) if self._outputs else (),
         )
         snapshot = replace(snapshot, position=position_of(snapshot, order.generation, order.sequence))
@@ -325,7 +325,7 @@ class PtraceSession:
             clocks=standing.told.clocks,
             process=process_state(self.pid, standing, self._identities),
             threads=thread_states(self.pid, standing),
-            vmas=(*self._identities.vmas(taken.lines, self._flags, taken.guards), *parcel.vmas),
+            vmas=(*self._identities.vmas(taken.lines, self._flags.flags, taken.guards), *parcel.vmas),
             epoch=order.epoch,
             freeze_us=frozen.freeze_us,
             notes=self.notes,
@@ -343,21 +343,22 @@ class PtraceSession:
         self._table = before.apply(forgotten, runs, content, outline.vmas)
         return replace(outline, cleared=forgotten, runs=runs, contents=content, page_sum=self._table.page_sum)
 
-    def _read_flags(self) -> None:
-        """VmFlags cost a walk over all pages: read while the program runs, and only when the mappings changed."""
-        if self._flags_of != self._memory.lines:
-            self._flags = procfs.parse_vm_flags(procfs.read_text(self.pid, "smaps"))
-            self._flags_of = self._memory.lines
-
     def _reasons_of(self, status: Status, lines: tuple[MapsLine, ...]) -> tuple[str, ...]:
         """Why what it has turned into cannot be captured."""
         try:
-            self._read_flags()
+            self._flags.refresh(self._memory.lines)
             of_mappings = (unsupported.refuse_mapping(line, self._foreign_flags(line)) for line in lines)
             return (*self._reasons_of_process(status), *(reason for reason in of_mappings if reason))
         except ProcessGoneError:
             return ()  # the picture was taken before it ended
 
+    def _locks(self, lines: tuple[MapsLine, ...]) -> tuple[Resource, ...]:
+        """Whether what it maps from now on is locked in memory."""
+        told = self._flags.flags
+        ours = [codes for start, codes in told.items() if self._memory.borrowed.holds(start)]
+        of_program = (told.get(line.start, ()) for line in lines if line.name not in NOT_CARRIED)
+        return memory_locks.describe(of_program, ours)
+
     def _foreign_flags(self, line: MapsLine) -> tuple[str, ...]:
         """VmFlags without those that our own write protection sets."""
-        return tuple(flag for flag in self._flags.get(line.start, ()) if flag not in ("um", "uw"))
+        return tuple(flag for flag in self._flags.flags.get(line.start, ()) if flag not in ("um", "uw"))

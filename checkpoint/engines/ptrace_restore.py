@@ -30,7 +30,15 @@ from typing import Final
 from checkpoint import carried, epoch_variable
 from checkpoint.arch import x86_64, x86_64_stub, x86_64_xstate
 from checkpoint.engine import RestoreOptions
-from checkpoint.engines import restore_checks, restore_memory, restore_process, restore_threads, restore_vdso, switches
+from checkpoint.engines import (
+    restore_checks,
+    restore_kinds,
+    restore_memory,
+    restore_process,
+    restore_threads,
+    restore_vdso,
+    switches,
+)
 from checkpoint.engines.restore_checks import Brought
 from checkpoint.engines.restore_process import Vessel
 from checkpoint.errors import CheckpointError, MismatchError, RestoreError
@@ -39,7 +47,7 @@ from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee
 from checkpoint.model import Credentials, Position, Snapshot, ThreadState, Vma
-from checkpoint.resources import files, laying, remembered
+from checkpoint.resources import files, laying, memory_locks, remembered
 from checkpoint.resources.rebuild import rebuild_all, rebuild_last
 from checkpoint.resources.rebuilding import number_of
 
@@ -243,6 +251,7 @@ class _Restore:
         ours, theirs = restore_memory.kernel_pages(mappings), restore_memory.kernel_pages_of(vmas)
         self._vdso = restore_memory.move_kernel_pages(table, ours, theirs, refuge)
         self._vdso_size = ours[-1].size
+        restore_kinds.allocate_keys(table, restore_kinds.keys_of(self._state))
         self._objects |= restore_memory.map_program(table, vmas, runs, brought)
         self._executable = brought.pop(self._state.process.executable.path, None)
         for descriptor in brought.values():
@@ -289,6 +298,7 @@ class _Restore:
         restore_process.interval_timers(table, process.interval_timers, elapsed_ns)
         restore_process.last_marks(table, process)
         rebuild_last(table, self._state)
+        memory_locks.rebuild(table, state.resources)
         switches.set_again(table, process.switches)
         return table
 

@@ -19,7 +19,7 @@ from checkpoint.arch.x86_64_xstate import Layout
 from checkpoint.capability import Area, by_rule, refused
 from checkpoint.contents import DIGEST_SIZE, digest_of_file, path_in
 from checkpoint.engine import RestoreOptions
-from checkpoint.engines import restore_vdso
+from checkpoint.engines import restore_kinds, restore_vdso
 from checkpoint.engines.description import this_machine
 from checkpoint.engines.identities import build_id
 from checkpoint.engines.restore_memory import is_file_mapping, kernel_pages, makes_shared_memory
@@ -148,6 +148,7 @@ def _of_machine(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
     if listed := ", ".join(portable.lacking(machine.features, here.features)):
         cure = "use one that has them, or start it with failover run --portable"
         yield f"this processor lacks {listed}, by which the program may have chosen its code: {cure}"
+    yield from restore_kinds.refuse(state)
     if any(vma.guards for vma in state.vmas) and not can_install_guards():
         yield f"it has guard pages of madvise(2), which our kernel ({here.kernel}) does not know: boot Linux 6.13 or later"
     if state.process.root_directory != "/":

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from checkpoint import pages
+from checkpoint.engines import restore_kinds
 from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.memory import Memory
@@ -146,7 +147,8 @@ def makes_shared_memory(vmas: Iterable[Vma], path: str) -> bool:
 
 def is_object_mapping(vma: Vma) -> bool:
     """Whether it is a shared mapping of a memory file, or of a file that has no name any more."""
-    return vma.kind is VmaKind.FILE and vma.shared and vma.file is not None and vma.file.deleted
+    is_named_nowhere = vma.kind is VmaKind.FILE and vma.file is not None and vma.file.deleted
+    return is_named_nowhere and vma.shared and not restore_kinds.is_huge(vma)
 
 
 def _object(vma: Vma) -> tuple[int, int]:
@@ -200,6 +202,9 @@ def _map(table: CallTable, vma: Vma, protection: int, descriptor: int) -> None:
         flags |= abi.MAP_GROWSDOWN | abi.MAP_STACK
     if "nr" in vma.flags:
         flags |= abi.MAP_NORESERVE
+    if restore_kinds.is_special(vma):
+        restore_kinds.map_special(table, vma, protection, flags & ~abi.MAP_FIXED)
+        return
     what = f"map {vma.size >> 10} KiB at {vma.start:#x} ({vma.name or 'anonymous'})"
     arguments = (vma.start, vma.size, protection, flags, descriptor, offset)
     table.call(what, "mmap", *arguments, least=vma.start, most=vma.start)
@@ -277,6 +282,8 @@ def settle(table: CallTable, vmas: Iterable[Vma], runs: Sequence[PageRun]) -> No
         if "lo" in vma.flags:
             on_fault = MAP_LOCKED_ON_FAULT if "lf" in vma.flags else 0
             table.attempt(f"memory at {vma.start:#x} is not locked", "mlock2", vma.start, vma.size, on_fault)
+        restore_kinds.protect(table, (vma,))
         if vma.name.startswith(NAMED_ANONYMOUS):
             name = table.place_path(vma.name.removeprefix(NAMED_ANONYMOUS).removesuffix("]"))
             table.attempt("", "prctl", PR_SET_VMA, 0, vma.start, vma.size, name)
+        restore_kinds.seal(table, vma)

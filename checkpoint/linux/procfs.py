@@ -181,21 +181,6 @@ class MapsReader:
         return True
 
 
-_SMAPS_HEAD: Final = re.compile(r"([0-9a-f]+)-([0-9a-f]+) [r-][w-][x-][ps] ")
-
-
-def parse_vm_flags(text: str) -> dict[int, tuple[str, ...]]:
-    """Read the VmFlags of /proc/PID/smaps: start of the mapping → its two-letter codes."""
-    flags: dict[int, tuple[str, ...]] = {}
-    start = 0
-    for line in text.splitlines():
-        if line.startswith("VmFlags:"):
-            flags[start] = tuple(line.split()[1:])
-        elif match := _SMAPS_HEAD.match(line):
-            start = int(match[1], 16)
-    return flags
-
-
 # The process
 
 

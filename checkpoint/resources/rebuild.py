@@ -33,6 +33,7 @@ from checkpoint.resources import (
     kernel_files,
     locks,
     memory_files,
+    memory_locks,
     pipes,
     signalfds,
     signalling,
@@ -73,7 +74,7 @@ NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
 }
 """Kinds that need something of this machine: why it does not have that, one sentence each."""
 SOCKETS: Final = (unix_sockets.KIND, tcp_connections.KIND, internet_sockets.KIND)
-KINDS: Final = (files.KIND, devices.KIND, streams.KIND, pipes.KIND, terminals.KIND, *MADE, *SOCKETS)
+KINDS: Final = (files.KIND, devices.KIND, streams.KIND, pipes.KIND, memory_locks.KIND, terminals.KIND, *MADE, *SOCKETS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +162,10 @@ def rebuild_last(table: CallTable, state: Snapshot) -> None:
     """Add the calls that must come after everything else of a restore: watches would tell of it, locks would be lost."""
     terminals.settle(table, state.resources, state.process.pid)
     for held in state.resources:
-        first = number_of(_pairs(held.facts["descriptors"])[0][0])
+        numbers = _pairs(held.facts["descriptors"])
+        if not numbers:
+            continue  # nothing that is open
+        first = number_of(numbers[0][0])
         locks.settle(table, held, first)
         if held.kind == watches.KIND:
             watches.settle(table, held, first)

@@ -15,7 +15,7 @@ from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import ProbeError, ProcessGoneError
-from checkpoint.linux import procfs
+from checkpoint.linux import procfs, vm_flags
 from checkpoint.linux.procfs import MapsLine, Status
 from checkpoint.linux.tracking import is_orphan
 from checkpoint.model import Resource
@@ -50,11 +50,12 @@ CAPABILITIES: Final = (
     refused(Area.MEMORY, "secret memory that is mapped", "run it without", "secret memory"),
     refused(
         Area.MEMORY,
-        "huge pages (hugetlb)",
-        "use transparent ones, which are kept as ordinary pages",
-        "huge pages",
-        "huge pages (hugetlb)",
+        "huge pages of a file or memory file (hugetlbfs), and more than 64 MiB of private ones at once",
+        "use MAP_HUGETLB in smaller pieces, or transparent ones, which are kept as ordinary pages",
+        "huge pages of a file (hugetlbfs)",
+        "MiB of huge pages, which every checkpoint compares",
     ),
+    refused(Area.MEMORY, "files that are stored by touching memory (DAX, MAP_SYNC)", "map them without", "memory that is stored"),
     refused(
         Area.MEMORY,
         "memory that the program itself watches by userfaultfd",
@@ -63,7 +64,7 @@ CAPABILITIES: Final = (
         "own userfaultfd watches",
         "own userfaultfd write-protects",
     ),
-    refused(Area.MEMORY, "protection keys, shadow stacks", "run it without", "has protection key", "a shadow stack"),
+    refused(Area.MEMORY, "shadow stacks", "run it without", "a shadow stack"),
     preserved(
         Area.MEMORY,
         "mapped files that were replaced or deleted since the program started",
@@ -141,12 +142,12 @@ _MAPPINGS: Final = (
     (re.compile(r"/\[aio\]"), "a ring of asynchronous I/O (aio)"),
     (re.compile(r"/SYSV[0-9a-f]+"), "System V shared memory"),
     (re.compile(r"/secretmem"), "secret memory"),
-    (re.compile(r"/anon_hugepage"), "huge pages"),
     (re.compile(r"/dev/(?!zero|shm/)"), "memory of a device"),
 )
 
 _VM_FLAGS: Final[Mapping[str, str]] = {
-    "ht": "huge pages (hugetlb)",
+    "ht": "huge pages of a file (hugetlbfs)",
+    "sf": "memory that is stored by touching it (DAX, MAP_SYNC)",
     "um": "memory that the program's own userfaultfd watches",
     "uw": "memory that the program's own userfaultfd write-protects",
     "ui": "memory that the program's own userfaultfd watches",
@@ -156,6 +157,8 @@ _VM_FLAGS: Final[Mapping[str, str]] = {
 }
 """VmFlags of proc_pid_smaps(5) that no fresh mapping can be given."""
 
+HUGE_NAME: Final = "/anon_hugepage"
+"""What the kernel calls memory of huge pages that has no file."""
 ORPHAN_LIMIT: Final = 64 << 20
 """Bytes of one mapping of a deleted file that are carried: every freeze reads them all, a millisecond for 4 MiB."""
 
@@ -215,6 +218,11 @@ def refuse_mapping(line: MapsLine, flags: tuple[str, ...]) -> str | None:
     for pattern, what in _MAPPINGS:
         if pattern.match(line.name):
             return f"{where} is {what} ({line.name}), which {_ADVICE}"
+    if vm_flags.HUGE in flags and line.name.startswith(HUGE_NAME):
+        if is_orphan(line) and line.size > ORPHAN_LIMIT:
+            cure = f"let the program map them in pieces of {ORPHAN_LIMIT >> 20} MiB at most"
+            return f"{where} is {line.size >> 20} MiB of huge pages, which every checkpoint compares: {cure}"
+        return None
     for flag in flags if not line.name.startswith(_KERNEL_PAGES) else ():
         if flag in _VM_FLAGS:
             return f"{where} is {_VM_FLAGS[flag]}, which {_ADVICE}"
@@ -229,6 +237,8 @@ def note_mappings(lines: Iterable[MapsLine]) -> Iterator[tuple[str, str]]:
     """Deleted files that mappings hold on to: the path of each, and what an operator should know of it."""
     carried: dict[str, int] = {}
     for line in filter(is_orphan, lines):
+        if line.name.startswith(HUGE_NAME):
+            continue
         path = line.name.removesuffix(procfs.DELETED)
         carried[path] = carried.get(path, 0) + line.size
     for path, size in carried.items():
@@ -244,21 +254,6 @@ def note_mappings(lines: Iterable[MapsLine]) -> Iterator[tuple[str, str]]:
 def is_shared_anonymous(line: MapsLine) -> bool:
     """Whether this is MAP_SHARED|MAP_ANONYMOUS, which the kernel shows as a deleted /dev/zero."""
     return line.shared and line.name == f"/dev/zero{procfs.DELETED}"
-
-
-_PROTECTION_KEY: Final = re.compile(r"([0-9a-f]+)-[0-9a-f]+ ([r-][w-][x-])|ProtectionKey: +([0-9]+)")
-_EXECUTE_ONLY: Final = "--x"
-"""The kernel itself gives such a mapping a key, and does so again when it is made again."""
-
-
-def refuse_protection_keys(smaps: str) -> Iterator[str]:
-    """Mappings with a protection key (pkeys(7)) that the program chose."""
-    start, protection = "?", ""
-    for match in _PROTECTION_KEY.finditer(smaps):
-        if match[1]:
-            start, protection = match[1], match[2]
-        elif match[3] != "0" and protection != _EXECUTE_ONLY:
-            yield f"the mapping at {start} has protection key {match[3]}, which {_ADVICE}"
 
 
 # --- The process as a whole --------------------------------------------------------------------------------------------

@@ -201,12 +201,6 @@ static void take_thread_seccomp(void) {
     take_unlike_thread(install_filter);
 }
 
-static void take_huge_pages(void) {
-    char *place = mmap(NULL, 2 << 20, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_HUGETLB, -1, 0);
-    if (place == MAP_FAILED) cannot("map a huge page");
-    place[0] = 1;
-}
-
 static void take_lease(void) {
     keep(open("leased", O_RDONLY | O_CREAT, 0600), "a file");
     if (fcntl(opened, F_SETLEASE, F_RDLCK)) cannot("take a lease");
@@ -263,12 +257,6 @@ static void take_memory_file(void) {
     keep(memfd_create("scratch", 0), "a memory file");
     if (ftruncate(opened, PAGE) || mmap(NULL, PAGE, PROT_READ | PROT_WRITE, MAP_SHARED, opened, 0) == MAP_FAILED)
         cannot("map a memory file");
-}
-
-static void take_protection_key(void) {
-    int key = pkey_alloc(0, 0);
-    if (key < 0 || pkey_mprotect(map_pages(1, PROT_READ | PROT_WRITE, 0), PAGE, PROT_READ | PROT_WRITE, key))
-        cannot("use a protection key");
 }
 
 static void take_deleted_directory(void) {
@@ -335,8 +323,7 @@ static const struct kind {
              {"userfaultfd", take_userfaultfd},
              {"userfaultfd_registered", take_userfaultfd_registered},
              {"seccomp", take_seccomp},
-             {"huge_pages", take_huge_pages},
-             {"lease", take_lease},
+              {"lease", take_lease},
              {"kernel_log", take_kernel_log},
              {"tun", take_tun},
              {"fuse", take_fuse},
@@ -351,8 +338,7 @@ static const struct kind {
              {"kernel_switch", take_kernel_switch},
              {"secret_memory", take_secret_memory},
              {"memory_file", take_memory_file},
-             {"protection_key", take_protection_key},
-             {"deleted_directory", take_deleted_directory},
+              {"deleted_directory", take_deleted_directory},
              {"root", take_root},
              {"own_namespace", take_own_namespace},
              {"owner_group", take_owner_group},

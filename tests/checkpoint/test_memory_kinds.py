@@ -1,0 +1,83 @@
+"""Memory of special kinds: each captured, killed and brought back, and what becomes of it where the machine has none of it."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from checkpoint.engine import CaptureOrder
+from tests.checkpoint.round_trip import (
+    captured_and_killed,
+    captured_at_last,
+    ended,
+    expect_ok,
+    protected,
+    restored,
+    start_tracee,
+    transported,
+)
+
+Compiled = Callable[..., Path]
+
+COUNT = Path("/proc/sys/vm/nr_hugepages")
+PAGES = 8
+"""Huge pages that these tests set aside: 16 MiB."""
+
+pytestmark = [pytest.mark.compiler, pytest.mark.root]
+
+
+@contextlib.contextmanager
+def huge_pages(count: int) -> Iterator[None]:
+    """So many huge pages on this machine for the body, or a skip."""
+    before = int(COUNT.read_text())
+    COUNT.write_text(f"{count}\n")
+    try:
+        if int(COUNT.read_text()) < count:
+            pytest.skip(f"this machine has no {count} huge pages to give")
+        yield
+    finally:
+        COUNT.write_text(f"{before}\n")
+
+
+KINDS = ("huge", "huge_shared", "keys", "locked", "locked_on_fault", "droppable", "sealed", "grows_down", "paged_out")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_memory_of_a_special_kind_comes_back_as_it_was(kind: str, compiled: Compiled, tmp_path: Path) -> None:
+    with huge_pages(PAGES) if kind.startswith("huge") else contextlib.nullcontext():
+        tracee = start_tracee(compiled("special_memory", "-O2"), tmp_path, kind)
+        for _ in range(2):
+            with ended(tracee):
+                snapshot = captured_and_killed(tracee)
+            tracee = restored(snapshot, tmp_path)
+        with ended(tracee):
+            tracee.tell()
+            expect_ok(tracee)
+
+
+@pytest.mark.parametrize("kind", ["huge", "huge_shared"])
+def test_huge_pages_become_ordinary_ones_where_there_are_none(kind: str, compiled: Compiled, tmp_path: Path) -> None:
+    with huge_pages(PAGES), ended(start_tracee(compiled("special_memory", "-O2"), tmp_path, kind)) as tracee:
+        snapshot = captured_and_killed(tracee)
+    with huge_pages(0), ended(restored(snapshot, tmp_path)) as tracee:
+        tracee.tell()
+        assert tracee.finish() == 1
+        assert tracee.output.splitlines()[1:] == ["flags are, were ht", "differs"], "nothing else is another one"
+
+
+def test_advice_to_a_whole_mapping_is_seen_by_the_next_base(compiled: Compiled, tmp_path: Path) -> None:
+    """/proc/PID/maps stays the same meanwhile."""
+    with ended(start_tracee(compiled("special_memory", "-O2"), tmp_path, "locked_late")) as tracee:
+        with protected(tracee) as session:
+            session.capture(CaptureOrder())
+            (tmp_path / "second").touch()
+            tracee.wait_for_line("advised")
+            snapshot = transported(captured_at_last(session, replace(CaptureOrder(), sequence=2)))
+            tracee.kill()
+    with ended(restored(snapshot, tmp_path)) as tracee:
+        tracee.tell()
+        expect_ok(tracee)
