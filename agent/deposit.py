@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection
 from agent.places import Places, complete_logs, log_directory
 from agent.shipping import Refusal
 from agent.streams import OutputLogs
-from checkpoint import format
+from checkpoint import carried, format
 from checkpoint.channel import close_all
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import ChainError, CheckpointError, FormatError, StoreError
@@ -27,12 +27,20 @@ class Deposit:
     """The desk (`agent.shipping.Desk`) at which peers hand in snapshots."""
 
     def __init__(
-        self, store: Store, places: Places, tell: Callable[[Event], None], kept: Callable[[str, Snapshot, int], None]
+        self,
+        store: Store,
+        places: Places,
+        tell: Callable[[Event], None],
+        kept: Callable[[str, Snapshot, int], None],
+        *,
+        runs: bool = True,
     ) -> None:
         """
         Args:
             kept: called with (component, the snapshot without its pages, its size) for the status.
+            runs: this member runs components: what it keeps it may have to lay down.
         """
+        self._runs = runs
         self._store = store
         self._places = places
         self._tell = tell
@@ -130,6 +138,8 @@ class Deposit:
         told = (offer.component, offer.position, offer.parent, offer.epoch)
         if (header.component, header.position, header.parent, header.epoch) != told:
             raise FormatError(f"a snapshot of {offer.component} is not the one that was offered: it names {header.component}")
+        if self._runs and offer.spec.launch.carry and (lack := carried.lack_of_room_for(format.read_outline(descriptor))):
+            raise StoreError(f"a checkpoint of {offer.component} is of no use here: {lack}")
         snapshot = self._store.put(descriptor)
         logs = OutputLogs(log_directory(offer.component, self._places))
         try:

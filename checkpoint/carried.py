@@ -2,8 +2,9 @@
 
 Every file has a *stretch* of addresses that no program can have (`FIRST_ADDRESS` and up), with a mapping of kind CARRIED_FILE
 as long as the file, in whole pages; a page that is not there is a hole. What a file is called, and whose it is, stands in one
-resource for each carried path: its ``name`` is the path, absolute; its only fact, ``entries``, lists the path itself (its name is
-b"") and all that lies below it, a directory before what is in it; a path where nothing stood has no entries. An entry is a list:
+resource for each carried path: its ``name`` is the path, absolute. Its fact ``size`` is what its files hold, in whole pages; its
+fact ``entries`` lists the path itself (its name is b"") and all that lies below it, a directory before what is in it; a path
+where nothing stood has no entries. An entry is a list:
 
     name        relative to the path, bytes
     mode        st_mode; uid; gid; mtime_ns
@@ -78,10 +79,11 @@ class Tree:
 
     path: str
     entries: tuple[Entry, ...]
+    held_size: int = 0
 
     def resource(self) -> Resource:
         """As it stands in a snapshot."""
-        return Resource(KIND, self.path, {"entries": [entry.fact() for entry in self.entries]})
+        return Resource(KIND, self.path, {"entries": [entry.fact() for entry in self.entries], "size": self.held_size})
 
 
 def start_of(place: int) -> int:
@@ -155,6 +157,28 @@ def _add_piece(found: dict[int, list[tuple[int, memoryview]]], run: PageRun, con
     found.setdefault(place, []).append((offset, content))
 
 
+FIXED_SIZE: Final = 1 << 20
+"""Bytes besides the content that must be free: names and attributes."""
+
+
+def lack_of_room(path: str, size: int) -> str:
+    """Why files that hold so much will not fit at a path, beside what stands there; "" if they will, as things are."""
+    while not os.path.isdir(path):
+        path = os.path.dirname(path)
+    about = os.statvfs(path)
+    free = about.f_bavail * about.f_frsize
+    if size + FIXED_SIZE <= free:
+        return ""
+    return f"its carried files need {size >> 10} KiB and {path} has {free >> 10} KiB free: make room there"
+
+
+def lack_of_room_for(state: Snapshot) -> str:
+    """Why the carried files of a snapshot, of which the pages are not needed, will not fit here; "" if they will."""
+    sizes = [(held.name, held.facts.get("size")) for held in state.resources if held.kind == KIND]
+    lacks = (lack_of_room(path, size) for path, size in sizes if isinstance(size, int) and path.startswith("/"))
+    return next((lack for lack in lacks if lack), "")
+
+
 def trees_of(state: Snapshot) -> tuple[Tree, ...]:
     """The carried trees of a snapshot.
 
@@ -165,10 +189,11 @@ def trees_of(state: Snapshot) -> tuple[Tree, ...]:
 
 
 def _tree(held: Resource) -> Tree:
-    listed = held.facts.get("entries")
-    if set(held.facts) != {"entries"} or not isinstance(listed, list) or not held.name.startswith("/"):
+    listed, held_size = held.facts.get("entries"), held.facts.get("size")
+    is_known = set(held.facts) == {"entries", "size"} and isinstance(held_size, int)
+    if not is_known or not isinstance(listed, list) or not held.name.startswith("/"):
         raise RestoreError(f"cannot lay down {held.name!r}: its snapshot does not tell of carried files as we know them")
-    tree = Tree(held.name, tuple(_entry(held.name, fact) for fact in listed))
+    tree = Tree(held.name, tuple(_entry(held.name, fact) for fact in listed), int(str(held_size)))
     if reason := _what_cannot_be(tree.entries):
         raise RestoreError(f"cannot lay down {held.name}: its snapshot {reason}")
     return tree

@@ -159,10 +159,11 @@ class CooperativeSession:
         since = parent.commit if parent else 0
         if self._trees is None:
             return self._reader.read(since), None
-        self._trees.prepare()
+        from checkpoint.resources.carried_trees import mapped_shared
+
+        self._trees.prepare(mapped_shared(self._pid))
         with contextlib.nullcontext() if is_held else _standing_still(self._pid):
-            lines = procfs.parse_maps(procfs.read_text(self._pid, "maps"))
-            seen = self._trees.look(line.inode for line in lines if line.shared)
+            seen = self._trees.look(mapped_shared(self._pid))
             committed = self._reader.read(since)
         if reasons := self._trees.reasons(seen):
             raise UnsupportedError(f"cannot capture {self._component}: {'; '.join(reasons)}", reasons)

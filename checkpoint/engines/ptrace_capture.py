@@ -191,7 +191,7 @@ class PtraceSession:
         try:
             self._onlooker.prepare()
             if self._carried:
-                self._carried.prepare()
+                self._carried.prepare(carried_trees.mapped_shared(self.pid))
             copied = self._copy_running(base=parent is None)
             frozen = self._frozen_look(copied, base=parent is None, hold=order.hold)
         except ProcessGoneError as error:

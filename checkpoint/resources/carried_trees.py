@@ -90,7 +90,8 @@ class Content:
     Attributes:
         place: number of its stretch of addresses.
         raw: its pages as they were read: addresses, and bytes in whole pages.
-        is_settled: a later write would have changed its times.
+        is_settled: a later write would have changed its times. Through a mapping that was there then, it would not: only the
+            first write to a clean page does (file_update_time() in the kernel's page_mkwrite).
     """
 
     version: Version
@@ -215,7 +216,7 @@ class CarriedTrees:
         if len(self.paths) > PATHS_MAX:
             reasons.append(f"{len(self.paths)} paths are to be carried; {PATHS_MAX} are the limit: name a folder that holds them")
         with contextlib.suppress(CaptureError):  # it changes while we look; more is found out when it stands still
-            reasons += self.reasons(self._look(frozenset(), frozen=False))
+            reasons += self.reasons(self._look(mapped_shared(self.pid), frozen=False))
         return tuple(reasons)
 
     def _refuse_path(self, path: str) -> str:
@@ -227,11 +228,15 @@ class CarriedTrees:
             return f"{path} lies on a network mount ({kind}), which is not carried: every robot sees it there; leave it out"
         return ""
 
-    def prepare(self) -> None:
-        """Read what is much while the program runs, so that little is left for when it stands still."""
+    def prepare(self, mapped: Iterable[int]) -> None:
+        """Read what is much while the program runs, so that little is left for when it stands still.
+
+        Args:
+            mapped: as for `look`.
+        """
         if sum(content.version[2] for content in self._known.values()) >= LARGE_SIZE or not self._known:
             with contextlib.suppress(CaptureError):  # it changes while we look: it will stand still in a moment
-                self._look(frozenset(), frozen=False)
+                self._look(frozenset(mapped), frozen=False)
 
     def look(self, mapped: Iterable[int]) -> Seen:
         """See everything as it is now: the program stands still.
@@ -320,13 +325,16 @@ class CarriedTrees:
         stale = {one.key: one for one in names if stat.S_ISREG(one.about.st_mode) and not self._is_known(one.about, mapped)}
         read_size = sum(_held_size(name.about) for name in stale.values())
         if read_size > size_max:
+            if read_size > self.size_max:
+                return 0  # `reasons` tells
             raise CaptureError(
                 f"cannot capture pid {self.pid}: {read_size >> 20} MiB of its carried files changed a moment ago; at most "
                 f"{size_max >> 20} MiB are read at a time: carry fewer or smaller files"
             )
         places = self._places(stale, names)
         for key, name in stale.items():
-            self._known[key] = self._read(name, places[key], now_ns)
+            content = self._read(name, places[key], now_ns)
+            self._known[key] = replace(content, is_settled=False) if key[1] in mapped else content
         return read_size
 
     def _is_known(self, about: os.stat_result, mapped: frozenset[int]) -> bool:
@@ -413,10 +421,14 @@ class CarriedTrees:
         standing = {name.key for name in seen.names if name.kind == stat.S_IFREG}
         self._known = {key: content for key, content in self._known.items() if key in standing}
         self._place_of = {(name.tree, name.name): self._known[name.key].place for name in seen.names if name.kind == stat.S_IFREG}
-        trees: list[list[Entry]] = [[] for _ in self.paths]
+        entries: list[list[Entry]] = [[] for _ in self.paths]
+        sizes: list[dict[Key, int]] = [{} for _ in self.paths]
         for name in seen.names:
-            trees[name.tree].append(self._entry(name, seen))
-        return tuple(Tree(path, tuple(entries)) for path, entries in zip(self.paths, trees, strict=True))
+            entries[name.tree].append(self._entry(name, seen))
+            if name.key in self._known:
+                sizes[name.tree][name.key] = len(self._known[name.key].filled.addresses) * abi.PAGE_SIZE
+        of_trees = zip(self.paths, entries, sizes, strict=True)
+        return tuple(Tree(path, tuple(below), sum(held.values())) for path, below, held in of_trees)
 
     def _entry(self, name: Name, seen: Seen) -> Entry:
         about = name.about
@@ -465,6 +477,12 @@ def _version(about: os.stat_result) -> Version:
 def _held_size(about: os.stat_result) -> int:
     """Bytes that a file holds: a sparse one may look larger."""
     return min(about.st_size, about.st_blocks * 512) if stat.S_ISREG(about.st_mode) else 0
+
+
+def mapped_shared(pid: int) -> frozenset[int]:
+    """Inodes of the files that a process has mapped to be shared."""
+    lines = procfs.parse_maps(procfs.read_text(pid, "maps"))
+    return frozenset(line.inode for line in lines if line.shared)
 
 
 def _pages_of(file: int, about: os.stat_result, start: int) -> Copy:

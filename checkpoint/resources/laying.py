@@ -38,9 +38,6 @@ from checkpoint.validity import place as position_text
 
 KEPT_COUNT: Final = 4
 """Sets of replaced files that are kept for each carried path; the oldest goes when there are more."""
-FIXED_SIZE: Final = 1 << 20
-"""Bytes besides the content that must be free: names and attributes."""
-
 AT_FDCWD: Final = -100
 RENAME_EXCHANGE: Final = 2
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
@@ -124,17 +121,6 @@ def _files_below(path: str) -> Iterator[str]:
                 yield full
 
 
-def require_room(path: str, size: int) -> str:
-    """Why the carried files of a component will not fit at a path; "" if they will, as far as can be told now."""
-    while not os.path.isdir(path):
-        path = os.path.dirname(path)
-    about = os.statvfs(path)
-    free = about.f_bavail * about.f_frsize
-    if size + FIXED_SIZE <= free:
-        return ""
-    return f"its carried files need {size >> 10} KiB and {path} has {free >> 10} KiB free: make room there"
-
-
 @dataclass(slots=True)
 class _Laying:
     """One tree on its way to its path."""
@@ -154,7 +140,7 @@ class _Laying:
             self._give_attributes(path)
             return []
         held_size = sum(len(content) for one in {entry.place for entry in entries} for _, content in self.pieces.get(one, []))
-        if reason := require_room(path, held_size):
+        if reason := carried.lack_of_room(path, held_size):
             raise RestoreError(f"cannot lay down {path}: {reason}")
         os.makedirs(os.path.dirname(path), exist_ok=True)
         inside = os.path.isdir(path) and is_mount_point(path)
@@ -332,7 +318,7 @@ def _write(path: str, entry: Entry, pieces: list[tuple[int, memoryview]]) -> Non
 
 def _holds(path: str, entry: Entry, pieces: list[tuple[int, memoryview]]) -> bool:
     """Whether a file has exactly this content."""
-    if entry.size > sum(len(content) for _, content in pieces) + FIXED_SIZE:
+    if entry.size > sum(len(content) for _, content in pieces) + carried.FIXED_SIZE:
         return False  # mostly holes: made anew rather than read
     expected = bytearray(entry.size)
     for offset, content in pieces:

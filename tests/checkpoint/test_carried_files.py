@@ -3,14 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
+import socket
+import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from checkpoint import carried
 from checkpoint.engine import CaptureOrder, Carry, Session
+from checkpoint.errors import MismatchError, RestoreError, UnsupportedError
+from checkpoint.linux.eyes import Eyes
+from checkpoint.model import Snapshot
+from checkpoint.resources import carried_trees, laying
+from checkpoint.resources.carried_trees import CarriedTrees
+from tests.checkpoint import round_trip
 from tests.checkpoint.round_trip import ENGINE, Program, captured_at_last, ended, restored, start, transported
 
 COUNTER = Path(__file__).with_name("sqlite_counter.py")
@@ -31,7 +43,7 @@ def carrying(program: Program, *paths: Path, size_max: int = 1 << 28) -> Iterato
 @pytest.mark.parametrize("mode", ["delete", "wal"])
 def test_a_database_and_the_memory_of_its_program_come_back_as_of_one_instant(tmp_path: Path, mode: str) -> None:
     """Killed at a moment of its own in each round, the folder lost: what was counted stands in the database, and no more."""
-    folder, last = tmp_path / "kept", 600
+    folder, last = tmp_path / "kept", 400
     folder.mkdir()
     program = start([sys.executable, COUNTER, folder / "steps.db", mode, str(last)], tmp_path)
     for round_number in range(3):
@@ -51,3 +63,318 @@ def test_a_database_and_the_memory_of_its_program_come_back_as_of_one_instant(tm
     with ended(program):
         assert program.finish() == 0, program.output[-400:] + program.complaints
         assert program.output.splitlines()[-2:] == [str(last), "ok"]
+
+
+@contextlib.contextmanager
+def asleep(directory: Path) -> Iterator[Program]:
+    """A program that does nothing, so that a test may change its files for it."""
+    program = start([sys.executable, "-c", SLEEPER], directory)
+    with ended(program):
+        program.wait_for_line("ready")
+        yield program
+
+
+def once_more(session: Session, sequence: int, parent: Snapshot | None = None) -> Snapshot:
+    """The next snapshot: a delta of one that is acknowledged, or a base."""
+    if parent is not None:
+        session.acknowledge(parent.position)
+    return transported(captured_at_last(session, CaptureOrder(base=parent is None, sequence=sequence)))
+
+
+def portrait(top: Path) -> dict[str, tuple[object, ...]]:
+    """All that can be told of a folder: names, kinds, modes, owners, times, contents, links."""
+    told: dict[str, tuple[object, ...]] = {}
+    links: dict[int, str] = {}
+    for path in (top, *sorted(top.rglob("*"))):
+        about, name = path.lstat(), str(path.relative_to(top))
+        content: object = None
+        if path.is_symlink():
+            content = os.readlink(path)
+        elif path.is_file():
+            content = path.read_bytes(), links.setdefault(about.st_ino, name), about.st_nlink
+        told[name] = (about.st_mode, about.st_uid, about.st_gid, about.st_mtime_ns, content)
+    return told
+
+
+def furnish(folder: Path) -> None:
+    """Everything that a folder may hold."""
+    folder.mkdir()
+    (folder / "plain").write_bytes(os.urandom(10_000))
+    (folder / "empty").touch()
+    (folder / "deep" / "er").mkdir(parents=True, mode=0o750)
+    (folder / "deep" / "er" / "secret").write_text("x")
+    (folder / "deep" / "er" / "secret").chmod(0o400)
+    (folder / "link").symlink_to("deep/er/secret")
+    (folder / "nowhere").symlink_to("/no/such/place")
+    os.link(folder / "plain", folder / "deep" / "second name")
+    os.mkfifo(folder / "fifo", 0o640)
+    with (folder / "sparse").open("wb") as sparse:
+        sparse.truncate(50 << 20)
+        sparse.seek(20 << 20)
+        sparse.write(b"in the middle")
+    if os.geteuid() == 0:
+        os.chown(folder / "empty", 12, 34)
+    os.utime(folder / "deep", ns=(1, 1_234_567_890_123_456_789))
+
+
+def test_a_folder_comes_back_with_all_that_is_in_it(tmp_path: Path) -> None:
+    folder = tmp_path / "kept"
+    furnish(folder)
+    before = portrait(folder)
+    with asleep(tmp_path) as program, carrying(program, folder) as session:
+        state = once_more(session, 1)
+    shutil.rmtree(folder)
+    with ended(restored(state, tmp_path)):
+        assert portrait(folder) == before
+        assert (folder / "sparse").stat().st_blocks * 512 < 1 << 20, "its holes were filled"
+        assert sorted(path.name for path in tmp_path.iterdir() if path.name.startswith(".")) == []
+
+
+def test_what_is_new_deleted_renamed_and_cut_travels_with_a_delta(tmp_path: Path) -> None:
+    """Only changed blocks are in it; one that nobody acknowledged forgets nothing."""
+    folder = tmp_path / "kept"
+    furnish(folder)
+    with asleep(tmp_path) as program, carrying(program, folder) as session:
+        base = once_more(session, 1)
+        (folder / "deep" / "er" / "secret").unlink()
+        (folder / "plain").rename(folder / "renamed")
+        os.truncate(folder / "renamed", 5_000)
+        (folder / "new").write_bytes(b"n" * 9_000)
+        session.acknowledge(base.position)
+        captured_at_last(session, CaptureOrder(base=False, sequence=2))  # is lost on its way
+        (folder / "new").write_bytes(b"o" * 3_000)
+        with (folder / "sparse").open("r+b") as sparse:
+            sparse.seek(30 << 20)
+            sparse.write(b"further on")
+        delta = once_more(session, 3, base)
+        assert carried.size_of(delta) < 40_000, "more than the changed blocks"
+        (folder / "new").unlink()
+        (folder / "at last").mkdir()
+        last = once_more(session, 4, delta)
+        expected = portrait(folder)
+    shutil.rmtree(folder)
+    with ended(restored([base, delta, last], tmp_path)):
+        assert portrait(folder) == expected
+
+
+MAPPER = """
+import mmap, os, time
+def wait(name):
+    print(name, flush=True)
+    while not os.path.exists(name):
+        time.sleep(0.002)
+file = os.open('mapped', os.O_RDWR)
+pages = mmap.mmap(file, 3 << 12)
+pages[5000:5005] = b'first'
+wait('one')
+pages[5000:5005] = b'later'  # the page is dirty already: no time tells of this one
+pages.close()
+os.close(file)
+wait('two')
+print(open('mapped', 'rb').read()[5000:5005].decode(), flush=True)
+"""
+
+
+def test_what_a_mapping_wrote_travels_though_no_time_shows_it(tmp_path: Path) -> None:
+    """The mapping is gone by the second capture, and the file's times are those of the first."""
+    path = tmp_path / "mapped"
+    path.write_bytes(bytes(3 << 12))
+    program = start([sys.executable, "-c", MAPPER], tmp_path)
+    with ended(program):
+        program.wait_for_line("one")
+        time.sleep(2 * carried_trees.GRAIN_NS / 1e9)  # so that nothing else makes the file be read again
+        with carrying(program, path) as session:
+            base = once_more(session, 1)
+            before = path.stat()
+            (tmp_path / "one").touch()
+            program.wait_for_line("two")
+            assert path.stat().st_mtime_ns == before.st_mtime_ns
+            delta = once_more(session, 2, base)
+    path.unlink()
+    program = restored([base, delta], tmp_path)
+    (tmp_path / "two").touch()
+    with ended(program):
+        assert program.finish() == 0, program.complaints
+        assert program.output.splitlines()[-1] == "later"
+
+
+def test_what_stood_there_is_kept_and_never_overwritten(tmp_path: Path) -> None:
+    folder = tmp_path / "kept"
+    folder.mkdir()
+    (folder / "state").write_text("of the checkpoint")
+    with asleep(tmp_path) as program, carrying(program, folder) as session:
+        state = once_more(session, 1)
+    for attempt in range(laying.KEPT_COUNT + 2):
+        (folder / "state").write_text(f"newer, by somebody else, {attempt}")
+        (folder / "another").write_text("his, too")
+        with ended(restored(state, tmp_path)):
+            assert {path.name: path.read_text() for path in folder.iterdir()} == {"state": "of the checkpoint"}
+    sets = sorted((tmp_path / ".failover-kept-kept").iterdir())
+    kept = [(one / "kept" / "state").read_text().rpartition(" ")[2] for one in sets]
+    assert kept == ["2", "3", "4", "5"]
+    assert all((one / "kept" / "another").exists() for one in sets)
+    with ended(restored(state, tmp_path)):
+        assert len(list((tmp_path / ".failover-kept-kept").iterdir())) == len(sets), "what was right was replaced"
+
+
+def test_a_path_where_nothing_stood_is_empty_again(tmp_path: Path) -> None:
+    path = tmp_path / "later"
+    with asleep(tmp_path) as program, carrying(program, path) as session:
+        state = once_more(session, 1)
+        path.write_text("after the checkpoint")
+        program.kill()
+    with ended(restored(state, tmp_path)):
+        assert not path.exists()
+        (kept,) = (tmp_path / ".failover-kept-later").iterdir()
+        assert (kept / "later").read_text() == "after the checkpoint"
+
+
+def test_a_file_that_another_process_writes_to_is_not_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "log"
+    path.write_text("one")
+    with asleep(tmp_path) as program, carrying(program, path) as session:
+        state = once_more(session, 1)
+    path.write_text("two")
+    writer = subprocess.Popen(["sleep", "1000"], stdout=path.open("ab"))
+    try:
+        with pytest.raises(MismatchError, match=f"is held open for writing by pid {writer.pid}"):
+            restored(state, tmp_path)
+        assert path.read_text() == "two"
+    finally:
+        writer.kill()
+        writer.wait()
+
+
+def a_socket(folder: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as made:
+        made.bind(str(folder / "s"))
+
+
+@pytest.mark.parametrize(
+    ("furnished", "said"),
+    [
+        (a_socket, "/s is a socket, which is not carried"),
+        (lambda folder: (folder / "large").write_bytes(bytes(3 << 20)), "hold 3 MiB, the limit is 2 MiB"),
+        (lambda folder: [(folder / str(index)).touch() for index in range(carried_trees.ENTRIES_MAX)], "more than 8192 names"),
+    ],
+    ids=["socket", "size", "names"],
+)
+def test_what_cannot_be_carried_is_refused_by_name_and_later_too(
+    tmp_path: Path, furnished: Callable[[Path], object], said: str
+) -> None:
+    folder = tmp_path / "kept"
+    folder.mkdir()
+    with asleep(tmp_path) as program, carrying(program, folder, size_max=2 << 20) as session:
+        once_more(session, 1)
+        furnished(folder)
+        for _ in range(2):
+            with pytest.raises(UnsupportedError, match=said):
+                session.capture(CaptureOrder())
+        with pytest.raises(UnsupportedError, match=said), carrying(program, folder, size_max=2 << 20):
+            pass
+        for path in folder.iterdir():
+            path.unlink()
+        once_more(session, 2)
+
+
+@pytest.mark.parametrize(
+    ("path", "said"), [("link/inside", "is a link, or behind one"), ("../x", "no absolute path"), ("", "no absolute path")]
+)
+def test_a_path_that_means_another_thing_elsewhere_is_refused(tmp_path: Path, path: str, said: str) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    named = f"{tmp_path}/{path}" if path else "relative"
+    with asleep(tmp_path) as program, pytest.raises(UnsupportedError, match=said):
+        ENGINE.protect(program.pid, "/test/carried", None, Carry((named,))).close()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root: a small file system is mounted")
+def test_a_full_disk_changes_nothing_and_is_said(tmp_path: Path) -> None:
+    folder = tmp_path / "mount"
+    folder.mkdir()
+    (folder / "state").write_bytes(os.urandom(4 << 20))
+    with asleep(tmp_path) as program, carrying(program, folder) as session:
+        state = once_more(session, 1)
+    shutil.rmtree(folder)
+    folder.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", folder], check=True)
+    try:
+        (folder / "his").write_text("stays")
+        with pytest.raises(RestoreError, match=r"need 4096 KiB and .* KiB free: make room there"):
+            restored(state, tmp_path)
+        assert [path.name for path in folder.iterdir()] == ["his"]
+        subprocess.run(["mount", "-o", "remount,size=16m", folder], check=True)
+        with ended(restored(state, tmp_path)):  # a mount point cannot be moved: what is in it is
+            assert (folder / "state").stat().st_size == 4 << 20
+            assert not (folder / "his").exists()
+            (kept,) = (folder / ".failover-kept-mount").iterdir()
+            assert (kept / "his").read_text() == "stays"
+    finally:
+        subprocess.run(["umount", folder], check=True)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root: whose rights are less is the question")
+def test_what_belongs_to_an_ordinary_user_is_read_and_laid_down_with_his_rights(tmp_path: Path) -> None:
+    """He names a folder of root's in a snapshot of his own: nothing of root's is read for him, and nothing written."""
+    for place in (tmp_path, *tmp_path.parents[:2]):
+        place.chmod(0o755)
+    folder = tmp_path / "roots"
+    folder.mkdir()
+    (folder / "secret").write_text("root's")
+    (folder / "secret").chmod(0o600)
+    nobody = Eyes(round_trip.NOBODY, round_trip.NOBODY)
+    with asleep(tmp_path) as program:
+        trees = CarriedTrees(program.pid, (str(folder),), nobody)
+        assert "cannot be read" in trees.refuse()[0]
+        trees.close()
+        with carrying(program, folder) as session:
+            state = once_more(session, 1)
+    (folder / "secret").write_text("changed")
+    with pytest.raises(RestoreError, match="see to room and rights there"):
+        laying.lay_down(state, nobody, frozenset())
+    assert (folder / "secret").read_text() == "changed"
+    assert os.geteuid() == 0 and (tmp_path / "roots").stat().st_uid == 0
+
+
+@pytest.mark.parametrize("name", [b"../out", b"/etc/passwd", b"a/../../out", b"a/b", b".", b"a//b"])
+def test_a_snapshot_cannot_name_a_file_outside_of_its_folder(tmp_path: Path, name: bytes) -> None:
+    with asleep(tmp_path) as program, carrying(program, tmp_path / "kept") as session:
+        (tmp_path / "kept").mkdir()
+        (tmp_path / "kept" / "a").touch()
+        state = once_more(session, 1)
+    (tree,) = carried.trees_of(state)
+    entries = (tree.entries[0], replace(tree.entries[1], name=name))
+    forged = replace(state, resources=(*carried.without(state).resources, carried.Tree(tree.path, entries).resource()))
+    with pytest.raises(RestoreError, match="its snapshot"):
+        laying.lay_down(forged, None, frozenset())
+
+
+RESTLESS = """
+import os
+a, b = (os.open(name, os.O_RDWR | os.O_CREAT) for name in ("kept/a", "kept/b"))
+count = 0
+for file in (a, b):
+    os.pwrite(file, bytes(8), 0)
+while True:
+    told = [int.from_bytes(os.pread(file, 8, 0), "little") for file in (a, b)]
+    assert told == [count, count], (told, count)
+    count += 1
+    os.pwrite(a, count.to_bytes(8, "little"), 0)
+    os.pwrite(b, count.to_bytes(8, "little"), 0)
+    if not count % 2000:
+        print(count, flush=True)
+"""
+
+
+def test_files_are_of_the_same_instant_as_the_memory_to_a_single_write(tmp_path: Path) -> None:
+    """It never stops writing: a file that was read a moment earlier or later than the memory would be told by its own check."""
+    (tmp_path / "kept").mkdir()
+    program = start([sys.executable, "-c", RESTLESS], tmp_path)
+    for _ in range(8):
+        with ended(program), carrying(program, tmp_path / "kept") as session:
+            program.wait_for_output((tmp_path / "out").stat().st_size)
+            base = once_more(session, 1)
+            program.wait_for_output((tmp_path / "out").stat().st_size)
+            delta = once_more(session, 2, base)
+        program = restored([base, delta], tmp_path)
+    with ended(program):
+        program.wait_for_output((tmp_path / "out").stat().st_size)

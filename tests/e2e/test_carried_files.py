@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,11 +16,29 @@ import pytest
 
 from failover.cli.demo.robots import RobotMachine, Stage, means
 from tests.checkpoint.test_carried_files import COUNTER
-from tests.e2e.robots import LOG_LINES, connected, mistake, numbers, output, result, until, until_protected
+from tests.e2e.robots import (
+    LOG_LINES,
+    component,
+    connected,
+    failover,
+    mistake,
+    numbers,
+    output,
+    result,
+    until,
+    until_protected,
+    until_status,
+)
 
 pytestmark = pytest.mark.skipif(
     os.geteuid() != 0 or not means().own_pids, reason="needs root: each robot has a file tree of its own in its mount namespace"
 )
+
+
+KILLS = int(os.environ.get("FAILOVER_CARRY_KILLS", "1"))
+SEED = int(os.environ.get("FAILOVER_SEED", str(random.randrange(1 << 32))))
+
+LEDGER = Path(__file__).with_name("ledger.py")
 
 
 class OwnTrees(Stage):
@@ -63,10 +82,11 @@ def disk(robot: RobotMachine) -> Path:
     return robot.directory / "disk"
 
 
+@pytest.mark.parametrize("kill", range(KILLS))
 @pytest.mark.parametrize("mode", ["delete", "wal"])
-def test_a_database_goes_on_at_a_robot_that_never_had_it(tmp_path: Path, mode: str) -> None:
+def test_a_database_goes_on_at_a_robot_that_never_had_it(tmp_path: Path, mode: str, kill: int) -> None:
     """Power is cut at a random moment; on the other robot nothing acknowledged is missing, and memory and database agree."""
-    seed = random.randrange(1 << 32)
+    seed = SEED
     print("seed", seed)
     with robots(tmp_path) as (first, second, here):
         path = here / "data" / "steps.db"
@@ -74,7 +94,7 @@ def test_a_database_goes_on_at_a_robot_that_never_had_it(tmp_path: Path, mode: s
         started = run_carrying(first, "count", [str(here / "data")], sys.executable, str(COUNTER), str(path), mode, "400")
         assert not started["reasons"], started
         until_protected(first)
-        seen = random.Random(seed).randrange(20, 200)
+        seen = random.Random(seed + kill).randrange(20, 200)
         until(lambda: len(numbers(first)) > seen, f"{seen} steps")
         acknowledged = numbers(second)
         first.cut_power()
@@ -84,3 +104,91 @@ def test_a_database_goes_on_at_a_robot_that_never_had_it(tmp_path: Path, mode: s
         assert lines == [*map(str, range(1, 401)), "ok"]
         assert len(acknowledged) > 0
         assert (disk(second) / "data" / "steps.db").exists()
+
+
+def until_more(robot: RobotMachine, count: int) -> None:
+    """Until the component has written so many more lines there."""
+    begun = len(numbers(robot))
+    until(lambda: len(numbers(robot)) > begun + count, f"{count} more steps")
+
+
+def test_a_program_with_a_log_of_its_own_goes_there_and_comes_back(tmp_path: Path) -> None:
+    """Handed over to and fro, and killed: everywhere its folder is as its memory has it, and what stood there is kept."""
+    seed = SEED
+    print("seed", seed)
+    dice = random.Random(seed)
+    with robots(tmp_path) as (first, second, here):
+        folder = here / "ledger"
+        (disk(first) / "ledger").mkdir()
+        (disk(second) / "ledger").mkdir()
+        (disk(second) / "ledger" / "his").write_text("stood here before")
+        run_carrying(first, "count", [str(folder)], sys.executable, str(LEDGER), str(folder), "1500")
+        until_protected(first)
+        for robot, other in ((first, second), (second, first)):
+            until_more(robot, dice.randrange(10, 60))
+            ordered = failover(robot, "handover", "count")
+            assert ordered.returncode == 0, ordered.stderr
+            until_protected(other)
+        kept = sorted((disk(second)).glob(".failover-kept-ledger/*/ledger/his"))
+        assert [path.read_text() for path in kept] == ["stood here before"]
+        first.cut_power()
+        ended = result(second, "count")
+        lines = output(second, "count").decode().split()
+        assert ended["exit_status"] == 0, lines[-3:]
+        assert lines == [*map(str, range(1, 1501)), "ok"]
+
+
+KEEPS_STATE = """
+import sys, time
+from pathlib import Path
+import failover
+
+path = Path(sys.argv[1])
+state = failover.resume("rows", default={"rows": 0})
+lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
+if not state["rows"] <= len(lines) <= state["rows"] + 1 or lines != [b"row %d\\n" % index for index in range(len(lines))]:
+    print("state", state["rows"], "file", len(lines), lines[-2:], flush=True)
+    sys.exit(1)
+if failover.resumed() is not None:
+    print("# resumed with", len(lines) - state["rows"], "more", flush=True)
+with path.open("wb", buffering=0) as rows:
+    rows.write(b"".join(lines[: state["rows"]]))
+    while state["rows"] < 1_000_000:
+        rows.write(b"row %d\\n" % state["rows"])
+        state["rows"] += 1
+        print(state["rows"], flush=True)
+        failover.commit()
+        time.sleep(0.005)
+"""
+
+
+def test_files_of_a_program_that_keeps_its_state_are_of_an_instant_of_its_commit(tmp_path: Path) -> None:
+    """It writes a row, then commits: elsewhere the file has all rows of the state, and at most the next one."""
+    script = tmp_path / "rows.py"
+    script.write_text(KEEPS_STATE)
+    with robots(tmp_path) as (first, second, here):
+        path = here / "rows"
+        run_carrying(first, "count", [str(path)], sys.executable, str(script), str(path), engine="cooperative")
+        until_protected(first)
+        until(lambda: len(numbers(first)) > 100, "some rows")
+        first.cut_power()
+        until(lambda: b"# resumed with" in output(second, "count"), "its resumption")
+        said = until(lambda: lines if len(lines := output(second, "count").decode().splitlines()) > 150 else [], "more rows")
+        assert [line for line in said if line.startswith("state")] == []
+        assert [int(line) for line in said if not line.startswith("#")][:150] == list(range(1, 151))
+
+
+def test_a_standby_without_room_for_the_files_is_named_and_mends_itself(tmp_path: Path) -> None:
+    """Protection says so, before anybody needs it; nothing is acknowledged that could not be laid down."""
+    with robots(tmp_path) as (first, second, here):
+        pid = second.processes()[0]
+        inside = ["nsenter", f"--target={pid}", "--mount"]
+        subprocess.run([*inside, "mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(here)], check=True)
+        (disk(first) / "data").mkdir()
+        (disk(first) / "data" / "large").write_bytes(os.urandom(8 << 20))
+        code = "import time\nwhile True:\n    print(1, flush=True)\n    time.sleep(0.05)"
+        run_carrying(first, "count", [str(here / "data")], sys.executable, "-c", code)
+        until_status(first, 1, "need 8192 KiB", "make room there")
+        assert component(first, "count")["protection"] != "protected"
+        subprocess.run([*inside, "mount", "-o", "remount,size=64m", str(here)], check=True)
+        until_protected(first)
