@@ -110,8 +110,8 @@ def rebuild_all(
         return ()
     moved = _move_streams_away(table, max(wanted[-1].number, *objects.values(), 0) + 1)
     piped = pipes.rebuild(table, [held for held in state.resources if held.kind == pipes.KIND], moved[-1] + 1)
-    connected = _prepare_sockets(table, state, moved[-1] + 1 + len(piped))
-    last = max((moved[-1] + len(piped), *connected.values()))
+    unix, connected = _prepare_sockets(table, state, moved[-1] + 1 + len(piped))
+    last = max((moved[-1] + len(piped), unix.end, *connected.values()))
     lines = terminals.prepare(table, [held for held in state.resources if held.kind == terminals.KIND], last + 1)
     rebuilding = Rebuilding(options, state.clocks, inner_pid, max((last, *lines.values())) + 1)
     for key, number in objects.items():
@@ -128,13 +128,14 @@ def rebuild_all(
             holders[id(one.resource)] = one.number
             signalling.rebuild(table, one.number, one.resource, inner_pid)
     memory_files.seal(table, [held for held in state.resources if held.kind == memory_files.KIND], rebuilding)
+    unix.fill()
     for number in (*moved, *piped.values(), *connected.values(), *lines.values(), *rebuilding.objects.values()):
         table.close(number)
     _settle(table, wanted, holders)
     return tcp_connections.notes(state.resources)
 
 
-def _prepare_sockets(table: CallTable, state: Snapshot, first: int) -> dict[int, int]:
+def _prepare_sockets(table: CallTable, state: Snapshot, first: int) -> tuple[unix_sockets.Work, dict[int, int]]:
     """Make all sockets at numbers from ``first`` on, in the working directory: names may be relative to it."""
     of_unix = [held for held in state.resources if held.kind == unix_sockets.KIND]
     of_internet = [held for held in state.resources if held.kind == internet_sockets.KIND]
@@ -142,12 +143,13 @@ def _prepare_sockets(table: CallTable, state: Snapshot, first: int) -> dict[int,
     if of_unix:
         directory = state.process.working_directory
         table.call(f"enter the working directory {directory}", "chdir", table.place_path(directory))
-    made = unix_sockets.prepare(table, of_unix, first)
-    connected = tcp_connections.prepare(table, of_tcp, first + len(made) + 1)
+    unix = unix_sockets.Work(table, of_unix, first)
+    made = dict(unix.run())
+    connected = tcp_connections.prepare(table, of_tcp, unix.end)
     made |= connected
-    made |= internet_sockets.prepare(table, of_internet, first + len(made) + 1)
+    made |= internet_sockets.prepare(table, of_internet, unix.end + len(connected))
     tcp_connections.settle(table, of_tcp, connected)
-    return made
+    return unix, made
 
 
 def _settle(table: CallTable, wanted: list[Wanted], holders: Mapping[int, int]) -> None:

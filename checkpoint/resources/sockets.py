@@ -20,7 +20,7 @@ import socket
 import stat
 import struct
 import termios
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -36,6 +36,9 @@ QUEUE_LIMIT: Final = 4 << 20
 MESSAGES_MAX: Final = 65536
 MUCH: Final = 1 << 15
 """Bytes that wait and may not find room again in a buffer of the usual size: the smallest is larger (wmem_default)."""
+_MESSAGE_HEAD: Final = struct.Struct("<QI4xQQQQi4x")
+_CONTROL_HEAD: Final = struct.Struct("<Qii")
+"""struct msghdr and struct cmsghdr."""
 PIECE_SIZE: Final = 1 << 18
 """Bytes that are looked at in one go: more than any datagram has."""
 RIGHTS_SPACE: Final = socket.CMSG_SPACE(253 * 4)
@@ -80,18 +83,22 @@ class Queue:
     """What waits to be read.
 
     Attributes:
-        rights: descriptors are on their way in one of the messages.
+        passed: of each message the descriptors of the program that are on their way in it, `UNKNOWN` for what it has not open.
         sources: of each message its sender's address, as recvmsg(2) tells it.
         too_long: more than `QUEUE_LIMIT` bytes.
     """
 
     messages: tuple[bytes, ...] = ()
     sources: tuple[object, ...] = ()
-    rights: bool = False
+    passed: tuple[tuple[int, ...], ...] = ()
     too_long: bool = False
 
 
 NOTHING: Final = Queue()
+UNKNOWN: Final = -1
+
+Identify = Callable[[int], int]
+"""Given a descriptor of ours that was on its way to the program: which of its own is the same, else `UNKNOWN`."""
 
 Noted = Callable[[int, int], AbstractContextManager[None]]
 """Given a descriptor of the program and its socket's SO_PEEK_OFF: writes both down for the body, for whoever comes after us if we
@@ -168,7 +175,7 @@ def _option(looked: socket.socket, level: int, number: int) -> bytes | None:
         return None
 
 
-def queue_of(looked: socket.socket, number: int, noted: Noted | None) -> Queue:
+def queue_of(looked: socket.socket, number: int, noted: Noted | None, identify: Identify = lambda _: UNKNOWN) -> Queue:
     """What waits to be read; it stays there.
 
     Only where several messages wait must the kernel be told to look behind the first (SO_PEEK_OFF). That is told to the program's
@@ -190,7 +197,7 @@ def queue_of(looked: socket.socket, number: int, noted: Noted | None) -> Queue:
         return NOTHING
     before = looked.getsockopt(socket.SOL_SOCKET, SO_PEEK_OFF)
     if before < 0 and (noted is None or looked.type != socket.SOCK_DGRAM):
-        first = _peeked(looked, 1)
+        first = _peeked(looked, 1, identify)
         if noted is None or _is_all(looked, first):
             return first
     if noted is None:
@@ -198,7 +205,7 @@ def queue_of(looked: socket.socket, number: int, noted: Noted | None) -> Queue:
     with noted(number, before):
         looked.setsockopt(socket.SOL_SOCKET, SO_PEEK_OFF, 0)
         try:
-            return _peeked(looked, MESSAGES_MAX)
+            return _peeked(looked, MESSAGES_MAX, identify)
         finally:
             set_peek_offset(looked, before)
 
@@ -220,28 +227,36 @@ def _is_all(looked: socket.socket, first: Queue) -> bool:
     return waiting <= sum(map(len, first.messages))
 
 
-def _peeked(looked: socket.socket, count: int) -> Queue:
+def _peeked(looked: socket.socket, count: int, identify: Identify) -> Queue:
     """At most so many messages, or pieces of a stream."""
     messages: list[bytes] = []
     sources: list[object] = []
-    size, rights = 0, False
+    passed: list[tuple[int, ...]] = []
+    size = 0
     is_datagram = looked.type == socket.SOCK_DGRAM
     while size <= QUEUE_LIMIT and len(messages) < count:
         try:
             content, ancillary, _, source = looked.recvmsg(PIECE_SIZE, RIGHTS_SPACE, socket.MSG_PEEK | socket.MSG_DONTWAIT)
         except BlockingIOError:
             break
-        for level, kind, carried in ancillary:
-            if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
-                rights = True
-                for (descriptor,) in struct.iter_unpack("<i", carried[: len(carried) // 4 * 4]):
-                    os.close(descriptor)
+        passed.append(tuple(_identified(ancillary, identify)))
         if not content and not is_datagram:  # its peer has shut it down
             break
         messages.append(content)
         sources.append(source)
         size += len(content)
-    return Queue(tuple(messages), tuple(sources), rights, size > QUEUE_LIMIT)
+    return Queue(tuple(messages), tuple(sources), tuple(passed[: len(messages)]), size > QUEUE_LIMIT)
+
+
+def _identified(ancillary: Iterable[tuple[int, int, bytes]], identify: Identify) -> Iterator[int]:
+    """Which of the program's descriptors came with a message; ours are closed."""
+    for level, kind, carried in ancillary:
+        if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
+            for (descriptor,) in struct.iter_unpack("<i", carried[: len(carried) // 4 * 4]):
+                try:
+                    yield identify(descriptor)
+                finally:
+                    os.close(descriptor)
 
 
 # --- Restore -----------------------------------------------------------------------------------------------------------
@@ -284,18 +299,30 @@ def fill(table: CallTable, held: Resource, sender: int, sending: Resource | None
     Args:
         sending: the sender, if it is the program's.
     """
-    messages = held.facts["queue"]
-    assert isinstance(messages, list)
+    messages, passed = held.facts["queue"], held.facts.get("passed", [])
+    assert isinstance(messages, list) and isinstance(passed, list)
     is_much = sum(len(message) for message in messages if isinstance(message, bytes)) > MUCH
     if is_much:
         _set_buffer(table, sender, socket.SO_SNDBUF, 4 * QUEUE_LIMIT)
-    for message in messages:
-        assert isinstance(message, bytes)
-        size, what = len(message), f"fill {held.name} with what waited in it"
-        arguments = (sender, table.place(message), size, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL, 0, 0)
-        table.call(what, "sendto", *arguments, least=size, most=size)
+    for index, message in enumerate(messages):
+        rights = passed[index] if passed else []
+        assert isinstance(message, bytes) and isinstance(rights, list)
+        _send(table, f"fill {held.name} with what waited in it", sender, message, [number_of(one) for one in rights])
     if is_much and sending is not None:
         _set_send_buffer_back(table, sending, sender)
+
+
+def _send(table: CallTable, what: str, sender: int, message: bytes, passed: Sequence[int]) -> None:
+    """Send one message, with descriptors if there are any. Source: sendmsg(2), cmsg(3)."""
+    size, flags = len(message), socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
+    if not passed:
+        table.call(what, "sendto", sender, table.place(message), size, flags, 0, 0, least=size, most=size)
+        return
+    rights = struct.pack(f"<{len(passed)}i", *passed)
+    control = _CONTROL_HEAD.pack(_CONTROL_HEAD.size + len(rights), socket.SOL_SOCKET, socket.SCM_RIGHTS) + rights
+    piece = table.place(struct.pack("<QQ", table.place(message), size))
+    head = _MESSAGE_HEAD.pack(0, 0, piece, 1, table.place(control), len(control), 0)
+    table.call(what, "sendmsg", sender, table.place(head), flags, least=size, most=size)
 
 
 def _set_send_buffer_back(table: CallTable, held: Resource, made: int) -> None:

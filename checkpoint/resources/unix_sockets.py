@@ -6,7 +6,8 @@ connected to that name again.
 
 Facts besides those of every socket: ``state`` of `checkpoint.linux.unix_sockets`; ``name``; ``peer``: inode number of its
 other end, 0 when that is gone; ``peer_name``; ``backlog``; ``shutdown``; ``path`` of its name, "" if that is no file's;
-``mode`` of that file, -1 if it is gone; ``waiting``: connections not accepted yet; ``rights``: descriptors wait in its queue;
+``mode`` of that file, -1 if it is gone; ``waiting``: connections not accepted yet; ``passed``: of each message in the
+queue the descriptors that came with it, as numbers of the program's own, -1 for one that it has closed; no list if none has any;
 ``too_long``: the queue; ``sources``: whether a message has a sender with a name.
 
 Source: unix(7).
@@ -19,11 +20,12 @@ import os
 import socket
 import stat
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError
-from checkpoint.linux import procfs
+from checkpoint.linux import abi, procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.unix_sockets import ESTABLISHED, LISTENING, unix_socket
 from checkpoint.model import Fact, Resource
@@ -33,7 +35,11 @@ from checkpoint.resources.rebuilding import number_of
 KIND: Final = "unix_sockets"
 
 CAPABILITIES: Final = (
-    preserved(Area.SOCKETS, "unix sockets that the program keeps to itself", "pairs and connections with what waits in them"),
+    preserved(
+        Area.SOCKETS,
+        "unix sockets that the program keeps to itself",
+        "pairs and connections with what waits in them, descriptors on their way included",
+    ),
     preserved(
         Area.SOCKETS,
         "unix listeners, and unix sockets for datagrams",
@@ -48,7 +54,7 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.SOCKETS,
-        "a unix socket with descriptors on their way, messages of a named sender, or over 4 MiB that wait",
+        "a unix socket with descriptors on their way that the program has closed, named senders, or over 4 MiB that wait",
         "it is kept as soon as the program has taken them",
         "with descriptors on their way",
         "MiB wait: it is kept as soon as",
@@ -90,7 +96,8 @@ def observe(held: OpenFile, looked: socket.socket, opened: Sequence[OpenFile], n
         raise CaptureError(f"cannot ask the kernel about the unix socket {held.name} (sock_diag): load the module unix_diag")
     facts = sockets.general_facts(held.first, looked)
     has_queue = told.state == ESTABLISHED or told.type == socket.SOCK_DGRAM
-    queue = sockets.queue_of(looked, held.first.number, noted) if has_queue else sockets.NOTHING
+    identify = partial(_number_of, held.pid, opened)
+    queue = sockets.queue_of(looked, held.first.number, noted, identify) if has_queue else sockets.NOTHING
     ours = {one.first.inode for one in opened}
     path = _path_of(held.pid, told.name)
     return facts | {
@@ -105,10 +112,20 @@ def observe(held: OpenFile, looked: socket.socket, opened: Sequence[OpenFile], n
         "mode": _mode_of(held.pid, path),
         "waiting": told.waiting,
         "queue": list(queue.messages),
-        "rights": queue.rights,
+        "passed": [list(numbers) for numbers in queue.passed] if any(queue.passed) else [],
         "too_long": queue.too_long,
         "sources": told.type == socket.SOCK_DGRAM and any(queue.sources),
     }
+
+
+def _number_of(pid: int, opened: Sequence[OpenFile], ours: int) -> int:
+    """Which of the program's descriptors leads to the same open file as one of ours, which was on its way to it."""
+    about = os.fstat(ours)
+    for one in opened:
+        is_alike = (one.first.device, one.first.inode) == (about.st_dev, about.st_ino)
+        if is_alike and abi.kcmp(pid, os.getpid(), abi.KCMP_FILE, one.first.number, ours) == 0:
+            return one.first.number
+    return sockets.UNKNOWN
 
 
 def _peer_name(looked: socket.socket) -> bytes:
@@ -152,8 +169,11 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return f"{what} connected to another process, which stays behind: protect the program while it has no such connection"
     if seen["peer"] and not seen["peer_is_ours"] and not seen["peer_name"]:
         return f"{what} connected to a socket of another process that has no name: protect the program while it has none"
-    if seen["rights"]:
-        return f"{what} with descriptors on their way in it (SCM_RIGHTS): it is kept as soon as the program has received them"
+    if any(isinstance(numbers, list) and sockets.UNKNOWN in numbers for numbers in _list(seen["passed"])):
+        return (
+            f"{what} with descriptors on their way in it (SCM_RIGHTS) that the program has closed already: it is kept as soon as "
+            "they are received"
+        )
     if seen["waiting"]:
         return f"{what} where a connection waits to be accepted: it is kept as soon as the program has accepted it"
     if seen["too_long"]:
@@ -200,10 +220,9 @@ def is_answered(path: str) -> bool:
 # --- Restore -----------------------------------------------------------------------------------------------------------
 
 
-def prepare(table: CallTable, held: Sequence[Resource], first: int) -> dict[int, int]:
-    """Make all of them at numbers from ``first`` on: the descriptor of each, by the socket's number in the snapshot."""
-    work = _Work(table, {_of(one, "socket"): one for one in held}, first)
-    return work.run()
+def _list(fact: Fact) -> list[Fact]:
+    assert isinstance(fact, list)
+    return fact
 
 
 def _of(held: Resource, name: str) -> int:
@@ -216,37 +235,46 @@ def _name_of(held: Resource) -> bytes:
     return name
 
 
-class _Work:
+class Work:
     """One restore of unix sockets: those with a name first, then connections, then what waits in them."""
 
-    def __init__(self, table: CallTable, held: Mapping[int, Resource], first: int) -> None:
+    def __init__(self, table: CallTable, held: Sequence[Resource], first: int) -> None:
         self._table = table
-        self._held = held
+        self._held = {_of(one, "socket"): one for one in held}
         self._next = first
         self._made: dict[int, int] = {}
         self._closing: list[int] = []
+        self._others: dict[int, int] = {}
+
+    @property
+    def end(self) -> int:
+        """The first number after those that they stand at."""
+        return self._next
 
     def run(self) -> dict[int, int]:
         """Make them all."""
-        table = self._table
         for inode, one in self._held.items():
             if self._stands_alone(one):
                 self._made[inode] = self._away(self._alone(one))
-        others: dict[int, int] = {}
         for inode, one in self._held.items():
             if inode not in self._made:
-                others |= self._connect(one)
+                self._others |= self._connect(one)
         for one in self._held.values():
             self._connect_datagrams(one)
+        return self._made
+
+    def fill(self) -> None:
+        """Send what waits in them, and shut down what is; descriptors that are on their way are there by now."""
+        table = self._table
+        for one in self._held.values():
             if one.facts["queue"]:
-                sockets.fill(table, one, self._sender_to(one, others), self._held.get(_of(one, "peer")))
+                sockets.fill(table, one, self._sender_to(one, self._others), self._held.get(_of(one, "peer")))
         for inode, one in self._held.items():
             if how := _of(one, "shutdown"):
                 table.attempt("", "shutdown", self._made[inode], _SHUTDOWN_HOW[how])
             sockets.set_flags(table, one, self._made[inode])
         for number in self._closing:
             table.close(number)
-        return self._made
 
     def _away(self, made: int) -> int:
         """Move a descriptor above all that are wanted."""

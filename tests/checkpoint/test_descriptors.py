@@ -34,7 +34,8 @@ CASES = {
     "path_descriptors": "inotify_directories inotify_gaps fifo_both fifo_reader path_only kernel_files file_locks",
     "memory_objects": "memfd_content memfd_sealed memfd_mapped posix_named posix_unlinked",
     "sockets": (
-        "pair_stream pair_datagram pair_packets pair_much pair_options pair_half_closed pair_orphan listener_path "
+        "pair_stream pair_datagram pair_packets pair_much pair_options pair_half_closed rights_stream "
+        "rights_datagram pair_orphan listener_path "
         "listener_abstract unix_with_itself unix_datagrams unix_fresh tcp_listener_4 tcp_listener_6 tcp_fresh udp_queue "
         "udp_options udp_group"
     ),

@@ -113,6 +113,47 @@ static void pair_options(void) {
     EXPECT_EQUAL("credentials", option(ends[0], SOL_SOCKET, SO_PASSCRED), 0);
 }
 
+static void pass(int file, const char *text, const int *passed, int count) {
+    char room[CMSG_SPACE(4 * sizeof(int))] = {0};
+    struct iovec content = {(char *)text, strlen(text)};
+    struct msghdr message = {.msg_iov = &content, .msg_iovlen = 1, .msg_control = room, .msg_controllen = CMSG_SPACE(count * sizeof(int))};
+    struct cmsghdr *rights = CMSG_FIRSTHDR(&message);
+    rights->cmsg_level = SOL_SOCKET, rights->cmsg_type = SCM_RIGHTS, rights->cmsg_len = CMSG_LEN(count * sizeof(int));
+    memcpy(CMSG_DATA(rights), passed, count * sizeof(int));
+    if (sendmsg(file, &message, 0) != (ssize_t)strlen(text)) cannot("pass descriptors");
+}
+
+static int receive(int file, const char *wanted, int *passed) {
+    char found[100] = "", room[CMSG_SPACE(4 * sizeof(int))];
+    struct iovec content = {found, sizeof found - 1};
+    struct msghdr message = {.msg_iov = &content, .msg_iovlen = 1, .msg_control = room, .msg_controllen = sizeof room};
+    recvmsg(file, &message, MSG_DONTWAIT);
+    EXPECT(!strcmp(found, wanted), "'%s' came, not '%s'", found, wanted);
+    struct cmsghdr *rights = CMSG_FIRSTHDR(&message);
+    if (!rights) return 0;
+    memcpy(passed, CMSG_DATA(rights), rights->cmsg_len - CMSG_LEN(0));
+    return (rights->cmsg_len - CMSG_LEN(0)) / sizeof(int);
+}
+
+static void pair_rights(int kind) {
+    int ends[2], pipes[2], passed[4];
+    make_pair(kind, ends);
+    if (pipe(pipes)) cannot("make a pipe");
+    int file = open("passed", O_RDWR | O_CREAT, 0600), both[] = {file, pipes[1]};
+    say(ends[0], "plain"), pass(ends[0], "two", both, 2), pass(ends[0], "itself", &ends[1], 1);
+    wait_here();
+    if (kind == SOCK_DGRAM) EXPECT_EQUAL("passed", receive(ends[1], "plain", passed), 0);
+    EXPECT_EQUAL("passed", receive(ends[1], kind == SOCK_DGRAM ? "two" : "plaintwo", passed), 2);
+    EXPECT(write(passed[1], "x", 1) == 1 && read(pipes[0], both, 1) == 1, "it is not the pipe");
+    lseek(file, 77, SEEK_SET);
+    EXPECT_EQUAL("offset", lseek(passed[0], 0, SEEK_CUR), 77);
+    EXPECT_EQUAL("passed", receive(ends[1], "itself", passed), 1);
+    say(ends[0], "more"), expect_text(passed[0], "more");
+}
+
+static void rights_stream(void) { pair_rights(SOCK_STREAM); }
+static void rights_datagram(void) { pair_rights(SOCK_DGRAM); }
+
 static void pair_half_closed(void) {
     int ends[2];
     char byte;
@@ -342,6 +383,8 @@ int main(int count, char **arguments) {
                  {"pair_packets", pair_packets},
                  {"pair_much", pair_much},
                  {"pair_options", pair_options},
+                 {"rights_stream", rights_stream},
+                 {"rights_datagram", rights_datagram},
                  {"pair_half_closed", pair_half_closed},
                  {"pair_orphan", pair_orphan},
                  {"listener_path", listener_path},
