@@ -31,6 +31,7 @@ from checkpoint.resources import (
     signalfds,
     signalling,
     streams,
+    system_v_memory,
     tcp_connections,
     terminals,
     timerfds,
@@ -70,6 +71,7 @@ CARRIERS: Final[tuple[ModuleType, ...]] = (
     restore_vdso,
     restore_kinds,
     memory_locks,
+    system_v_memory,
 )
 """In the order in which their rows stand within an area and a verdict."""
 

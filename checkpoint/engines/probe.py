@@ -12,7 +12,7 @@ from checkpoint.engine import KEPT, NOTED, REFUSED, Finding, Report, Streams
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import dirty, processor, procfs, vm_flags
 from checkpoint.linux.procfs import Status
-from checkpoint.resources import Surroundings, glance, look, pipes_of, unsupported
+from checkpoint.resources import Surroundings, glance, look, pipes_of, system_v_memory, unsupported
 
 COMMAND_LENGTH: Final = 200
 """Characters of a command line that a report shows."""
@@ -100,7 +100,9 @@ def _memory_findings(pid: int) -> Iterator[Finding]:
         reason = unsupported.refuse_mapping(line, flags.get(line.start, ()))
         if reason is not None:
             yield Finding("memory", f"VMA {line.start:x}-{line.end:x}", REFUSED, reason)
-    for path, note in unsupported.note_mappings(lines):
+    for reason in system_v_memory.refuse(lines):
+        yield Finding("memory", "System V shared memory", REFUSED, reason)
+    for path, note in unsupported.note_mappings(line for line in lines if not system_v_memory.is_segment(line)):
         yield Finding("memory", path, NOTED, note)
 
 

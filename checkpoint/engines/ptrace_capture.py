@@ -49,7 +49,7 @@ from checkpoint.linux.tracking import NONE, NOT_CARRIED
 from checkpoint.linux.vm_flags import FlagsReader
 from checkpoint.model import Position, Resource, Snapshot
 from checkpoint.pages import PageTable
-from checkpoint.resources import Surroundings, carried_trees, glance, look, memory_locks, unsupported
+from checkpoint.resources import Surroundings, carried_trees, glance, look, memory_locks, system_v_memory, unsupported
 from checkpoint.resources.carried_trees import NO_PARCEL, CarriedTrees, Parcel, Seen
 from checkpoint.stream_counts import Totals
 
@@ -293,7 +293,7 @@ class PtraceSession:
         parcel = self._carried.parcel(frozen.seen, parent) if self._carried else NO_PARCEL
         snapshot = replace(
             self._with_pages(self._outline(order, parent, frozen, parcel), taken, parcel),
-            resources=(*held.resources, *self._locks(taken.lines), *parcel.resources),
+            resources=(*held.resources, *self._locks(taken.lines), *system_v_memory.describe(taken.lines), *parcel.resources),
             output=self._outputs.pieces(self._output_since(parent), standing.totals) if self._outputs else (),
         )
         snapshot = replace(snapshot, position=position_of(snapshot, order.generation, order.sequence))
@@ -348,7 +348,8 @@ class PtraceSession:
         try:
             self._flags.refresh(self._memory.lines)
             of_mappings = (unsupported.refuse_mapping(line, self._foreign_flags(line)) for line in lines)
-            return (*self._reasons_of_process(status), *(reason for reason in of_mappings if reason))
+            of_segments = system_v_memory.refuse(lines)
+            return (*self._reasons_of_process(status), *(reason for reason in of_mappings if reason), *of_segments)
         except ProcessGoneError:
             return ()  # the picture was taken before it ended
 

@@ -47,7 +47,7 @@ from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee
 from checkpoint.model import Credentials, Position, Snapshot, ThreadState, Vma
-from checkpoint.resources import files, laying, memory_locks, remembered
+from checkpoint.resources import files, laying, memory_locks, remembered, system_v_memory
 from checkpoint.resources.rebuild import rebuild_all, rebuild_last
 from checkpoint.resources.rebuilding import number_of
 
@@ -124,6 +124,7 @@ class _Restore:
         self._notes: list[str] = []
         self._objects: dict[tuple[int, int], int] = {}
         self._foreign: tuple[Vma, ...] = ()
+        self._segments = system_v_memory.Segments()
         self._own_functions: tuple[vdso.Function, ...] = ()
 
     def run(self) -> RestoredProgram:
@@ -131,6 +132,7 @@ class _Restore:
             self._run()
         except BaseException:
             restore_threads.end(self._tracee, [tracee for tracee, _ in self._others])
+            self._segments.undo()
             raise
         threads = Threads(self._tracee)
         threads.adopt(tuple(tracee for tracee, _ in self._others))
@@ -190,6 +192,7 @@ class _Restore:
     def _build_and_run(self, vessel: Vessel, mappings: tuple[procfs.MapsLine, ...]) -> None:
         state, tracee = self._state, self._tracee
         taken = [(line.start, line.end) for line in mappings] + [(vma.start, vma.end) for vma in state.vmas]
+        self._segments.make(state.resources)
         base = call_table.find_hole(taken, AREA_SIZE + REFUGE_SIZE)
         kernel_pages = restore_memory.kernel_pages(mappings)
         first = self._mappings_table(CallTable(base), vessel, mappings, base + AREA_SIZE)
@@ -205,6 +208,8 @@ class _Restore:
         stub = Stub(tracee, base)
         stub.install(self._syscall_instruction(kernel_pages[-1].start, kernel_pages[-1].size), size)
         self._notes += stub.run(first)
+        self._segments.attached()
+        self._notes += self._segments.notes
         restore_memory.fill(tracee.memory, state)
         if self._own_functions:
             self._leave_old_vdso()
@@ -252,6 +257,8 @@ class _Restore:
         self._vdso = restore_memory.move_kernel_pages(table, ours, theirs, refuge)
         self._vdso_size = ours[-1].size
         restore_kinds.allocate_keys(table, restore_kinds.keys_of(self._state))
+        attached = [vma for vma in vmas if system_v_memory.is_segment(vma)]
+        system_v_memory.attach(table, attached, self._segments.ids, system_v_memory.sizes_of(self._state.resources))
         self._objects |= restore_memory.map_program(table, vmas, runs, brought)
         self._executable = brought.pop(self._state.process.executable.path, None)
         for descriptor in brought.values():

@@ -26,7 +26,7 @@ from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.tracking import MEMORY_PLACE
 from checkpoint.model import PageRun, Snapshot, Vma, VmaKind
 from checkpoint.pages import Words
-from checkpoint.resources import memory_files, rebuild
+from checkpoint.resources import memory_files, rebuild, system_v_memory
 
 MREMAP_MAYMOVE_FIXED: Final = 1 | 2
 MAP_LOCKED_ON_FAULT: Final = 1
@@ -90,7 +90,7 @@ def _move(table: CallTable, start: int, target: int, size: int) -> None:
 def map_program(
     table: CallTable, vmas: Iterable[Vma], runs: Sequence[PageRun], brought: Mapping[str, int]
 ) -> dict[tuple[int, int], int]:
-    """Map everything that the program had; what will be filled is writable for now.
+    """Map everything that the program had, but for attached segments; what will be filled is writable for now.
 
     Answers with a descriptor of each shared object without a name, by (device, inode): open files may be of the same one.
 
@@ -98,7 +98,7 @@ def map_program(
         brought: descriptors of what is mapped in place of this machine's files, by path; they stay open.
     """
     carried = Carried(runs)
-    mapped = [vma for vma in vmas if vma.kind not in KERNEL_KINDS]
+    mapped = [vma for vma in vmas if vma.kind not in KERNEL_KINDS and not system_v_memory.is_segment(vma)]
     files = [vma for vma in mapped if is_file_mapping(vma)]
     for (path, writable), group in groupby(sorted(files, key=_file_order), key=_file_order):
         pieces = list(group)

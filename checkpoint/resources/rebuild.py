@@ -38,6 +38,7 @@ from checkpoint.resources import (
     signalfds,
     signalling,
     streams,
+    system_v_memory,
     tcp_connections,
     terminals,
     timerfds,
@@ -71,10 +72,13 @@ NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
     unix_sockets.KIND: unix_sockets.mismatches,
     kernel_files.KIND: kernel_files.mismatches,
     internet_sockets.KIND: internet_sockets.mismatches,
+    system_v_memory.KIND: system_v_memory.mismatches,
 }
 """Kinds that need something of this machine: why it does not have that, one sentence each."""
 SOCKETS: Final = (unix_sockets.KIND, tcp_connections.KIND, internet_sockets.KIND)
-KINDS: Final = (files.KIND, devices.KIND, streams.KIND, pipes.KIND, memory_locks.KIND, terminals.KIND, *MADE, *SOCKETS)
+NOT_OPEN: Final = (memory_locks.KIND, system_v_memory.KIND)
+"""Kinds of what no descriptor stands for."""
+KINDS: Final = (files.KIND, devices.KIND, streams.KIND, pipes.KIND, terminals.KIND, *NOT_OPEN, *MADE, *SOCKETS)
 
 
 @dataclass(frozen=True, slots=True)

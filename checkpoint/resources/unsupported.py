@@ -46,7 +46,6 @@ CAPABILITIES: Final = (
         "a socket ({}, {})",
     ),
     refused(Area.DEVICES, "memory of a device", "the driver process maps it", "memory of a device"),
-    refused(Area.MEMORY, "System V shared memory", "use a file in /dev/shm", "System V shared memory"),
     refused(Area.MEMORY, "secret memory that is mapped", "run it without", "secret memory"),
     refused(
         Area.MEMORY,
@@ -140,7 +139,6 @@ _MAPPINGS: Final = (
     (re.compile(r"anon_inode:\[io_uring\]"), "the rings of an io_uring"),
     (re.compile(r"anon_inode:\[perf_event\]"), "the buffer of a perf event"),
     (re.compile(r"/\[aio\]"), "a ring of asynchronous I/O (aio)"),
-    (re.compile(r"/SYSV[0-9a-f]+"), "System V shared memory"),
     (re.compile(r"/secretmem"), "secret memory"),
     (re.compile(r"/dev/(?!zero|shm/)"), "memory of a device"),
 )

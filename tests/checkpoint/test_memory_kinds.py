@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 from checkpoint.engine import CaptureOrder
+from checkpoint.errors import CheckpointError
+from checkpoint.linux import system_v
 from tests.checkpoint.round_trip import (
     captured_and_killed,
     captured_at_last,
@@ -17,9 +19,11 @@ from tests.checkpoint.round_trip import (
     expect_ok,
     protected,
     restored,
+    start,
     start_tracee,
     transported,
 )
+from tests.conftest import children
 
 Compiled = Callable[..., Path]
 
@@ -81,3 +85,59 @@ def test_advice_to_a_whole_mapping_is_seen_by_the_next_base(compiled: Compiled, 
     with ended(restored(snapshot, tmp_path)) as tracee:
         tracee.tell()
         expect_ok(tracee)
+
+
+# --- System V shared memory ------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def segment_removed(identifier: int) -> Iterator[None]:
+    """Leave no segment of a program behind, however the body ends."""
+    try:
+        yield
+    finally:
+        system_v.remove(identifier)
+
+
+@pytest.mark.parametrize("is_left", [True, False], ids=["the segment was left", "another robot"])
+def test_shared_memory_of_system_v_comes_back(is_left: bool, compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("special_memory", "-O2"), tmp_path, "segments")) as tracee:
+        identifier = int(tracee.output.split()[0])
+        with segment_removed(identifier):
+            snapshot = captured_and_killed(tracee)
+            assert identifier in system_v.segments()
+            if not is_left:
+                system_v.remove(identifier)
+                assert identifier not in system_v.segments()
+            with ended(restored(snapshot, tmp_path)) as tracee:
+                tracee.tell()
+                expect_ok(tracee)
+
+
+def test_a_key_that_somebody_else_has_is_said_so(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("special_memory", "-O2"), tmp_path, "segments")) as tracee:
+        identifier = int(tracee.output.split()[0])
+        with segment_removed(identifier):
+            snapshot = captured_and_killed(tracee)
+            key = system_v.segments()[identifier].key
+    other = system_v.make(system_v.Segment(key, identifier + 1, 0o600, 4096, 0, 0, 0))
+    with segment_removed(other):
+        before, known = children(), set(system_v.segments())
+        with pytest.raises(CheckpointError, match="belongs to another segment here"):
+            restored(snapshot, tmp_path).kill()
+        assert (children(), set(system_v.segments())) == (before, known)
+
+
+def test_a_restore_that_fails_leaves_no_segment(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("special_memory", "-O2"), tmp_path, "segments")) as tracee:
+        identifier = int(tracee.output.split()[0])
+        with segment_removed(identifier):
+            snapshot = captured_and_killed(tracee)
+    (thread,) = snapshot.threads
+    (tmp_path / "beside").mkdir()
+    with ended(start(["/bin/sleep", "600"], tmp_path / "beside")) as other:
+        beside = replace(snapshot, threads=(thread, replace(thread, tid=other.pid)))
+        known = set(system_v.segments())
+        with pytest.raises(CheckpointError, match="id is in use"):
+            restored(beside, tmp_path).kill()
+        assert set(system_v.segments()) == known

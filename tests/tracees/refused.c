@@ -217,12 +217,20 @@ static void take_device_memory(void) {
     close(memory);
 }
 
-static void take_system_v_memory(void) {
+static unsigned char *attached(void) {
     int segment = shmget(IPC_PRIVATE, 4 * PAGE, IPC_CREAT | 0600);
     void *place = segment < 0 ? (void *)-1 : shmat(segment, NULL, 0);
     if (segment >= 0) shmctl(segment, IPC_RMID, NULL);
     if (place == (void *)-1) cannot("attach shared memory");
+    return place;
 }
+
+static void take_system_v_memory(void) {
+    attached();
+    take_child();
+}
+
+static void take_system_v_part(void) { munmap(attached() + 3 * PAGE, PAGE); }
 
 static void take_message_queue(void) {
     struct mq_attr attributes = {.mq_maxmsg = 2, .mq_msgsize = 8};
@@ -330,6 +338,7 @@ static const struct kind {
              {"fuse", take_fuse},
              {"device_memory", take_device_memory},
              {"system_v_memory", take_system_v_memory},
+            {"system_v_part", take_system_v_part},
              {"message_queue", take_message_queue},
              {"bpf_map", take_bpf_map},
              {"perf_event", take_perf_event},

@@ -4,6 +4,7 @@
 #include <pthread.h>
 #include <setjmp.h>
 #include <sys/prctl.h>
+#include <sys/shm.h>
 
 #define HUGE_PAGE (2UL << 20)
 #define CODES "ht gb lo lf dp sl wf dd "
@@ -174,12 +175,48 @@ static int paged_out(void) {
     return finish();
 }
 
+/* Two segments: one that others could find by its key, attached twice, and one that goes with the program. */
+static int segments(void) {
+    key_t key = 0x5e000000 + (getpid() & 0xffffff);
+    int named = shmget(key, 4 * PAGE, IPC_CREAT | IPC_EXCL | 0640), passing = shmget(IPC_PRIVATE, 3 * PAGE - 5, 0600);
+    unsigned char *place = shmat(named, NULL, 0), *again = shmat(named, NULL, 0), *other = shmat(passing, NULL, 0);
+    if (place == (void *)-1 || again == (void *)-1 || other == (void *)-1) cannot("attach shared memory");
+    shmctl(passing, IPC_RMID, NULL);
+    fill(place, 4 * PAGE, 10);
+    fill(other, 3 * PAGE, 11);
+    munmap(again, PAGE); /* the other attachment has the whole */
+    mprotect(place + 2 * PAGE, PAGE, PROT_READ);
+    printf("%d\n", named);
+    ready();
+    wait_for_go(go);
+    expect_filled("the segment", place, 4 * PAGE, 10);
+    expect_filled("the segment that goes with us", other, 3 * PAGE, 11);
+    EXPECT(!strncmp(permissions_at(place + 2 * PAGE), "r--s", 4), "a page is %s", permissions_at(place + 2 * PAGE));
+    EXPECT(!*permissions_at(again), "what was unmapped is there again");
+    place[0] ^= 1;
+    place[3 * PAGE] ^= 1;
+    EXPECT(again[3 * PAGE] == place[3 * PAGE], "the two attachments are not of one segment");
+    struct shmid_ds about;
+    EXPECT_EQUAL("the id by its key", shmget(key, 0, 0), named);
+    EXPECT(shmctl(named, IPC_STAT, &about) == 0, "the segment is not known by its id");
+    EXPECT_EQUAL("size", about.shm_segsz, 4 * PAGE);
+    EXPECT_EQUAL("permissions", about.shm_perm.mode, 0640);
+    EXPECT(shmctl(passing, IPC_STAT, &about) == 0, "the passing segment is not known by its id");
+    EXPECT_EQUAL("the passing one's size", about.shm_segsz, 3 * PAGE - 5);
+    EXPECT(about.shm_perm.mode & SHM_DEST, "it does not go with us any more");
+    unsigned char *anew = shmat(named, NULL, 0);
+    EXPECT(anew != (void *)-1 && anew[0] == place[0], "attached anew it is another one");
+    shmctl(named, IPC_RMID, NULL);
+    return finish();
+}
+
 int main(int count, char **arguments) {
     if (count < 3) return 2;
     go = arguments[1];
     const char *kind = arguments[2];
     if (!strcmp(kind, "huge")) return huge(MAP_PRIVATE);
     if (!strcmp(kind, "huge_shared")) return huge(MAP_SHARED);
+    if (!strcmp(kind, "segments")) return segments();
     if (!strcmp(kind, "keys")) return keys();
     if (!strcmp(kind, "locked")) return locked_for_ever(MCL_CURRENT | MCL_FUTURE);
     if (!strcmp(kind, "locked_on_fault")) return locked_for_ever(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT);
