@@ -60,6 +60,7 @@ class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
     portable: Literal["", "no", "x86-64-v1", "x86-64-v2", "x86-64-v3", "x86-64-v4"] = ""
     hooks: dict[HookName, list[Text]] = {}
     carry: list[Text] = []
+    devices: dict[Text, Text] = {}
 
 
 class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):
@@ -68,6 +69,7 @@ class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):
     pid: Annotated[int, msgspec.Meta(ge=1, le=PID_MAX)]
     name: str
     carry: list[Text] = []
+    devices: dict[Text, Text] = {}
 
 
 class StopArguments(msgspec.Struct, forbid_unknown_fields=True):

@@ -25,6 +25,7 @@ from agent.places import Places, complete_logs, log_directory
 from agent.streams import discard, total_of
 from checkpoint import channel, epoch_variable, format
 from checkpoint.carried import paths_of
+from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import CARRIED_SIZE_MAX, COOPERATIVE, PTRACE, Carry
 from checkpoint.engines.cooperative import age_ns as commit_age_ns
 from checkpoint.errors import CheckpointError, MismatchError
@@ -116,6 +117,7 @@ async def restore(
     task: guard_messages.Task | None = None,
     epoch: int = 0,
     carry_limit: int = CARRIED_SIZE_MAX,
+    devices: tuple[DeviceRule, ...] = (),
 ) -> Component:
     """Rebuild a component from a chain (descriptors of encoded snapshots, oldest first), stopped, committed to nothing.
 
@@ -127,6 +129,7 @@ async def restore(
         task: for a program that may still say that it keeps its state.
         owner: uid; None: whoever it ran as. What is not root's opens its files with its owner's rights, and gets no others.
         carry_limit: bytes that its carried files may hold here.
+        devices: what becomes of devices that it had open.
 
     Raises:
         checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
@@ -152,7 +155,7 @@ async def restore(
         task=task,
     )
     component.engine_wanted = task.engine if task is not None else PTRACE
-    component.keeper.carry = Carry(paths_of(outline), carry_limit)
+    component.keeper.carry, component.keeper.devices = Carry(paths_of(outline), carry_limit), devices
     component.keeper.names = names_of_contents(needs(outline), places.contents)
     try:
         keeper = await component.keeper.give()
@@ -169,6 +172,7 @@ async def restore(
             epoch=epoch,
             contents=places.contents,
             carry=component.keeper.carry,
+            devices=devices,
         )
         restored, _ = await component.keeper.ask(order, (*chain, *component.streams))
         laps.lap("restore")

@@ -26,6 +26,7 @@ from agent.snapshots import Snapshots
 from agent.standby import Standby
 from agent.surroundings import Surroundings, program_of
 from checkpoint.channel import close_all
+from checkpoint.device_rules import arrived, merged
 from checkpoint.engine import COOPERATIVE, Carry
 from checkpoint.errors import CheckpointError, NothingCommittedError, UnsupportedError
 from failover.client.quantities import size_bytes
@@ -116,7 +117,10 @@ class Charge:
 
     def adopt(self, component: Component, epoch: int) -> None:
         """A guard was found alive after a restart."""
-        component.keeper.carry = self.around.records.carry(self.name)
+        component.keeper.carry, component.keeper.devices = (
+            self.around.records.carry(self.name),
+            self.around.records.devices(self.name),
+        )
         self.component, self.epoch = component, epoch
         self.started.set()
         self._watch_the_end()
@@ -228,13 +232,14 @@ class Charge:
         adopted = self.component is not None
         self._occasions.runs_here(act.spec)
         carry = Carry(act.spec.launch.carry, size_bytes(self.around.here(self.name).carry_limit))
-        self.around.records.note(self.name, act.epoch, carry)
+        devices = merged(arrived(act.spec.launch.devices), self.around.here(self.name).device_rules())
+        self.around.records.note(self.name, act.epoch, carry, devices)
         if self.component is None:
             await self.around.settled(self.name)
             if not act.spec.launch.pid:
                 await self._occasions.before_start(act)
             self.component = await self._begun(act.spec.launch, act.epoch)
-        self.component.keeper.carry = carry
+        self.component.keeper.carry, self.component.keeper.devices = carry, devices
         await self.component.lease(self._lease_until_ns)
         await self._protect(refuse=act.spec.launch.pid != 0)
         self.started.set()
@@ -306,7 +311,7 @@ class Charge:
     async def _let_it_run(self, component: Component, epoch: int, outage_ns: int, laps: clock.Laps) -> tuple[Component, int]:
         """Give it the newest lease, and those that come while it is resumed; then it runs, or nothing of it is left."""
         prepared = component.prepared
-        self.around.records.note(self.name, epoch, component.keeper.carry)
+        self.around.records.note(self.name, epoch, component.keeper.carry, component.keeper.devices)
         self._coming = component
         try:
             if self._lease_until_ns:
@@ -322,7 +327,7 @@ class Charge:
 
     async def _thaw(self, act: acts.Thaw) -> None:
         component = self._present()
-        self.around.records.note(self.name, act.epoch, component.keeper.carry)
+        self.around.records.note(self.name, act.epoch, component.keeper.carry, component.keeper.devices)
         if self._is_held:
             return  # by a newer order
         await component.lease(self._lease_until_ns)

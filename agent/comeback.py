@@ -14,6 +14,7 @@ from agent.guard_messages import Task
 from agent.rules import started_here
 from agent.surroundings import Surroundings, program_of
 from checkpoint import format
+from checkpoint.device_rules import arrived, merged
 from checkpoint.engine import AUTO, COOPERATIVE
 from checkpoint.errors import RestoreError
 from failover.client.quantities import size_bytes
@@ -59,6 +60,7 @@ async def brought_back(
             task=task,
             epoch=act.epoch,
             carry_limit=carry_limit,
+            devices=merged(arrived(spec.launch.devices if spec is not None else ()), around.here(name).device_rules()),
         )
     if spec is None:
         raise RestoreError(f"cannot start {name} again: this robot was never told its command; start it by failover run")

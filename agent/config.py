@@ -12,6 +12,7 @@ from typing import Final, Literal
 
 from agent.errors import ConfigError
 from agent.hooks import KINDS
+from checkpoint.device_rules import RULES_MAX, DeviceRule, checked, rule_from
 from checkpoint.engine import is_carriable
 from failover.client import strict_toml
 from failover.client import team as team_directory
@@ -60,6 +61,19 @@ class HooksConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class DeviceConfig:
+    """A rule for a device that needs more than a word.
+
+    Attributes:
+        reopen: what is opened on this robot in its place; "" for itself.
+        optional: where it is missing the program finds it hung up.
+    """
+
+    reopen: str = ""
+    optional: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class ComponentConfig:
     """What the operator wants for one component; ``[components."/lab/robot1/mapper"]``.
 
@@ -77,6 +91,7 @@ class ComponentConfig:
         directory: and in this one, an absolute path; "" for that of `failover run`.
         environment: and with these variables besides, or instead.
         hooks: this robot's own commands around it.
+        devices: what becomes of devices that it has open, by path: see `checkpoint.device_rules`.
         carry: files and folders that travel with it when it is started here, besides those that `failover run` names.
         carry_limit: what they may hold while it runs here.
     """
@@ -93,8 +108,20 @@ class ComponentConfig:
     directory: str = ""
     environment: dict[str, str] = field(default_factory=dict)
     hooks: HooksConfig = field(default_factory=HooksConfig)
+    devices: dict[str, DeviceConfig | Literal["reopen", "hook", "optional"]] = field(default_factory=dict)
     carry: tuple[str, ...] = field(default_factory=tuple)
     carry_limit: str = "256MB"
+
+    def device_rules(self) -> tuple[DeviceRule, ...]:
+        """This robot's own rules for its devices.
+
+        Raises:
+            ValueError: one of them names no device.
+        """
+        return tuple(
+            rule_from(path, said) if isinstance(said, str) else checked(DeviceRule(path, "reopen", said.reopen, said.optional))
+            for path, said in self.devices.items()
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,6 +295,7 @@ def _check_components(path: Path, config: Config, members: Team) -> None:
             )
         _check_command(where, component)
         _check_carry(where, component)
+        _check_devices(where, component)
 
 
 def _check_choice(where: str, key: str, chosen: str, members: Team, roles: set[str]) -> None:
@@ -278,6 +306,16 @@ def _check_choice(where: str, key: str, chosen: str, members: Team, roles: set[s
         able = ", ".join(sorted(name for name, member in members.robots.items() if member.role in roles)) or "nobody"
         what = "runs nothing" if key == "prefer" else "keeps no checkpoints"
         raise ConfigError(f"{where}: {key} = {chosen!r}: it is a {members.robots[chosen].role} and {what}; choose among {able}")
+
+
+def _check_devices(where: str, component: ComponentConfig) -> None:
+    """A rule for no device would be obeyed by nobody."""
+    if len(component.devices) > RULES_MAX:
+        raise ConfigError(f"{where}: {len(component.devices)} devices; at most {RULES_MAX}")
+    try:
+        component.device_rules()
+    except ValueError as error:
+        raise ConfigError(f"{where}: devices: {error}") from error
 
 
 def _check_carry(where: str, component: ComponentConfig) -> None:

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from agent.component import Captured
+from checkpoint.device_rules import DeviceRule, rules_of
 from checkpoint.engine import PTRACE
-from checkpoint.model import Position
+from checkpoint.model import Position, Snapshot
 
 REASONS_TOLD: Final = 3
 """Of the reasons why it cannot be captured, in one sentence of the core; ``status --json`` has them all."""
@@ -80,6 +81,8 @@ class Figures:
     notes: tuple[str, ...] = ()
     lacking: tuple[str, ...] = ()
     """Of a standby: instruction sets that the program may use and this processor has not."""
+    devices: tuple[DeviceRule, ...] = ()
+    """Of those that it has open, as the newest snapshot from its primary tells."""
     hooks: dict[str, str] = field(default_factory=dict)
     """By occasion: what the last run of a hook had to complain of."""
     bringing: dict[str, str] = field(default_factory=dict)
@@ -103,10 +106,11 @@ class Figures:
             "start it with failover run --portable, see docs/configuration.md"
         )
 
-    def stored(self, position: Position, size: int, engine: str) -> None:
+    def stored(self, snapshot: Snapshot, size: int) -> None:
         """Count one snapshot that came from the primary."""
         self.snapshots += 1
-        self.newest, self.snapshot_size, self.engine = position, size, engine
+        self.devices = rules_of(snapshot.resources)
+        self.newest, self.snapshot_size, self.engine = snapshot.position, size, snapshot.engine
 
 
 def seconds(duration_ns: int) -> str:

@@ -9,6 +9,7 @@ from agent.nursery import KeeperLink
 from agent.places import Places
 from checkpoint import channel, errors
 from checkpoint.channel import Failed
+from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import NOTHING_CARRIED
 from checkpoint.errors import CheckpointError, RestoreError, UnsupportedError
 
@@ -20,12 +21,14 @@ class Following:
         followed: engine and pid; None while nothing is followed.
         carry: files that travel with it.
         names: by which the program knows those of its files that were brought here, by their paths here.
+        devices: what becomes of devices that it has open.
     """
 
     def __init__(self, name: str, places: Places) -> None:
         self.followed: tuple[str, int] | None = None
         self.carry = NOTHING_CARRIED
         self.names: dict[str, str] = {}
+        self.devices: tuple[DeviceRule, ...] = ()
         self._name = name
         self._places = places
         self._link: KeeperLink | None = None
@@ -52,7 +55,9 @@ class Following:
         Raises:
             UnsupportedError, CheckpointError; KeeperLostError.
         """
-        order = channel.Protect(pid, self._name, bool(streams), self._places.robot, engine, self.carry, names=self.names)
+        order = channel.Protect(
+            pid, self._name, bool(streams), self._places.robot, engine, self.carry, self.devices, names=self.names
+        )
         try:
             protected, _ = await self.ask(order, streams)
         except UnsupportedError:

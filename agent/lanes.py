@@ -298,7 +298,7 @@ class Lanes(Switchboard):
 
     def _stored(self, component: str, snapshot: Snapshot, size: int) -> None:
         figures = self.charge(component).figures
-        figures.stored(snapshot.position, size, snapshot.engine)
+        figures.stored(snapshot, size)
         if snapshot.engine == PTRACE:
             figures.lacking = portable.lacking(snapshot.machine.features, processor.features())
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import msgspec
 
+from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import NOTHING_CARRIED, Carry
 from checkpoint.shelf import folder_name
 
@@ -20,6 +21,7 @@ class Running(msgspec.Struct, frozen=True):
     component: str
     epoch: int
     carry: Carry = NOTHING_CARRIED
+    devices: tuple[DeviceRule, ...] = ()
 
 
 class Records:
@@ -29,7 +31,7 @@ class Records:
         self._directory = directory
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
 
-    def note(self, component: str, epoch: int, carry: Carry = NOTHING_CARRIED) -> None:
+    def note(self, component: str, epoch: int, carry: Carry = NOTHING_CARRIED, devices: tuple[DeviceRule, ...] = ()) -> None:
         """From now on it runs under this epoch.
 
         Raises:
@@ -37,7 +39,7 @@ class Records:
         """
         path = self._path(component)
         aside = path.with_suffix(".new")
-        aside.write_bytes(msgspec.json.encode(Running(component, epoch, carry)))
+        aside.write_bytes(msgspec.json.encode(Running(component, epoch, carry, devices)))
         aside.replace(path)
 
     def epoch(self, component: str) -> int:
@@ -49,6 +51,11 @@ class Records:
         """Which files travel with it."""
         noted = self._noted(component)
         return noted.carry if noted else NOTHING_CARRIED
+
+    def devices(self, component: str) -> tuple[DeviceRule, ...]:
+        """What becomes of devices that it has open."""
+        noted = self._noted(component)
+        return noted.devices if noted else ()
 
     def _noted(self, component: str) -> Running | None:
         try:

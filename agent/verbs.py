@@ -32,6 +32,7 @@ from agent.places import Places
 from agent.questions import Lines, Questions
 from agent.rules import level_of, rules_for
 from checkpoint import portable
+from checkpoint.device_rules import RULES_MAX, rule_from, travelling
 from checkpoint.engine import is_carriable
 from failover.core import acts, events
 from failover.core.names import check_component, weight
@@ -128,6 +129,7 @@ class Verbs(Questions):
             output=wanted.output,
             hooks=tuple((occasion, tuple(command)) for occasion, command in wanted.hooks.items() if command),
             carry=self._carried(name, wanted.carry),
+            devices=self._device_rules(name, wanted.devices),
         )
         charge = await self._begin(name, launch, inheritance.uid)
         started: dict[str, Any] = {"name": name, "notes": list(charge.figures.notes), "reasons": list(charge.figures.reasons)}
@@ -159,7 +161,9 @@ class Verbs(Questions):
             if known.component is not None and known.component.pid == wanted.pid:
                 raise RefusedError(f"pid {wanted.pid} is protected already, as {known.name}; failover release lets it go")
         name = await self._fresh_name(wanted.name, "", say.caller.uid)
-        charge = await self._begin(name, Launch(pid=wanted.pid, carry=self._carried(name, wanted.carry)), owner)
+        carried, devices = self._carried(name, wanted.carry), self._device_rules(name, wanted.devices)
+        launch = Launch(pid=wanted.pid, carry=carried, devices=devices)
+        charge = await self._begin(name, launch, owner)
         return {"name": name, "pid": wanted.pid, "notes": list(charge.figures.notes)}
 
     async def release(self, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -282,6 +286,22 @@ class Verbs(Questions):
             if not is_carriable(path):
                 raise RefusedError(f"cannot carry {path!r}: name the file or folder by its whole path, without . and ..")
         return paths
+
+    def _device_rules(self, name: str, wanted: dict[str, str]) -> tuple[tuple[str, str], ...]:
+        """What becomes of a component's devices on every robot: what was asked for, and what this robot's operator wants here.
+
+        Raises:
+            RefusedError: a rule is none.
+        """
+        if len(wanted) > RULES_MAX:
+            raise RefusedError(f"{len(wanted)} rules for devices; at most {RULES_MAX}")
+        try:
+            for path, said in wanted.items():
+                rule_from(path, said)
+        except ValueError as error:
+            raise RefusedError(str(error)) from error
+        own = travelling(self._lanes.settings.component(name).device_rules())
+        return tuple({**wanted, **dict(own)}.items())
 
     async def _begin(self, name: str, launch: Launch, owner: int) -> Charge:
         """Have a component started or taken in, and wait until it is.

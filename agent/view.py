@@ -12,6 +12,7 @@ from agent.config import Settings
 from agent.door import Life, Told
 from agent.pump import HOLD_LIMIT
 from agent.transport import Link, LinkState
+from checkpoint.device_rules import merged, missing
 from checkpoint.engine import COOPERATIVE, PTRACE
 from failover.core.types import COMMITTED, IMMEDIATE, ComponentView, PeerView, Protection, State
 
@@ -119,6 +120,15 @@ def _own_notes(view: ComponentView, figures: Figures | None) -> tuple[str, ...]:
     return (*figures.notes, *_overdue(view, figures), *narrower, *figures.hooks.values(), *figures.bringing.values())
 
 
+def _missing_devices(view: ComponentView, figures: Figures | None, settings: Settings) -> tuple[str, ...]:
+    """Which devices a standby lacks that it would need, while there is time to attach them."""
+    if figures is None or view.state is not State.STANDBY:
+        return ()
+    wanted = {rule.path for rule in figures.devices}
+    rules = merged(figures.devices, settings.component(view.name).device_rules())
+    return tuple(f"{settings.config.robot} {lack}" for lack in missing(rule for rule in rules if rule.path in wanted))
+
+
 def _waiting_output(view: ComponentView, waiting: int) -> tuple[str, ...]:
     """What becomes of held output while no checkpoint of it reaches another robot."""
     if not waiting or view.protection is Protection.PROTECTED:
@@ -176,7 +186,12 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, s
         "output": COMMITTED if held else IMMEDIATE,
         "output_waiting": waiting,
         "reasons": list(figures.reasons) if figures else [],
-        "notes": [*view.notes, *_own_notes(view, figures), *_waiting_output(view, waiting)],
+        "notes": [
+            *view.notes,
+            *_own_notes(view, figures),
+            *_missing_devices(view, figures, settings),
+            *_waiting_output(view, waiting),
+        ],
     }
 
 

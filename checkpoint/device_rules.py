@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -9,6 +10,8 @@ from typing import Final, Literal
 
 from checkpoint.model import Resource
 
+RULES_MAX: Final = 256
+"""Rules of one component: each is looked at for each device that it has open."""
 KIND: Final = "attached_devices"
 """Of resources that are kept by these rules."""
 
@@ -64,6 +67,20 @@ def rule_from(path: str, said: str) -> DeviceRule:
     return checked(DeviceRule(path, "hook" if said == "hook" else "reopen", optional=said == "optional"))
 
 
+def travelling(rules: Iterable[DeviceRule]) -> tuple[tuple[str, str], ...]:
+    """The rules of one robot as they travel with a component: without what is a place on that robot alone."""
+    return tuple((rule.path, "hook" if rule.action == "hook" else "optional" if rule.optional else "reopen") for rule in rules)
+
+
+def arrived(said: Iterable[tuple[str, str]]) -> tuple[DeviceRule, ...]:
+    """The rules that came with a component; what is none counts as none: the device is refused by name then."""
+    found = []
+    for path, words in said:
+        with contextlib.suppress(ValueError):
+            found.append(rule_from(path, words))
+    return tuple(found)
+
+
 def checked(rule: DeviceRule) -> DeviceRule:
     """The rule itself.
 
@@ -76,9 +93,9 @@ def checked(rule: DeviceRule) -> DeviceRule:
     return rule
 
 
-def merged(carried: Iterable[DeviceRule], own: Iterable[DeviceRule]) -> tuple[DeviceRule, ...]:
-    """The rules that came with a component, and this robot's own for it, which come in their place."""
-    return tuple({rule.path: rule for rule in (*carried, *own)}.values())
+def merged(others: Iterable[DeviceRule], own: Iterable[DeviceRule]) -> tuple[DeviceRule, ...]:
+    """The rules that came along with a component, and a robot's own for it, which come in their place."""
+    return tuple({rule.path: rule for rule in (*others, *own)}.values())
 
 
 def rule_for(target: str, rules: Iterable[DeviceRule]) -> DeviceRule | None:

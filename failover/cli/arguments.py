@@ -107,6 +107,7 @@ def run(room: argparse.ArgumentParser) -> None:
         option = f"--{hook.replace('_', '-')}"
         room.add_argument(option, metavar="CMD", type=shlex.split, default=[], help=f"run this, as you, {when}")
     _carry(room)
+    _devices(room)
     room.add_argument("--user", metavar="USER", help="run it as this user, by name or number (only root may; default: as you)")
     room.add_argument("command", metavar="CMD", nargs="+", help="the program and its arguments, after --")
     _agent(room)
@@ -123,11 +124,33 @@ def _carry(room: argparse.ArgumentParser) -> None:
     )
 
 
+def _devices(room: argparse.ArgumentParser) -> None:
+    room.add_argument(
+        "--device",
+        metavar="PATH=RULE",
+        dest="devices",
+        action="append",
+        type=device,
+        default=[],
+        help="what becomes of a device that it has open: reopen, hook, optional, or the path of what is opened in its place; may "
+        "be given again (see docs/devices.md)",
+    )
+
+
+def device(text: str) -> tuple[str, str]:
+    """A path and its rule, which the agent reads."""
+    path, is_there, rule = text.rpartition("=")
+    if not is_there or not path.startswith("/"):
+        raise argparse.ArgumentTypeError(f"{text!r}: say which device and what becomes of it: /dev/ttyUSB0=reopen")
+    return path, rule
+
+
 def protect(room: argparse.ArgumentParser) -> None:
     """Of ``failover protect``."""
     _pid(room)
     room.add_argument("--name", metavar="NAME", help="its name (default: /TEAM/ROBOT/pid-PID)")
     _carry(room)
+    _devices(room)
     _agent(room)
 
 

@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     wanted |= {"engine": arguments.engine, "isolate": arguments.isolate, "wait": not arguments.detach}
     wanted |= {"output": arguments.output, "hooks": {kind: getattr(arguments, kind) for kind in HOOKS}}
     wanted["portable"] = arguments.portable
-    wanted |= {"carry": [os.path.realpath(path) for path in arguments.carry]}
+    wanted |= {"carry": [os.path.realpath(path) for path in arguments.carry], "devices": dict(arguments.devices)}
     if arguments.name:
         wanted["name"] = arguments.name
     if arguments.user:
@@ -180,7 +180,8 @@ def protect(arguments: argparse.Namespace) -> int:
     """Protect a process that runs already."""
     name = arguments.name or f"pid-{arguments.pid}"
     with connect(arguments) as agent:
-        answer = agent.ask("protect", pid=arguments.pid, name=name, carry=[os.path.realpath(path) for path in arguments.carry])
+        carry = [os.path.realpath(path) for path in arguments.carry]
+        answer = agent.ask("protect", pid=arguments.pid, name=name, carry=carry, devices=dict(arguments.devices))
     return _tell(arguments, answer, f"pid {answer['pid']} is protected as {answer['name']}")
 
 

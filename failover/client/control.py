@@ -14,6 +14,7 @@ verb           arguments                                                result, 
 ``run``        ``argv`` *must*, ``name`` = argv[0]'s, ``env``, ``cwd``,  Update ``{"started": {name, pid, inner_pid, isolated,
                ``umask`` 18, ``isolate`` true, ``wait`` true,           notes}}``; with ``wait`` Output … and Result
                ``user`` "", ``engine`` "auto", ``output`` "immediate",  ``{name, exit_status}`` (a wait status); else at once
+               ``devices`` {}: path → rule,
                ``hooks`` {}: occasion → words of a command,
                ``portable`` "": a level, or "no"
 ``protect``    ``pid`` *must*, ``name`` *must*                          ``{name, pid, notes}``

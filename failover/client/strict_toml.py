@@ -76,9 +76,10 @@ def _unknown(table: Mapping[str, Any], kind: Any, at: tuple[str, ...]) -> Iterat
 
 
 def _plain(hint: Any) -> Any:
-    """The type without an "or None"."""
-    if isinstance(hint, types.UnionType):
-        return next(kind for kind in typing.get_args(hint) if kind is not type(None))
+    """The type without an "or None"; of several, the one that is a table."""
+    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
+        kinds = [kind for kind in typing.get_args(hint) if kind is not type(None)]
+        return next((kind for kind in kinds if dataclasses.is_dataclass(kind)), kinds[0])
     return hint
 
 
@@ -88,7 +89,8 @@ def _nested(hint: Any) -> Any:
     if dataclasses.is_dataclass(hint):
         return hint
     arguments = typing.get_args(hint)
-    return arguments[-1] if arguments and dataclasses.is_dataclass(arguments[-1]) else None
+    entry = _plain(arguments[-1]) if arguments else None
+    return entry if dataclasses.is_dataclass(entry) else None
 
 
 def _unknown_key(path: Path, text: str, keys: tuple[str, ...], valid: list[str]) -> str:
@@ -107,7 +109,7 @@ def _wrong_value(path: Path, text: str, message: str) -> str:
 
 
 def line_of(text: str, keys: tuple[str, ...]) -> int:
-    """The line on which a key stands, from 1; of its table if the key itself is not found.
+    """The line on which a key stands, from 1; of its table, or the nearest, if the key itself is not found.
 
     Inner names that are not known exactly (msgspec says only "some entry") match any table.
     """
@@ -117,9 +119,9 @@ def line_of(text: str, keys: tuple[str, ...]) -> int:
         header = _TABLE.match(line)
         if header is not None:
             table = _split(header["path"])
-            best = number if table == keys else best
             if table == keys:
                 return number
+            best = number if best == 1 and _is_near(table, keys) else best
             continue
         key = _KEY.match(line)
         if key is None:
@@ -128,6 +130,12 @@ def line_of(text: str, keys: tuple[str, ...]) -> int:
         if name == keys[-1] and _fits(table, keys[:-1]):
             return number
     return best
+
+
+def _is_near(table: tuple[str, ...], keys: tuple[str, ...]) -> bool:
+    """Whether a table is within the one that is looked for, holds it, or has the name of what is looked for."""
+    shared = min(len(table), len(keys))
+    return (shared > 1 and table[:shared] == keys[:shared]) or (table[:1] == keys[:1] and table[-1] == keys[-1])
 
 
 def _fits(table: tuple[str, ...], wanted: tuple[str, ...]) -> bool:

@@ -126,6 +126,7 @@ class Launch:
         output: `IMMEDIATE` or `COMMITTED`: when what it writes is shown.
         inheritance: whose rights, limits and priorities it gets, packed (`checkpoint.linux.inheritance`); b"": the agent's own.
         carry: files and folders that travel with it, as absolute paths.
+        devices: (path, rule) of devices that it has open, where a robot has no rule of its own; see `checkpoint.device_rules`.
     """
 
     argv: tuple[str, ...] = ()
@@ -140,6 +141,7 @@ class Launch:
     output: str = IMMEDIATE
     hooks: tuple[tuple[str, tuple[str, ...]], ...] = ()
     carry: tuple[str, ...] = ()
+    devices: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

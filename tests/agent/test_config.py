@@ -84,6 +84,11 @@ def test_the_level_of_processors_is_the_callers_then_the_components_then_the_rob
     ("lines", "line", "said"),
     [
         (("baet_ms = 10",), 4, "did you mean 'beat_ms'"),
+        (('[components."/lab/a".devices]', '"/dev/x" = "open"'), 4, "Invalid enum value 'open'"),
+        (('[components."/lab/a".devices]', '"ttyUSB0" = "reopen"'), 4, "'ttyUSB0' is not the absolute path of a device"),
+        (('[components."/lab/a"]', 'devices."/dev/x" = { reopen = "/dev/y", optoinal = true }'), 4, "did you mean 'optional'"),
+        (('[components."/lab/a".hooks]', "limit_s = 0"), 4, "limit_s of its hooks is 0"),
+        (('[components."/lab/a".hooks]', 'after_resmue = ["x"]'), 5, "did you mean 'after_resume'"),
         (("# fine", 'beat_ms = "often"'), 5, "Expected `int`"),
         (('when_alone = "panic"',), 4, "Invalid enum value 'panic'"),
         (('rule = "dice"',), 4, "Invalid enum value 'dice'"),

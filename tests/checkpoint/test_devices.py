@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint.device_rules import DeviceRule, merged, missing, rule_from
+from checkpoint.device_rules import DeviceRule, arrived, merged, missing, rule_from, travelling
 from checkpoint.engine import REFUSED
 from checkpoint.errors import MismatchError, UnsupportedError
 from checkpoint.linux.descriptors import copy_of
@@ -223,6 +223,9 @@ def test_rules_are_read_as_they_are_typed_and_the_robots_own_come_first() -> Non
             rule_from("/dev/a", said)
     with pytest.raises(ValueError, match="absolute"):
         rule_from("ttyUSB0", "reopen")
+    rules = (DeviceRule("/dev/a", there="/dev/b"), DeviceRule("/dev/c", "hook"), DeviceRule("/dev/d", optional=True))
+    assert travelling(rules) == (("/dev/a", "reopen"), ("/dev/c", "hook"), ("/dev/d", "optional"))
+    assert arrived((*travelling(rules), ("x", "reopen"), ("/dev/e", "?"))) == (DeviceRule("/dev/a"), *rules[1:])
     came, own = DeviceRule("/dev/a"), DeviceRule("/dev/a", there="/dev/b")
     assert merged((came, DeviceRule("/dev/c")), (own,)) == (own, DeviceRule("/dev/c"))
 
