@@ -15,6 +15,7 @@ from agent.clock import Laps
 from agent.component import Component
 from agent.config import ComponentConfig
 from agent.errors import GuardError
+from agent.following import Following
 from agent.records import Records
 from agent.standby import Standby
 from agent.surroundings import Surroundings
@@ -35,6 +36,7 @@ class Told:
         self.refused = 0
         self.pid = 1
         self.engine = "ptrace"
+        self.keeper = Following(NAME, cast(Any, None))
 
     async def lease(self, until_ns: int) -> None:
         self.lease_ns = until_ns
