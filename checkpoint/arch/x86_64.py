@@ -68,9 +68,9 @@ SYSCALLS: Final[Mapping[str, int]] = {
     "nanosleep": 35, "getitimer": 36, "getpid": 39, "accept": 43, "sendto": 44, "recvfrom": 45, "sendmsg": 46,
     "recvmsg": 47, "semop": 65, "sigaltstack": 131, "rt_sigtimedwait": 128, "rt_sigsuspend": 130, "prctl": 157,
     "futex": 202, "io_getevents": 208, "restart_syscall": 219, "semtimedop": 220, "timer_gettime": 224,
-    "timer_getoverrun": 225, "clock_gettime": 228, "clock_nanosleep": 230, "epoll_wait": 232, "pselect6": 270,
-    "ppoll": 271, "get_robust_list": 274, "epoll_pwait": 281, "accept4": 288, "userfaultfd": 323, "io_uring_enter": 426,
-    "epoll_pwait2": 441, "futex_waitv": 449,
+    "timer_getoverrun": 225, "clock_gettime": 228, "clock_nanosleep": 230, "epoll_wait": 232, "waitid": 247,
+    "pselect6": 270, "ppoll": 271, "get_robust_list": 274, "epoll_pwait": 281, "accept4": 288, "userfaultfd": 323,
+    "io_uring_enter": 426, "epoll_pwait2": 441, "futex_waitv": 449,
 }  # fmt: skip
 """Numbers by name: those that we make or tell of."""
 SYSCALL_NAMES: Final[Mapping[int, str]] = {number: name for name, number in SYSCALLS.items()}

@@ -125,7 +125,11 @@ class MemoryCapture:
         self._tracker = tracker
         self.borrowed = borrowed
         self._shared = SharedPages(memory.pid)
-        self._page_tables = pagetables.existence(memory.pid)
+        try:
+            self._page_tables = pagetables.existence(memory.pid)
+        except BaseException:
+            self._shared.close()
+            raise
         self._maps = MapsReader(memory.pid)
         self._has_moved = False
         self._private: list[MapsLine] = []

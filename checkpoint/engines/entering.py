@@ -85,7 +85,12 @@ def _try_to_enter(threads: Threads, interruptions: Interruptions, *, last: bool)
         batch = remote.Batch(entered.pages.table)
         for number in {entered.inside, *entry.left_open(tracee.pid)}:
             batch.add("close", number)
-        entered.pages.run(tracee, batch, registers, mask)
+        try:
+            entered.pages.run(tracee, batch, registers, mask)
+        except BaseException:
+            if entered.faults is not None:
+                os.close(entered.faults)
+            raise
         return entered
 
 
@@ -117,8 +122,10 @@ def _tracker_for(pid: int, entered: entry.Entered) -> tuple[Tracker, tuple[str, 
     if entered.faults is not None:
         try:
             return PagemapTracker(pid, entered.faults), ()
-        except OSError as error:
+        except BaseException as error:
             os.close(entered.faults)
+            if not isinstance(error, OSError):
+                raise
             why = str(error)
     tracker: Tracker = SoftDirtyTracker(pid) if dirty.has_soft_dirty() else DigestTracker(pid)
     return tracker, (f"written pages are found by {tracker.name}, which takes longer: no write protection ({why})",)

@@ -40,7 +40,7 @@ from checkpoint.engines.identities import Identities
 from checkpoint.engines.outputs import Outputs
 from checkpoint.engines.restart import Interruptions
 from checkpoint.engines.standing import Onlooker, Standing
-from checkpoint.errors import ProbeError, ProcessGoneError, UnsupportedError
+from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.procfs import MapsLine, Status
 from checkpoint.linux.threads import Threads
@@ -103,7 +103,6 @@ class PtraceSession:
         self._threads = threads
         self._surroundings = surroundings
         self._onlooker = Onlooker(threads, entered, surroundings.devices)
-        self._memory = MemoryCapture(threads.leader.memory, entered.tracker, entered.pages)
         self._level = portable.level_in(procfs.read_bytes(pid, "environ"))
         self._flags = FlagsReader(pid)
         self._identities = Identities(pid, names or {})
@@ -116,6 +115,7 @@ class PtraceSession:
         self._held = False
         self._collects = False
         self._closed = False
+        self._memory = MemoryCapture(threads.leader.memory, entered.tracker, entered.pages)
 
     # Opening and closing
 
@@ -141,7 +141,12 @@ class PtraceSession:
                 raise UnsupportedError(f"cannot protect pid {pid} ({report.command}): {'; '.join(reasons)}", reasons)
             interruptions = Interruptions()
             threads = Threads(Tracee(pid), interruptions.mend)
-            session = cls(pid, component, threads, entering.enter(threads, interruptions), surroundings, trees, names)
+            entered = entering.enter(threads, interruptions)
+            try:
+                session = cls(pid, component, threads, entered, surroundings, trees, names)
+            except BaseException:
+                entered.tracker.close()
+                raise
         except BaseException:
             if outputs:
                 outputs.close()
@@ -194,8 +199,11 @@ class PtraceSession:
                 self._carried.prepare(carried_trees.mapped_shared(self.pid))
             copied = self._copy_running(base=parent is None)
             frozen = self._frozen_look(copied, base=parent is None, hold=order.hold)
-        except ProcessGoneError as error:
-            raise self._gone(error) from error
+        except CaptureError as error:
+            explained = self._explained(error)
+            if explained is error:
+                raise
+            raise explained from error
         self.frozen_size = frozen.taken.frozen_size
         try:
             return self._described(order, parent, frozen)
@@ -217,21 +225,24 @@ class PtraceSession:
             of_files = self._carried.refuse() if self._carried else ()
             self._refuse((*held.reasons, *self._reasons_of_process(procfs.status(self.pid)), *of_files))
 
-    def _reasons_of_process(self, status: Status) -> Iterator[str]:
-        return unsupported.refuse_process(self.pid, status, files_kept=self._files_kept)
+    def _reasons_of_process(self, status: Status, had_children: bool | None = None) -> Iterator[str]:
+        return unsupported.refuse_process(self.pid, status, files_kept=self._files_kept, had_children=had_children)
 
     def _refuse(self, reasons: tuple[str, ...]) -> None:
         self._refused = bool(reasons)
         if reasons:
             raise UnsupportedError(f"cannot capture {self.component} (pid {self.pid}): {'; '.join(reasons)}", reasons)
 
-    def _gone(self, error: ProcessGoneError) -> ProcessGoneError:
-        """A process that executed another program is not the one that was protected."""
+    def _explained(self, error: CaptureError) -> CaptureError:
+        """A process that executed another program is not the one that was protected; one that has lost a thread is."""
         with contextlib.suppress(ProcessGoneError, ProbeError):
             if procfs.status(self.pid).state in "ZX":
                 return error
-            self._memory.start_over()
-            return ProcessGoneError(f"{self.component} (pid {self.pid}) has become another program (exec): protect it anew")
+            if not self._onlooker.is_entered():
+                self._memory.start_over()
+                return ProcessGoneError(f"{self.component} (pid {self.pid}) has become another program (exec): protect it anew")
+            if isinstance(error, ProcessGoneError):
+                return CaptureError(f"{error}: it was a thread of pid {self.pid}, which lives on; capture it again")
         return error
 
     # While it stands still
@@ -288,7 +299,7 @@ class PtraceSession:
         standing, taken = frozen.standing, frozen.taken
         held = look(standing.opened, self._surroundings)
         of_files = self._carried.reasons(frozen.seen) if self._carried else ()
-        reasons = (*held.reasons, *self._reasons_of(standing.status, taken.lines), *of_files)
+        reasons = (*held.reasons, *self._reasons_of(standing, taken.lines), *of_files)
         self._refuse(reasons)
         parcel = self._carried.parcel(frozen.seen, parent) if self._carried else NO_PARCEL
         snapshot = replace(
@@ -343,13 +354,14 @@ class PtraceSession:
         self._table = before.apply(forgotten, runs, content, outline.vmas)
         return replace(outline, cleared=forgotten, runs=runs, contents=content, page_sum=self._table.page_sum)
 
-    def _reasons_of(self, status: Status, lines: tuple[MapsLine, ...]) -> tuple[str, ...]:
+    def _reasons_of(self, standing: Standing, lines: tuple[MapsLine, ...]) -> tuple[str, ...]:
         """Why what it has turned into cannot be captured."""
         try:
             self._flags.refresh(self._memory.lines)
             of_mappings = (unsupported.refuse_mapping(line, self._foreign_flags(line)) for line in lines)
             of_segments = system_v_memory.refuse(lines)
-            return (*self._reasons_of_process(status), *(reason for reason in of_mappings if reason), *of_segments)
+            of_process = self._reasons_of_process(standing.status, standing.told.has_children)
+            return (*of_process, *(reason for reason in of_mappings if reason), *of_segments)
         except ProcessGoneError:
             return ()  # the picture was taken before it ended
 

@@ -101,6 +101,10 @@ class Onlooker:
         self._inquiry: Inquiry | None = None
         self._inquiry_key: tuple[int, bytes] = (0, b"")
 
+    def is_entered(self) -> bool:
+        """Whether it still is the program that was entered."""
+        return self._borrowed.are_there()
+
     def prepare(self) -> None:
         """Do what the first look would do for the first time, while the program runs."""
         if self._inquiry is None:

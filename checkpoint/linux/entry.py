@@ -98,7 +98,6 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
     finally:
         found = give_back(tracee, registers, mask, range(place, place + len(stub)).__contains__)
     code, table, inside = (ctypes.c_int64(found[name]).value for name in arch.ENTRY_REGISTERS)
-    faults = _taken(tracee.pid, inside) if inside >= 0 else None
     tracee.memory.poke(place, bytes(len(stub)))
     if code != hole or table != hole + CODE_SIZE:
         raise CaptureError(
@@ -106,6 +105,7 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
         )
     pages = BorrowedPages(tracee.memory, hole)
     tracee.memory.poke(pages.table - len(MAGIC), MAGIC)
+    faults = _taken(tracee.pid, inside) if inside >= 0 else None
     return Entered(pages, faults, inside, -inside if inside < 0 else 0)
 
 

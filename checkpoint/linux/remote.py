@@ -260,6 +260,13 @@ class BorrowedPages:
         """Whether an address lies inside."""
         return self.address <= address < self.end
 
+    def are_there(self) -> bool:
+        """Whether they still are: a process that has become another program (exec) has lost them."""
+        try:
+            return self._memory.read(self.table - len(MAGIC), len(MAGIC)) == MAGIC
+        except CaptureError:
+            return False
+
     def state(self) -> int:
         """`IDLE`, `ARMED`, `ENDED` or `ABANDONED`: of the large desk, unless a small one is still `ARMED`."""
         state = self._large.state()

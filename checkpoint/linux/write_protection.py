@@ -52,7 +52,7 @@ class PagemapTracker:
     without registration is fresh, whatever maps says, and is copied whole; one that cannot be registered is fresh each time.
 
     Args:
-        faults: a userfaultfd of the process's memory; the tracker owns it.
+        faults: a userfaultfd of the process's memory; the tracker owns it, once it is made.
     """
 
     name = "pagemap"
@@ -60,6 +60,7 @@ class PagemapTracker:
     scans_running = True
 
     def __init__(self, pid: int, faults: int) -> None:
+        enable_write_protection(faults)
         self._faults = faults
         self._scanner = PageScanner(pid)
         self._armed: Words = NONE
@@ -70,7 +71,6 @@ class PagemapTracker:
         self._files: Words = NONE
         self._owned: Words = NONE
         self._stubborn: set[tuple[int, int]] = set()
-        enable_write_protection(faults)
 
     def arm(self, lines: Sequence[MapsLine]) -> None:
         """See `Tracker.arm`. A mapping that goes or comes meanwhile is found fresh by the scan."""

@@ -278,16 +278,18 @@ def require_traceable(pid: int, status: Status) -> None:
         )
 
 
-def refuse_process(pid: int, status: Status, *, files_kept: bool = False) -> Iterator[str]:
+def refuse_process(pid: int, status: Status, *, files_kept: bool = False, had_children: bool | None = None) -> Iterator[str]:
     """Why a process as a whole cannot be captured.
 
     Args:
+        had_children: whether it had any when it stood still; None where it did not: what it has now counts.
         files_kept: somebody keeps its program file by content, so that it need not be there any more.
     """
     yield from refused_threads.refuse(pid, status)
-    children = refused_threads.children(pid)
-    if children:
-        yield f"it has child processes ({', '.join(children)}), which are not kept yet: protect it while it has none"
+    children = [] if had_children is False else refused_threads.children(pid)
+    if children or had_children:
+        listed = f" ({', '.join(children)})" if children else ""
+        yield f"it has child processes{listed}, which are not kept yet: protect it while it has none"
     if status.seccomp:
         yield "it runs under a seccomp filter, which forbids what a capture asks of it: run it without the filter"
     yield from shared_objects.refuse(pid)

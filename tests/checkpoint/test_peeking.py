@@ -62,9 +62,9 @@ def test_a_program_that_runs_finds_what_it_would_find_while_its_sockets_are_look
 ) -> None:
     look, seen = sockets._peeked, set()
 
-    def watched(looked: socket.socket, count: int) -> sockets.Queue:
+    def watched(looked: socket.socket, count: int, identify: sockets.Identify) -> sockets.Queue:
         seen.add(looked.getsockopt(socket.SOL_SOCKET, sockets.SO_PEEK_OFF))
-        return look(looked, count)
+        return look(looked, count, identify)
 
     with peeking(tmp_path) as program:
         with monkeypatch.context() as patch:
@@ -99,10 +99,10 @@ def _die_in_the_middle(program: Program) -> NoReturn:
     """Capture it, and be killed when the first of its sockets has been told to look behind the first message."""
     look = sockets._peeked
 
-    def killed(looked: socket.socket, count: int) -> sockets.Queue:
+    def killed(looked: socket.socket, count: int, identify: sockets.Identify) -> sockets.Queue:
         if count > 1:
             os.kill(os.getpid(), signal.SIGKILL)
-        return look(looked, count)
+        return look(looked, count, identify)
 
     sockets._peeked = killed
     with contextlib.suppress(BaseException), protected(program) as session:
