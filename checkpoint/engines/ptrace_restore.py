@@ -284,7 +284,7 @@ class _Restore:
         restore_process.memory_layout(
             table, process, with_executable=vessel.may_choose_executable, brought=self._executable
         )  # before the program's own descriptors take their numbers
-        self._notes += rebuild_all(table, self._state, self._options, vessel.inner_pid, self._objects)
+        self._notes += rebuild_all(table, self._state, self._options, vessel.inner_pid, self._objects, vessel.pid)
         restore_process.signal_actions(table, process.signal_actions)
         restore_process.thread_marks(table, thread)
         restore_process.surroundings(table, process)

@@ -34,6 +34,8 @@ _SYS_CLONE3: Final = 435
 _SYS_CLOSE_RANGE: Final = 436
 _CLOSE_RANGE_CLOEXEC: Final = 4
 _MS_NOSUID_NODEV_NOEXEC: Final = 2 | 4 | 8
+_MS_NOSUID: Final = 2
+_MS_NOEXEC: Final = 8
 _MS_REC_SLAVE: Final = 16384 | (1 << 19)
 _CAPABILITY_VERSION_3: Final = 0x20080522
 _NS_PER_S: Final = 1_000_000_000
@@ -161,6 +163,18 @@ def mount_proc() -> None:
         OSError: EPERM in a container whose own /proc is partly hidden.
     """
     _checked(_libc.mount(b"proc", b"/proc", b"proc", ctypes.c_ulong(_MS_NOSUID_NODEV_NOEXEC), None), "mount(/proc)")
+
+
+def mount_terminals() -> None:
+    """Mount pseudo-terminals of the caller's own over those that are there: their numbers begin at 0, and nobody else takes one.
+
+    Raises:
+        OSError: there is no /dev/pts, or it may not be mounted.
+
+    Source: Documentation/filesystems/devpts.rst.
+    """
+    options = b"newinstance,ptmxmode=0666,mode=0620"
+    _checked(_libc.mount(b"devpts", b"/dev/pts", b"devpts", ctypes.c_ulong(_MS_NOSUID | _MS_NOEXEC), options), "mount(/dev/pts)")
 
 
 def keep_restore_right() -> None:

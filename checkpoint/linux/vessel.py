@@ -210,7 +210,8 @@ def _attend(lines: _Lines, birth: Birth, become: Callable[[], NoReturn], keep_ri
         if init_pid == 0:
             os.close(watch_write)
             os.close(ready_read)
-            _end_after(_become_first_process, lines, watch_read, ready_write)
+            own_terminals = not any(os.isatty(stream) for stream in birth.stdio)  # whose name must go on leading to it
+            _end_after(_become_first_process, lines, watch_read, ready_write, own_terminals)
         lines.say(init_pid=init_pid)
         os.close(ready_write)
         notes += json.loads(os.read(ready_read, _REPORT_LIMIT) or b"[]")
@@ -246,13 +247,16 @@ def _end_after(act: Callable[..., object], lines: _Lines, *arguments: object) ->
 # --- The children ----------------------------------------------------------------------------------------------------
 
 
-def _become_first_process(lines: _Lines, watch_read: int, ready_write: int) -> None:
-    """PID 1 of the namespace: mount /proc, learn whom to watch, then run nothing but a poll on its pidfd."""
+def _become_first_process(lines: _Lines, watch_read: int, ready_write: int, own_terminals: bool) -> None:
+    """PID 1 of the namespace: mount /proc and terminals, learn whom to watch, then run nothing but a poll on its pidfd."""
     notes = []
     try:
         namespaces.mount_proc()
     except OSError as error:
         notes.append(f"/proc shows the machine's processes, not only the program's: {error}")
+    if own_terminals:
+        with contextlib.suppress(OSError):  # then they get numbers among the machine's, and a restore says when one differs
+            namespaces.mount_terminals()
     os.write(ready_write, json.dumps(notes).encode())
     watched = os.read(watch_read, 32)
     if not watched:

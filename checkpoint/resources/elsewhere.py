@@ -8,6 +8,7 @@ Source: kcmp(2).
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Iterator, Mapping
@@ -48,9 +49,23 @@ def holder_of(held: OpenFile) -> int | None:
     return None
 
 
-def opener_of(held: OpenFile, name: str = "") -> int | None:
-    """Another process that has a file of the same name, or of another, open; what was opened in the last second may be missed."""
-    return next((other for other, _ in _holders(held.pid, _second()).get(name or held.first.target, ())), None)
+def opener_of(held: OpenFile) -> int | None:
+    """Another process that has a file of the same name open; what was opened in the last second may be missed."""
+    return next((other for other, _ in _holders(held.pid, _second()).get(held.first.target, ())), None)
+
+
+def opener_at(held: OpenFile, name: str, place: tuple[int, int]) -> int | None:
+    """Another process that has a certain file open, by a name that others may have, too; as `opener_of`.
+
+    Args:
+        place: its device and inode number.
+    """
+    for other, number in _holders(held.pid, _second()).get(name, ()):
+        with contextlib.suppress(OSError):  # closed meanwhile
+            about = os.stat(f"/proc/{other}/fd/{number}")
+            if (about.st_dev, about.st_ino) == place:
+                return other
+    return None
 
 
 def refuse(held: OpenFile, what: str) -> str | None:

@@ -91,13 +91,19 @@ class Wanted:
 
 
 def rebuild_all(
-    table: CallTable, state: Snapshot, options: RestoreOptions, inner_pid: int, objects: Mapping[tuple[int, int], int]
+    table: CallTable,
+    state: Snapshot,
+    options: RestoreOptions,
+    inner_pid: int,
+    objects: Mapping[tuple[int, int], int],
+    vessel_pid: int,
 ) -> tuple[str, ...]:
     """Add the calls that bring all descriptors back: a note for each difference.
 
     Args:
         inner_pid: what the process itself will know as its PID.
         objects: files without a name that were made for its mappings: a descriptor of each, by (device, inode).
+        vessel_pid: the process, as we know it.
 
     Raises:
         RestoreError: a resource of a kind that this version does not know.
@@ -116,7 +122,7 @@ def rebuild_all(
     piped = pipes.rebuild(table, [held for held in state.resources if held.kind == pipes.KIND], moved[-1] + 1)
     unix, connected = _prepare_sockets(table, state, moved[-1] + 1 + len(piped))
     last = max((moved[-1] + len(piped), unix.end, *connected.values()))
-    lines = terminals.prepare(table, [held for held in state.resources if held.kind == terminals.KIND], last + 1)
+    lines = terminals.prepare(table, [held for held in state.resources if held.kind == terminals.KIND], last + 1, vessel_pid)
     rebuilding = Rebuilding(options, state.clocks, inner_pid, max((last, *lines.values())) + 1)
     for key, number in objects.items():
         rebuilding.keep(table, key, number)

@@ -24,7 +24,7 @@ import select
 import stat
 import struct
 import termios
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
@@ -204,17 +204,31 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return f"{held.name} is a pseudo-terminal with {waiting} bytes that wait in it: it is kept as soon as they are read"
     if discipline != N_TTY:
         return f"{held.name} is a pseudo-terminal with line discipline {discipline}: only the ordinary one (N_TTY) is kept"
-    if not seen["hung_up"] and (other := elsewhere.opener_of(held, f"/dev/pts/{number}")):
+    if not seen["hung_up"] and (other := _other_opener(held, number)):
         return f"{held.name} is a pseudo-terminal that pid {other} has open too: protect the program when that has closed it"
     return elsewhere.refuse(held, "a pseudo-terminal")
+
+
+def _other_opener(held: OpenFile, number: int) -> int | None:
+    """Another process that has the slave open; terminals of other mounts (devpts) have the same names."""
+    try:
+        about = os.stat(f"/proc/{held.pid}/root/dev/pts/{number}")
+    except OSError:
+        return None
+    name = held.first.target if held.observed["end"] == SLAVE else f"/dev/pts/{number}"
+    return elsewhere.opener_at(held, name, (about.st_dev, about.st_ino))
 
 
 # --- Restore -----------------------------------------------------------------------------------------------------------
 
 
-def prepare(table: CallTable, held: Sequence[Resource], first: int) -> dict[int, int]:
-    """Make all of them at numbers from ``first`` on: the descriptor of each, by the resource's id()."""
-    return _Work(table, first).run(held) if held else {}
+def prepare(table: CallTable, held: Sequence[Resource], first: int, vessel_pid: int) -> dict[int, int]:
+    """Make all of them at numbers from ``first`` on: the descriptor of each, by the resource's id().
+
+    Args:
+        vessel_pid: who makes them; it may have terminals of its own.
+    """
+    return _Work(table, first, _numbers_in_use(vessel_pid)).run(held) if held else {}
 
 
 class _Work:
@@ -224,11 +238,11 @@ class _Work:
         next: the number to which the next descriptor is moved.
     """
 
-    def __init__(self, table: CallTable, first: int) -> None:
+    def __init__(self, table: CallTable, first: int, taken: Iterable[int]) -> None:
         self._table = table
         self._first = first
         self._made: dict[int, int] = {}
-        self._taken = set(_numbers_in_use())
+        self._taken = set(taken)
         self._fillers: list[int] = []
 
     def run(self, held: Sequence[Resource]) -> dict[int, int]:
@@ -313,9 +327,9 @@ class _Work:
         self._table.call(f"set up the terminal {one.name} (ioctl {order:#x})", "ioctl", terminal, order, place)
 
 
-def _numbers_in_use() -> Iterator[int]:
-    with contextlib.suppress(FileNotFoundError):
-        yield from (int(name) for name in os.listdir("/dev/pts") if name.isdigit())
+def _numbers_in_use(pid: int) -> Iterator[int]:
+    with contextlib.suppress(OSError):
+        yield from (int(name) for name in os.listdir(f"/proc/{pid}/root/dev/pts") if name.isdigit())
 
 
 def settle(table: CallTable, held: Sequence[Resource], pid: int) -> None:

@@ -219,13 +219,14 @@ def restored(
     contents: Path | str = "",
     own_eyes: bool = False,
     devices: tuple[DeviceRule, ...] = (),
+    isolate: bool = False,
 ) -> Program:
     """Bring a base, or a base with its deltas, back as a child of ours and let it run."""
     snapshots = [state] if isinstance(state, Snapshot) else list(state)
     whole = chain.fold(snapshots) if len(snapshots) > 1 else snapshots[0]
     elapsed_ns = max(time.time_ns() - whole.clocks.realtime_ns, 0)
     with _stdio(directory) as stdio:
-        born = spawn_vessel(Birth(inner_pid=whole.process.pid if keep_pid else 0, stdio=stdio))
+        born = spawn_vessel(Birth(inner_pid=whole.process.pid if keep_pid else 0, isolate=isolate, stdio=stdio))
     try:
         options = RestoreOptions(elapsed_ns, accept_changed, own_eyes, contents=str(contents), devices=devices)
         program = ENGINE.restore(born.pid, whole, options)

@@ -12,7 +12,7 @@ import pytest
 from checkpoint.engine import RestoreOptions
 from checkpoint.errors import UnsupportedError
 from checkpoint.linux.vessel import Birth, discard, spawn_vessel
-from tests.checkpoint.round_trip import ENGINE, captured, captured_and_killed, ended, expect_ok, restored, start_tracee
+from tests.checkpoint.round_trip import ENGINE, captured, captured_and_killed, ended, expect_ok, restored, start, start_tracee
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
@@ -34,6 +34,24 @@ def test_a_terminal_of_which_a_program_has_both_ends_comes_back(case: str, compi
         captured(tracee)
         tracee.tell()
         expect_ok(tracee)
+
+
+def test_a_terminal_of_an_isolated_program_keeps_its_number_whatever_others_have_open(compiled: Compiled, tmp_path: Path) -> None:
+    ours = pty.openpty()
+    try:
+        tracee = start([compiled("terminals", "-O2", "-lutil"), "go", "named"], tmp_path, isolate=True)
+        tracee.wait_for_line("ready")
+        for _ in range(ROUNDS):
+            with ended(tracee):
+                snapshot = captured_and_killed(tracee)
+                assert [held.facts["terminal"] for held in snapshot.resources if held.kind == "terminals"] == [1, 1]
+            tracee = restored(snapshot, tmp_path, isolate=True)
+        with ended(tracee):
+            tracee.tell()
+            expect_ok(tracee)
+    finally:
+        for descriptor in ours:
+            os.close(descriptor)
 
 
 def test_a_terminal_whose_number_is_taken_gets_another_which_is_said(compiled: Compiled, tmp_path: Path) -> None:

@@ -150,6 +150,18 @@ static void controlling(void) {
     EXPECT_EQUAL("interrupts", interrupts, 1);
 }
 
+static void named(void) {
+    int passing[2];
+    if (openpty(&passing[0], &passing[1], NULL, NULL, NULL)) cannot("open a pseudo-terminal");
+    make_terminal();
+    close(passing[0]), close(passing[1]), close(slave);
+    slave = open(name, O_RDWR | O_NOCTTY);
+    wait_here();
+    EXPECT(!strcmp(ttyname(slave) ?: "", name), "its name is %s, not %s", ttyname(slave), name);
+    EXPECT(!strcmp(ptsname(master) ?: "", name), "its name is %s, not %s", ptsname(master), name);
+    talk();
+}
+
 static void alone(void) {
     make_terminal();
     close(slave);
@@ -182,7 +194,7 @@ int main(int argument_count, char **arguments) {
         const char *name;
         void (*act)(void);
     } cases[] = {{"plain", plain},     {"settings", settings}, {"modes", modes},     {"several", several},
-                 {"controlling", controlling}, {"alone", alone}, {"hung_up", hung_up}, {"unread", unread}};
+                 {"controlling", controlling}, {"alone", alone}, {"named", named}, {"hung_up", hung_up}, {"unread", unread}};
     go = arguments[1];
     for (size_t index = 0; index < sizeof cases / sizeof *cases; index++)
         if (argument_count > 2 && !strcmp(arguments[2], cases[index].name)) {
