@@ -20,7 +20,7 @@ CAPABILITIES: Final = (
     by_rule(
         Area.PROCESS,
         "the PID",
-        "the same wherever `failover run` gave a PID namespace, or it is free; else a new one, and that is said",
+        "the same in a PID namespace of `failover run` (also for ordinary users), or where it is free; else another, and noted",
     ),
     by_rule(
         Area.PROCESS,
@@ -60,8 +60,13 @@ CAPABILITIES: Final = (
     ),
     preserved(
         Area.TIME,
-        "interval timers, POSIX timers, sleeps",
-        "go on with what was left, the outage counted",
+        "interval timers, POSIX timers, sleeps, relative or absolute, of the realtime, monotonic, boot and TAI clocks",
+        "go on with what was left, the outage counted; where the hour is set later, a POSIX timer does not follow",
+    ),
+    preserved(
+        Area.TIME,
+        "timers of processor time (setitimer, CLOCK_PROCESS_CPUTIME_ID, CLOCK_THREAD_CPUTIME_ID)",
+        "go on with what was left; the clocks themselves, and what getrusage tells, begin anew",
     ),
     by_rule(
         Area.TIME,

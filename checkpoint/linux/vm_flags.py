@@ -57,9 +57,9 @@ def key_in(flags: tuple[str, ...]) -> int:
     return next((int(code[1:], 16) for code in flags if code in KEYS), 0)
 
 
-REST: Final = 20
-"""How many times as long as a reading took nothing is read again while the mappings stay: a twentieth of our time at most."""
-REST_S_MIN: Final = 1.0
+REST: Final = 200
+"""How many times as long as a reading took nothing is read again while the mappings stay: a reader is in the way of who maps."""
+REST_S_MIN: Final = 5.0
 
 
 @dataclass(slots=True)

@@ -96,6 +96,20 @@ TIME = [
     *cases("clocks"),
 ]
 
+REALTIME, MONOTONIC, PROCESS_CPU, THREAD_CPU, BOOTTIME, TAI = 0, 1, 2, 3, 7, 11
+TIMERS = [
+    *(
+        Case("time_kinds", ("timer", str(clock), how))
+        for clock in (REALTIME, MONOTONIC, PROCESS_CPU, THREAD_CPU, BOOTTIME, TAI)
+        for how in ("relative", "absolute")
+    ),
+    *(
+        Case("time_kinds", ("descriptor", str(clock), how))
+        for clock in (REALTIME, MONOTONIC, BOOTTIME)
+        for how in ("relative", "absolute")
+    ),
+]
+
 SLEEPS = cases(
     "sleeps",
     "nanosleep nanosleep_no_rest clock_relative clock_boottime absolute_monotonic absolute_realtime poll poll_file ppoll "
@@ -164,6 +178,20 @@ def test_blocking_calls_end_only_when_their_time_is_over(compiled: Compiled, tmp
         directory.mkdir()
         tracee = start_tracee(program, directory, *case.arguments)
         back[case] = restored(captured_and_killed(tracee), directory)
+    complaints = [f"{case}: {found}" for case, tracee in back.items() if (found := _complaint(tracee))]
+    assert not complaints, "\n".join(complaints)
+
+
+def test_timers_of_every_clock_go_off_when_they_are_due(compiled: Compiled, tmp_path: Path) -> None:
+    """All at once, because each takes its time: captured, killed and brought back while they run."""
+    program = compiled("time_kinds", "-O2")
+    back = {}
+    for case in TIMERS:
+        directory = tmp_path / str(case)
+        directory.mkdir()
+        tracee = start_tracee(program, directory, *case.arguments)
+        back[case] = restored(captured_and_killed(tracee), directory)
+        back[case].tell()
     complaints = [f"{case}: {found}" for case, tracee in back.items() if (found := _complaint(tracee))]
     assert not complaints, "\n".join(complaints)
 
