@@ -138,6 +138,8 @@ def is_plausible(file: Belonging) -> bool:
 
 def is_in_place(file: Belonging | Need) -> bool:
     """Whether the file at the path here has the content; where that is not known, whether it is as long."""
+    if not file.exact:
+        return os.path.lexists(file.path)
     try:
         about = os.stat(file.path)
         if not stat.S_ISREG(about.st_mode) or about.st_size != file.size:

@@ -37,7 +37,11 @@ from checkpoint.task_channel import Origin
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """What to start, as execve(2) wants it."""
+    """What to start, as execve(2) wants it.
+
+    Attributes:
+        brought: its files that were brought here, for where its own are missing: (path, content, mode).
+    """
 
     argv: tuple[bytes, ...]
     environment: tuple[bytes, ...]
@@ -47,6 +51,7 @@ class Program:
     inheritance: Inheritance | None = None
     engine: str = PTRACE
     holds_output: bool = False
+    brought: tuple[tuple[str, str, int], ...] = ()
 
 
 async def start(name: str, program: Program, places: Places, epoch: int = 0) -> Component:
@@ -89,6 +94,7 @@ def _starting(
         inheritance=program.inheritance,
         task=task,
         totals=totals,
+        brought=program.brought,
     )
 
 

@@ -128,7 +128,7 @@ class Bringing:
         """Which of the files a peer will take, by digest."""
         by_digest = {need.digest: need for need in files}
         found: dict[bytes, Need] = {}
-        told = [Belonging(need.path, need.size, need.digest) for need in files]
+        told = [Belonging(need.path, need.size, need.digest, need.exact) for need in files]
         for part in (told[first : first + BELONGINGS_MAX] for first in range(0, len(told), BELONGINGS_MAX)):
             answer = await self._ask(peer, component, tuple(file for file in part if is_plausible(file)))
             if answer.reason:

@@ -21,8 +21,7 @@ from agent.errors import TROUBLE, AgentError, GuardError, KeeperLostError
 from agent.figures import Commits, Figures, shortened
 from agent.mistake import end_lanes_on_mistake
 from agent.occasions import Occasions
-from agent.rules import started_here
-from agent.snapshots import Snapshots
+from agent.snapshots import Snapshots, newest_of
 from agent.standby import Standby
 from agent.surroundings import Surroundings, program_of
 from checkpoint.channel import close_all
@@ -113,7 +112,7 @@ class Charge:
         def tell(ready: bool, why: str) -> None:
             self.around.tell(events.Warmed(self.name, act.epoch, ready, why))
 
-        self.standby.warm(program_of(started_here(act.spec.launch, here)), act.spec.owner, tell)
+        self.standby.warm(comeback.again(self.around, act.spec, newest_of(self.around.store, self.name)), act.spec.owner, tell)
 
     def adopt(self, component: Component, epoch: int) -> None:
         """A guard was found alive after a restart."""

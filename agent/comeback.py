@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 from agent import births
@@ -13,12 +14,15 @@ from agent.component import Component
 from agent.guard_messages import Task
 from agent.rules import started_here
 from agent.surroundings import Surroundings, program_of
-from checkpoint import format
+from checkpoint import format, needs
+from checkpoint.contents import DIGEST_SIZE, path_in
 from checkpoint.device_rules import arrived, merged
 from checkpoint.engine import AUTO, COOPERATIVE
 from checkpoint.errors import RestoreError
+from checkpoint.model import Snapshot
 from failover.client.quantities import size_bytes
 from failover.core import acts
+from failover.core.types import ComponentSpec
 
 LINE_LIMIT: Final = 300
 """Characters of what a program said last that are told."""
@@ -64,7 +68,7 @@ async def brought_back(
         )
     if spec is None:
         raise RestoreError(f"cannot start {name} again: this robot was never told its command; start it by failover run")
-    program = program_of(started_here(spec.launch, around.here(name)))
+    program = again(around, spec, newest)
     return await births.begin_again(
         name,
         program,
@@ -77,6 +81,17 @@ async def brought_back(
         waiting=waiting,
         carry_limit=carry_limit,
     )
+
+
+def again(around: Surroundings, spec: ComponentSpec, newest: Snapshot | None) -> births.Program:
+    """What is to be started again, with what was brought of it; a command of this robot's own needs nothing of that."""
+    here = around.here(spec.name)
+    program = program_of(started_here(spec.launch, here))
+    if newest is None or here.command or not around.places.contents:
+        return program
+    known = [file for file in needs.program_of(newest) if len(file.digest) == DIGEST_SIZE]
+    kept = [(file.path, str(path_in(around.places.contents, file.digest)), file.mode) for file in known]
+    return replace(program, brought=tuple(file for file in kept if os.path.exists(file[1])))
 
 
 def refusal(component: Component, status: int) -> str:

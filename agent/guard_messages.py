@@ -45,6 +45,7 @@ class Start(Message, frozen=True):
         inheritance: whose rights, limits and priorities it gets; None: the guard's.
         task: for a program that may keep its state; with a descriptor, if it has an origin: the state as a segment.
         totals: bytes that it had written to its two streams by then.
+        brought: its files that were brought here, shown where its own are missing: (path, content, mode).
     """
 
     component: str
@@ -58,6 +59,7 @@ class Start(Message, frozen=True):
     inheritance: Inheritance | None = None
     task: Task | None = None
     totals: tuple[int, int] = (0, 0)
+    brought: tuple[tuple[str, str, int], ...] = ()
 
 
 class MakeVessel(Message, frozen=True):

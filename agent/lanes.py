@@ -30,6 +30,7 @@ from agent.places import Places, guard_sockets
 from agent.records import Records
 from agent.rules import retention
 from agent.shipping import Receiver, Shipper
+from agent.snapshots import newest_of
 from agent.surroundings import Surroundings
 from agent.switchboard import Switchboard, live, make_directory
 from agent.units import starter
@@ -181,20 +182,8 @@ class Lanes(Switchboard):
 
     def _names_of_brought(self, name: str) -> dict[str, str]:
         """By which a program that was restored here knows its files: its newest snapshot says it."""
-        outline = self._newest(name)
+        outline = newest_of(self._around.store, name)
         return names_of_contents(needs(outline), self.places.contents) if outline is not None else {}
-
-    def _newest(self, name: str) -> Snapshot | None:
-        """The newest snapshot of a component here, without its pages; None where there is none that can be read."""
-        chain: list[int] = []
-        try:
-            chain = self._around.store.open_chain(name)
-            return format.read_outline(chain[-1])
-        except (CheckpointError, OSError) as error:
-            log.info("%s: its newest checkpoint cannot be read: %s", name, error)
-            return None
-        finally:
-            close_all(tuple(chain))
 
     async def _mend_logs(self, found: tuple[Found, ...]) -> None:
         try:
@@ -270,7 +259,7 @@ class Lanes(Switchboard):
             for name, charge in list(self.charges.items()):
                 if charge.component is None or charge.component.engine == COOPERATIVE:
                     continue
-                outline = await asyncio.to_thread(self._newest, name)
+                outline = await asyncio.to_thread(newest_of, self._around.store, name)
                 try:
                     await self._sources.keep_what_goes(name, needs(outline) if outline is not None else ())
                 except TROUBLE as error:

@@ -12,8 +12,11 @@ from agent import clock, lost
 from agent.component import Captured, Component
 from agent.figures import Figures
 from agent.surroundings import Surroundings
-from checkpoint.channel import Unchanged, content_of
-from checkpoint.model import Position
+from checkpoint import format
+from checkpoint.channel import Unchanged, close_all, content_of
+from checkpoint.errors import CheckpointError
+from checkpoint.model import Position, Snapshot
+from checkpoint.store import Store
 from failover.core import acts, events
 
 log = logging.getLogger("failover.component")
@@ -95,3 +98,16 @@ class Snapshots:
                 await asyncio.to_thread(store.prune, self.name, act.oldest)
             case acts.Drop():
                 await asyncio.to_thread(store.drop, self.name)
+
+
+def newest_of(store: Store, name: str) -> Snapshot | None:
+    """The newest snapshot of a component here, without its pages; None where there is none that can be read."""
+    chain: list[int] = []
+    try:
+        chain = store.open_chain(name)
+        return format.read_outline(chain[-1])
+    except (CheckpointError, OSError) as error:
+        log.info("%s: its newest checkpoint cannot be read: %s", name, error)
+        return None
+    finally:
+        close_all(tuple(chain))

@@ -31,6 +31,7 @@ from agent.pump import Pump
 from agent.streams import STREAMS, OutputLogs
 from agent.task_end import TaskEnd, name_told_to
 from checkpoint.engine import PTRACE
+from checkpoint.linux.brought import BroughtFile
 from checkpoint.linux.vessel import Birth, Born, spawn_program, spawn_vessel
 from checkpoint.task_channel import VARIABLE
 
@@ -97,7 +98,9 @@ class Ward:
         user = (kept.uid, kept.gid) if kept is not None else None
         waits = order.task is not None and order.task.warm
         totals = None if waits else order.totals
-        ward = cls._bear(order, totals, Birth(isolate=order.isolate, inheritance=kept), give_birth, user, task)
+        brought = tuple(BroughtFile(*file) for file in order.brought)
+        birth = Birth(isolate=order.isolate, inheritance=kept, brought=brought)
+        ward = cls._bear(order, totals, birth, give_birth, user, task)
         ward.warm, ward.committed = waits, not waits
         ward.engine = order.task.engine if order.task is not None else PTRACE
         return ward

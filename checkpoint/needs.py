@@ -16,6 +16,9 @@ from checkpoint.model import Fact, FileIdentity, Snapshot, Vma, VmaKind
 OPEN_FILES: Final = "files"
 """The kind of resource that open files are, `checkpoint.resources.files`."""
 
+PROGRAM: Final = "program"
+"""The kind of resource of `checkpoint.program_files`."""
+
 MEMORY_PLACE: Final = "/dev/shm/"
 """What lies here is memory with a name, and no file that could be brought."""
 
@@ -33,27 +36,51 @@ class Need:
         path: as the program names it.
         size: bytes.
         digest: blake3 of its content, 32 bytes; b"" where it was not taken (too large, or closed to us): it cannot be brought.
+        exact: another version at the path will not do. Of a program that is started again it will: it was installed there.
     """
 
     path: str
     size: int
     digest: bytes
+    exact: bool = True
 
 
 def needs(state: Snapshot, *, opened: bool = True) -> tuple[Need, ...]:
-    """Every file that a program of the ptrace engine must find again, one for each path.
+    """Every file that a program must find again, one for each path.
 
     Args:
         opened: also those that it has open for reading only.
     """
     if not state.threads:
-        return ()
+        return tuple(Need(file.path, file.size, file.digest, exact=False) for file in program_of(state))
     found = [_need(state.process.executable)]
     found += [_need(vma.file) for vma in state.vmas if vma.file is not None and _is_run(vma)]
     if opened:
         found += _opened(state)
     carry = carried.paths_of(state)
     return tuple({need.path: need for need in found if not _is_below(need.path, carry)}.values())
+
+
+@dataclass(frozen=True, slots=True)
+class ProgramFile:
+    """One file that a program of the cooperative engine is started again from; ``mode``: permissions of it."""
+
+    path: str
+    size: int
+    digest: bytes
+    mode: int
+
+
+def program_of(state: Snapshot) -> tuple[ProgramFile, ...]:
+    """What a program is started again from (`checkpoint.program_files`), the first one by its command; nothing malformed."""
+    held = next((one for one in state.resources if one.kind == PROGRAM), None)
+    files = held.facts.get("files") if held is not None else None
+    found = []
+    for fact in files if isinstance(files, list) else ():
+        match fact:
+            case [str(path), int(size), bytes(digest), int(mode)] if path.startswith("/") and ".." not in path.split("/"):
+                found.append(ProgramFile(path, size, digest, mode & 0o755))
+    return tuple(found)
 
 
 def _is_below(path: str, folders: tuple[str, ...]) -> bool:

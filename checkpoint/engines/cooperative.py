@@ -107,8 +107,15 @@ class CooperativeSession:
         self._component = component
         self._process = describe_process(pid)
         self._directory = self._process.working_directory
+        self.program: tuple[Resource, ...] = ()
+        """What it is started again from, as `checkpoint.program_files` tells it."""
         self._waiting: deque[_Mark] = deque(maxlen=MAX_WAITING)
         self._acknowledged: _Mark | None = None
+
+    @property
+    def process(self) -> ProcessState:
+        """The process that keeps the state, as it was when it was first looked at."""
+        return self._process
 
     @property
     def reader(self) -> SegmentReader:
@@ -245,7 +252,11 @@ class CooperativeSession:
             process=self._process,
             threads=(),
             vmas=vmas,
-            resources=(Resource(KIND, self._component, self._facts(committed)), *(parcel.resources if parcel else ())),
+            resources=(
+                Resource(KIND, self._component, self._facts(committed)),
+                *self.program,
+                *(parcel.resources if parcel else ()),
+            ),
             cleared=cleared,
             runs=runs,
             contents=contents,

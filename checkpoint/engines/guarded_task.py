@@ -6,8 +6,11 @@ nothing, and each capture looks where its commits go now.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
+from typing import Final
 
+from checkpoint import program_files
 from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import (
     COOPERATIVE,
@@ -30,6 +33,9 @@ from checkpoint.model import Position, Snapshot
 from checkpoint.resources import carried_trees
 from checkpoint.resources.carried_trees import CarriedTrees
 
+LOOK_S: Final = 10.0
+"""Between two looks at the files that a program is started again from."""
+
 
 class GuardedTask:
     """See `checkpoint.engine.Session`."""
@@ -43,6 +49,7 @@ class GuardedTask:
         self._session: CooperativeSession | None = None
         self._carry = carry
         self._trees: CarriedTrees | None = None
+        self._look_at_s = 0.0
 
     @property
     def totals(self) -> tuple[int, int]:
@@ -53,7 +60,13 @@ class GuardedTask:
         """See `checkpoint.engine.Session.capture`."""
         if procfs.status(self.pid).state in "ZX":
             raise ProcessGoneError(f"the process of {self.component} that keeps its state (pid {self.pid}) has ended")
-        return self._following().capture(order)
+        session = self._following()
+        if order.base or time.monotonic() >= self._look_at_s:
+            self._look_at_s = time.monotonic() + LOOK_S
+            arguments, directory = session.process.arguments, session.process.working_directory
+            program = program_files.describe(self.pid, self.component, arguments, directory)
+            session.program = (program,) if program is not None else ()
+        return session.capture(order)
 
     def unchanged(self) -> Position | None:
         """The newest acknowledged position, if a capture would say nothing new; None: capture."""
@@ -76,7 +89,10 @@ class GuardedTask:
 
     def open_file(self, path: str, digest: bytes) -> int:
         """See `checkpoint.engine.Session.open_file`."""
-        raise CaptureError(f"cannot open {path} of {self.component}: it is not among the files that the program maps")
+        try:
+            return program_files.open_file(self.pid, path)
+        except OSError as error:
+            raise CaptureError(f"cannot open {path} of {self.component}: {error.strerror}") from error
 
     def close(self) -> None:
         """See `checkpoint.engine.Session.close`."""

@@ -33,6 +33,7 @@ CAP_CHECKPOINT_RESTORE: Final = 40
 _SYS_CLONE3: Final = 435
 _SYS_CLOSE_RANGE: Final = 436
 _CLOSE_RANGE_CLOEXEC: Final = 4
+_MS_NOSUID_NODEV: Final = 2 | 4
 _MS_NOSUID_NODEV_NOEXEC: Final = 2 | 4 | 8
 _MS_NOSUID: Final = 2
 _MS_NOEXEC: Final = 8
@@ -154,6 +155,21 @@ def set_clocks(clocks: Clocks, elapsed_ns: int) -> None:
     except PermissionError as error:
         reason = "its clocks cannot be set; give the agent CAP_SYS_TIME, see systemd/failover-agent.service"
         raise PermissionError(error.errno, reason) from error
+
+
+def mount_memory(place: int, uid: int, gid: int) -> None:
+    """Mount an empty file system in memory over a directory, for the caller's mount namespace alone.
+
+    Args:
+        place: descriptor of the directory: a name could be made to lead elsewhere meanwhile.
+        uid, gid: whose it is.
+
+    Raises:
+        OSError: EPERM without the right to mount.
+    """
+    options = f"mode=755,uid={uid},gid={gid}".encode()
+    target = f"/proc/self/fd/{place}".encode()
+    _checked(_libc.mount(b"failover", target, b"tmpfs", ctypes.c_ulong(_MS_NOSUID_NODEV), options), "mount(tmpfs)")
 
 
 def mount_proc() -> None:

@@ -36,6 +36,7 @@ from typing import Final, NoReturn
 from checkpoint.arch import x86_64_stub as stub
 from checkpoint.errors import RestoreError
 from checkpoint.linux import namespaces
+from checkpoint.linux.brought import BroughtFile, show
 from checkpoint.linux.inheritance import Inheritance, take_on
 from checkpoint.model import Clocks
 
@@ -61,6 +62,7 @@ class Birth:
         own_session: make it the leader of a session, with standard input as its terminal if that is one.
         die_with_parent: SIGKILL it when the calling thread ends.
         inheritance: whose rights, limits and priorities it gets; None: ours.
+        brought: files of the program that are to be there; they are shown to it where its own are missing.
     """
 
     inner_pid: int = 0
@@ -71,6 +73,7 @@ class Birth:
     own_session: bool = True
     die_with_parent: bool = True
     inheritance: Inheritance | None = None
+    brought: tuple[BroughtFile, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,7 +220,7 @@ def _attend(lines: _Lines, birth: Birth, become: Callable[[], NoReturn], keep_ri
         notes += json.loads(os.read(ready_read, _REPORT_LIMIT) or b"[]")
     pid, note = _sibling_with_pid(birth.inner_pid)
     if pid == 0:
-        _end_after(_grow_up, lines, birth, watch_write, become, keep_right and entered.user)
+        _end_after(_grow_up, lines, birth, watch_write, become, keep_right and entered.user, entered.pids)
     lines.say(pid=pid, isolated=entered.pids, own_clocks=entered.clocks, notes=notes + note)
 
 
@@ -274,8 +277,12 @@ def _become_first_process(lines: _Lines, watch_read: int, ready_write: int, own_
     os.execve(code, ["failover-init"], {})
 
 
-def _grow_up(lines: _Lines, birth: Birth, watch_write: int, become: Callable[[], NoReturn], keep_right: bool) -> None:
+def _grow_up(
+    lines: _Lines, birth: Birth, watch_write: int, become: Callable[[], NoReturn], keep_right: bool, own_mounts: bool
+) -> None:
     """The child's own part, up to the execve that ends it."""
+    kept = birth.inheritance
+    show(birth.brought, (kept.uid, kept.gid) if kept else (os.geteuid(), os.getegid()), own_mounts=own_mounts)
     with contextlib.suppress(OSError):  # only kernels with Yama know this; the others let our keeper in anyway
         namespaces.prctl(namespaces.PR_SET_PTRACER, -1)
     if keep_right:

@@ -172,11 +172,13 @@ class Belonging(msgspec.Struct, frozen=True, array_like=True):
     Attributes:
         path: as the program names it, absolute.
         size: bytes; ``digest``: blake3 of them, 32 bytes, b"" where it was not taken: such a file cannot be brought.
+        exact: only this content will do; otherwise whatever stands at the path.
     """
 
     path: str
     size: int
     digest: bytes
+    exact: bool = True
 
 
 class Belongings(msgspec.Struct, frozen=True, tag="belongings"):

@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -159,3 +160,38 @@ def over(robot: RobotMachine, other: Path, place: Path) -> None:
     """From now on this robot has another file at a path."""
     pid = robot.processes()[-1]
     subprocess.run(["nsenter", "--mount", f"--target={pid}", "mount", "--bind", str(other), str(place)], check=True)
+
+
+COUNTER = """
+import time
+from counting import steps
+import failover
+
+state = failover.resume("count", default={"value": 0})
+while True:
+    print(state["value"], flush=True)
+    state["value"] += steps.ONE
+    failover.commit()
+    time.sleep(0.01)
+"""
+
+
+def test_a_program_that_keeps_its_state_is_started_from_what_was_brought_of_it(pair: Pair, place: Path) -> None:
+    """With the package beside it; and it waits there, started already."""
+    first, second = pair
+    (place / "counter.py").write_text(COUNTER)
+    (place / "secret.txt").write_text("stays at home")
+    (place / "counting").mkdir()
+    (place / "counting" / "__init__.py").touch()
+    (place / "counting" / "steps.py").write_text("ONE = 1\n")
+    robots.run(first, "count", sys.executable, str(place / "counter.py"), cwd=str(place), engine="cooperative")
+    robots.until_protected(first)
+    assert len(contents_of(second)) == 3
+    robots.until(lambda: robots.component(second, "count").get("warm"), "the program to wait at robot2")
+    goes_on(second, first.cut_power)
+    running = robots.host_pid(second, robots.component(second, "count")["pid"])
+    shown = Path(f"/proc/{running}/root{place}")
+    assert sorted(path.name for path in shown.rglob("*.py")) == ["__init__.py", "counter.py", "steps.py"]
+    assert not (shown / "secret.txt").exists()
+    agent = robots.host_pid(second, second.status()["pid"])
+    assert not list(Path(f"/proc/{agent}/root{place}").iterdir()), "nobody else sees them"
