@@ -46,7 +46,7 @@ CAPABILITIES: Final = (
     preserved(
         Area.MEMORY,
         "private memory: heap, stacks, mapped files",
-        "with protection, guard pages and advice; zero pages and untouched ones cost nothing",
+        "with protection, guard pages and advice; zero pages and untouched ones cost nothing, swapped ones are carried",
     ),
     preserved(
         Area.MEMORY,

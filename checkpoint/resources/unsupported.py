@@ -140,7 +140,7 @@ _MAPPINGS: Final = (
     (re.compile(r"anon_inode:\[perf_event\]"), "the buffer of a perf event"),
     (re.compile(r"/\[aio\]"), "a ring of asynchronous I/O (aio)"),
     (re.compile(r"/secretmem"), "secret memory"),
-    (re.compile(r"/dev/(?!zero|shm/)"), "memory of a device"),
+    (re.compile(r"/dev/(?!zero|shm/|hugepages/)"), "memory of a device"),
 )
 
 _VM_FLAGS: Final[Mapping[str, str]] = {

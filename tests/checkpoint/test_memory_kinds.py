@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import shutil
+import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from checkpoint import capabilities
+from checkpoint.capability import Verdict
 from checkpoint.engine import CaptureOrder
 from checkpoint.errors import CheckpointError
-from checkpoint.linux import system_v
+from checkpoint.linux import procfs, system_v
+from checkpoint.resources import unsupported
 from tests.checkpoint.round_trip import (
     captured_and_killed,
     captured_at_last,
@@ -28,6 +34,8 @@ from tests.conftest import children
 Compiled = Callable[..., Path]
 
 COUNT = Path("/proc/sys/vm/nr_hugepages")
+SWAP_SIZE = 32 << 20
+SYSTEM_PATH = "/usr/sbin:/sbin"
 PAGES = 8
 """Huge pages that these tests set aside: 16 MiB."""
 
@@ -85,6 +93,66 @@ def test_advice_to_a_whole_mapping_is_seen_by_the_next_base(compiled: Compiled, 
     with ended(restored(snapshot, tmp_path)) as tracee:
         tracee.tell()
         expect_ok(tracee)
+
+
+# --- Swapped pages -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def swap(tmp_path: Path) -> Iterator[None]:
+    """A file to swap to."""
+    file = tmp_path / "swap"
+    with file.open("wb") as made:
+        os.posix_fallocate(made.fileno(), 0, SWAP_SIZE)
+    file.chmod(0o600)
+    if shutil.which("mkswap", path=SYSTEM_PATH) is None:
+        pytest.skip("needs mkswap (util-linux)")
+    subprocess.run(["/usr/sbin/mkswap", file], check=True, capture_output=True)
+    turned_on = subprocess.run(["/usr/sbin/swapon", file], check=False, capture_output=True, text=True)
+    if turned_on.returncode:
+        pytest.skip(f"this machine does not swap to a file: {turned_on.stderr.strip()}")
+    try:
+        yield
+    finally:
+        subprocess.run(["/usr/sbin/swapoff", file], check=True)
+
+
+@pytest.mark.usefixtures("swap")
+def test_swapped_pages_are_carried_and_those_written_since(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("special_memory", "-O2"), tmp_path, "paged_out_again")) as tracee:
+        assert procfs.swapped_size(tracee.pid) > 1 << 20
+        with protected(tracee) as session:
+            base = transported(captured_at_last(session, CaptureOrder()))
+            session.acknowledge(base.position)
+            (tmp_path / "second").touch()
+            tracee.wait_for_line("again")
+            assert procfs.swapped_size(tracee.pid) > 100 << 10
+            delta = transported(captured_at_last(session, CaptureOrder(base=False, sequence=2)))
+            tracee.kill()
+    assert 100 <= sum(run.size for run in delta.runs) // delta.machine.page_size < 500
+    with ended(restored([base, delta], tmp_path)) as tracee:
+        tracee.tell()
+        expect_ok(tracee)
+
+
+# --- Refused -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "flags", "said"),
+    [
+        ("/mnt/pmem/log", ("rd", "wr", "sf"), "memory that is stored by touching it"),
+        ("/dev/hugepages/pool", ("rd", "wr", "ht"), "huge pages of a file"),
+        ("/memfd:pool (deleted)", ("rd", "wr", "ht"), "huge pages of a file"),
+        ("/anon_hugepage (deleted)", ("rd", "wr", "ht"), "MiB of huge pages, which every checkpoint compares"),
+    ],
+)
+def test_memory_that_this_machine_may_not_have_is_named(name: str, flags: tuple[str, ...], said: str) -> None:
+    line = procfs.parse_maps_line(f"7f0000000000-7f0008000000 rw-p 00000000 00:11 99 {name}")
+    reason = unsupported.refuse_mapping(line, flags)
+    assert reason is not None and said in reason
+    row = capabilities.row_of(reason)
+    assert row is not None and row.verdict == Verdict.REFUSED
 
 
 # --- System V shared memory ------------------------------------------------------------------------------------------

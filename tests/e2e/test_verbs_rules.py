@@ -94,11 +94,15 @@ def test_a_portable_program_stays_so_wherever_it_goes(pair: Pair) -> None:
     """What its libraries were told is a part of its memory."""
     robots.until_protected(pair[0])
     assert level(pair[0]) == "x86-64-v2"
+    for name, wanted, found in (("v3", "--portable=x86-64-v3", "x86-64-v3"), ("plain", "--portable=no", "")):
+        started = robots.failover(pair[0], "run", "--detach", wanted, "--name", f"/demo/robot1/{name}", "--", "/bin/sleep", "600")
+        assert started.returncode == 0, started
+        assert level(pair[0], name) == found
     assert robots.failover(pair[0], "handover", "count").returncode == 0
     robots.until(lambda: robots.component(pair[1], "count").get("role") == "primary", "it to run at robot2")
     assert level(pair[1]) == "x86-64-v2"
 
 
-def level(robot: RobotMachine) -> str:
-    pid = robots.host_pid(robot, robots.component(robot, "count")["pid"])
+def level(robot: RobotMachine, name: str = "count") -> str:
+    pid = robots.host_pid(robot, robots.component(robot, name)["pid"])
     return portable.level_in(Path(f"/proc/{pid}/environ").read_bytes())

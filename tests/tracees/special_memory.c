@@ -210,6 +210,24 @@ static int segments(void) {
     return finish();
 }
 
+/* Written and paged out before one snapshot, and in part once more before the next. */
+static int paged_out_again(void) {
+    unsigned char *place = map_pages(512, PROT_READ | PROT_WRITE, 0);
+    fill(place, 512 * PAGE, 12);
+    if (madvise(place, 512 * PAGE, MADV_PAGEOUT)) cannot("page memory out");
+    ready();
+    while (!is_told("second")) usleep(1000);
+    fill(place, 100 * PAGE, 13);
+    madvise(place, 512 * PAGE, MADV_PAGEOUT);
+    puts("again");
+    fflush(stdout);
+    wait_for_go(go);
+    expect_filled("what was written again", place, 100 * PAGE, 13);
+    fill(place, 100 * PAGE, 12);
+    expect_filled("memory that was paged out twice", place, 512 * PAGE, 12);
+    return finish();
+}
+
 int main(int count, char **arguments) {
     if (count < 3) return 2;
     go = arguments[1];
@@ -224,6 +242,7 @@ int main(int count, char **arguments) {
     if (!strcmp(kind, "droppable")) return droppable();
     if (!strcmp(kind, "sealed")) return sealed();
     if (!strcmp(kind, "grows_down")) return grows_down();
+    if (!strcmp(kind, "paged_out_again")) return paged_out_again();
     if (!strcmp(kind, "paged_out")) return paged_out();
     return 2;
 }
