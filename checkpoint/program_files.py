@@ -104,6 +104,8 @@ def _beside(pid: int, entry: str) -> Iterator[str]:
     for found in sorted(os.scandir(_seen(pid, folder)), key=lambda one: one.name):
         if found.is_file(follow_symlinks=False) and suffix and found.name.endswith(suffix):
             yield f"{folder}/{found.name}"
+        elif found.name.startswith("."):
+            continue
         elif found.is_dir(follow_symlinks=False) and suffix and os.path.isfile(f"{found.path}/__init__{suffix}"):
             yield from _package(pid, f"{folder}/{found.name}")
 
