@@ -45,7 +45,7 @@ def functions(image: bytes) -> tuple[Function, ...]:
     """
     try:
         return tuple(_functions(image))
-    except (struct.error, KeyError, ValueError, UnicodeDecodeError):
+    except (struct.error, KeyError, ValueError, OverflowError):
         return ()
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import random
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +15,7 @@ from checkpoint.arch import x86_64
 from checkpoint.engines.restore_memory import content_at
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import procfs, vdso
+from checkpoint.linux.memory import Memory
 from checkpoint.linux.vdso import Function
 from checkpoint.model import Snapshot, Vma, VmaKind
 from tests.checkpoint.round_trip import (
@@ -32,6 +36,8 @@ pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
 Compiled = Callable[..., Path]
 
+FOREIGN = os.environ.get("FAILOVER_TEST_VDSO")
+"""A file with the image of another kernel: its vdso64.so, or cut out of it."""
 BREAKPOINT = b"\xcc"
 """An instruction that ends whoever comes to it."""
 ATTEMPTS = 400
@@ -155,3 +161,64 @@ def test_a_snapshot_without_the_old_image_is_said_so(compiled: Compiled, tmp_pat
     with pytest.raises(CheckpointError, match=r"vdso.*2\.6\.18.*does not hold the old one"):
         restored(of_another_kernel(blank), tmp_path).kill()
     assert children() == before
+
+
+# --- With the image of a real other kernel ---------------------------------------------------------------------------
+
+
+@pytest.fixture(params=["ours", "foreign"])
+def image(request: pytest.FixtureRequest) -> bytes:
+    """The image of a vdso: our own, and the one that FAILOVER_TEST_VDSO names, of any other kernel for x86-64."""
+    if request.param == "ours":
+        (line,) = (line for line in procfs.parse_maps(procfs.read_text(os.getpid(), "maps")) if line.name == "[vdso]")
+        return Memory(os.getpid()).read(line.start, line.size)
+    if FOREIGN is None:
+        pytest.skip("FAILOVER_TEST_VDSO names no image of another kernel")
+    return Path(FOREIGN).read_bytes()
+
+
+def with_image(snapshot: Snapshot, image: bytes) -> Snapshot:
+    """The same, born with another kernel's vdso."""
+    place = image_of(snapshot)
+    assert len(image) == place.size, "of the same size as ours, which every kernel's of these years is"
+    return written_over(of_another_kernel(snapshot), place.start, image)
+
+
+def test_functions_that_are_looked_up_late_in_an_old_image_are_this_kernels(
+    image: bytes, compiled: Compiled, tmp_path: Path
+) -> None:
+    with ended(start_tracee(compiled("vdso_user", "-O2"), tmp_path)) as tracee:
+        snapshot = with_image(outside_the_image(tracee), image)
+    with ended(restored(with_deadly_functions(snapshot), tmp_path)) as tracee:
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_a_thread_comes_out_of_an_old_image_by_a_system_call(image: bytes, compiled: Compiled, tmp_path: Path) -> None:
+    """It stands before the first instruction of clock_gettime, which reads the time of a kernel that is not there."""
+    with ended(start_tracee(compiled("vdso_user", "-O2"), tmp_path)) as tracee:
+        landed, reading = (int(word, 16) for word in tracee.output.split()[:2])
+        snapshot = with_image(outside_the_image(tracee), image)
+    (offset,) = (function.offset for function in functions_of(snapshot) if function.name == "__vdso_clock_gettime")
+    (thread,) = snapshot.threads
+    registers = x86_64.decode_registers(thread.registers["prstatus"])
+    stack = registers["rsp"] - 1024 & ~15
+    registers |= {"rip": image_of(snapshot).start + offset, "rsp": stack, "rdi": time.CLOCK_MONOTONIC, "rsi": reading}
+    state = {**thread.registers, "prstatus": x86_64.encode_registers(registers | {"orig_rax": x86_64.NO_CALL})}
+    snapshot = written_over(snapshot, stack, landed.to_bytes(8, "little"))
+    snapshot = replace(snapshot, threads=(replace(thread, registers=state, interrupted=""),))
+    with ended(restored(snapshot, tmp_path)) as tracee:
+        expect_ok(tracee)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_torn_image_has_no_functions_and_raises_nothing(seed: int) -> None:
+    dice = random.Random(seed)
+    (line,) = (line for line in procfs.parse_maps(procfs.read_text(os.getpid(), "maps")) if line.name == "[vdso]")
+    whole = bytearray(Memory(os.getpid()).read(line.start, line.size))
+    for _ in range(50):
+        torn = bytearray(whole)
+        for _ in range(8):
+            torn[dice.randrange(1024)] = dice.randrange(256)
+        for function in vdso.functions(bytes(torn)):
+            assert 0 <= function.offset <= function.offset + function.size <= len(torn)
