@@ -163,7 +163,7 @@ class Charge:
                 if act.hold:
                     self._is_thaw_owed = False  # a lease that comes meanwhile lets nothing run that is to be handed over
                 component = self._present()
-                await self._occasions.before_capture(act)
+                await self._occasions.before_capture(act, component.pid)
                 await self._snapshots.capture(component, act)
             case acts.Acknowledge():
                 if self.component is not None:
@@ -293,7 +293,7 @@ class Charge:
         self._notice(sentence)
         self._watch_the_end()
         if occasion is not None:
-            self._task(self._occasions.after_resume(act.spec, occasion))
+            self._task(self._occasions.after_resume(act.spec, occasion, component.pid))
 
     async def _resumed(self, act: acts.Restore, chain: list[int], outage_ns: int, laps: clock.Laps) -> tuple[Component, int]:
         """The component, running, and the age of its state: what waits here for it, or, where that fails, from its beginning."""

@@ -9,6 +9,7 @@ the program looks for them. They are told in their environment which robot this 
     FAILOVER_EPOCH       the fencing token of the program that begins, is captured, or goes on
     FAILOVER_GENERATION  of the snapshots that are taken of it here
     FAILOVER_WHY         started, captured, restarted (here, after a crash), taken over, handed over
+    FAILOVER_PID         the program's, as this robot knows it; not before it is there (before_start, before_resume)
     FAILOVER_FROM        the robot whose checkpoint it goes on from; not where it is started or captured
     FAILOVER_AGE_MS      how old that checkpoint is; likewise
 
@@ -70,7 +71,7 @@ class Hook:
 
 @dataclass(frozen=True, slots=True)
 class Occasion:
-    """Why a hook is run. ``source`` is "" and ``age_ns`` 0 where the program does not go on from a checkpoint."""
+    """Why a hook is run. ``source`` is "", ``age_ns`` 0 where it does not go on from a checkpoint; ``pid`` 0 before it runs."""
 
     component: str
     robot: str
@@ -79,6 +80,7 @@ class Occasion:
     why: str
     source: str = ""
     age_ns: int = 0
+    pid: int = 0
 
     def environment(self, kind: Kind) -> dict[str, str]:
         """As the hook is told."""
@@ -90,6 +92,8 @@ class Occasion:
             "FAILOVER_GENERATION": str(self.generation),
             "FAILOVER_WHY": self.why,
         }
+        if self.pid:
+            told["FAILOVER_PID"] = str(self.pid)
         if self.source:
             told |= {"FAILOVER_FROM": self.source, "FAILOVER_AGE_MS": str(self.age_ns // 1_000_000)}
         return {"PATH": PATH, **told}

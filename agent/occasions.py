@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from agent import clock, hooks
@@ -39,7 +39,7 @@ class Occasions:
         """
         await self._prepare("before_start", act.spec, self._occasion(act, hooks.STARTED))
 
-    async def before_capture(self, act: acts.Capture) -> None:
+    async def before_capture(self, act: acts.Capture, pid: int) -> None:
         """Run what is to be run before a whole snapshot, or the last one of a handover; it runs on meanwhile.
 
         A snapshot is taken whatever comes of it: one of a program that is not prepared is better than none.
@@ -49,7 +49,7 @@ class Occasions:
             return
         if act.hold or (act.base and clock.now_ns() - self._prepared_ns >= pause_ns):
             self._prepared_ns = clock.now_ns()
-            await self._run("before_capture", self._spec, self._occasion(act, hooks.CAPTURED))
+            await self._run("before_capture", self._spec, replace(self._occasion(act, hooks.CAPTURED), pid=pid))
 
     async def before_resume(self, act: acts.Restore, newest: int, age_ns: int) -> Occasion | None:
         """Run what is to be run before it goes on here; why it does, where anybody is to be told.
@@ -68,9 +68,9 @@ class Occasions:
         await self._prepare("before_resume", act.spec, occasion)
         return occasion
 
-    async def after_resume(self, spec: ComponentSpec | None, occasion: Occasion) -> None:
+    async def after_resume(self, spec: ComponentSpec | None, occasion: Occasion, pid: int) -> None:
         """Run what is to be run once it has gone on here."""
-        await self._run("after_resume", spec, occasion)
+        await self._run("after_resume", spec, replace(occasion, pid=pid))
 
     def runs_here(self, spec: ComponentSpec | None) -> None:
         """From now on this is the program that captures are of."""

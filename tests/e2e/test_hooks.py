@@ -24,7 +24,7 @@ NOTE = """#!/bin/sh
 [ -e "$1/hang-$FAILOVER_ROBOT" ] && sleep 1000
 cat >"$1/part.$$" <<END
 {"hook": "$FAILOVER_HOOK", "robot": "$FAILOVER_ROBOT", "epoch": "$FAILOVER_EPOCH", "why": "$FAILOVER_WHY",
- "generation": "$FAILOVER_GENERATION",
+ "generation": "$FAILOVER_GENERATION", "pid": "$FAILOVER_PID",
  "from": "$FAILOVER_FROM", "age": "$FAILOVER_AGE_MS", "component": "$FAILOVER_COMPONENT", "uid": "$(id -u)"}
 END
 cat "$1/part.$$" | tr -d '\\n' >>"$1/told"; echo >>"$1/told"
@@ -93,6 +93,9 @@ def test_hooks_are_told_which_robot_this_is_and_why(tmp_path: Path) -> None:
         generations = {(line["robot"], line["epoch"]): line["generation"] for line in lines}
         assert len(set(generations.values())) == len(generations)
         assert all(line["generation"] == generations[line["robot"], line["epoch"]] for line in captures)
+        assert [bool(line["pid"]) for line in lines] == [line["hook"] == "after_resume" for line in lines]
+        assert all(line["pid"] for line in captures)
+        assert int(lines[-1]["pid"]) == robots.component(second, "count")["pid"]
         epochs = [int(line["epoch"]) for line in lines]
         assert epochs == sorted(epochs)
         assert epochs[-1] == robots.component(second, "count")["epoch"]
