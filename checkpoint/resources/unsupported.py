@@ -6,6 +6,7 @@ that is not by itself. What threads must not be is in ``refused_threads``.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import stat
@@ -19,7 +20,7 @@ from checkpoint.linux import procfs, vm_flags
 from checkpoint.linux.procfs import MapsLine, Status
 from checkpoint.linux.tracking import is_orphan
 from checkpoint.model import Resource
-from checkpoint.resources import OpenFile, Surroundings, refused_threads, shared_objects
+from checkpoint.resources import OpenFile, Surroundings, refused_threads, shared_objects, sockets
 
 KIND: Final = "unsupported"
 
@@ -191,8 +192,23 @@ def _called(held: OpenFile) -> str:
     return f"{target}, of a kind that we do not know"
 
 
+SOCKET_FAMILIES: Final[Mapping[int, str]] = {
+    16: "netlink",
+    17: "packet",
+    29: "CAN",
+    31: "Bluetooth",
+    38: "AF_ALG",
+    40: "vsock",
+    44: "XDP",
+}
+"""By the number of socket(2), which not every kernel's headers name."""
+
+
 def socket_family(held: OpenFile) -> str:
-    """TCP, UDP, unix, netlink … as far as /proc/PID/net tells."""
+    """TCP, UDP, unix, netlink … as far as the socket itself or /proc/PID/net tells."""
+    with contextlib.suppress(OSError), sockets.looked_into(held.pid, held.first.number) as looked:
+        if looked.family in SOCKET_FAMILIES:
+            return SOCKET_FAMILIES[looked.family]
     for table in ("tcp", "tcp6", "udp", "udp6", "unix", "netlink", "packet", "raw"):
         try:
             text = procfs.read_text(held.pid, f"net/{table}")

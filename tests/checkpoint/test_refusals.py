@@ -36,7 +36,7 @@ REFUSED = {
     "traced_child": "child",
     "unix_rights": "scm_rights",
     "unix_waiting": "accepted",
-    "netlink_socket": "socket",
+    "netlink_socket": r"a socket (netlink",
     "fanotify": "fanotify",
     "io_uring": "io_uring",
     "io_uring_mapped": "io_uring",
