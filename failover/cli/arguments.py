@@ -240,6 +240,7 @@ def capture(room: argparse.ArgumentParser) -> None:
         "--leave-running", action="store_true", help="let the program run on (default: it is ended once the snapshot is safe)"
     )
     room.add_argument("--force", action="store_true", help="replace FILE if it exists")
+    _devices(room)
     _json(room)
 
 
@@ -247,6 +248,7 @@ def restore(room: argparse.ArgumentParser) -> None:
     """Of ``failover restore``."""
     room.add_argument("file", metavar="FILE", help="a snapshot made by failover capture")
     room.add_argument("--wait", action="store_true", help="stay until the program ends, and pass on its exit status")
+    _devices(room)
     _json(room)
 
 

@@ -279,3 +279,31 @@ def test_a_signal_that_ends_a_restored_program_is_passed_on_as_shells_do(snapsho
         assert ran.stdout is not None
         os.kill(int(ran.stdout.readline()), signal.SIGKILL)
         assert ran.wait() == 137
+
+
+def test_a_program_with_a_line_is_captured_and_restored_by_the_rule_that_is_given(tmp_path: Path) -> None:
+    ours, theirs = os.openpty()
+    path = os.ttyname(theirs)
+    hold = f"import os; line = os.open({path!r}, os.O_RDWR | os.O_NOCTTY); print(flush=True)"
+    hold += "; os.read(line, 9); os.write(line, b'here')"
+    try:
+        with subprocess.Popen([PYTHON, "-c", hold], stdout=subprocess.PIPE, stdin=subprocess.DEVNULL) as process:
+            assert process.stdout is not None
+            process.stdout.readline()
+            file = str(tmp_path / "x")
+            assert failover("capture", str(process.pid), "-o", file).returncode == 1
+            wrong = failover("capture", str(process.pid), "-o", file, "--device", f"{path}=close")
+            assert wrong.returncode == 1
+            assert "say reopen, hook, optional, or the path" in wrong.stderr
+            assert failover("capture", str(process.pid), "-o", file, "--device", f"{path}=reopen").returncode == 0
+        with subprocess.Popen(
+            [sys.executable, "-m", "failover.cli.main", "restore", file, "--wait"], stdout=subprocess.DEVNULL
+        ) as restoring:
+            os.write(ours, b"say\n")
+            heard = b""
+            while b"here" not in heard:  # the line echoes what we say
+                heard += os.read(ours, 100)
+            assert restoring.wait(BOUND_S) == 0
+    finally:
+        os.close(theirs)
+        os.close(ours)
