@@ -296,6 +296,7 @@ class _Restore:
         """What comes after the birth of the threads, which takes a right."""
         state, thread, elapsed_ns = self._state, self._thread, self._options.elapsed_ns
         process = state.process
+        memory_locks.rebuild(table, state.resources)  # which takes a right, or a limit
         restore_process.scheduling(table, thread, vessel)
         self._notes += restore_process.limits(table, process, vessel)
         self._notes += restore_process.rights(table, process, vessel)
@@ -305,7 +306,6 @@ class _Restore:
         restore_process.interval_timers(table, process.interval_timers, elapsed_ns)
         restore_process.last_marks(table, process)
         rebuild_last(table, self._state)
-        memory_locks.rebuild(table, state.resources)
         switches.set_again(table, process.switches)
         return table
 
