@@ -195,3 +195,29 @@ def test_a_program_that_keeps_its_state_is_started_from_what_was_brought_of_it(p
     assert not (shown / "secret.txt").exists()
     agent = robots.host_pid(second, second.status()["pid"])
     assert not list(Path(f"/proc/{agent}/root{place}").iterdir()), "nobody else sees them"
+
+
+def test_status_tells_what_is_still_on_its_way(tmp_path: Path, place: Path) -> None:
+    """Over a link of 8 Mbit/s two seconds pass until the C library is there."""
+    with robots.two_robots(tmp_path, "link_mbit_s = 8\n") as (first, second):
+        hide(second, place.parent)
+        start(first, place)
+        shown = robots.until(lambda: [note for note in notes_of(first) if "have arrived" in note], "the status to tell")
+        assert "protected from robot2 after" in shown[0]
+        assert robots.component(first, "count")["protection"] == "none"
+        robots.until_protected(first)
+        assert not [note for note in notes_of(first) if "have arrived" in note]
+
+
+def test_a_standby_that_would_have_to_take_too_much_is_none_and_says_which_files(tmp_path: Path, place: Path) -> None:
+    with robots.two_robots(tmp_path, 'bring_size = "1MB"\n') as (first, second):
+        hide(second, place.parent)
+        start(first, place)
+        words = "over bring_size = 1.0 MB there", str(place / "libc.so.6")
+        robots.until_status(first, 1, *words)
+        assert robots.component(first, "count")["protection"] != "protected"
+        assert not contents_of(second)
+
+
+def notes_of(robot: RobotMachine) -> list[str]:
+    return list(robots.component(robot, "count").get("notes", ()))
