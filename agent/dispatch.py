@@ -34,13 +34,16 @@ class Dispatch:
         tell: Callable[[Event], None],
         hindrance: Callable[[], str] = lambda: "",
         bringing: Bringing | None = None,
+        brings_data: Callable[[str], bool] = lambda component: False,
     ) -> None:
         """
         Args:
             hindrance: why no snapshot may leave this robot now; "" if they may.
             bringing: sees that a peer has the files that a snapshot needs, before it is offered; None: they are there already.
+            brings_data: whether a component's files that are only read belong to them.
         """
         self._bringing = bringing
+        self._brings_data = brings_data
         self._hindrance = hindrance
         self._store = store
         self._shipper = shipper
@@ -90,7 +93,7 @@ class Dispatch:
         try:
             if self._bringing is not None:
                 outline = await asyncio.to_thread(format.read_outline, descriptor)
-                await self._bringing.bring(act.to, act.component, needs(outline))
+                await self._bringing.bring(act.to, act.component, needs(outline, opened=self._brings_data(act.component)))
             digest = await asyncio.to_thread(digest_of, descriptor, entry.size)
             offer = Offer(0, act.component, entry.epoch, entry.position, entry.parent, entry.size, digest, act.spec)
             await self._shipper.ship(act.to, offer, descriptor)

@@ -104,7 +104,9 @@ class Lanes(Switchboard):
         self._around = Surroundings(self.places, store, records, self.tell, self._silence_ns, settled, here, hooks)
         self._sources = Sources(store, self._from_program)
         self._bringing = Bringing(self._shipper, self._lane.say, self._sources.open, self._note_bringing)
-        self._dispatch = Dispatch(store, self._shipper, self.tell, self._links.hindrance, self._bringing)
+        self._dispatch = Dispatch(
+            store, self._shipper, self.tell, self._links.hindrance, self._bringing, lambda name: here(name).bring_data
+        )
         self._receiver = Receiver(self._lane, self._store_path, self._deposit)
         self._stock = Stock(store, self._limits(), self.settings.config.robot, self._deposit.hindrance)
         self._contents = Receiver(self._lane, self._store_path, self._stock)

@@ -221,3 +221,24 @@ def test_a_standby_that_would_have_to_take_too_much_is_none_and_says_which_files
 
 def notes_of(robot: RobotMachine) -> list[str]:
     return list(robots.component(robot, "count").get("notes", ()))
+
+
+READER = """
+import time
+data = open("{path}")
+for line in data:
+    print(int(line), flush=True)
+    time.sleep(0.01)
+"""
+
+
+def test_data_that_is_only_read_is_brought_by_choice(tmp_path: Path, place: Path) -> None:
+    table = '[components."/demo/robot1/count"]\nbring_data = true\n'
+    with robots.two_robots(tmp_path, table) as (first, second):
+        hide(second, place.parent)
+        data = place / "data"
+        data.write_text("".join(f"{number}\n" for number in range(100_000)))
+        robots.run(first, "count", "/usr/bin/python3", "-S", "-c", READER.format(path=data))
+        robots.until_protected(first)
+        assert len(contents_of(second)) == 1
+        goes_on(second, first.cut_power)
