@@ -15,7 +15,7 @@ from checkpoint.errors import CaptureError
 from checkpoint.linux import procfs, vm_flags
 from checkpoint.linux.procfs import DELETED, MapsLine
 from checkpoint.linux.tracking import NOT_CARRIED, is_shared_object
-from checkpoint.model import FileIdentity, Vma, VmaKind
+from checkpoint.model import FileIdentity, Resource, Vma, VmaKind
 from checkpoint.pages import Words
 from checkpoint.resources import files
 
@@ -89,6 +89,13 @@ class Identities:
         target = os.readlink(f"/proc/{self._pid}/exe")
         deleted = target.endswith(DELETED)
         return self._identity(target.removesuffix(DELETED), f"/proc/{self._pid}/exe", deleted)
+
+    def as_known(self, held: Resource) -> Resource:
+        """A resource with the path by which the program knows it, where it is a file from elsewhere."""
+        path = held.facts.get("path")
+        if not isinstance(path, str) or path not in self._names:
+            return held
+        return replace(held, facts={**held.facts, "path": self._names[path]})
 
     def open(self, path: str, digest: bytes) -> int:
         """A descriptor of a file that the process runs, or has at that path; no name need lead to it any more.

@@ -304,7 +304,12 @@ class PtraceSession:
         parcel = self._carried.parcel(frozen.seen, parent) if self._carried else NO_PARCEL
         snapshot = replace(
             self._with_pages(self._outline(order, parent, frozen, parcel), taken, parcel),
-            resources=(*held.resources, *self._locks(taken.lines), *system_v_memory.describe(taken.lines), *parcel.resources),
+            resources=(
+                *map(self._identities.as_known, held.resources),
+                *self._locks(taken.lines),
+                *system_v_memory.describe(taken.lines),
+                *parcel.resources,
+            ),
             output=self._outputs.pieces(self._output_since(parent), standing.totals) if self._outputs else (),
         )
         snapshot = replace(snapshot, position=position_of(snapshot, order.generation, order.sequence))

@@ -241,4 +241,8 @@ def test_data_that_is_only_read_is_brought_by_choice(tmp_path: Path, place: Path
         robots.run(first, "count", "/usr/bin/python3", "-S", "-c", READER.format(path=data))
         robots.until_protected(first)
         assert len(contents_of(second)) == 1
-        goes_on(second, first.cut_power)
+        goes_on(second, lambda: robots.failover(first, "handover", "count", "--to", second.name))
+        robots.until_protected(second)
+        goes_on(first, lambda: robots.failover(second, "failback", "count"))
+        pid = robots.host_pid(first, robots.component(first, "count")["pid"])
+        assert str(data) in {os.readlink(one) for one in Path(f"/proc/{pid}/fd").iterdir()}, "its own file again"
