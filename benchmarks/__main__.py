@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from benchmarks import beside, encoding, engine, interference, machine, outage, results, task
+from benchmarks import beside, crowd, encoding, engine, interference, machine, outage, results, task
 from benchmarks.figures import Absent, Findings
 from benchmarks.running import BenchmarkError
 from checkpoint.errors import CheckpointError
@@ -34,6 +34,14 @@ def _freeze(quick: bool, directory: Path) -> Findings:
         "How long the keeper holds the program still, by its own account, for its first snapshot (a base, copied while the "
         "program runs) and for the deltas after it, ten a second; the time until a delta is encoded; what it carries.",
         tuple(engine.freeze(quick, directory)),
+    )
+
+
+def _crowd(quick: bool, directory: Path) -> Findings:
+    return Findings(
+        "Threads and descriptors",
+        "How much longer a program stands still for each thread that sleeps, and each descriptor, that it has more.",
+        tuple(crowd.crowd(quick, directory)),
     )
 
 
@@ -61,6 +69,7 @@ def _outage(quick: bool, directory: Path) -> Findings:
 
 BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "freeze": _freeze,
+    "crowd": _crowd,
     "beside": beside.beside,
     "restore": _restore,
     "outage": _outage,

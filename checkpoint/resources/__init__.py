@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -93,7 +94,25 @@ def pipes_of(outputs: Sequence[int]) -> dict[str, int]:
     }
 
 
-def gather(pid: int) -> tuple[OpenFile, ...]:
+Group = tuple[int, str]
+"""A multicast group: interface and address."""
+
+
+class Opened(tuple[OpenFile, ...]):
+    """All open files of a process, one entry for those that share one; and what is asked once for many of them."""
+
+    @functools.cached_property
+    def groups(self) -> dict[int, tuple[Group, ...]]:
+        """Multicast groups of the machine by family, as far as they were asked for."""
+        return {}
+
+    @functools.cached_property
+    def inodes(self) -> frozenset[int]:
+        """Their numbers."""
+        return frozenset(one.first.inode for one in self)
+
+
+def gather(pid: int) -> Opened:
     """Read every descriptor, and which of them share an open file. For an exact picture the process stands still."""
     groups: list[list[Descriptor]] = []
     alike: dict[tuple[int | bytes, ...], list[list[Descriptor]]] = {}
@@ -110,7 +129,7 @@ def gather(pid: int) -> tuple[OpenFile, ...]:
             candidates.insert(place, groups[-1])
     ends = {(group[0].target, group[0].flags & os.O_ACCMODE) for group in groups}
     other = {os.O_RDONLY: os.O_WRONLY, os.O_WRONLY: os.O_RDONLY}
-    return tuple(
+    return Opened(
         OpenFile(pid, tuple(group), both_ends=(group[0].target, other.get(group[0].flags & os.O_ACCMODE)) in ends)
         for group in groups
     )
@@ -136,7 +155,7 @@ def _place_among(pid: int, ordered: Sequence[Sequence[Descriptor]], one: Descrip
     return low, False
 
 
-def with_contents(opened: Sequence[OpenFile], noted: Noted | None, rules: tuple[DeviceRule, ...] = ()) -> tuple[OpenFile, ...]:
+def with_contents(opened: Opened, noted: Noted | None, rules: tuple[DeviceRule, ...] = ()) -> tuple[OpenFile, ...]:
     """Add the content of every deleted file and of every pipe that is kept, and what else must be asked while it stands still.
 
     Args:

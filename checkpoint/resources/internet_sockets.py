@@ -26,7 +26,7 @@ from checkpoint.engine import NOTED, Finding
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings, elsewhere, sockets
+from checkpoint.resources import Group, Opened, OpenFile, Surroundings, elsewhere, sockets
 from checkpoint.resources.rebuilding import number_of
 
 KIND: Final = "internet_sockets"
@@ -68,7 +68,7 @@ ADDRESS_SIZE: Final = 128
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
-def observe(held: OpenFile, looked: socket.socket, noted: sockets.Noted | None) -> dict[str, Fact]:
+def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: sockets.Noted | None) -> dict[str, Fact]:
     """Its state, its addresses and what waits in it.
 
     Args:
@@ -91,7 +91,7 @@ def observe(held: OpenFile, looked: socket.socket, noted: sockets.Noted | None) 
         "waiting": waiting if state == LISTENING else 0,
         "queue": list(queue.messages),
         "sources": [list(source) for source in queue.sources if isinstance(source, tuple)],
-        "groups": list(_groups(held.pid, looked)) if is_datagram else [],
+        "groups": list(_groups(looked, _machine_groups(held.pid, opened, looked.family))) if is_datagram else [],
     }
 
 
@@ -111,10 +111,10 @@ def _peer(looked: socket.socket) -> list[Fact]:
         return []
 
 
-def _groups(pid: int, looked: socket.socket) -> Iterator[list[Fact]]:
-    """The multicast groups that a socket has joined: every group of this machine is asked for."""
+def _groups(looked: socket.socket, known: Sequence[Group]) -> Iterator[list[Fact]]:
+    """Those of the known multicast groups that a socket has joined."""
     level = socket.IPPROTO_IP if looked.family == socket.AF_INET else socket.IPPROTO_IPV6
-    for interface, group in _machine_groups(pid, looked.family):
+    for interface, group in known:
         packed = bytearray(
             _FILTER.pack(interface, sockaddr([group, 0, 0, 0]), 0, SOURCES_MAX) + bytes(ADDRESS_SIZE * SOURCES_MAX)
         )
@@ -126,8 +126,15 @@ def _groups(pid: int, looked: socket.socket) -> Iterator[list[Fact]]:
                 yield [socket.if_indextoname(interface), group, bytes(packed[: _FILTER.size + ADDRESS_SIZE * count])]
 
 
-def _machine_groups(pid: int, family: int) -> Iterator[tuple[int, str]]:
-    """(interface, group) of all groups that anybody on this machine has joined. Source: proc_pid_net(5)."""
+def _machine_groups(pid: int, opened: Opened, family: int) -> tuple[Group, ...]:
+    """All groups that anybody on this machine has joined: asked once for all sockets."""
+    if family not in opened.groups:
+        opened.groups[family] = tuple(_listed_groups(pid, family))
+    return opened.groups[family]
+
+
+def _listed_groups(pid: int, family: int) -> Iterator[Group]:
+    """Source: proc_pid_net(5)."""
     if family == socket.AF_INET6:
         for line in procfs.read_text(pid, "net/igmp6").splitlines():
             words = line.split()

@@ -12,6 +12,7 @@ from checkpoint.errors import CaptureError
 from checkpoint.linux.descriptors import Descriptor
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import (
+    Opened,
     OpenFile,
     Surroundings,
     attached_devices,
@@ -36,7 +37,7 @@ from checkpoint.resources import (
     watches,
 )
 
-Observer = Callable[[OpenFile, Sequence[OpenFile]], Mapping[str, Fact]]
+Observer = Callable[[OpenFile, Opened], Mapping[str, Fact]]
 """Given one open file, and all."""
 
 
@@ -98,7 +99,7 @@ def observer_of(one: Descriptor, noted: sockets.Noted | None) -> Observer | None
     return fifos.observe if fifos.is_fifo(one) else _OBSERVED.get(one.target)
 
 
-def _observe_socket(held: OpenFile, opened: Sequence[OpenFile], *, noted: sockets.Noted | None) -> Mapping[str, Fact]:
+def _observe_socket(held: OpenFile, opened: Opened, *, noted: sockets.Noted | None) -> Mapping[str, Fact]:
     """A socket of a family that is kept; nothing of another.
 
     Raises:
@@ -109,14 +110,16 @@ def _observe_socket(held: OpenFile, opened: Sequence[OpenFile], *, noted: socket
             if looked.family == socket.AF_UNIX:
                 return unix_sockets.observe(held, looked, opened, noted)
             if looked.family in internet_sockets.FAMILIES and looked.proto in internet_sockets.PROTOCOLS:
-                return _observe_internet_socket(held, looked, noted)
+                return _observe_internet_socket(held, looked, opened, noted)
     except OSError as error:
         raise CaptureError(f"cannot look into the socket {held.name} of pid {held.pid}: {error.strerror}; try again") from error
     return {}
 
 
-def _observe_internet_socket(held: OpenFile, looked: socket.socket, noted: sockets.Noted | None) -> Mapping[str, Fact]:
-    facts = internet_sockets.observe(held, looked, noted)
+def _observe_internet_socket(
+    held: OpenFile, looked: socket.socket, opened: Opened, noted: sockets.Noted | None
+) -> Mapping[str, Fact]:
+    facts = internet_sockets.observe(held, looked, opened, noted)
     if looked.proto == socket.IPPROTO_TCP and facts["state"] == internet_sockets.CLOSED:
         facts["ends"] = tcp_connections.ends_of(looked)
     return facts | tcp_connections.observe(held, looked, facts) if tcp_connections.is_connection(facts) else facts

@@ -118,11 +118,11 @@ def looked_into(pid: int, number: int) -> Iterator[socket.socket]:
         OSError: it was closed meanwhile.
     """
     with copy_of(pid, number) as descriptor:
-        copied = socket.socket(fileno=os.dup(descriptor))
+        lent = socket.socket(fileno=descriptor)
         try:
-            yield copied
+            yield lent
         finally:
-            copied.close()
+            lent.detach()
 
 
 def general_facts(one: Descriptor, looked: socket.socket) -> dict[str, Fact]:
@@ -138,16 +138,23 @@ def general_facts(one: Descriptor, looked: socket.socket) -> dict[str, Fact]:
 
 
 def _options(looked: socket.socket, form: Form) -> Iterator[list[Fact]]:
-    fresh = _fresh_options(form)
-    locks = int.from_bytes(_option(looked, socket.SOL_SOCKET, SO_BUF_LOCK) or b"\3", "little")
-    for (level, number), usual in fresh.items():
-        value = _option(looked, level, number)
-        if value != usual and _is_chosen(level, number, locks):
+    """The program stands still meanwhile: some sixty questions to each socket."""
+    ask = looked.getsockopt
+    for (level, number), usual in _fresh_options(form).items():
+        try:
+            value = ask(level, number, OPTION_SIZE)
+        except OSError:
+            continue
+        if value != usual and _is_chosen(looked, level, number):
             yield [level, number, value]
 
 
-def _is_chosen(level: int, number: int, locks: int) -> bool:
-    return level != socket.SOL_SOCKET or number not in _BUFFERS or bool(locks & _BUFFERS[number])
+def _is_chosen(looked: socket.socket, level: int, number: int) -> bool:
+    """Whether an option is as the program has set it, and not as the kernel has."""
+    if level != socket.SOL_SOCKET or number not in _BUFFERS:
+        return True
+    locks = _option(looked, socket.SOL_SOCKET, SO_BUF_LOCK) or b"\3"
+    return bool(int.from_bytes(locks, "little") & _BUFFERS[number])
 
 
 @lru_cache(maxsize=32)

@@ -29,7 +29,7 @@ from checkpoint.linux import abi, procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.unix_sockets import ESTABLISHED, LISTENING, unix_socket
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings, elsewhere, sockets
+from checkpoint.resources import Opened, OpenFile, Surroundings, elsewhere, sockets
 from checkpoint.resources.rebuilding import number_of
 
 KIND: Final = "unix_sockets"
@@ -81,7 +81,7 @@ BOTH_DIRECTIONS: Final = 3
 _SHUTDOWN_HOW: Final = {1: socket.SHUT_RD, 2: socket.SHUT_WR, 3: socket.SHUT_RDWR}
 
 
-def observe(held: OpenFile, looked: socket.socket, opened: Sequence[OpenFile], noted: sockets.Noted | None) -> dict[str, Fact]:
+def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: sockets.Noted | None) -> dict[str, Fact]:
     """Its state, its peer and what waits in it.
 
     Args:
@@ -98,13 +98,12 @@ def observe(held: OpenFile, looked: socket.socket, opened: Sequence[OpenFile], n
     has_queue = told.state == ESTABLISHED or told.type == socket.SOCK_DGRAM
     identify = partial(_number_of, held.pid, opened)
     queue = sockets.queue_of(looked, held.first.number, noted, identify) if has_queue else sockets.NOTHING
-    ours = {one.first.inode for one in opened}
     path = _path_of(held.pid, told.name)
     return facts | {
         "state": told.state,
         "name": told.name,
         "peer": told.peer,
-        "peer_is_ours": told.peer in ours,
+        "peer_is_ours": told.peer in opened.inodes,
         "peer_name": _peer_name(looked),
         "backlog": told.backlog,
         "shutdown": told.shutdown,
@@ -145,11 +144,13 @@ def _path_of(pid: int, name: bytes) -> str:
 
 def _mode_of(pid: int, path: str) -> int:
     """Mode of the socket at a path, as the process sees it; -1 where there is none."""
+    if not path:
+        return -1
     try:
         about = os.stat(f"/proc/{pid}/root{path}")
     except OSError:
         return -1
-    return about.st_mode if path and stat.S_ISSOCK(about.st_mode) else -1
+    return about.st_mode if stat.S_ISSOCK(about.st_mode) else -1
 
 
 def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:

@@ -1,6 +1,6 @@
 """Captures that race with what a program does: nothing is lost, no thread is left stopped, no descriptor is left open.
 
-``FAILOVER_TEST_RACES=10000`` for the long version: so many captures of each kind, some minutes each.
+``FAILOVER_TEST_RACES=10000`` for the long version: so many captures of each kind, some ten minutes each.
 """
 
 from __future__ import annotations
@@ -30,14 +30,15 @@ from tests.checkpoint.round_trip import (
     start_tracee,
     transported,
 )
-from tests.checkpoint.test_threads import RACES, open_descriptors, states, tracers
+from tests.checkpoint.test_threads import open_descriptors, states, tracers
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root, pytest.mark.timeout(3600)]
 
 Compiled = Callable[..., Path]
 Outcome = TypeVar("Outcome")
 
-KILLED_ONE_IN = 20
+RACES = int(os.environ.get("FAILOVER_TEST_RACES", "30"))
+KILLED_ONE_IN = 10
 """Captures for each program that is killed while it is captured: starting one takes as long as some captures."""
 
 
@@ -102,18 +103,19 @@ def test_captures_that_race_with_the_execution_of_another_program_harm_nobody(co
     with ended(start_tracee(compiled("races", "-O2", "-pthread"), tmp_path, "execs")) as tracee:
         ours, its = open_descriptors(), len(os.listdir(f"/proc/{tracee.pid}/fd"))
         found = executed = sequence = 0
-        while sequence < RACES:
+        deadline = time.monotonic() + PATIENCE_S
+        while sequence < RACES or not (found and executed):
+            assert sequence < RACES or time.monotonic() < deadline, f"{found} captures, {executed} executions"
             try:
                 with protected(tracee) as session:
-                    while sequence < RACES:
+                    while sequence < RACES or not executed:
                         sequence += 1
                         session.acknowledge(session.capture(CaptureOrder(sequence=sequence)).position)
                         found += 1
             except (ProcessGoneError, CaptureError, UnsupportedError, ProbeError) as error:
                 executed += isinstance(error, ProcessGoneError)
                 assert tracee.poll() is None, f"it has ended: {tracee.status}\n{tracee.output}"
-        print(f"{found} of {RACES} captures, {executed} of a program that had become another")
-        assert found and executed
+        print(f"{found} of {sequence} captures, {executed} of a program that had become another")
         assert open_descriptors() == ours
         expect_unharmed(tracee, its)
 

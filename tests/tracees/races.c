@@ -97,7 +97,7 @@ static int execute_itself(long turn) {
     if (is_told(go)) return finish();
     for (int number = 0; number < WORKERS; number++)
         if (pthread_create(&thread, NULL, idle, NULL)) cannot("start a thread");
-    usleep((useconds_t)(mix((uint64_t)turn) % 100000));
+    usleep((useconds_t)(mix((uint64_t)turn) % (turn % 8 ? 50000 : 500000)));
     if (turn % 2) execute_next((void *)turn);
     if (pthread_create(&thread, NULL, execute_next, (void *)turn)) cannot("start a thread");
     for (;;) pause();

@@ -1,0 +1,44 @@
+"""What one more thread, and one more descriptor of each kind, adds to the time that a program stands still."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from pathlib import Path
+from typing import Final
+
+from benchmarks.engine import PERIOD_S, capture
+from benchmarks.figures import Figure
+from benchmarks.running import running
+from checkpoint import channel
+from failover.cli.keeper import Keeper
+
+KINDS: Final = ("thread", "file", "end of a pipe", "eventfd", "epoll", "unix socket", "UDP socket", "TCP socket")
+"""In the order of `benchmarks.programs.crowded`."""
+COUNTS: Final = (8, 64)
+DELTAS: Final = 20
+
+
+def crowd(quick: bool, directory: Path) -> list[Figure]:
+    """Freeze time with many of a kind, less that with none, by how many there are."""
+    found = []
+    for kind, name in enumerate(KINDS[: 2 if quick else None]):
+        usual = statistics.median(_freezes_us(kind, 0, directory))
+        for count in COUNTS:
+            values = tuple((freeze - usual) / count for freeze in _freezes_us(kind, count, directory))
+            found.append(Figure(f"one more {name}", f"of {count}", "µs", values))
+    return found
+
+
+def _freezes_us(kind: int, count: int, directory: Path) -> list[float]:
+    """Of deltas, by the keeper's own account."""
+    found: list[float] = []
+    with running("crowded", kind, count, directory=directory) as program, Keeper.spawn() as keeper:
+        keeper.ask(channel.Protect(program.pid, "/benchmark"), channel.Protected)
+        capture(keeper, base=True, sequence=1)
+        for sequence in range(2, DELTAS + 2):
+            time.sleep(PERIOD_S)
+            captured, _ = capture(keeper, base=False, sequence=sequence)
+            found.append(float(captured.freeze_us))
+        keeper.ask(channel.Release(), channel.Released)
+    return found
