@@ -22,6 +22,7 @@ from checkpoint.resources import files
 _ADVICE: Final = frozenset(("gd", "dc", "dd", "wf", "hg", "nh", "lo", "lf", "nr", "sr", "rr", "mg"))
 KEPT_FLAGS: Final = _ADVICE | {vm_flags.HUGE, vm_flags.GIGANTIC, vm_flags.SEALED, vm_flags.DROPPABLE} | vm_flags.KEYS
 """Codes that a restore gives back."""
+ROOT: Final = 0
 VSYSCALL: Final = "[vsyscall]"
 KINDS: Final = {
     "[heap]": VmaKind.HEAP,
@@ -77,12 +78,20 @@ class Identities:
         """The file behind a mapping."""
         key = _key(line)
         if key not in self._known or is_shared_object(line):  # the size of such a one is told by nothing else
-            through = f"/proc/{self._pid}/map_files/{line.start:x}-{line.end:x}"
             deleted = line.name.endswith(DELETED)
             path = line.name.removesuffix(DELETED) if deleted else line.name
-            place = through if deleted else f"/proc/{self._pid}/root{path}"
-            self._known[key] = self._identity(path, place, deleted, is_memory=is_shared_object(line))
+            self._known[key] = self._identity(path, self._place(line), deleted, is_memory=is_shared_object(line))
         return self._known[key]
+
+    def _place(self, line: MapsLine) -> str:
+        """Where the very file that is mapped is read: its name may lead elsewhere by now, to what we may read and it may not."""
+        named = f"/proc/{self._pid}/root{line.name}"
+        with contextlib.suppress(OSError):  # it is gone, or closed to us
+            about = os.stat(named)
+            if (about.st_dev, about.st_ino) == (line.device, line.inode):
+                return named
+        must_be_exact = os.geteuid() == ROOT or line.name.endswith(DELETED)
+        return f"/proc/{self._pid}/map_files/{line.start:x}-{line.end:x}" if must_be_exact else named
 
     def executable(self) -> FileIdentity:
         """The program itself."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import shutil
 import subprocess
@@ -11,10 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint.contents import Contents
+from checkpoint.contents import Contents, digest_of_file
 from checkpoint.disk import Disk
 from checkpoint.engine import CaptureOrder
+from checkpoint.engines.identities import Identities
 from checkpoint.errors import MismatchError, UnsupportedError
+from checkpoint.linux import procfs
 from checkpoint.model import Snapshot
 from checkpoint.needs import Need, needs
 from checkpoint.whole_files import WholeFiles
@@ -261,3 +264,16 @@ def test_a_working_directory_that_is_missing_is_made(stage: Stage) -> None:
         assert os.readlink(f"/proc/{back.pid}/cwd") == str(place)
         (stage.work / "go").touch()
         expect_ok(back)
+
+
+def test_a_link_by_the_name_that_the_kernel_shows_of_a_mapped_file_does_not_lead_us_to_another_file(tmp_path: Path) -> None:
+    """In /proc/PID/maps a newline is ``\\012``, but so is a backslash with these digits; and names change while we look."""
+    mapped, closed = tmp_path / "file\\012x", tmp_path / "closed"
+    mapped.write_bytes(b"the program's own")
+    closed.write_bytes(b"nobody else's business")
+    (tmp_path / "file\nx").symlink_to(closed)
+    with mapped.open("rb") as file, mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ):
+        lines = procfs.parse_maps(procfs.read_text(os.getpid(), "maps"))
+        (line,) = (line for line in lines if line.name.startswith(str(tmp_path)))
+        identity = Identities(os.getpid(), {}).of_mapping(line)
+    assert (identity.digest, identity.size) == (digest_of_file(mapped), len("the program's own"))
