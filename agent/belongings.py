@@ -122,7 +122,7 @@ class Stock:
 
     async def take(self, peer: str, offer: Content, descriptor: int) -> None:
         """Keep it; its digest is right."""
-        await asyncio.to_thread(self._store.contents.put, descriptor, offer.digest)
+        await asyncio.to_thread(self._store.contents.put, descriptor, offer.digest, own=True)
         self._awaited.get(peer, {}).pop(offer.digest, None)
 
     def not_taken(self, peer: str, offer: Content, why: str) -> None:

@@ -60,20 +60,32 @@ class Contents:
             return False
         return stat.S_ISREG(about.st_mode) and about.st_size == size
 
-    def put(self, source: int, digest: bytes) -> None:
+    def put(self, source: int, digest: bytes, *, own: bool = False) -> None:
         """Keep the content of a file; when this returns it survives a power cut.
 
         Args:
-            source: descriptor of the whole file, which has this digest: whoever received it has counted. It stays the caller's;
-                an unnamed one (O_TMPFILE) on the store's file system is taken as it is.
+            source: descriptor of the whole file, which has this digest: whoever received it has counted. It stays the caller's.
+            own: we have made it: an unnamed one (O_TMPFILE) on the store's file system is taken as it is. That of a program is
+                copied, unnamed or not: its owner could go on writing to it.
 
         Raises:
             StoreError: the disk does not take it; nothing of it is left.
         """
         final = self.path(digest)
-        self._files.write(final, lambda file: file.copy_from(source), source)
+        self._files.write(final, lambda file: file.copy_from(source), source if own else None)
         with disk_trouble(f"set the mode of {final}"):
             os.chmod(final, CONTENT_MODE)
+
+    def mend(self) -> None:
+        """Give back the mode that a power cut, or our end, has taken from what was just put: it could not be executed.
+
+        Raises:
+            StoreError: the disk does not let us.
+        """
+        with disk_trouble(f"set the modes of what is in {self._folder}"):
+            for path in self._folder.iterdir() if self._folder.is_dir() else ():
+                if stat.S_IMODE(path.lstat().st_mode) != CONTENT_MODE and not path.name.startswith(TEMPORARY_PREFIX):
+                    os.chmod(path, CONTENT_MODE)
 
     def open(self, digest: bytes) -> int:
         """A descriptor of a content, the caller's to close.

@@ -446,6 +446,7 @@ class Store:
                 if folder.is_dir():
                     self._read_folder(folder)
             self._history.read()
+        self.contents.mend()
 
     def _read_folder(self, folder: Path) -> None:
         for path in sorted(folder.iterdir()):

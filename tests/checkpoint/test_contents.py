@@ -67,6 +67,25 @@ def test_a_content_is_there_after_a_restart_for_all_to_read_and_run_and_for_nobo
         assert store.components() == ()
 
 
+def test_a_content_can_be_executed_also_if_the_power_went_before_its_mode_was_safe(tmp_path: Path) -> None:
+    with opened(tmp_path / "store") as store:
+        digest = keep(store, CONTENT)
+        store.contents.path(digest).chmod(0o600)
+    with opened(tmp_path / "store") as store:
+        assert store.contents.path(digest).stat().st_mode & 0o7777 == 0o555
+
+
+def test_a_program_that_goes_on_writing_to_a_file_of_its_own_does_not_write_to_what_is_kept_of_it(tmp_path: Path) -> None:
+    digest = blake3(CONTENT).digest()
+    with opened(tmp_path / "store") as store:
+        descriptor = os.open(tmp_path, os.O_TMPFILE | os.O_RDWR)
+        os.write(descriptor, CONTENT)
+        store.contents.put(descriptor, digest)
+        os.pwrite(descriptor, b"another", 0)
+        os.close(descriptor)
+        assert store.contents.path(digest).read_bytes() == CONTENT
+
+
 def test_a_content_stays_as_long_as_a_snapshot_names_it(tmp_path: Path) -> None:
     with opened(tmp_path / "store") as store:
         named, other = keep(store, CONTENT), keep(store, b"of nobody")
