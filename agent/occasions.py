@@ -18,6 +18,10 @@ from failover.core.types import ComponentSpec
 CAPTURE_PAUSE_S: Final = 10
 """Between two runs of before_capture: a whole snapshot that cannot be taken is tried again every second."""
 
+CAPTURE_LIMIT_S: Final = 5.0
+"""What before_capture may take, whatever limit_s says: a handover as a whole has ten seconds, and acknowledgements, deltas and
+stops of the component wait behind it."""
+
 
 @dataclass(slots=True)
 class Occasions:
@@ -82,9 +86,10 @@ class Occasions:
     def _hook(self, kind: Kind, spec: ComponentSpec | None) -> Hook:
         """This robot's own command for the occasion, else the one that came with the program, with its user's rights."""
         here = self.around.here(self.name).hooks
+        limit_s = min(here.limit_s, CAPTURE_LIMIT_S) if kind == "before_capture" else here.limit_s
         if spec is None or here.command(kind):
-            return Hook(here.command(kind), here.limit_s)
-        return Hook(dict(spec.launch.hooks).get(kind, ()), here.limit_s, program_of(spec.launch).inheritance)
+            return Hook(here.command(kind), limit_s)
+        return Hook(dict(spec.launch.hooks).get(kind, ()), limit_s, program_of(spec.launch).inheritance)
 
     async def _prepare(self, kind: Kind, spec: ComponentSpec | None, occasion: Occasion) -> None:
         """Run one without which the program perhaps must not run here.
