@@ -29,7 +29,10 @@ class Eyes:
 
 @contextmanager
 def seeing_as(eyes: Eyes | None) -> Iterator[None]:
-    """Use a user's rights to files in the body; nothing changes for None, for root, and where we are not root."""
+    """Use a user's rights to files in the body; nothing changes for None, for root, and where we are not root.
+
+    The body must import nothing for the first time: modules are files, too, that this user may not be able to read.
+    """
     if eyes is None or eyes.uid == ROOT or os.geteuid() != ROOT:
         yield
         return

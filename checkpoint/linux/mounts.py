@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Final
 
@@ -10,6 +11,9 @@ NETWORK_TYPES: Final = frozenset(
     ("nfs", "nfs4", "cifs", "smb3", "smbfs", "9p", "ceph", "afs", "coda", "lustre", "glusterfs", "ocfs2", "gfs2", "beegfs")
 )
 """File systems that other machines see, too."""
+_ESCAPED: Final = re.compile(rb"\\([0-3][0-7]{2})")
+"""Blanks, newlines and backslashes of a mount point, as octal numbers."""
+
 USER_SPACE: Final = "fuse."
 """Of those that a process serves nobody can tell what is behind them: sshfs is one."""
 
@@ -40,6 +44,6 @@ def _mounts(pid: int) -> list[tuple[str, str]]:
     found = []
     for line in lines:
         before, _, after = line.partition(b" - ")
-        point = before.split(b" ")[4].decode("unicode_escape").encode("latin-1")
+        point = _ESCAPED.sub(lambda found: bytes((int(found[1], 8),)), before.split(b" ")[4])
         found.append((os.fsdecode(point), os.fsdecode(after.split(b" ")[0])))
     return found
