@@ -35,6 +35,7 @@ class Segment:
         key: signed; 0 where nobody can ask for it by a key.
         permissions: of a file, and `SHM_DEST`.
         attached: mappings of it, in all processes.
+        creator: uid of who made it, and may use it whoever owns it; -1 where that is not known.
     """
 
     key: int
@@ -44,6 +45,7 @@ class Segment:
     attached: int
     uid: int
     gid: int
+    creator: int = -1
 
 
 class _Permissions(ctypes.Structure):
@@ -66,7 +68,7 @@ def segments() -> dict[int, Segment]:
         for line in _TABLE.read_text().splitlines()[1:]:
             words = line.split()
             key, identifier, permissions, size = int(words[0]), int(words[1]), int(words[2], 8), int(words[3])
-            found[identifier] = Segment(key, identifier, permissions, size, int(words[6]), int(words[7]), int(words[8]))
+            found[identifier] = Segment(key, identifier, permissions, size, *map(int, words[6:10]))
     return found
 
 

@@ -11,8 +11,9 @@ Source: shmget(2), shmop(2); ipc/shm.c: the inode number of a mapping is the id.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
@@ -112,9 +113,12 @@ def _wanted(held: Resource) -> Segment:
 
 
 def _left_behind(wanted: Segment, here: Iterable[Segment]) -> Segment | None:
-    """The very segment, that nobody has attached any more: the program left it here when it died."""
-    same = (one for one in here if (one.key, one.identifier, one.size) == (wanted.key, wanted.identifier, wanted.size))
-    return next((one for one in same if wanted.key and not one.attached), None)
+    """The very segment, that nobody has attached any more: the program left it here when it died.
+
+    Whoever else may use one like it would share the program's memory.
+    """
+    same = (one for one in here if replace(one, attached=0, creator=wanted.creator) == wanted)
+    return next((one for one in same if wanted.key and not one.attached and one.creator in (wanted.uid, os.geteuid())), None)
 
 
 def mismatches(held: Resource) -> Iterator[str]:

@@ -17,8 +17,9 @@ from checkpoint.capability import Verdict
 from checkpoint.engine import CaptureOrder
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import procfs, system_v
-from checkpoint.resources import unsupported
+from checkpoint.resources import system_v_memory, unsupported
 from tests.checkpoint.round_trip import (
+    NOBODY,
     captured_and_killed,
     captured_at_last,
     ended,
@@ -180,6 +181,20 @@ def test_shared_memory_of_system_v_comes_back(is_left: bool, compiled: Compiled,
             with ended(restored(snapshot, tmp_path)) as tracee:
                 tracee.tell()
                 expect_ok(tracee)
+
+
+def test_a_segment_that_another_user_has_made_is_not_taken_for_the_one_that_was_left() -> None:
+    """He could write to what the program has in it, also when he has given it away."""
+    left = system_v.Segment(0x5EED, 7, 0o600, 4096, 0, 0, 0, creator=0)
+    wanted = replace(left, creator=-1)
+    assert system_v_memory._left_behind(wanted, [left]) is left
+    for other in (
+        replace(left, creator=NOBODY),
+        replace(left, uid=NOBODY),
+        replace(left, permissions=0o666),
+        replace(left, attached=1),
+    ):
+        assert system_v_memory._left_behind(wanted, [other]) is None
 
 
 def test_a_key_that_somebody_else_has_is_said_so(compiled: Compiled, tmp_path: Path) -> None:
