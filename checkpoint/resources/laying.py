@@ -29,7 +29,7 @@ from typing import Final
 from checkpoint import carried
 from checkpoint.carried import Entry, Tree
 from checkpoint.errors import MismatchError, RestoreError
-from checkpoint.linux.eyes import Eyes, seeing_as
+from checkpoint.linux.eyes import Eyes, own_uid, seeing_as
 from checkpoint.linux.mounts import is_mount_point
 from checkpoint.model import Snapshot
 from checkpoint.resources import writers
@@ -208,7 +208,10 @@ class _Laying:
     def _kept(self, place: str) -> str:
         """A new folder for what is replaced, and no more than `KEPT_COUNT` of them."""
         above = os.path.join(place, f"{os.fsdecode(carried.OWN_PREFIX)}kept-{os.path.basename(self.tree.path)}")
-        os.makedirs(above, mode=0o700, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(above, 0o700)
+        if not _is_own(above):
+            above = tempfile.mkdtemp(prefix=f"{os.path.basename(above)}-", dir=place)
         now_ns = time.time_ns()
         stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime(now_ns // 1_000_000_000)) + f".{now_ns // 1_000_000 % 1000:03}Z"
         for old in sorted(os.listdir(above))[: 1 - KEPT_COUNT]:
@@ -269,6 +272,12 @@ class _Laying:
             return True
         links = sum(other.place == entry.place for other in self.tree.entries)
         return about.st_size == entry.size and about.st_nlink == links and _holds(path, entry, self.pieces.get(entry.place, []))
+
+
+def _is_own(folder: str) -> bool:
+    """Whether it is no link and nobody else's, who would have us remove, or could see, what is in it."""
+    about = os.lstat(folder)
+    return stat.S_ISDIR(about.st_mode) and about.st_uid == own_uid() and not about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
 def _exchange(one: str, other: str) -> bool:

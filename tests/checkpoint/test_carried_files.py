@@ -229,6 +229,25 @@ def test_what_stood_there_is_kept_and_never_overwritten(tmp_path: Path) -> None:
         assert len(list((tmp_path / ".failover-kept-kept").iterdir())) == len(sets), "what was right was replaced"
 
 
+@pytest.mark.parametrize("is_link", [True, False], ids=["a link", "a folder that all may write"])
+def test_what_somebody_else_has_put_where_replaced_files_are_kept_is_left_alone(tmp_path: Path, is_link: bool) -> None:
+    path, his, trap = tmp_path / "state", tmp_path / "his", tmp_path / ".failover-kept-state"
+    path.write_text("of the checkpoint")
+    with asleep(tmp_path) as program, carrying(program, path) as session:
+        state = once_more(session, 1)
+    (his if is_link else trap).mkdir()
+    trap.symlink_to(his) if is_link else trap.chmod(0o777)
+    wanted = {str(number) for number in range(2 * laying.KEPT_COUNT)}
+    for name in wanted:
+        (trap / name).mkdir()
+    path.write_text("newer")
+    with ended(restored(state, tmp_path)):
+        assert path.read_text() == "of the checkpoint"
+    assert {one.name for one in trap.iterdir()} == wanted
+    (kept,) = tmp_path.glob(".failover-kept-state-*/*/state")
+    assert kept.read_text() == "newer"
+
+
 def test_a_path_where_nothing_stood_is_empty_again(tmp_path: Path) -> None:
     path = tmp_path / "later"
     with asleep(tmp_path) as program, carrying(program, path) as session:
