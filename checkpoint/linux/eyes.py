@@ -28,7 +28,7 @@ class Eyes:
 
 
 def own_uid() -> int:
-    """Whose rights to files count just now: what is made belongs to him. Source: setfsuid(2), which answers, whatever it is told."""
+    """Whose rights to files count just now: what is made belongs to him. Source: setfsuid(2), which always answers."""
     return int(_LIBC.setfsuid(-1)) & 0xFFFFFFFF
 
 
