@@ -24,10 +24,42 @@ def notes(robot: RobotMachine) -> list[Any]:
     return found
 
 
-def start(robot: RobotMachine, *argv: str) -> None:
+CAMERA = """
+import os, signal, sys, time, tty
+path = sys.argv[1]
+line = os.open(path, os.O_RDWR | os.O_NOCTTY)
+def on_resume(*_):
+    again = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    tty.setraw(again)
+    os.dup2(again, line)
+    os.close(again)
+    print("opened anew", flush=True)
+signal.signal(signal.SIGHUP, on_resume)
+tty.setraw(line)
+print("ready", flush=True)
+while True:
+    try:
+        said = os.read(line, 100)
+    except OSError:
+        said = b""
+    if said:
+        os.write(line, b"got " + said)
+    else:
+        time.sleep(0.05)
+"""
+"""Opens its device anew when it is told to by SIGHUP."""
+
+
+def logged(robot: RobotMachine) -> list[str]:
+    """What no takeover can take back of the driver's output."""
+    return robots.failover(robot, "logs", "driver").stdout.splitlines()
+
+
+def start(robot: RobotMachine, *argv: str, **wanted: Any) -> None:
     """Start a driver, not isolated: its terminals are those of this machine."""
     with robot.control() as link:
-        link.ask("run", argv=list(argv), name="driver", env={"PATH": "/usr/bin:/bin"}, cwd="/", wait=False, isolate=False)
+        environment = {"PATH": "/usr/bin:/bin"}
+        link.ask("run", argv=list(argv), name="driver", env=environment, cwd="/", wait=False, isolate=False, **wanted)
 
 
 def test_a_driver_goes_on_with_the_device_of_the_other_robot(tmp_path: Path) -> None:
@@ -49,8 +81,26 @@ def test_a_driver_goes_on_with_the_device_of_the_other_robot(tmp_path: Path) -> 
             robots.until(lambda: robots.failover(first, "handover", "driver").returncode == 0, "a handover")
             assert told(second_line, b"three\n") == b"got three\n"
             robots.until_protected(second, "driver")
-            output = robots.failover(second, "logs", "driver").stdout.splitlines()
-            assert output[-1] == "heard three same 0"
+            robots.until(lambda: logged(second)[-1] == "heard three same 0", "what it said")
     finally:
         for descriptor in (first_line, first_end, second_line, second_end):
             os.close(descriptor)
+
+
+def test_a_program_that_opens_its_device_anew_is_told_to_by_the_hook(tmp_path: Path) -> None:
+    line, end = os.openpty()
+    tty.setraw(line)
+    path = os.ttyname(end)
+    told_by = ["/bin/sh", "-c", "kill -HUP $FAILOVER_PID"]
+    try:
+        with robots.two_robots(tmp_path) as (first, second):
+            start(first, PYTHON, "-S", "-c", CAMERA, path, devices={path: "hook"}, hooks={"after_resume": told_by})
+            robots.until_protected(first, "driver")
+            assert told(line, b"one\n") == b"got one\n"
+            robots.until(lambda: robots.failover(first, "handover", "driver").returncode == 0, "a handover")
+            assert told(line, b"two\n") == b"got two\n"
+            robots.until_protected(second, "driver")
+            robots.until(lambda: logged(second) == ["ready", "opened anew"], "what it said")
+    finally:
+        os.close(end)
+        os.close(line)
