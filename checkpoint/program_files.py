@@ -20,6 +20,7 @@ from typing import Final
 
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import procfs
+from checkpoint.linux.eyes import Eyes, seeing_as
 from checkpoint.model import Fact, Resource
 from checkpoint.resources.files import digest_at
 
@@ -42,19 +43,27 @@ def describe(pid: int, component: str, arguments: Sequence[str], directory: str)
         arguments, directory: as it was started.
     """
     try:
-        entry, listed = _listed(pid, arguments, directory)
+        with seeing_as(_eyes_of(pid)):
+            entry, listed = _listed(pid, arguments, directory)
+            paths = list(dict.fromkeys((entry, *listed)))
+            if not entry or len(paths) > FILES_MAX:
+                return None
+            files: list[Fact] = [fact for path in paths if (fact := _fact(pid, path)) is not None]
     except (OSError, ProbeError, ProcessGoneError):
         return None  # it has ended, or may not be looked at: it is captured all the same
-    paths = list(dict.fromkeys((entry, *listed)))
-    if not entry or len(paths) > FILES_MAX:
-        return None
-    files: list[Fact] = [fact for path in paths if (fact := _fact(pid, path)) is not None]
     return Resource(KIND, component, {"files": files})
 
 
 def open_file(pid: int, path: str) -> int:
-    """A descriptor of one of them, as the program sees paths. Raises OSError."""
-    return os.open(_seen(pid, path), os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
+    """A descriptor of one of them, as the program sees paths. Raises OSError, ProbeError, ProcessGoneError."""
+    with seeing_as(_eyes_of(pid)):
+        return os.open(_seen(pid, path), os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
+
+
+def _eyes_of(pid: int) -> Eyes:
+    """The rights of the program's own user: it chooses its arguments, and shall not have us read for it what it may not read."""
+    status = procfs.status(pid)
+    return Eyes(status.uids[3], status.gids[3], status.groups)
 
 
 def is_of_the_system(path: str) -> bool:

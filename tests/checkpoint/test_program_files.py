@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from blake3 import blake3
 
 from checkpoint import program_files
 from checkpoint.linux.brought import BroughtFile
@@ -178,3 +179,28 @@ def test_a_resource_that_says_anything_else_names_no_file() -> None:
 
     found = program_of(replace(made, resources=(Resource("program", "/test", facts),)))  # type: ignore[arg-type]
     assert [(file.path, file.mode) for file in found] == [("/fine", 0o755)]
+
+
+@pytest.mark.root
+def test_nothing_is_read_for_a_program_that_its_user_may_not_read() -> None:
+    """It chooses its own arguments, and where the links in its directory lead."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        folder.chmod(0o755)
+        (folder / "closed").write_text("nobody else's business")
+        (folder / "closed").chmod(0o600)
+        (folder / "link.sh").symlink_to(folder / "closed")
+        (folder / "own.sh").write_text("")
+        words = ["/bin/sh", "-c", "echo ready; read line"]
+        pipe = subprocess.PIPE
+        with subprocess.Popen(words, user=NOBODY, group=NOBODY, extra_groups=[], stdin=pipe, stdout=pipe) as process:
+            assert process.stdout is not None and process.stdout.readline() == b"ready\n"
+            digests = {}
+            for script in ("own.sh", "link.sh", "closed"):
+                found = program_files.describe(process.pid, "/test", ("/bin/sh", script), name)
+                assert found is not None
+                digests |= {str(file[0]): file[2] for file in found.facts["files"]}  # type: ignore[union-attr,index]
+            with pytest.raises(PermissionError):
+                program_files.open_file(process.pid, str(folder / "closed"))
+            process.kill()
+    assert digests == {f"{name}/own.sh": blake3(b"").digest(), f"{name}/link.sh": b"", f"{name}/closed": b""}
