@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from checkpoint.resources.sockets import Noted
 
 STREAM_NUMBERS: Final = (1, 2)
+GLANCES_MORE: Final = 3
+"""How often a process that runs is looked at again that was in the middle of something."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +185,28 @@ def with_contents(opened: Opened, noted: Noted | None, rules: tuple[DeviceRule, 
 
 
 def glance(pid: int) -> tuple[OpenFile, ...]:
-    """Read every descriptor of a process that runs on: enough to tell what is refused."""
+    """Read every descriptor of a process that runs on: enough to tell what is refused.
+
+    What it closes between two of our looks is neither there nor gone: then all is looked at again.
+    """
+    from checkpoint.resources import epolls
+
+    found = _glanced(pid)
+    for _ in range(GLANCES_MORE):
+        if all(map(_is_still_there, found)) and not any(map(epolls.watches_what_is_gone, found)):
+            break
+        found = _glanced(pid)
+    return tuple(filter(_is_still_there, found))
+
+
+def _is_still_there(held: OpenFile) -> bool:
+    try:
+        return os.readlink(f"/proc/{held.pid}/fd/{held.first.number}") == held.first.target
+    except OSError:
+        return not os.path.exists(f"/proc/{held.pid}")  # it has ended as a whole
+
+
+def _glanced(pid: int) -> tuple[OpenFile, ...]:
     from checkpoint.resources import kinds
 
     opened = gather(pid)
@@ -197,7 +220,10 @@ def glance(pid: int) -> tuple[OpenFile, ...]:
 
 
 def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
-    """Sort open files into the kinds: what comes back, and what does not."""
+    """Sort one process's open files into the kinds: what comes back, and what does not.
+
+    What can be told only of all processes of a component together is told by `kinds.findings_of_all`.
+    """
     from checkpoint.resources import kinds, locks, signalling
 
     resources, findings = [], []
@@ -210,4 +236,4 @@ def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
                 resources.append(replace(resource, facts={**resource.facts, **signalling.describe(held), **locks.describe(held)}))
                 findings.append(Finding(kind.KIND, held.name, KEPT, f"{held.name} is {held.first.target}"))
                 break
-    return Held(tuple(resources), (*findings, *kinds.findings_of_all(resources)))
+    return Held(tuple(resources), tuple(findings))

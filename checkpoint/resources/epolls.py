@@ -93,16 +93,24 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     """Why an epoll instance cannot be kept."""
     if held.first.target != TARGET:
         return None
+    if (closed := _closed(held)) is not None:
+        return (
+            f"{held.name} is an epoll instance that watches what was descriptor {closed}, which the program has closed and "
+            "somebody else still holds: let it take that out (EPOLL_CTL_DEL) before closing"
+        )
+    return elsewhere.refuse(held, "an epoll instance")
+
+
+def watches_what_is_gone(held: OpenFile) -> bool:
+    """Whether it is an epoll instance that watches what the program has no descriptor of."""
+    return held.first.target == TARGET and _closed(held) is not None
+
+
+def _closed(held: OpenFile) -> int | None:
+    """The number under which something was registered that the program has no descriptor of any more."""
     watched = held.observed.get("watched", [])
     assert isinstance(watched, list)
-    for one in watched:
-        if isinstance(one, list) and one[1] == GONE:
-            closed = number_of(one[0])
-            return (
-                f"{held.name} is an epoll instance that watches what was descriptor {closed}, which the program has closed and "
-                "somebody else still holds: let it take that out (EPOLL_CTL_DEL) before closing"
-            )
-    return elsewhere.refuse(held, "an epoll instance")
+    return next((number_of(one[0]) for one in watched if isinstance(one, list) and one[1] == GONE), None)
 
 
 def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
