@@ -12,7 +12,7 @@ from checkpoint.engine import KEPT, NOTED, REFUSED, Finding, Report, Streams
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import dirty, processor, procfs, vm_flags
 from checkpoint.linux.procfs import Status
-from checkpoint.resources import Surroundings, glance, look, pipes_of, system_v_memory, unsupported
+from checkpoint.resources import Surroundings, glance, kinds, look, pipes_of, system_v_memory, unsupported
 
 COMMAND_LENGTH: Final = 200
 """Characters of a command line that a report shows."""
@@ -39,11 +39,13 @@ def _probe(pid: int, surroundings: Surroundings, files_kept: bool) -> Report:
     status = procfs.status(pid)
     unsupported.require_traceable(pid, status)
     _require_permission(pid, status)
+    held = look(glance(pid), surroundings)
     findings = (
         *_process_findings(pid, status, files_kept),
         *_processor_findings(pid),
         *_memory_findings(pid),
-        *look(glance(pid), surroundings).findings,
+        *held.findings,
+        *kinds.findings_of_all(held.resources, standing=False),
     )
     return Report(pid, _command(pid, status), status.resident_size, dirty.best_tracking(), findings)
 

@@ -49,7 +49,7 @@ from checkpoint.linux.tracking import NONE, NOT_CARRIED
 from checkpoint.linux.vm_flags import FlagsReader
 from checkpoint.model import Position, Resource, Snapshot
 from checkpoint.pages import PageTable
-from checkpoint.resources import Surroundings, carried_trees, glance, look, memory_locks, system_v_memory, unsupported
+from checkpoint.resources import Surroundings, carried_trees, glance, kinds, look, memory_locks, system_v_memory, unsupported
 from checkpoint.resources.carried_trees import NO_PARCEL, CarriedTrees, Parcel, Seen
 from checkpoint.stream_counts import Totals
 
@@ -299,7 +299,7 @@ class PtraceSession:
         standing, taken = frozen.standing, frozen.taken
         held = look(standing.opened, self._surroundings)
         of_files = self._carried.reasons(frozen.seen) if self._carried else ()
-        reasons = (*held.reasons, *self._reasons_of(standing, taken.lines), *of_files)
+        reasons = (*held.reasons, *kinds.reasons_of_all(held.resources), *self._reasons_of(standing, taken.lines), *of_files)
         self._refuse(reasons)
         parcel = self._carried.parcel(frozen.seen, parent) if self._carried else NO_PARCEL
         snapshot = replace(

@@ -7,7 +7,7 @@ import socket
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, Protocol
 
-from checkpoint.engine import Finding
+from checkpoint.engine import REFUSED, Finding
 from checkpoint.errors import CaptureError
 from checkpoint.linux.descriptors import Descriptor
 from checkpoint.model import Fact, Resource
@@ -125,6 +125,15 @@ def _observe_internet_socket(
     return facts | tcp_connections.observe(held, looked, facts) if tcp_connections.is_connection(facts) else facts
 
 
-def findings_of_all(resources: Sequence[Resource]) -> tuple[Finding, ...]:
-    """What can be told only of all resources together."""
-    return (*tcp_connections.findings(resources), *internet_sockets.findings(resources))
+def findings_of_all(resources: Sequence[Resource], *, standing: bool) -> tuple[Finding, ...]:
+    """What can be told only of all resources of all processes of a component together.
+
+    Args:
+        standing: they all stood still.
+    """
+    return (*tcp_connections.findings(resources, standing=standing), *internet_sockets.findings(resources))
+
+
+def reasons_of_all(resources: Sequence[Resource]) -> tuple[str, ...]:
+    """Why all of them together, of processes that stood still, cannot be kept, one sentence each."""
+    return tuple(finding.text for finding in findings_of_all(resources, standing=True) if finding.verdict == REFUSED)

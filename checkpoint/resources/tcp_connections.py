@@ -165,15 +165,20 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     return elsewhere.refuse(held, "a TCP connection") if is_connection(held.observed) else None
 
 
-def findings(held: Sequence[Resource]) -> Iterator[Finding]:
-    """What can be told only of all connections together: which cannot be made again yet, and which end."""
+def findings(held: Sequence[Resource], *, standing: bool) -> Iterator[Finding]:
+    """What can be told only of all connections together: which cannot be made again yet, and which end.
+
+    Args:
+        standing: the program stood still, so that what is said of two ends was true at the same time.
+    """
     others = pairs(held)
     for one in held:
         if one.kind != KIND:
             continue
         other = others.get(_number(one, "socket"))
         if other is not None:
-            yield from (Finding(KIND, one.name, REFUSED, reason) for reason in _refuse_end(one, other))
+            reasons = _refuse_end(one, other) if standing else ()
+            yield from (Finding(KIND, one.name, REFUSED, reason) for reason in reasons)
         elif text := note(one):
             yield Finding(KIND, one.name, NOTED, f"{text} when the program comes back")
 

@@ -99,7 +99,7 @@ def test_a_connection_that_was_asked_for_is_asked_for_anew(compiled: Compiled, t
 def test_a_connection_with_itself_that_is_full_is_refused_by_name(compiled: Compiled, tmp_path: Path) -> None:
     with ended(start_tracee(compiled("tcp_connections", "-O2"), tmp_path, "itself_full")) as tracee:
         with pytest.raises(UnsupportedError, match="bytes of which have not arrived"):
-            ENGINE.protect(tracee.pid, "/test/full", None)
+            captured(tracee)
         tracee.tell()
         expect_ok(tracee)
 
