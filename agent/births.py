@@ -26,11 +26,11 @@ from agent.streams import discard, total_of
 from checkpoint import channel, epoch_variable, format
 from checkpoint.carried import paths_of
 from checkpoint.device_rules import DeviceRule
-from checkpoint.engine import CARRIED_SIZE_MAX, COOPERATIVE, PTRACE, Carry
+from checkpoint.engine import COOPERATIVE, NOTHING_CARRIED, PTRACE, Carry
 from checkpoint.engines.cooperative import age_ns as commit_age_ns
 from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
-from checkpoint.model import Credentials
+from checkpoint.model import Credentials, Snapshot
 from checkpoint.needs import names_of_contents, needs
 from checkpoint.task_channel import Origin
 
@@ -122,7 +122,7 @@ async def restore(
     laps: Laps | None = None,
     task: guard_messages.Task | None = None,
     epoch: int = 0,
-    carry_limit: int = CARRIED_SIZE_MAX,
+    carry: Carry = NOTHING_CARRIED,
     devices: tuple[DeviceRule, ...] = (),
 ) -> Component:
     """Rebuild a component from a chain (descriptors of encoded snapshots, oldest first), stopped, committed to nothing.
@@ -134,7 +134,7 @@ async def restore(
         outage_ns: added to the program's monotonic and boot time: how long ago the newest snapshot was taken.
         task: for a program that may still say that it keeps its state.
         owner: uid; None: whoever it ran as. What is not root's opens its files with its owner's rights, and gets no others.
-        carry_limit: bytes that its carried files may hold here.
+        carry: limit and places of its carried files on this robot.
         devices: what becomes of devices that it had open.
 
     Raises:
@@ -161,7 +161,7 @@ async def restore(
         task=task,
     )
     component.engine_wanted = task.engine if task is not None else PTRACE
-    component.keeper.carry, component.keeper.devices = Carry(paths_of(outline), carry_limit), devices
+    component.keeper.carry, component.keeper.devices = carry_of(outline, carry), devices
     component.keeper.names = names_of_contents(needs(outline), places.contents)
     try:
         keeper = await component.keeper.give()
@@ -189,6 +189,12 @@ async def restore(
     return component
 
 
+def carry_of(outline: Snapshot, here: Carry) -> Carry:
+    """What a component that comes back carries on this robot."""
+    places = dict(here.places)
+    return replace(here, paths=tuple(places.get(path, path) for path in paths_of(outline)))
+
+
 async def begin_again(
     name: str,
     program: Program,
@@ -200,7 +206,7 @@ async def begin_again(
     epoch: int,
     why: str,
     waiting: Component | None = None,
-    carry_limit: int = CARRIED_SIZE_MAX,
+    carry: Carry = NOTHING_CARRIED,
 ) -> Component:
     """Prepare a program that keeps its state to go on from a chain of the cooperative engine; `resume` lets it.
 
@@ -209,7 +215,7 @@ async def begin_again(
     Args:
         why: one of `checkpoint.task_channel.REASONS`.
         waiting: the program, started to wait (`start_to_wait`); None: `resume` starts it.
-        carry_limit: bytes that its carried files may hold here.
+        carry: limit and places of its carried files on this robot.
 
     Raises:
         checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
@@ -219,10 +225,10 @@ async def begin_again(
     await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
     component = waiting or Component(name, await places.nursery.guard(), places)
     component.engine_wanted = COOPERATIVE  # what another engine took before it says Hello would be older than its state
-    component.keeper.carry = Carry(paths_of(outline), carry_limit)
+    component.keeper.carry = carry_of(outline, carry)
     try:
         await component.keeper.give()
-        filled, (segment,) = await component.keeper.ask(channel.Fill(name, owner != ROOT), tuple(chain))
+        filled, (segment,) = await component.keeper.ask(channel.Fill(name, owner != ROOT, carry.places), tuple(chain))
     except (CheckpointError, GuardError, KeeperLostError):
         await component.undo()
         raise

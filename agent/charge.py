@@ -12,7 +12,7 @@ import logging
 import os
 import signal
 from collections.abc import Coroutine
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from agent import births, clock, comeback
@@ -21,14 +21,14 @@ from agent.errors import TROUBLE, AgentError, GuardError, KeeperLostError
 from agent.figures import Commits, Figures, shortened
 from agent.mistake import end_lanes_on_mistake
 from agent.occasions import Occasions
+from agent.rules import carry_here
 from agent.snapshots import Snapshots, newest_of
 from agent.standby import Standby
 from agent.surroundings import Surroundings, program_of
 from checkpoint.channel import close_all
 from checkpoint.device_rules import arrived, merged
-from checkpoint.engine import COOPERATIVE, Carry
+from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CheckpointError, NothingCommittedError, UnsupportedError
-from failover.client.quantities import size_bytes
 from failover.core import acts, events
 from failover.core.acts import Act
 from failover.core.types import Launch, Resumption
@@ -230,7 +230,7 @@ class Charge:
         self.standby.cool()
         adopted = self.component is not None
         self._occasions.runs_here(act.spec)
-        carry = Carry(act.spec.launch.carry, size_bytes(self.around.here(self.name).carry_limit))
+        carry = replace(carry_here(self.around.here(self.name)), paths=act.spec.launch.carry)
         devices = merged(arrived(act.spec.launch.devices), self.around.here(self.name).device_rules())
         self.around.records.note(self.name, act.epoch, carry, devices)
         if self.component is None:

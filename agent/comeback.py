@@ -12,7 +12,7 @@ from agent import births
 from agent.clock import Laps
 from agent.component import Component
 from agent.guard_messages import Task
-from agent.rules import started_here
+from agent.rules import carry_here, started_here
 from agent.surroundings import Surroundings, program_of
 from checkpoint import format, needs
 from checkpoint.contents import DIGEST_SIZE, path_in
@@ -20,7 +20,6 @@ from checkpoint.device_rules import arrived, merged
 from checkpoint.engine import AUTO, COOPERATIVE
 from checkpoint.errors import RestoreError
 from checkpoint.model import Snapshot
-from failover.client.quantities import size_bytes
 from failover.core import acts
 from failover.core.types import ComponentSpec
 
@@ -47,7 +46,7 @@ async def brought_back(
         CheckpointError, AgentError: as `births.restore` and `births.begin_again`; nothing of it is left.
     """
     name, places, spec = act.component, around.places, act.spec
-    carry_limit = size_bytes(around.here(name).carry_limit)
+    carry = carry_here(around.here(name))
     newest = await asyncio.to_thread(format.read_outline, chain[-1])
     if newest.engine != COOPERATIVE:
         if waiting is not None:
@@ -63,7 +62,7 @@ async def brought_back(
             laps=laps,
             task=task,
             epoch=act.epoch,
-            carry_limit=carry_limit,
+            carry=carry,
             devices=merged(arrived(spec.launch.devices if spec is not None else ()), around.here(name).device_rules()),
         )
     if spec is None:
@@ -79,7 +78,7 @@ async def brought_back(
         epoch=act.epoch,
         why=act.why,
         waiting=waiting,
-        carry_limit=carry_limit,
+        carry=carry,
     )
 
 

@@ -95,6 +95,7 @@ class ComponentConfig:
         bring_data: files that it has open for reading only are brought to its standby, as its program is, when it runs here.
         carry: files and folders that travel with it when it is started here, besides those that `failover run` names.
         carry_limit: what they may hold while it runs here.
+        carry_at: where they are laid down here, by their path on the other robots; the same path for those not named.
     """
 
     on_loss: Literal["takeover", "hold"] = "takeover"
@@ -113,6 +114,7 @@ class ComponentConfig:
     bring_data: bool = False
     carry: tuple[str, ...] = field(default_factory=tuple)
     carry_limit: str = "256MB"
+    carry_at: dict[str, str] = field(default_factory=dict)
 
     def device_rules(self) -> tuple[DeviceRule, ...]:
         """This robot's own rules for its devices.
@@ -322,9 +324,11 @@ def _check_devices(where: str, component: ComponentConfig) -> None:
 
 def _check_carry(where: str, component: ComponentConfig) -> None:
     """A path that names nothing in full would carry something else on another robot."""
-    for path in component.carry:
+    for path in (*component.carry, *component.carry_at, *component.carry_at.values()):
         if not is_carriable(path):
-            raise ConfigError(f"{where}: carry holds {path!r}; name each file or folder by its whole path, without . and ..")
+            raise ConfigError(
+                f"{where}: carry or carry_at holds {path!r}; name each file or folder by its whole path, without . and .."
+            )
     try:
         size_bytes(component.carry_limit)
     except ValueError as error:

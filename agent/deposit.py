@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Collection
 
+from agent.config import ComponentConfig
 from agent.places import Places, complete_logs, log_directory
 from agent.shipping import Refusal
 from agent.streams import OutputLogs
@@ -34,13 +35,16 @@ class Deposit:
         kept: Callable[[str, Snapshot, int], None],
         *,
         runs: bool = True,
+        here: Callable[[str], ComponentConfig] = lambda _: ComponentConfig(),
     ) -> None:
         """
         Args:
             kept: called with (component, the snapshot without its pages, its size) for the status.
             runs: this member runs components: what it keeps it may have to lay down.
+            here: what this robot's operator wants for a component.
         """
         self._runs = runs
+        self._here = here
         self._store = store
         self._places = places
         self._tell = tell
@@ -133,12 +137,16 @@ class Deposit:
         finally:
             close_all(tuple(descriptors))
 
+    def _lack_of_room(self, component: str, descriptor: int) -> str:
+        """Why the files that a snapshot carries will not fit here; "" if they will."""
+        return carried.lack_of_room_for(format.read_outline(descriptor), self._here(component).carry_at)
+
     def _put(self, offer: Offer, descriptor: int) -> Snapshot:
         header = format.read_header(descriptor)
         told = (offer.component, offer.position, offer.parent, offer.epoch)
         if (header.component, header.position, header.parent, header.epoch) != told:
             raise FormatError(f"a snapshot of {offer.component} is not the one that was offered: it names {header.component}")
-        if self._runs and offer.spec.launch.carry and (lack := carried.lack_of_room_for(format.read_outline(descriptor))):
+        if self._runs and offer.spec.launch.carry and (lack := self._lack_of_room(offer.component, descriptor)):
             raise StoreError(f"a checkpoint of {offer.component} is of no use here: {lack}")
         snapshot = self._store.put(descriptor)
         logs = OutputLogs(log_directory(offer.component, self._places))

@@ -99,7 +99,7 @@ class Lanes(Switchboard):
         store = self._store = await self._open_store()
         records = Records(self._runtime / "running")
         hooks, here = Hooks(self._starter), self.settings.component
-        self._deposit = Deposit(store, self.places, self.tell, self._stored, runs=self.settings.me.role == "robot")
+        self._deposit = Deposit(store, self.places, self.tell, self._stored, runs=self.settings.me.role == "robot", here=here)
         settled = self._deposit.settled
         self._around = Surroundings(self.places, store, records, self.tell, self._silence_ns, settled, here, hooks)
         self._sources = Sources(store, self._from_program)

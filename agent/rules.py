@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from agent.config import ComponentConfig, Config, Settings
 from checkpoint import portable
+from checkpoint.engine import Carry
 from checkpoint.history import Retention
 from failover.client.quantities import size_bytes, span_ms
 from failover.core import types
@@ -70,6 +71,11 @@ def level_of(wanted: str, config: Config, component: ComponentConfig) -> str:
     if isinstance(said, bool):
         return portable.DEFAULT if said else ""
     return said if said in portable.LEVELS else ""
+
+
+def carry_here(component: ComponentConfig) -> Carry:
+    """How carried files are kept on this robot, whatever their paths."""
+    return Carry(size_max=size_bytes(component.carry_limit), places=tuple(component.carry_at.items()))
 
 
 def started_here(launch: Launch, component: ComponentConfig) -> Launch:

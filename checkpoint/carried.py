@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -136,6 +136,38 @@ def without(state: Snapshot) -> Snapshot:
     )
 
 
+def relocated(state: Snapshot, places: Mapping[str, str]) -> Snapshot:
+    """The same base with carried paths that lie elsewhere here: for what is open or mapped, and the working directory, too.
+
+    Args:
+        places: by the path that the snapshot tells of, the path here. Others stay where they are.
+    """
+    moved = {path: places[path] for path in paths_of(state) if path in places}
+    if not moved:
+        return state
+
+    def here(path: str) -> str:
+        found = next((old for old in moved if path == old or path.startswith(old + "/")), None)
+        return path if found is None else moved[found] + path[len(found) :]
+
+    return replace(
+        state,
+        process=replace(state.process, working_directory=here(state.process.working_directory)),
+        vmas=tuple(
+            replace(vma, name=here(vma.name), file=replace(vma.file, path=here(vma.file.path))) if vma.file is not None else vma
+            for vma in state.vmas
+        ),
+        resources=tuple(_resource_at(held, here) for held in state.resources),
+    )
+
+
+def _resource_at(held: Resource, here: Callable[[str], str]) -> Resource:
+    if held.kind == KIND:
+        return replace(held, name=here(held.name))
+    path = held.facts.get("path")
+    return replace(held, facts={**held.facts, "path": here(path)}) if isinstance(path, str) else held
+
+
 def size_of(state: Snapshot) -> int:
     """Bytes of carried files that hold something, of a base."""
     return sum(run.size for run in state.runs if run.start >= FIRST_ADDRESS)
@@ -172,9 +204,13 @@ def lack_of_room(path: str, size: int) -> str:
     return f"its carried files need {size >> 10} KiB and {path} has {free >> 10} KiB free: make room there"
 
 
-def lack_of_room_for(state: Snapshot) -> str:
-    """Why the carried files of a snapshot, of which the pages are not needed, will not fit here; "" if they will."""
-    sizes = [(held.name, held.facts.get("size")) for held in state.resources if held.kind == KIND]
+def lack_of_room_for(state: Snapshot, places: Mapping[str, str]) -> str:
+    """Why the carried files of a snapshot, of which the pages are not needed, will not fit here; "" if they will.
+
+    Args:
+        places: as for `relocated`.
+    """
+    sizes = [(places.get(held.name, held.name), held.facts.get("size")) for held in state.resources if held.kind == KIND]
     lacks = (lack_of_room(path, size) for path, size in sizes if isinstance(size, int) and path.startswith("/"))
     return next((lack for lack in lacks if lack), "")
 

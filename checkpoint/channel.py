@@ -279,10 +279,12 @@ class Fill(msgspec.Struct, frozen=True, tag=True):
 
     Attributes:
         own_eyes: see `checkpoint.engine.RestoreOptions`.
+        places: see `checkpoint.engine.Carry`.
     """
 
     component: str
     own_eyes: bool = False
+    places: tuple[tuple[str, str], ...] = ()
 
 
 class Resume(msgspec.Struct, frozen=True, tag=True):

@@ -101,10 +101,12 @@ class Carry:
     Attributes:
         paths: of files, and of folders with all that is in them; absolute.
         size_max: bytes that they may hold together.
+        places: (path in a snapshot, path on this robot) of those that are laid down elsewhere here.
     """
 
     paths: tuple[str, ...] = ()
     size_max: int = CARRIED_SIZE_MAX
+    places: tuple[tuple[str, str], ...] = ()
 
 
 NOTHING_CARRIED: Final = Carry()

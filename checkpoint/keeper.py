@@ -18,7 +18,7 @@ from typing import Final
 
 import msgspec
 
-from checkpoint import chain, channel, engine, format
+from checkpoint import carried, chain, channel, engine, format
 from checkpoint.channel import Channel, ChannelClosedError, ChannelError, Failed, Reply, Request
 from checkpoint.engine import CaptureOrder, Engine, Restored, RestoreOptions, Session, Streams
 from checkpoint.errors import CaptureError, CheckpointError, RestoreError
@@ -137,7 +137,7 @@ class Keeper:
         try:
             if self._session is not None or self._restored is not None:
                 raise RestoreError(f"cannot restore into pid {request.pid}: this keeper follows a process already")
-            state = folded(files)
+            state = carried.relocated(folded(files), dict(request.carry.places))
         finally:
             channel.close_all(files)
         options = RestoreOptions(
@@ -155,7 +155,7 @@ class Keeper:
 
     def _fill(self, request: channel.Fill, descriptors: Descriptors) -> Answer:
         try:
-            state = folded(descriptors)
+            state = carried.relocated(folded(descriptors), dict(request.places))
         finally:
             channel.close_all(descriptors)
         from checkpoint.engines.cooperative import fill_segment

@@ -407,3 +407,21 @@ def test_files_are_of_the_same_instant_as_the_memory_to_a_single_write(tmp_path:
         program = restored([base, delta], tmp_path)
     with ended(program):
         program.wait_for_output((tmp_path / "out").stat().st_size)
+
+
+def test_files_are_laid_down_at_another_path_where_the_robot_wants_them(tmp_path: Path) -> None:
+    """What is open, and the working directory, follow; the old path is not touched."""
+    there, here = tmp_path / "kept", tmp_path / "elsewhere" / "here"
+    there.mkdir()
+    code = RESTLESS.replace("import os\n", "import os\nos.chdir('kept')\n").replace("kept/", "")
+    program = start([sys.executable, "-c", code], tmp_path)
+    with ended(program), carrying(program, there) as session:
+        program.wait_for_output((tmp_path / "out").stat().st_size)
+        state = once_more(session, 1)
+    left = (there / "a").read_bytes()
+    program = restored(carried.relocated(state, {str(there): str(here)}), tmp_path)
+    with ended(program):
+        program.wait_for_output((tmp_path / "out").stat().st_size)
+        assert os.readlink(f"/proc/{program.pid}/cwd") == str(here)
+        assert (here / "a").read_bytes() > bytes(8)
+        assert (there / "a").read_bytes() == left
