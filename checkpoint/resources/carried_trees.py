@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import functools
 import os
 import stat
 import time
@@ -31,13 +30,22 @@ from checkpoint.capability import Area, by_rule, refused
 from checkpoint.carried import Entry, Tree
 from checkpoint.engine import CARRIED_SIZE_MAX, Carry, is_carriable
 from checkpoint.errors import CaptureError
-from checkpoint.gathering import Copy
 from checkpoint.linux import abi, digests, procfs
 from checkpoint.linux.eyes import Eyes, seeing_as
 from checkpoint.linux.mounts import network_mount
 from checkpoint.linux.tracking import NONE
 from checkpoint.model import PageRun, Position, Resource, Vma
 from checkpoint.pages import PageMap, Words
+from checkpoint.resources.carried_contents import (
+    Content,
+    Key,
+    attributes_of,
+    digests_of,
+    held_size_of,
+    pages_of,
+    places_of,
+    version_of,
+)
 
 FROZEN_SIZE_MAX: Final = 64 << 20
 """Bytes that are read while the program stands still: 15 to 30 ms. Beyond, the capture is refused."""
@@ -76,46 +84,6 @@ CAPABILITIES: Final = (
 )
 
 KINDS_LEFT_OUT: Final = {stat.S_IFSOCK: "socket", stat.S_IFCHR: "device", stat.S_IFBLK: "device"}
-
-Key = tuple[int, int]
-"""Device and inode."""
-Version = tuple[int, int, int, int, int]
-"""Device, inode, size, time of modification, time of change: of one content of a file."""
-
-
-@dataclass(frozen=True, eq=False)
-class Content:
-    """What one file held when it was read.
-
-    Attributes:
-        place: number of its stretch of addresses.
-        raw: its pages as they were read: addresses, and bytes in whole pages.
-        is_settled: a later write would have changed its times. Through a mapping that was there then, it would not: only the
-            first write to a clean page does (file_update_time() in the kernel's page_mkwrite).
-    """
-
-    version: Version
-    place: int
-    raw: Copy
-    is_settled: bool
-    attributes: tuple[tuple[str, bytes], ...]
-
-    @functools.cached_property
-    def filled(self) -> PageMap:
-        """Where each page that is not all zero lies: (0, its place in ``raw``). Costs a pass over all."""
-        addresses = pages.addresses_of(self.raw.pages, abi.PAGE_SIZE)
-        indexes = np.flatnonzero(~pages.zero_pages(self.raw.content, abi.PAGE_SIZE)) if len(addresses) else np.empty(0, np.intp)
-        words = np.zeros((len(indexes), 2), dtype=np.uint64)
-        words[:, 1] = indexes
-        return PageMap(addresses[indexes], words)
-
-    @functools.cached_property
-    def table(self) -> PageMap:
-        """The digest of each page that is not all zero."""
-        rows = np.frombuffer(self.raw.content, dtype=np.uint8).reshape(-1, abi.PAGE_SIZE)[self.filled.words[:, 1]]
-        return PageMap(
-            self.filled.addresses, pages.digest_pages(rows.tobytes(), self.filled.addresses, abi.PAGE_SIZE).reshape(-1, 2)
-        )
 
 
 class Name(NamedTuple):
@@ -323,7 +291,7 @@ class CarriedTrees:
         """
         now_ns = time.clock_gettime_ns(time.CLOCK_REALTIME)
         stale = {one.key: one for one in names if stat.S_ISREG(one.about.st_mode) and not self._is_known(one.about, mapped)}
-        read_size = sum(_held_size(name.about) for name in stale.values())
+        read_size = sum(held_size_of(name.about) for name in stale.values())
         if read_size > size_max:
             if read_size > self.size_max:
                 return 0  # `reasons` tells
@@ -339,7 +307,7 @@ class CarriedTrees:
 
     def _is_known(self, about: os.stat_result, mapped: frozenset[int]) -> bool:
         held = self._known.get((about.st_dev, about.st_ino))
-        return held is not None and held.is_settled and held.version == _version(about) and about.st_ino not in mapped
+        return held is not None and held.is_settled and held.version == version_of(about) and about.st_ino not in mapped
 
     def _places(self, stale: Mapping[Key, Name], names: Sequence[Name]) -> dict[Key, int]:
         """A place for each file: that which it had, also under another name; else that of its name; else a free one."""
@@ -365,8 +333,8 @@ class CarriedTrees:
             if not stat.S_ISREG(about.st_mode) or (about.st_dev, about.st_ino) != name.key:
                 raise FileNotFoundError(errno.ENOENT, "it was replaced", self._place(name))
             is_settled = now_ns - about.st_ctime_ns > GRAIN_NS
-            raw = _pages_of(file, about, carried.start_of(place))
-            return Content(_version(about), place, raw, is_settled, _attributes(file))
+            raw = pages_of(file, about, carried.start_of(place))
+            return Content(version_of(about), place, raw, is_settled, attributes_of(file))
         finally:
             os.close(file)
 
@@ -381,7 +349,7 @@ class CarriedTrees:
                 reasons.append(reason)
         if len(seen.names) > ENTRIES_MAX:
             reasons.append(f"more than {ENTRIES_MAX} names lie below {', '.join(self.paths)}: carry a folder with fewer")
-        held_size = sum({name.key: _held_size(name.about) for name in seen.names}.values())
+        held_size = sum({name.key: held_size_of(name.about) for name in seen.names}.values())
         if held_size > self.size_max:
             reasons.append(
                 f"the files to be carried hold {held_size >> 20} MiB, the limit is {self.size_max >> 20} MiB: carry less, or "
@@ -405,12 +373,12 @@ class CarriedTrees:
         trees = self._trees(seen)
         contents = tuple(sorted(self._known.values(), key=lambda content: content.place))
         if self._now_of != contents:
-            self._now, self._now_of = _joined(contents), contents
+            self._now, self._now_of = digests_of(contents), contents
         if parent is None:
             written, cleared = pages.extents_of_addresses(self._now.addresses, abi.PAGE_SIZE), NONE
         else:
             written, cleared = self._changes(self._at.get(parent, PageMap.empty()))
-        sources = PageMap(self._now.addresses, _indexed(contents)).without(written, NONE)[0]
+        sources = PageMap(self._now.addresses, places_of(contents)).without(written, NONE)[0]
         content = gathering.gathered([one.raw.content for one in contents], sources, abi.PAGE_SIZE)
         resources = tuple(tree.resource() for tree in trees)
         mappings = carried.mappings_of(trees, abi.PAGE_SIZE)
@@ -470,79 +438,7 @@ def followed(pid: int, carry: Carry) -> CarriedTrees | None:
     return CarriedTrees(pid, carry.paths, Eyes(status.uids[3], status.gids[3], status.groups), carry.size_max)
 
 
-def _version(about: os.stat_result) -> Version:
-    return about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns
-
-
-def _held_size(about: os.stat_result) -> int:
-    """Bytes that a file holds: a sparse one may look larger."""
-    return min(about.st_size, about.st_blocks * 512) if stat.S_ISREG(about.st_mode) else 0
-
-
 def mapped_shared(pid: int) -> frozenset[int]:
     """Inodes of the files that a process has mapped to be shared."""
     lines = procfs.parse_maps(procfs.read_text(pid, "maps"))
     return frozenset(line.inode for line in lines if line.shared)
-
-
-def _pages_of(file: int, about: os.stat_result, start: int) -> Copy:
-    """What a file holds, in whole pages, at its addresses; holes are left out of a sparse one."""
-    page = abi.PAGE_SIZE
-    end = -(-about.st_size // page) * page
-    is_sparse = about.st_blocks * 512 < about.st_size
-    extents = [(first, min(last, end)) for first, last in digests.filled_extents(file)] if is_sparse else [(0, end)]
-    extents = [(first, last) for first, last in _merged(extents) if first < last]
-    buffer = np.empty(sum(last - first for first, last in extents), dtype=np.uint8).data
-    filled = 0
-    for first, last in extents:
-        target = buffer[filled : filled + last - first]
-        got = _read_into(file, target, first)
-        target[got:] = bytes(len(target) - got)
-        filled += len(target)
-    return Copy(np.array([(start + first, start + last) for first, last in extents], dtype=np.uint64).reshape(-1, 2), buffer)
-
-
-def _read_into(file: int, target: memoryview, offset: int) -> int:
-    """Fill a buffer as far as the file goes; bytes read."""
-    got = 0
-    while got < len(target) and (count := os.preadv(file, [target[got:]], offset + got)):
-        got += count
-    return got
-
-
-def _merged(extents: Iterable[tuple[int, int]]) -> Iterator[tuple[int, int]]:
-    """Extents rounded to pages may touch or share one."""
-    begun: tuple[int, int] | None = None
-    for first, last in extents:
-        if begun is not None and first <= begun[1]:
-            begun = begun[0], max(last, begun[1])
-            continue
-        if begun is not None:
-            yield begun
-        begun = first, last
-    if begun is not None:
-        yield begun
-
-
-def _attributes(file: int) -> tuple[tuple[str, bytes], ...]:
-    """Extended attributes that belong to the file: its user's own, and access lists. Source: xattr(7)."""
-    try:
-        names = os.listxattr(file)
-    except OSError:  # a file system without
-        return ()
-    kept = sorted(name for name in names if name.startswith(("user.", "system.posix_acl_")))
-    return tuple((name, os.getxattr(file, name)) for name in kept)
-
-
-def _joined(contents: Sequence[Content]) -> PageMap:
-    """The digests of all files' pages."""
-    if not contents:
-        return PageMap.empty()
-    tables = [content.table for content in contents]
-    return PageMap(np.concatenate([one.addresses for one in tables]), np.concatenate([one.words for one in tables]))
-
-
-def _indexed(contents: Sequence[Content]) -> Words:
-    """Where each page of all files lies: (index of the file, index of the page in what was read)."""
-    words = [content.filled.words + np.array((index, 0), dtype=np.uint64) for index, content in enumerate(contents)]
-    return np.concatenate(words) if words else np.empty((0, 2), dtype=np.uint64)
