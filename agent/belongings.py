@@ -10,6 +10,7 @@ import asyncio
 import logging
 import os
 import stat
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -29,6 +30,9 @@ NAMED: Final = 3
 """Files that a sentence names; of more it says how many."""
 
 DIGESTS_KEPT: Final = 4096
+
+ASKING_S: Final = 60.0
+"""What was named within this time counts as one asking: all parts of one come in seconds."""
 
 MB: Final = 10**6
 
@@ -64,6 +68,7 @@ class Stock:
         self._robot = robot
         self._admits_component = admits
         self._awaited: dict[str, dict[bytes, int]] = {}
+        self._named: dict[tuple[str, str], dict[bytes, tuple[Belonging, float]]] = {}
 
     async def compare(self, peer: str, asked: Belongings) -> Lacking:
         """Answer what of a program's files is lacking here; from then on it may be offered by that peer."""
@@ -75,7 +80,7 @@ class Stock:
             )
         elsewhere = await asyncio.to_thread(self._not_in_place, asked.files)
         lacking = [file for file in elsewhere if not self._is_kept(file)]
-        if reason := self._hindrance(elsewhere, lacking):
+        if reason := self._hindrance(self._all_named(peer, asked.component, elsewhere), lacking):
             return Lacking(asked.number, (), reason)
         awaited = {file.digest: file.size for file in lacking}
         self._awaited.setdefault(peer, {}).update(awaited)
@@ -84,8 +89,16 @@ class Stock:
     def _not_in_place(self, files: Iterable[Belonging]) -> list[Belonging]:
         return [file for file in files if not (self._limits.runs and is_in_place(file))]
 
+    def _all_named(self, peer: str, component: str, files: Iterable[Belonging]) -> list[Belonging]:
+        """These, and what was named in the same asking: it may come in several messages."""
+        now_s = time.monotonic()
+        known = self._named.setdefault((peer, component), {})
+        known |= {file.digest: (file, now_s) for file in files}
+        self._named[peer, component] = {key: one for key, one in known.items() if now_s - one[1] < ASKING_S}
+        return [file for file, _ in self._named[peer, component].values()]
+
     def _is_kept(self, file: Belonging) -> bool:
-        return bool(file.digest) and self._store.contents.has(file.digest, file.size)
+        return bool(file.digest) and self._store.contents.hold(file.digest, file.size)
 
     def _hindrance(self, elsewhere: list[Belonging], lacking: list[Belonging]) -> str:
         """Why what is lacking cannot be brought; "" if it can."""
@@ -105,6 +118,7 @@ class Stock:
     def lost(self, peer: str) -> None:
         """The lane to a peer is gone; it will ask again."""
         self._awaited.pop(peer, None)
+        self._named = {key: named for key, named in self._named.items() if key[0] != peer}
 
     # As a desk (`agent.shipping.Desk`)
 

@@ -7,6 +7,7 @@ One content is kept once, however many programs, paths and snapshots name it; wh
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
 import time
@@ -59,6 +60,14 @@ class Contents:
         except OSError:
             return False
         return stat.S_ISREG(about.st_mode) and about.st_size == size
+
+    def hold(self, digest: bytes, size: int) -> bool:
+        """Whether it is kept, and stays for `GRACE_S` whoever names it: a snapshot that relies on it is on its way."""
+        if not self.has(digest, size):
+            return False
+        with contextlib.suppress(OSError):  # removed in this instant
+            os.utime(self.path(digest))
+        return self.has(digest, size)
 
     def put(self, source: int, digest: bytes, *, own: bool = False) -> None:
         """Keep the content of a file; when this returns it survives a power cut.

@@ -51,7 +51,8 @@ def describe(pid: int, component: str, arguments: Sequence[str], directory: str)
             files: list[Fact] = [fact for path in paths if (fact := _fact(pid, path)) is not None]
     except (OSError, ProbeError, ProcessGoneError):
         return None  # it has ended, or may not be looked at: it is captured all the same
-    return Resource(KIND, component, {"files": files})
+    is_told = bool(files) and isinstance(files[0], list) and files[0][0] == entry
+    return Resource(KIND, component, {"files": files}) if is_told else None
 
 
 def open_file(pid: int, path: str) -> int:
@@ -142,8 +143,12 @@ def _mapped_below(pid: int, folder: str) -> Iterator[str]:
 def _fact(pid: int, path: str) -> Fact | None:
     seen = _seen(pid, path)
     try:
-        about = os.stat(seen)
+        descriptor = os.open(seen, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
+        about = os.fstat(descriptor)  # of what may be opened: a digest may be remembered from other eyes
+        os.close(descriptor)
     except OSError:
-        return None  # deleted since
+        return None  # deleted since, or closed to the program
+    if not stat.S_ISREG(about.st_mode):
+        return None
     digest = digest_at(seen, (about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns))
-    return [path, about.st_size, digest, 0o755 if about.st_mode & 0o100 else 0o644]
+    return [path, about.st_size, digest, 0o755 if about.st_mode & 0o100 else 0o644] if digest else None

@@ -175,6 +175,35 @@ def test_what_is_over_the_limit_is_refused_by_name_before_a_byte_travels(store: 
     run(body())
 
 
+def test_the_limit_holds_for_a_component_however_many_messages_name_its_files(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bringing, "BELONGINGS_MAX", 1)
+
+    async def body() -> None:
+        two = Two(store, tmp_path, Limits(size_max=1_500_000))
+        files = two.file(LARGE), two.file(LARGE[::-1], ELSEWHERE + "2")
+        with pytest.raises(LaneError, match="over bring_size"):
+            await two.bring(*files)
+        await two.bring(files[0], component="/lab/other")
+
+    run(body())
+
+
+def test_what_was_answered_for_stays_until_the_snapshot_that_relies_on_it_is_here(store: Store, tmp_path: Path) -> None:
+    async def body() -> None:
+        two = Two(store, tmp_path)
+        need = two.file(LARGE)
+        await two.bring(need)
+        os.utime(store.contents.path(need.digest), (1, 1))
+        await two.bring(need, component="/lab/other")
+        assert store.collect_contents() == 0
+        os.utime(store.contents.path(need.digest), (1, 1))
+        assert store.collect_contents() == len(LARGE)
+
+    run(body())
+
+
 def test_a_robot_that_takes_no_files_says_which_it_lacks(store: Store, tmp_path: Path) -> None:
     async def body() -> None:
         two = Two(store, tmp_path, Limits(bring=False))
