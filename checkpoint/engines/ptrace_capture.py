@@ -31,7 +31,7 @@ from checkpoint.arch import x86_64_xstate
 from checkpoint.chain import position_of
 from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import NOTHING_CARRIED, PTRACE, CaptureOrder, Carry, Streams
-from checkpoint.engines import description, entering
+from checkpoint.engines import description, entering, waits
 from checkpoint.engines import probe as probing
 from checkpoint.engines.capture_memory import MemoryCapture, RunningCopy, Taken
 from checkpoint.engines.capture_process import process_state, thread_states
@@ -139,7 +139,7 @@ class PtraceSession:
             reasons = (*report.reasons, *(trees.refuse() if trees else ()))
             if reasons:
                 raise UnsupportedError(f"cannot protect pid {pid} ({report.command}): {'; '.join(reasons)}", reasons)
-            interruptions = Interruptions()
+            interruptions = Interruptions(makes_again=waits.makes_calls_again(pid))
             threads = Threads(Tracee(pid), interruptions.mend)
             entered = entering.enter(threads, interruptions)
             try:

@@ -35,8 +35,8 @@ class Interruption:
         waiting: of those calls that do not go on by themselves.
     """
 
-    def __init__(self, memory: Memory) -> None:
-        self.waiting = Waiting(memory)
+    def __init__(self, memory: Memory, *, makes_again: bool = False) -> None:
+        self.waiting = Waiting(memory, makes_again=makes_again)
         self._memory = memory
         self._place: Place = ()
         self._number = -1
@@ -80,13 +80,18 @@ class Interruption:
 class Interruptions:
     """Those of all threads of one process."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, makes_again: bool = False) -> None:
+        """
+        Args:
+            makes_again: the program makes calls that EINTR has ended again itself (`waits.makes_calls_again`).
+        """
+        self._makes_again = makes_again
         self._by_tid: dict[int, Interruption] = {}
 
     def of(self, tracee: Tracee) -> Interruption:
         """Of one thread."""
         if tracee.pid not in self._by_tid:
-            self._by_tid[tracee.pid] = Interruption(tracee.memory)
+            self._by_tid[tracee.pid] = Interruption(tracee.memory, makes_again=self._makes_again)
         return self._by_tid[tracee.pid]
 
     def keep_only(self, tids: Container[int]) -> None:

@@ -14,6 +14,9 @@ very call that was made again, without having come back between. No call times o
 do so late, by less than its timeout and by less than the time between three captures. A signal handler that runs ends it with
 EINTR, as ever. If we die, a system call is left that times out by itself.
 
+Programs that make such a call again themselves, with what is left of its time, do that more exactly than we can: of theirs only
+those without a timeout are made again here (`makes_calls_again`).
+
 Where there is no room for a mark a call is known by the registers that the program cannot have lost, and nothing proves that it
 has not come back and been made once more: when its time is over it ends with EINTR, once.
 
@@ -27,6 +30,7 @@ import ctypes
 import errno
 import functools
 import os
+import re
 import secrets
 import socket
 import struct
@@ -36,6 +40,7 @@ from typing import Final
 
 from checkpoint.arch import x86_64 as arch
 from checkpoint.errors import CaptureError
+from checkpoint.linux import procfs
 from checkpoint.linux.descriptors import copy_of
 from checkpoint.linux.memory import Memory
 
@@ -43,6 +48,15 @@ NS_PER_S: Final = 1_000_000_000
 NS_PER_MS: Final = 1_000_000
 NS_PER_US: Final = 1_000
 _CHANGED_BY_A_CALL: Final = frozenset((arch.RESULT, arch.CALL_NUMBER, *arch.LOST_IN_A_CALL))
+
+
+_MAKES_CALLS_AGAIN: Final = re.compile(r"(python|pypy)[0-9.]*[dt]?|node(js)?")
+"""Names of interpreters in which every call that EINTR has ended is made again: PEP 475 (CPython 3.5), libuv's uv__io_poll."""
+
+
+def makes_calls_again(pid: int) -> bool:
+    """Whether a process runs one of those interpreters: EINTR does not harm it, and its timeouts stay exact."""
+    return bool(_MAKES_CALLS_AGAIN.fullmatch(os.path.basename(procfs.read_link(pid, "exe"))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +89,13 @@ def has_room_for_marks() -> bool:
 class Waiting:
     """Follows one thread from stop to stop."""
 
-    def __init__(self, memory: Memory) -> None:
+    def __init__(self, memory: Memory, *, makes_again: bool = False) -> None:
+        """
+        Args:
+            makes_again: the program itself does so, see `makes_calls_again`.
+        """
         self._memory = memory
+        self._makes_again = makes_again
         self._wait: Wait | None = None
 
     def undisturbed(self, registers: arch.Registers) -> arch.Registers:
@@ -93,6 +112,8 @@ class Waiting:
             return registers
         if asked_ns < 0:
             return made_again(registers, 0)
+        if self._makes_again:
+            return registers
         decided, self._wait = decide(registers, before, asked_ns, timeout.at_end, time.monotonic_ns())
         return decided
 

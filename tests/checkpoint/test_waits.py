@@ -6,6 +6,7 @@ import contextlib
 import errno
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,6 +26,7 @@ from tests.checkpoint.round_trip import (
     expect_ok,
     protected,
     restored,
+    start,
     start_tracee,
 )
 
@@ -220,3 +222,24 @@ def test_without_marks_a_call_that_may_be_another_one_never_times_out_by_us(monk
     assert decided(stopped(), kept, wait.deadline_ns) == (stopped(), None)  # EINTR, once
     _, fresh = decided(stopped(), kept, BEGAN_NS + ASKED_NS // 2 + ASKED_NS)  # the kernel would have ended it by now
     assert fresh is not None and fresh.deadline_ns > wait.deadline_ns
+
+
+EINTR_SEEN_BY_C = """
+import ctypes, os, sys
+libc = ctypes.CDLL(None, use_errno=True)
+epoll, events = libc.epoll_create1(0), ctypes.create_string_buffer(64)
+print("waits", flush=True)
+while True:
+    came = libc.epoll_wait(epoll, events, 1, 60_000)
+    print(came, ctypes.get_errno(), flush=True)
+"""
+
+
+def test_python_makes_its_calls_again_itself_with_what_is_left_of_their_time(tmp_path: Path) -> None:
+    """What the kernel said is seen below Python: it is not hidden from an interpreter that knows what to do about it."""
+    program = start((sys.executable, "-c", EINTR_SEEN_BY_C), tmp_path)
+    with ended(program):
+        program.wait_for_line("waits")
+        with protected(program) as session:
+            session.capture(CaptureOrder())
+            program.wait_for_line(f"-1 {errno.EINTR}")
