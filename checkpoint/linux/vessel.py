@@ -24,6 +24,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import itertools
 import json
 import os
 import signal
@@ -252,6 +253,8 @@ def _end_after(act: Callable[..., object], lines: _Lines, *arguments: object) ->
 
 def _become_first_process(lines: _Lines, watch_read: int, ready_write: int, own_terminals: bool) -> None:
     """PID 1 of the namespace: mount /proc and terminals, learn whom to watch, then run nothing but a poll on its pidfd."""
+    null = os.open("/dev/null", os.O_RDWR)
+    _keep_only((lines.descriptor, watch_read, ready_write), null)  # before the checks look who holds the program's files
     notes = []
     try:
         namespaces.mount_proc()
@@ -264,17 +267,23 @@ def _become_first_process(lines: _Lines, watch_read: int, ready_write: int, own_
     watched = os.read(watch_read, 32)
     if not watched:
         return
-    pidfd = os.pidfd_open(int(watched))
+    pidfd = fcntl.fcntl(os.pidfd_open(int(watched)), fcntl.F_DUPFD_CLOEXEC, _WATCHED + 1)
     os.chdir("/")
     os.close(lines.descriptor)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # orphans that come to us are reaped by the kernel
-    null = os.open("/dev/null", os.O_RDWR)
-    code = _executable(stub.WATCH)
-    for target, source in enumerate((null, null, null, pidfd)):
-        os.dup2(source, target)
-    code = fcntl.fcntl(code, fcntl.F_DUPFD_CLOEXEC, _WATCHED + 1)
+    code = fcntl.fcntl(_executable(stub.WATCH), fcntl.F_DUPFD_CLOEXEC, _WATCHED + 1)
+    os.dup2(pidfd, _WATCHED)
     namespaces.close_others_on_exec(_WATCHED + 1)
     os.execve(code, ["failover-init"], {})
+
+
+def _keep_only(kept: tuple[int, ...], null: int) -> None:
+    """Close what came from the caller, whose files may be the program's; the three streams become ``null``."""
+    for stream in range(3):
+        os.dup2(null, stream)
+    edges = (2, *sorted(kept), os.sysconf("SC_OPEN_MAX"))
+    for low, high in itertools.pairwise(edges):
+        os.closerange(low + 1, high)
 
 
 def _grow_up(

@@ -147,3 +147,29 @@ def born_by_another_process(birth: Birth) -> Born:
     os.kill(parent, signal.SIGKILL)
     os.waitpid(parent, 0)
     return Born(pid, inner_pid, init_pid)
+
+
+def is_open(number: int) -> bool:
+    """Whether a descriptor of this process is in use."""
+    try:
+        os.fstat(number)
+    except OSError:
+        return False
+    return True
+
+
+def test_the_first_process_keeps_nothing_of_who_restores(tmp_path: Path) -> None:
+    """A restore looks who holds the program's files for writing: the first process, still a copy of who restores, does not."""
+    read_end, write_end = os.pipe()
+    child = os.fork()
+    if child == 0:
+        with contextlib.suppress(OSError):
+            os.open(tmp_path / "out", os.O_WRONLY | os.O_CREAT)
+            vessel._keep_only((write_end,), os.open("/dev/null", os.O_RDWR))
+            os.write(write_end, " ".join(str(number) for number in range(256) if is_open(number)).encode())
+        os._exit(0)
+    os.close(write_end)
+    with os.fdopen(read_end) as reader:
+        held = reader.read()
+    os.waitpid(child, 0)
+    assert held == f"0 1 2 {write_end}"
