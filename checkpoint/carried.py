@@ -193,15 +193,23 @@ FIXED_SIZE: Final = 1 << 20
 """Bytes besides the content that must be free: names and attributes."""
 
 
-def lack_of_room(path: str, size: int) -> str:
-    """Why files that hold so much will not fit at a path, beside what stands there; "" if they will, as things are."""
-    while not os.path.isdir(path):
-        path = os.path.dirname(path)
-    about = os.statvfs(path)
-    free = about.f_bavail * about.f_frsize
-    if size + FIXED_SIZE <= free:
-        return ""
-    return f"its carried files need {size >> 10} KiB and {path} has {free >> 10} KiB free: make room there"
+def lack_of_room(sizes: Iterable[tuple[str, int]]) -> str:
+    """Why files will not fit at their paths, all together and beside what stands there; "" if they will, as things are.
+
+    Args:
+        sizes: (absolute path, bytes that its files hold).
+    """
+    needed: dict[int, int] = {}
+    for path, size in sizes:
+        place = path
+        while not os.path.isdir(place):
+            place = os.path.dirname(place)
+        device, about = os.stat(place).st_dev, os.statvfs(place)
+        needed[device] = needed.get(device, 0) + size
+        free = about.f_bavail * about.f_frsize
+        if needed[device] + FIXED_SIZE > free:
+            return f"its carried files need {needed[device] >> 10} KiB and {place} has {free >> 10} KiB free: make room there"
+    return ""
 
 
 def lack_of_room_for(state: Snapshot, places: Mapping[str, str]) -> str:
@@ -211,8 +219,7 @@ def lack_of_room_for(state: Snapshot, places: Mapping[str, str]) -> str:
         places: as for `relocated`.
     """
     sizes = [(places.get(held.name, held.name), held.facts.get("size")) for held in state.resources if held.kind == KIND]
-    lacks = (lack_of_room(path, size) for path, size in sizes if isinstance(size, int) and path.startswith("/"))
-    return next((lack for lack in lacks if lack), "")
+    return lack_of_room((path, size) for path, size in sizes if isinstance(size, int) and path.startswith("/"))
 
 
 def trees_of(state: Snapshot) -> tuple[Tree, ...]:

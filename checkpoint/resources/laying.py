@@ -1,12 +1,13 @@
 """Carried files (rule ``carry``) on the side that restores: laid down as they were at the checkpoint, before the program runs.
 
-1. Everything is built aside, in ``.failover-new-…`` beside the carried path, from the snapshot alone. Whatever fails until
+1. Everything of every path is built aside, in ``.failover-new-…`` beside the path, from the snapshot alone. Whatever fails until
    here has changed nothing.
-2. What stands at the path and is not as the checkpoint has it, whosever it is and however new, is kept: it moves as a whole to
+2. What stands at a path and is not as the checkpoint has it, whosever it is and however new, is kept: it moves as a whole to
    ``.failover-kept-NAME/TIME-POSITION`` beside the path, and a note says so. The newest `KEPT_COUNT` of those stay.
    A file that somebody else holds open for writing is never replaced: the restore is refused, by that process's name.
 3. What was built takes its place in the same instant (RENAME_EXCHANGE of renameat2(2)), also for a whole folder. Where that
    cannot be, because the folder is a mount point or its parent is not writable, each name in it is moved by itself.
+   When one move fails, all of them, of every path, are taken back (`resources.moves`).
 
 Nothing is forced to the disk: should the power go, the checkpoint is still in the store and is laid down again.
 """
@@ -14,14 +15,12 @@ Nothing is forced to the disk: should the power go, the checkpoint is still in t
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import errno
 import os
 import shutil
 import stat
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -33,14 +32,12 @@ from checkpoint.linux.eyes import Eyes, own_uid, seeing_as
 from checkpoint.linux.mounts import is_mount_point
 from checkpoint.model import Snapshot
 from checkpoint.resources import writers
+from checkpoint.resources.moves import Moves
 from checkpoint.resources.remembered import Identity
 from checkpoint.validity import place as position_text
 
 KEPT_COUNT: Final = 4
 """Sets of replaced files that are kept for each carried path; the oldest goes when there are more."""
-AT_FDCWD: Final = -100
-RENAME_EXCHANGE: Final = 2
-_LIBC: Final = ctypes.CDLL(None, use_errno=True)
 
 Pieces = Mapping[int, list[tuple[int, memoryview]]]
 """By place: (offset in the file, bytes in whole pages)."""
@@ -84,23 +81,77 @@ def lay_down(state: Snapshot, eyes: Eyes | None, spared: frozenset[int]) -> Laid
         MismatchError: another process writes to what is to be replaced.
         RestoreError: there is no room, or no right; what stood there stands there still.
     """
-    trees, pieces = carried.trees_of(state), carried.pieces(state)
+    trees, pieces = _outermost(carried.trees_of(state)), carried.pieces(state)
     for tree in trees:
         _require_unwritten(state, tree, spared)
-    notes: list[str] = []
-    identities: dict[Identity, Identity] = {}
-    for tree in trees:
+    layings = [_Laying(tree, pieces, position_text(state.position)) for tree in trees]
+    with seeing_as(eyes):
         try:
-            with seeing_as(eyes):
-                laying = _Laying(tree, pieces, position_text(state.position))
-                notes += laying.run()
-                identities |= laying.identities()
-        except OSError as error:
-            raise RestoreError(
-                f"cannot lay down {tree.path}, which {state.component} carries ({error.filename or 'there'}: {error.strerror}); "
-                "see to room and rights there"
-            ) from error
-    return Laid(tuple(notes), identities)
+            return _laid(state, layings)
+        except BaseException as error:
+            if stuck := [where for laying in reversed(layings) for where in laying.take_back()]:
+                raise RestoreError(
+                    f"cannot lay down what {state.component} carries ({error}), nor undo it: {'; '.join(stuck)}"
+                ) from error
+            raise
+        finally:
+            for laying in layings:
+                laying.clear()
+
+
+def _laid(state: Snapshot, layings: Sequence[_Laying]) -> Laid:
+    """All of them: each step of every tree before the next step of any."""
+    for laying in layings:
+        with _told(state, laying.tree):
+            laying.compare()
+    wanted = [(laying.tree.path, laying.held_size) for laying in layings if not laying.stands]
+    if reason := carried.lack_of_room(wanted):
+        raise RestoreError(f"cannot lay down what {state.component} carries: {reason}")
+    for step in (_Laying.build, _Laying.swap, _Laying.settle):
+        for laying in layings:
+            with _told(state, laying.tree):
+                step(laying)
+    identities: dict[Identity, Identity] = {}
+    for laying in layings:
+        with _told(state, laying.tree):
+            identities |= laying.identities()
+    for laying in layings:
+        laying.forget_oldest()
+    return Laid(tuple(note for laying in layings for note in laying.notes), identities)
+
+
+@contextlib.contextmanager
+def _told(state: Snapshot, tree: Tree) -> Iterator[None]:
+    """Turn what the kernel says into one sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise RestoreError(
+            f"cannot lay down {tree.path}, which {state.component} carries ({error.filename or 'there'}: {error.strerror}); "
+            "see to room and rights there"
+        ) from error
+
+
+def _outermost(trees: Sequence[Tree]) -> list[Tree]:
+    """Those that no other one holds.
+
+    Raises:
+        RestoreError: two of them would have different things at one path.
+    """
+    found: list[Tree] = []
+    for tree in sorted(trees, key=lambda one: one.path):
+        above = next((one for one in found if f"{tree.path}/".startswith(f"{one.path}/")), None)
+        if above is None:
+            found.append(tree)
+        elif _names_at(above, tree.path) != {os.fsencode(_at(tree.path, entry)) for entry in tree.entries}:
+            raise RestoreError(f"cannot lay down {tree.path} in {above.path}: they are carried apart; see to carry_at")
+    return found
+
+
+def _names_at(tree: Tree, path: str) -> set[bytes]:
+    """What a tree has at a path and below it."""
+    names = {os.fsencode(_at(tree.path, entry)) for entry in tree.entries}
+    return {name for name in names if (name + b"/").startswith(os.fsencode(path) + b"/")}
 
 
 def _require_unwritten(state: Snapshot, tree: Tree, spared: frozenset[int]) -> None:
@@ -123,90 +174,147 @@ def _files_below(path: str) -> Iterator[str]:
 
 @dataclass(slots=True)
 class _Laying:
-    """One tree on its way to its path."""
+    """One tree on its way to its path: `compare`, `build`, `swap`, `settle`, `forget_oldest`; then, however it ends, `clear`.
+
+    Until `forget_oldest`, `take_back` undoes it. Each of them raises OSError when it does not work.
+
+    Attributes:
+        stands: all of it is at its path already.
+        notes: a sentence for each difference.
+    """
 
     tree: Tree
     pieces: Pieces
     position: str
+    stands: bool = False
+    notes: list[str] = field(default_factory=list)
+    _inside: bool = False
+    _aside: str = ""
+    _kept: str = ""
+    _made: list[str] = field(default_factory=list)
+    _moves: Moves = field(default_factory=Moves)
+    _is_stuck: bool = False
 
-    def run(self) -> list[str]:
-        """A note for each difference.
+    @property
+    def held_size(self) -> int:
+        """Bytes that its files hold."""
+        places = {entry.place for entry in self.tree.entries}
+        return sum(len(content) for place in places for _, content in self.pieces.get(place, []))
 
-        Raises:
-            OSError: it does not work; what stood there stands there still.
-        """
-        path, entries = self.tree.path, self.tree.entries
-        if self._is_there():
-            self._give_attributes(path)
-            return []
-        held_size = sum(len(content) for one in {entry.place for entry in entries} for _, content in self.pieces.get(one, []))
-        if reason := carried.lack_of_room(path, held_size):
-            raise RestoreError(f"cannot lay down {path}: {reason}")
-        os.makedirs(os.path.dirname(path), exist_ok=True)
-        inside = os.path.isdir(path) and is_mount_point(path)
+    def compare(self) -> None:
+        """Find out whether anything is to be done."""
+        self.stands = self._is_there()
+
+    def build(self) -> None:
+        """Make everything aside, beside the path; in it, where it is a mount point or what is beside it may not be changed."""
+        path = self.tree.path
+        if self.stands:
+            return
+        self._make_folders(os.path.dirname(path))
+        self._inside = os.path.isdir(path) and is_mount_point(path)
         try:
-            aside = self._aside(path if inside else os.path.dirname(path))
+            self._make_aside(path if self._inside else os.path.dirname(path))
         except PermissionError:
             if not os.path.isdir(path):
                 raise
-            inside, aside = True, self._aside(path)
-        try:
-            return self._replaced(os.path.join(aside, "new"), inside=inside)
-        finally:
-            shutil.rmtree(aside, ignore_errors=True)
+            self._inside = True
+            self._make_aside(path)
+        if self.tree.entries:
+            self.notes += self._build(self._new)
+
+    def swap(self) -> None:
+        """Let what was built take its place."""
+        if self.stands:
+            return
+        if self._inside:
+            self._swap_names()
+        else:
+            self._swap_whole()
+        if self._kept:
+            self.notes.append(f"{self.tree.path} was not as the checkpoint has it; what stood there is kept in {self._kept}")
+
+    def settle(self) -> None:
+        """Give what did not move itself its attributes."""
+        if self.stands:
+            self._give_attributes(self.tree.path)
+        elif self._inside and self.tree.entries:
+            _give(self.tree.path, self.tree.entries[0])
 
     def identities(self) -> dict[Identity, Identity]:
         """Device and inode of everything, then and now."""
         now = [(entry, os.lstat(_at(self.tree.path, entry))) for entry in self.tree.entries]
         return {(entry.device, entry.inode): (about.st_dev, about.st_ino) for entry, about in now}
 
-    def _aside(self, place: str) -> str:
-        return tempfile.mkdtemp(prefix=os.fsdecode(carried.OWN_PREFIX) + "new-", dir=place)
+    def forget_oldest(self) -> None:
+        """Keep no more than `KEPT_COUNT` sets of what was replaced."""
+        if self._kept:
+            above = os.path.dirname(self._kept)
+            for old in sorted(os.listdir(above))[:-KEPT_COUNT]:
+                shutil.rmtree(os.path.join(above, old), ignore_errors=True)
 
-    def _replaced(self, new: str, *, inside: bool) -> list[str]:
-        """Build it aside, then let it take its place."""
-        path, entries = self.tree.path, self.tree.entries
-        notes = self._build(new) if entries else []
-        if inside:
-            kept = self._swap_names(new)
-            if entries:
-                _give(path, entries[0])
-        else:
-            kept = self._swap_whole(new)
-        if kept:
-            notes.append(f"{path} was not as the checkpoint has it; what stood there is kept in {kept}")
-        return notes
+    def take_back(self) -> tuple[str, ...]:
+        """Let everything stand where it stood; a sentence for each thing that does not."""
+        if stuck := self._moves.take_back():
+            self._is_stuck = True
+            return stuck
+        with contextlib.suppress(OSError):  # earlier sets are in it
+            if self._kept:
+                os.rmdir(self._kept)
+                os.rmdir(os.path.dirname(self._kept))
+        self.clear()
+        with contextlib.suppress(OSError):  # somebody else has put something there
+            for folder in reversed(self._made):
+                os.rmdir(folder)
+        return ()
 
-    def _swap_whole(self, new: str) -> str:
-        """Let a file or folder take the place of another; where that is kept, "" if there was none."""
-        path, entries = self.tree.path, self.tree.entries
-        if not os.path.lexists(path):
-            if entries:
-                os.rename(new, path)
-            return ""
-        kept = self._kept(os.path.dirname(path))
-        target = os.path.join(kept, os.path.basename(path))
-        if entries and _exchange(new, path):
-            os.rename(new, target)
-        else:
-            os.rename(path, target)
-            if entries:
-                os.rename(new, path)
-        return kept
+    def clear(self) -> None:
+        """Remove what was built and is not needed; never what may hold something that stood at the path."""
+        if self._aside and not self._is_stuck:
+            shutil.rmtree(self._aside, ignore_errors=True)
 
-    def _swap_names(self, new: str) -> str:
+    @property
+    def _new(self) -> str:
+        return os.path.join(self._aside, "new")
+
+    def _make_folders(self, folder: str) -> None:
+        """What is missing above the path."""
+        missing = []
+        while not os.path.lexists(folder):
+            missing.append(folder)
+            folder = os.path.dirname(folder)
+        for one in reversed(missing):
+            os.mkdir(one)
+            self._made.append(one)
+
+    def _make_aside(self, place: str) -> None:
+        self._aside = tempfile.mkdtemp(prefix=os.fsdecode(carried.OWN_PREFIX) + "new-", dir=place)
+
+    def _swap_whole(self) -> None:
+        """Let a file or folder take the place of another."""
+        path, entries, new = self.tree.path, self.tree.entries, self._new
+        if os.path.lexists(path):
+            self._make_kept(os.path.dirname(path))
+            target = os.path.join(self._kept, os.path.basename(path))
+            if entries and self._moves.exchange(new, path):
+                self._moves.rename(new, target)
+                return
+            self._moves.rename(path, target)
+        if entries:
+            self._moves.rename(new, path)
+
+    def _swap_names(self) -> None:
         """Let each name of a folder take the place of another, for the folder itself cannot move."""
         path = self.tree.path
         standing = [name for name in os.listdir(path) if not os.fsencode(name).startswith(carried.OWN_PREFIX)]
-        kept = self._kept(path) if standing else ""
+        if standing:
+            self._make_kept(path)
         for name in standing:
-            os.rename(os.path.join(path, name), os.path.join(kept, name))
-        for name in os.listdir(new) if self.tree.entries else ():
-            os.rename(os.path.join(new, name), os.path.join(path, name))
-        return kept
+            self._moves.rename(os.path.join(path, name), os.path.join(self._kept, name))
+        for name in os.listdir(self._new) if self.tree.entries else ():
+            self._moves.rename(os.path.join(self._new, name), os.path.join(path, name))
 
-    def _kept(self, place: str) -> str:
-        """A new folder for what is replaced, and no more than `KEPT_COUNT` of them."""
+    def _make_kept(self, place: str) -> None:
+        """A new folder for what is replaced."""
         above = os.path.join(place, f"{os.fsdecode(carried.OWN_PREFIX)}kept-{os.path.basename(self.tree.path)}")
         with contextlib.suppress(FileExistsError):
             os.mkdir(above, 0o700)
@@ -214,11 +322,9 @@ class _Laying:
             above = tempfile.mkdtemp(prefix=f"{os.path.basename(above)}-", dir=place)
         now_ns = time.time_ns()
         stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime(now_ns // 1_000_000_000)) + f".{now_ns // 1_000_000 % 1000:03}Z"
-        for old in sorted(os.listdir(above))[: 1 - KEPT_COUNT]:
-            shutil.rmtree(os.path.join(above, old), ignore_errors=True)
         kept = os.path.join(above, f"{stamp}-{self.position}")
         os.mkdir(kept, 0o700)
-        return kept
+        self._kept = kept
 
     # Building
 
@@ -278,20 +384,6 @@ def _is_own(folder: str) -> bool:
     """Whether it is no link and nobody else's, who would have us remove, or could see, what is in it."""
     about = os.lstat(folder)
     return stat.S_ISDIR(about.st_mode) and about.st_uid == own_uid() and not about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-
-
-def _exchange(one: str, other: str) -> bool:
-    """Let two names change places in one instant; False where this file system or kernel cannot.
-
-    Raises:
-        OSError: it fails for another reason.
-    """
-    if _LIBC.renameat2(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE) == 0:
-        return True
-    number = ctypes.get_errno()
-    if number in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP):
-        return False
-    raise OSError(number, os.strerror(number), other)
 
 
 def _at(top: str, entry: Entry) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import shutil
 import socket
@@ -21,7 +22,7 @@ from checkpoint.engine import CaptureOrder, Carry, Session
 from checkpoint.errors import MismatchError, RestoreError, UnsupportedError
 from checkpoint.linux.eyes import Eyes
 from checkpoint.model import Snapshot
-from checkpoint.resources import carried_trees, laying
+from checkpoint.resources import carried_trees, laying, moves
 from checkpoint.resources.carried_trees import CarriedTrees
 from tests.checkpoint import round_trip
 from tests.checkpoint.round_trip import ENGINE, Program, captured_at_last, ended, restored, start, transported
@@ -362,6 +363,113 @@ def test_what_belongs_to_an_ordinary_user_is_read_and_laid_down_with_his_rights(
         laying.lay_down(state, nobody, frozenset())
     assert (folder / "secret").read_text() == "changed"
     assert os.geteuid() == 0 and folder.stat().st_uid == 0
+
+
+def contents(top: Path) -> dict[str, tuple[object, ...]]:
+    """All that can be told of a folder but times, which change when something is made beside, and taken away again."""
+    return {name: (*about[:3], about[4]) for name, about in portrait(top).items()}
+
+
+def of_two_paths(tmp_path: Path, one: Path, other: Path) -> Snapshot:
+    """A snapshot that carries two folders, which are of another content now."""
+    for folder in (one, other):
+        folder.mkdir()
+        (folder / "state").write_text("of the checkpoint")
+    with asleep(tmp_path) as program, carrying(program, one, other) as session:
+        state = once_more(session, 1)
+    for folder in (one, other):
+        (folder / "state").write_text("newer")
+        (folder / "his").mkdir()
+    return state
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root: whose rights are less is the question")
+@pytest.mark.parametrize("built", [False, True], ids=["built", "moved"])
+def test_a_path_that_cannot_be_laid_down_leaves_the_others_as_they_were(tmp_path: Path, open_path: Path, built: bool) -> None:
+    """The second one has no room beside it that may be written; or has, but may not be moved from there."""
+    top = open_path / "top"
+    top.mkdir()
+    one, other = top / "a", top / "z"
+    state = of_two_paths(tmp_path, one, other)
+    for path in (top, one, *one.iterdir()):
+        os.chown(path, round_trip.NOBODY, round_trip.NOBODY)
+    if built:
+        os.chown(other, round_trip.NOBODY, round_trip.NOBODY)
+    other.chmod(0o555)
+    if not built:
+        top.chmod(0o555)
+    before = contents(top)
+    with pytest.raises(RestoreError, match=f"cannot lay down {other}, which .* see to room and rights there"):
+        laying.lay_down(state, Eyes(round_trip.NOBODY, round_trip.NOBODY), frozenset())
+    assert contents(top) == before
+
+
+@pytest.mark.parametrize("failing", ["kept", "z"])
+def test_a_disk_that_fails_between_two_moves_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str) -> None:
+    """The move after the exchange fails, or the exchange of the second path: no disk can be made to do that when asked."""
+    top = tmp_path / "top"
+    top.mkdir()
+    state = of_two_paths(tmp_path, top / "a", top / "z")
+    before = contents(top)
+    real, failures = moves._renameat2, [OSError(errno.EIO, os.strerror(errno.EIO))]
+
+    def renameat2(old: str, new: str, flag: int) -> None:
+        if failures and (new == str(top / failing) or (failing == "kept" and ".failover-kept" in new)):
+            raise failures.pop()
+        real(old, new, flag)
+
+    monkeypatch.setattr(moves, "_renameat2", renameat2)
+    with pytest.raises(RestoreError, match="Input/output error"):
+        laying.lay_down(state, None, frozenset())
+    assert not failures
+    assert contents(top) == before
+
+
+def test_what_cannot_be_moved_back_is_not_removed_and_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    top = tmp_path / "top"
+    top.mkdir()
+    state = of_two_paths(tmp_path, top / "a", top / "z")
+    real, calls = moves._renameat2, []
+
+    def renameat2(old: str, new: str, flag: int) -> None:
+        calls.append(old)
+        if len(calls) > 1:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        real(old, new, flag)
+
+    monkeypatch.setattr(moves, "_renameat2", renameat2)
+    with pytest.raises(RestoreError, match=f"nor undo it: what stood at {top}/a is at {top}/.failover-new"):
+        laying.lay_down(state, None, frozenset())
+    assert (Path(calls[0]) / "state").read_text() == "newer"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root: whose rights are less is the question")
+def test_a_folder_that_is_emptied_name_by_name_is_whole_again_when_a_name_cannot_move(tmp_path: Path, open_path: Path) -> None:
+    """Its parent is not writable, and a folder in it is closed: that cannot move to another folder."""
+    folder = open_path / "mine"
+    folder.mkdir()
+    with asleep(tmp_path) as program, carrying(program, folder) as session:
+        (folder / "state").write_text("of the checkpoint")
+        state = once_more(session, 1)
+    for index in range(8):
+        (folder / str(index)).mkdir(mode=0o755 if index % 4 else 0o555)
+    for path in (folder, *folder.iterdir()):
+        os.chown(path, round_trip.NOBODY, round_trip.NOBODY)
+    before = contents(folder)
+    with pytest.raises(RestoreError, match="see to room and rights there"):
+        laying.lay_down(state, Eyes(round_trip.NOBODY, round_trip.NOBODY), frozenset())
+    assert contents(folder) == before
+
+
+def test_a_path_in_a_carried_folder_may_be_carried_by_itself_too(tmp_path: Path) -> None:
+    folder = tmp_path / "kept"
+    furnish(folder)
+    before = portrait(folder)
+    with asleep(tmp_path) as program, carrying(program, folder / "deep", folder, folder / "plain") as session:
+        state = once_more(session, 1)
+    (folder / "deep" / "er" / "secret").unlink()
+    laying.lay_down(state, None, frozenset())
+    assert portrait(folder) == before
 
 
 @pytest.mark.parametrize("name", [b"../out", b"/etc/passwd", b"a/../../out", b"a/b", b".", b"a//b"])
