@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+from checkpoint.engine import is_carriable
 from checkpoint.errors import RestoreError
 from checkpoint.model import Fact, PageRun, Resource, Snapshot, Vma, VmaKind
 
@@ -234,8 +235,10 @@ def trees_of(state: Snapshot) -> tuple[Tree, ...]:
 def _tree(held: Resource) -> Tree:
     listed, held_size = held.facts.get("entries"), held.facts.get("size")
     is_known = set(held.facts) == {"entries", "size"} and isinstance(held_size, int)
-    if not is_known or not isinstance(listed, list) or not held.name.startswith("/"):
+    if not is_known or not isinstance(listed, list):
         raise RestoreError(f"cannot lay down {held.name!r}: its snapshot does not tell of carried files as we know them")
+    if not is_carriable(held.name):
+        raise RestoreError(f"cannot lay down {held.name!r}: its snapshot does not name the path in full, as itself")
     tree = Tree(held.name, tuple(_entry(held.name, fact) for fact in listed), int(str(held_size)))
     if reason := _what_cannot_be(tree.entries):
         raise RestoreError(f"cannot lay down {held.name}: its snapshot {reason}")

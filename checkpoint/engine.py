@@ -114,7 +114,9 @@ NOTHING_CARRIED: Final = Carry()
 
 def is_carriable(path: str) -> bool:
     """Whether a path names a file or folder in full: absolute, normal, and not the root of everything."""
-    return path.startswith("/") and path not in ("/", "//") and os.path.normpath(path) == path and "\0" not in path
+    return (
+        path.startswith("/") and path != "/" and not path.startswith("//") and os.path.normpath(path) == path and "\0" not in path
+    )
 
 
 @dataclass(frozen=True, slots=True)

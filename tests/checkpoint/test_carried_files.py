@@ -24,7 +24,7 @@ from checkpoint.linux.eyes import Eyes
 from checkpoint.model import Snapshot
 from checkpoint.resources import carried_trees, laying, moves
 from checkpoint.resources.carried_trees import CarriedTrees
-from tests.checkpoint import round_trip
+from tests.checkpoint import round_trip, snapshots
 from tests.checkpoint.round_trip import ENGINE, Program, captured_at_last, ended, restored, start, transported
 
 COUNTER = Path(__file__).with_name("sqlite_counter.py")
@@ -483,6 +483,13 @@ def test_a_snapshot_cannot_name_a_file_outside_of_its_folder(tmp_path: Path, nam
     forged = replace(state, resources=(*carried.without(state).resources, carried.Tree(tree.path, entries).resource()))
     with pytest.raises(RestoreError, match="its snapshot"):
         laying.lay_down(forged, None, frozenset())
+
+
+@pytest.mark.parametrize("path", ["/tmp/a/../../etc/x", "/tmp/./a", "/tmp//a", "//tmp/a", "/tmp/a/", "/", "tmp/a", "/tmp/a\0b"])
+def test_a_snapshot_cannot_name_a_path_by_another_name(path: str) -> None:
+    forged = replace(snapshots.history(1)[0], resources=(carried.Tree(path, ()).resource(),))
+    with pytest.raises(RestoreError, match="does not name the path in full"):
+        carried.trees_of(forged)
 
 
 RESTLESS = """
