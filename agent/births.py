@@ -222,6 +222,12 @@ async def begin_again(
     """
     outline = await asyncio.to_thread(format.read_outline, chain[-1])
     _check_owner(name, program, owner)
+    try:
+        check_rights(name, outline.process.credentials, owner)  # its carried files are laid down with them
+    except MismatchError:
+        if waiting is not None:
+            await waiting.undo()
+        raise
     await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
     component = waiting or Component(name, await places.nursery.guard(), places)
     component.engine_wanted = COOPERATIVE  # what another engine took before it says Hello would be older than its state

@@ -24,6 +24,7 @@ from agent.places import Places, guard_sockets
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CaptureError, MismatchError, NothingCommittedError
 from checkpoint.linux import procfs
+from checkpoint.linux.inheritance import Inheritance
 from checkpoint.task_channel import TAKEN_OVER
 from tests.agent.guards import PATIENCE_S
 from tests.agent.test_component import Captures, live, output, piece_of, until
@@ -341,6 +342,21 @@ def test_a_chain_is_not_started_as_somebody_who_does_not_own_it(tmp_path: Path) 
             await births.begin_again(
                 NAME, program(STEPS), captures.chain, places, outage_ns=0, owner=12345, epoch=4, why=TAKEN_OVER
             )
+        captures.close()
+
+    live(tmp_path, story)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root: whose rights are less is the question")
+def test_a_chain_with_more_rights_than_its_owners_lays_nothing_down_and_starts_nothing(tmp_path: Path) -> None:
+    """Root ran it; it comes back as an ordinary user's program, and its files would be laid down with root's rights."""
+
+    async def story(places: Places) -> None:
+        captures = await left_behind(places)
+        theirs = replace(program(STEPS), inheritance=Inheritance(12345, 12345))
+        with pytest.raises(MismatchError, match="other rights than those of its owner, uid 12345"):
+            await births.begin_again(NAME, theirs, captures.chain, places, outage_ns=0, owner=12345, epoch=4, why=TAKEN_OVER)
+        assert not guard_sockets(places)
         captures.close()
 
     live(tmp_path, story)
