@@ -15,6 +15,7 @@ Nothing is forced to the disk: should the power go, the checkpoint is still in t
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import shutil
 import stat
@@ -22,7 +23,6 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Final
 
 from checkpoint import carried
@@ -32,6 +32,7 @@ from checkpoint.linux.eyes import Eyes, own_uid, seeing_as
 from checkpoint.linux.mounts import is_mount_point
 from checkpoint.model import Snapshot
 from checkpoint.resources import writers
+from checkpoint.resources.giving import DESCRIPTORS, give, path_of
 from checkpoint.resources.moves import Moves
 from checkpoint.resources.remembered import Identity
 from checkpoint.validity import place as position_text
@@ -102,18 +103,18 @@ def lay_down(state: Snapshot, eyes: Eyes | None, spared: frozenset[int]) -> Laid
 def _laid(state: Snapshot, layings: Sequence[_Laying]) -> Laid:
     """All of them: each step of every tree before the next step of any."""
     for laying in layings:
-        with _told(state, laying.tree):
+        with _told(state, laying):
             laying.compare()
     wanted = [(laying.tree.path, laying.held_size) for laying in layings if not laying.stands]
     if reason := carried.lack_of_room(wanted):
         raise RestoreError(f"cannot lay down what {state.component} carries: {reason}")
     for step in (_Laying.build, _Laying.swap, _Laying.settle):
         for laying in layings:
-            with _told(state, laying.tree):
+            with _told(state, laying):
                 step(laying)
     identities: dict[Identity, Identity] = {}
     for laying in layings:
-        with _told(state, laying.tree):
+        with _told(state, laying):
             identities |= laying.identities()
     for laying in layings:
         laying.forget_oldest()
@@ -121,13 +122,14 @@ def _laid(state: Snapshot, layings: Sequence[_Laying]) -> Laid:
 
 
 @contextlib.contextmanager
-def _told(state: Snapshot, tree: Tree) -> Iterator[None]:
+def _told(state: Snapshot, laying: _Laying) -> Iterator[None]:
     """Turn what the kernel says into one sentence."""
     try:
         yield
     except OSError as error:
+        where = laying.called(os.fsdecode(error.filename or "there"))
         raise RestoreError(
-            f"cannot lay down {tree.path}, which {state.component} carries ({error.filename or 'there'}: {error.strerror}); "
+            f"cannot lay down {laying.tree.path}, which {state.component} carries ({where}: {error.strerror}); "
             "see to room and rights there"
         ) from error
 
@@ -190,6 +192,8 @@ class _Laying:
     notes: list[str] = field(default_factory=list)
     _inside: bool = False
     _aside: str = ""
+    _held: int = -1
+    _seen: dict[bytes, Identity] = field(default_factory=dict)
     _kept: str = ""
     _made: list[str] = field(default_factory=list)
     _moves: Moves = field(default_factory=Moves)
@@ -220,7 +224,8 @@ class _Laying:
             self._inside = True
             self._make_aside(path)
         if self.tree.entries:
-            self.notes += self._build(self._new)
+            self._build(self._new)
+            self.notes += self._give_attributes(self._new)
 
     def swap(self) -> None:
         """Let what was built take its place."""
@@ -236,9 +241,11 @@ class _Laying:
     def settle(self) -> None:
         """Give what did not move itself its attributes."""
         if self.stands:
-            self._give_attributes(self.tree.path)
+            for entry in reversed(self.tree.entries):
+                give(self.tree.path, entry, entry.name, self._seen[entry.name])
         elif self._inside and self.tree.entries:
-            _give(self.tree.path, self.tree.entries[0])
+            about = os.stat("..", dir_fd=self._held)
+            give(self.tree.path, self.tree.entries[0], b"", (about.st_dev, about.st_ino))
 
     def identities(self) -> dict[Identity, Identity]:
         """Device and inode of everything, then and now."""
@@ -256,7 +263,7 @@ class _Laying:
         """Let everything stand where it stood; a sentence for each thing that does not."""
         if stuck := self._moves.take_back():
             self._is_stuck = True
-            return stuck
+            return tuple(map(self.called, stuck))
         with contextlib.suppress(OSError):  # earlier sets are in it
             if self._kept:
                 os.rmdir(self._kept)
@@ -269,12 +276,28 @@ class _Laying:
 
     def clear(self) -> None:
         """Remove what was built and is not needed; never what may hold something that stood at the path."""
-        if self._aside and not self._is_stuck:
-            shutil.rmtree(self._aside, ignore_errors=True)
+        if self._held >= 0:
+            if not self._is_stuck:
+                self._remove_aside()
+            os.close(self._held)
+            self._held = -1
+
+    def called(self, path: str) -> str:
+        """What a path of ours is called by everybody."""
+        return path.replace(path_of(self._held), self._aside) if self._held >= 0 else path
+
+    def _remove_aside(self) -> None:
+        new = self._new
+        with contextlib.suppress(OSError):  # it is what we made, and no harm where it lies
+            if os.path.isdir(new) and not os.path.islink(new):
+                shutil.rmtree(new)
+            elif os.path.lexists(new):
+                os.unlink(new)
+            os.rmdir(self._aside)
 
     @property
     def _new(self) -> str:
-        return os.path.join(self._aside, "new")
+        return os.path.join(path_of(self._held), "new")
 
     def _make_folders(self, folder: str) -> None:
         """What is missing above the path."""
@@ -287,7 +310,11 @@ class _Laying:
             self._made.append(one)
 
     def _make_aside(self, place: str) -> None:
+        """Nobody else can change what is in it. Who may write beside it can let its name lead elsewhere, so that is not used."""
         self._aside = tempfile.mkdtemp(prefix=os.fsdecode(carried.OWN_PREFIX) + "new-", dir=place)
+        self._held = os.open(self._aside, os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        if not _is_own(path_of(self._held)) or os.listdir(path_of(self._held)):
+            raise PermissionError(errno.EPERM, "another folder has its name already", self._aside)
 
     def _swap_whole(self) -> None:
         """Let a file or folder take the place of another."""
@@ -328,8 +355,8 @@ class _Laying:
 
     # Building
 
-    def _build(self, new: str) -> list[str]:
-        """Make everything at another path; a note for each owner that it could not be given."""
+    def _build(self, new: str) -> None:
+        """Make everything at another path."""
         made: dict[int, str] = {}
         for entry in self.tree.entries:
             path = _at(new, entry)
@@ -344,11 +371,10 @@ class _Laying:
             else:
                 made[entry.place] = path
                 _write(path, entry, self.pieces.get(entry.place, []))
-        return self._give_attributes(new)
 
     def _give_attributes(self, top: str) -> list[str]:
-        """Owners, modes, times: what lies in a folder first, for it changes the folder's times."""
-        strangers = [self._called(entry) for entry in reversed(self.tree.entries) if not _give(_at(top, entry), entry)]
+        """Owners, modes, times, of what lies in a folder before its own; a note for owners that could not be given."""
+        strangers = [self._called(entry) for entry in reversed(self.tree.entries) if not give(top, entry, entry.name)]
         if not strangers:
             return []
         more = f" and {len(strangers) - 1} more" if len(strangers) > 1 else ""
@@ -370,6 +396,7 @@ class _Laying:
     def _is_same(self, entry: Entry) -> bool:
         path = _at(self.tree.path, entry)
         about = os.lstat(path)
+        self._seen[entry.name] = about.st_dev, about.st_ino
         if (about.st_mode, about.st_uid, about.st_gid) != (entry.mode, entry.uid, entry.gid):
             return False
         if stat.S_ISLNK(entry.mode):
@@ -377,12 +404,14 @@ class _Laying:
         if not entry.is_file:
             return True
         links = sum(other.place == entry.place for other in self.tree.entries)
-        return about.st_size == entry.size and about.st_nlink == links and _holds(path, entry, self.pieces.get(entry.place, []))
+        if about.st_size != entry.size or about.st_nlink != links:
+            return False
+        return _holds(path, entry, self.pieces.get(entry.place, []), self._seen[entry.name])
 
 
 def _is_own(folder: str) -> bool:
     """Whether it is no link and nobody else's, who would have us remove, or could see, what is in it."""
-    about = os.lstat(folder)
+    about = os.stat(folder) if folder.startswith(DESCRIPTORS) else os.lstat(folder)
     return stat.S_ISDIR(about.st_mode) and about.st_uid == own_uid() and not about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
@@ -417,29 +446,13 @@ def _write(path: str, entry: Entry, pieces: list[tuple[int, memoryview]]) -> Non
         os.close(file)
 
 
-def _holds(path: str, entry: Entry, pieces: list[tuple[int, memoryview]]) -> bool:
-    """Whether a file has exactly this content."""
+def _holds(path: str, entry: Entry, pieces: list[tuple[int, memoryview]], identity: Identity) -> bool:
+    """Whether a file, which must be that one still, has exactly this content."""
     if entry.size > sum(len(content) for _, content in pieces) + carried.FIXED_SIZE:
         return False  # mostly holes: made anew rather than read
     expected = bytearray(entry.size)
     for offset, content in pieces:
         expected[offset : min(offset + len(content), entry.size)] = content[: max(entry.size - offset, 0)]
-    return Path(path).read_bytes() == expected
-
-
-def _give(path: str, entry: Entry) -> bool:
-    """Give a name its owner, mode, attributes and time; whether it has its owner now."""
-    is_its = True
-    about = os.lstat(path)
-    if (about.st_uid, about.st_gid) != (entry.uid, entry.gid):
-        try:
-            os.lchown(path, entry.uid, entry.gid)
-        except PermissionError:
-            is_its = False
-    if not stat.S_ISLNK(entry.mode):
-        os.chmod(path, stat.S_IMODE(entry.mode))
-        for name, value in entry.attributes:
-            with contextlib.suppress(OSError):  # a file system without: content and rights are what counts
-                os.setxattr(path, name, value)
-    os.utime(path, ns=(entry.mtime_ns, entry.mtime_ns), follow_symlinks=False)
-    return is_its
+    with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+        about = os.fstat(file.fileno())
+        return (about.st_dev, about.st_ino) == identity and file.read() == expected

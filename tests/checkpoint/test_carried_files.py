@@ -7,6 +7,7 @@ import errno
 import os
 import shutil
 import socket
+import stat
 import subprocess
 import sys
 import tempfile
@@ -14,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,7 +24,7 @@ from checkpoint.engine import CaptureOrder, Carry, Session
 from checkpoint.errors import MismatchError, RestoreError, UnsupportedError
 from checkpoint.linux.eyes import Eyes
 from checkpoint.model import Snapshot
-from checkpoint.resources import carried_trees, laying, moves
+from checkpoint.resources import carried_trees, giving, laying, moves
 from checkpoint.resources.carried_trees import CarriedTrees
 from tests.checkpoint import round_trip, snapshots
 from tests.checkpoint.round_trip import ENGINE, Program, captured_at_last, ended, restored, start, transported
@@ -440,7 +442,8 @@ def test_what_cannot_be_moved_back_is_not_removed_and_is_said(tmp_path: Path, mo
     monkeypatch.setattr(moves, "_renameat2", renameat2)
     with pytest.raises(RestoreError, match=f"nor undo it: what stood at {top}/a is at {top}/.failover-new"):
         laying.lay_down(state, None, frozenset())
-    assert (Path(calls[0]) / "state").read_text() == "newer"
+    (left,) = top.glob(".failover-new-*/new/state")
+    assert left.read_text() == "newer"
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root: whose rights are less is the question")
@@ -483,6 +486,63 @@ def test_a_snapshot_cannot_name_a_file_outside_of_its_folder(tmp_path: Path, nam
     forged = replace(state, resources=(*carried.without(state).resources, carried.Tree(tree.path, entries).resource()))
     with pytest.raises(RestoreError, match="its snapshot"):
         laying.lay_down(forged, None, frozenset())
+
+
+@pytest.mark.parametrize("name", ["folder/file", "folder", "link", "pipe", "file"])
+def test_owner_and_mode_are_given_through_no_link_and_to_nothing_else(tmp_path: Path, name: str) -> None:
+    """Somebody puts a link in its place after it was made: what that leads to stays as it is."""
+    victim, top = tmp_path / "victim", tmp_path / "top"
+    for made in (victim, top):
+        (made / "folder").mkdir(parents=True)
+        (made / "folder" / "file").touch(mode=0o600)
+    file = (top / "folder" / "file").stat()
+    entry = carried.Entry(b"", stat.S_IFREG | 0o777, file.st_uid, file.st_gid, 5, attributes=(("user.x", b"y"),))
+    before = portrait(victim)
+    kinds = {"folder": stat.S_IFDIR, "link": stat.S_IFLNK, "pipe": stat.S_IFIFO}
+    if name == "folder/file":
+        shutil.rmtree(top / "folder")
+        (top / "folder").symlink_to(victim / "folder")
+    else:
+        if name == "folder":
+            shutil.rmtree(top / name)
+        (top / name).symlink_to(victim / "folder" / "file")
+    entry = replace(entry, mode=kinds.get(name, stat.S_IFREG) | 0o777)
+    if name == "link":  # it is one itself
+        giving.give(str(top), entry, os.fsencode(name))
+        assert (top / name).lstat().st_mtime_ns == 5
+    else:
+        with pytest.raises(OSError, match=r"Not a directory|something else has its place"):
+            giving.give(str(top), entry, os.fsencode(name))
+    assert portrait(victim) == before
+    assert os.listxattr(victim / "folder" / "file") == []
+
+
+def test_what_was_built_aside_is_given_away_there_wherever_its_name_leads_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who owns the folder renames what is built, and lets its name lead to files that are not his, as soon as it is made."""
+    folder, victim, real = tmp_path / "kept", tmp_path / "victim", laying._write
+    (victim / "new").mkdir(parents=True)
+    folder.mkdir()
+    for path in (victim / "new" / "state", folder / "state"):
+        path.write_text("x")
+        path.chmod(0o600)
+    with asleep(tmp_path) as program, carrying(program, folder) as session:
+        (folder / "state").chmod(0o666)
+        state = once_more(session, 1)
+    (folder / "state").unlink()
+    before = portrait(victim)
+
+    def write(*told: Any) -> None:
+        real(*told)
+        (aside,) = tmp_path.glob(".failover-new-*")
+        aside.rename(tmp_path / "moved")
+        aside.symlink_to(victim)
+
+    monkeypatch.setattr(laying, "_write", write)
+    laying.lay_down(state, None, frozenset())
+    assert portrait(victim) == before
+    assert (folder / "state").stat().st_mode & 0o777 == 0o666
 
 
 @pytest.mark.parametrize("path", ["/tmp/a/../../etc/x", "/tmp/./a", "/tmp//a", "//tmp/a", "/tmp/a/", "/", "tmp/a", "/tmp/a\0b"])
