@@ -44,7 +44,8 @@ class Disk:
             False where it cannot have that one: it lies on another file system, or is a memory file.
         """
         try:
-            os.link(f"/proc/self/fd/{descriptor}", path, follow_symlinks=True)
+            # Any src_dir_fd makes it linkat(2) with AT_SYMLINK_FOLLOW; link(2) would give a second name to the link in /proc.
+            os.link(f"/proc/self/fd/{descriptor}", path, src_dir_fd=descriptor, follow_symlinks=True)
         except OSError as error:
             if error.errno in (errno.EXDEV, errno.ENOENT, errno.EPERM, errno.EOPNOTSUPP):
                 return False

@@ -20,10 +20,11 @@ import pytest
 
 from checkpoint import chain, format
 from checkpoint.channel import memfd_holding
-from checkpoint.disk import Disk
+from checkpoint.disk import Disk, DiskFile
 from checkpoint.errors import ChainError, FormatError, StoreError
 from checkpoint.model import Position, Snapshot
 from checkpoint.store import Store, open_store
+from checkpoint.whole_files import WholeFiles
 from tests.checkpoint.snapshots import COMPONENT, history, page, pages_of, snapshot
 
 PATIENCE_S = 60.0
@@ -226,6 +227,33 @@ class StuckDisk(Disk):
         self.waits.set()
         assert self.gate.wait(PATIENCE_S)
         super().sync_file(descriptor)
+
+
+def test_what_arrived_in_an_unnamed_file_on_the_same_disk_is_not_written_again(tmp_path: Path) -> None:
+    """It gets its name; one of another file system, or in memory, is copied. What is kept is the same."""
+    (tmp_path / "store").mkdir()
+    files = WholeFiles(Disk())
+    unnamed = os.open(tmp_path / "store", os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o644)
+    memory = os.memfd_create("arrived")
+    copied = []
+    try:
+        for number, source in enumerate((unnamed, memory)):
+            os.write(source, b"whole")
+
+            def fill(file: DiskFile, source: int = source) -> None:
+                copied.append(source)
+                file.copy_from(source)
+
+            final = tmp_path / "store" / str(number)
+            assert files.write(final, fill, source) == 5
+            assert final.read_bytes() == b"whole"
+            assert final.stat().st_mode & 0o777 == 0o600
+        assert copied == [memory]
+        assert (tmp_path / "store" / "0").stat().st_ino == os.fstat(unnamed).st_ino
+    finally:
+        os.close(unnamed)
+        os.close(memory)
+    assert sorted(path.name for path in (tmp_path / "store").iterdir()) == ["0", "1"]
 
 
 LONG_CHANGES: dict[str, Callable[[Store, tuple[Snapshot, ...]], object]] = {
