@@ -190,8 +190,6 @@ class CarriedTrees:
     def _refuse_path(self, path: str) -> str:
         if not is_carriable(path):
             return f"{path!r} is to be carried, which is no absolute path of a file or folder: name it in full"
-        if (real := os.path.realpath(path)) != path:
-            return f"{path} is to be carried, which is a link, or behind one: name it as {real}"
         if kind := network_mount(self.pid, path):
             return f"{path} lies on a network mount ({kind}), which is not carried: every robot sees it there; leave it out"
         return ""
@@ -225,6 +223,8 @@ class CarriedTrees:
         """
         with seeing_as(self.eyes):
             try:
+                if behind := tuple(filter(None, map(self._refuse_link, self.paths))):
+                    return Seen(unreadable=behind)
                 names = [name for index, path in enumerate(self.paths) for name in self._below(index, path)]
                 links = {(one.tree, one.name): os.readlink(self._place(one)) for one in names if one.kind == stat.S_IFLNK}
                 read_size = self._read_stale(names, mapped, FROZEN_SIZE_MAX if frozen else self.size_max)
@@ -236,6 +236,18 @@ class CarriedTrees:
                     f"{error.strerror}); try again, and let nobody else write there"
                 ) from error
         return Seen(tuple(names), links, (), read_size)
+
+    def _refuse_link(self, path: str) -> str:
+        """Why a path means another one; at each look, for what was a folder may have become a link."""
+        top, parts = f"/proc/self/fd/{self._root}", path.strip("/").split("/")
+        for count in range(1, len(parts) + 1):
+            try:
+                about = os.lstat("/".join((top, *parts[:count])))
+            except (FileNotFoundError, NotADirectoryError):
+                return ""  # nothing stands there
+            if stat.S_ISLNK(about.st_mode):
+                return f"{path} is to be carried, which is a link, or behind one: name it as {os.path.realpath(path)}"
+        return ""
 
     # Names
 

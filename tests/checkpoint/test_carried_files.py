@@ -321,6 +321,22 @@ def test_a_path_that_means_another_thing_elsewhere_is_refused(tmp_path: Path, pa
         ENGINE.protect(program.pid, "/test/carried", None, Carry((named,))).close()
 
 
+def test_a_folder_above_that_becomes_a_link_is_refused_by_name_until_it_is_a_folder_again(tmp_path: Path) -> None:
+    """What it leads to would be carried under the old name."""
+    above, moved = tmp_path / "above", tmp_path / "moved"
+    (above / "kept").mkdir(parents=True)
+    with asleep(tmp_path) as program, carrying(program, above / "kept") as session:
+        once_more(session, 1)
+        above.rename(moved)
+        above.symlink_to(moved)
+        for _ in range(2):
+            with pytest.raises(UnsupportedError, match=f"{above}/kept is to be carried, .*: name it as {moved}/kept"):
+                session.capture(CaptureOrder())
+        above.unlink()
+        moved.rename(above)
+        once_more(session, 2)
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root: a small file system is mounted")
 def test_a_full_disk_changes_nothing_and_is_said(tmp_path: Path) -> None:
     folder = tmp_path / "mount"
