@@ -480,6 +480,26 @@ def test_a_folder_that_is_emptied_name_by_name_is_whole_again_when_a_name_cannot
     assert contents(folder) == before
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root: whose rights are less is the question")
+@pytest.mark.parametrize("writable", [True, False], ids=["as a whole", "name by name"])
+def test_an_ordinary_users_folder_is_laid_down_with_his_rights_alone(tmp_path: Path, open_path: Path, writable: bool) -> None:
+    folder = open_path / "his" / "mine"
+    (folder / "deep").mkdir(parents=True)
+    (folder / "deep" / "state").write_text("of the checkpoint")
+    os.mkfifo(folder / "pipe", 0o620)
+    (folder / "link").symlink_to("deep")
+    for path in (*((folder.parent,) if writable else ()), folder, *folder.rglob("*")):
+        os.chown(path, round_trip.NOBODY, round_trip.NOBODY, follow_symlinks=False)
+    before = contents(folder)
+    with asleep(tmp_path) as program, carrying(program, folder) as session:
+        state = once_more(session, 1)
+    (folder / "deep" / "state").write_text("newer")
+    (note,) = laying.lay_down(state, Eyes(round_trip.NOBODY, round_trip.NOBODY), frozenset()).notes
+    kept = Path(note.partition("is kept in ")[2])
+    assert next(kept.rglob("state")).read_text() == "newer"
+    assert {name: about for name, about in contents(folder).items() if ".failover-kept" not in name} == before
+
+
 def test_a_path_in_a_carried_folder_may_be_carried_by_itself_too(tmp_path: Path) -> None:
     folder = tmp_path / "kept"
     furnish(folder)
