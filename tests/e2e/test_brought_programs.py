@@ -81,12 +81,18 @@ def contents_of(robot: RobotMachine) -> set[str]:
     return {path.name for path in folder.iterdir()} if folder.is_dir() else set()
 
 
+def process_of(robot: RobotMachine) -> int:
+    """The program's process; it runs a moment before the status knows its PID."""
+    robots.until(lambda: robots.component(robot, "count")["pid"], f"{robot.name} to tell the PID")
+    return robots.host_pid(robot, robots.component(robot, "count")["pid"])
+
+
 def test_a_program_that_only_its_robot_has_goes_on_at_the_other(pair: Pair, place: Path) -> None:
     first, second = pair
     start(first, place)
     robots.until_protected(first)
     goes_on(second, first.cut_power)
-    running = robots.host_pid(second, robots.component(second, "count")["pid"])
+    running = process_of(second)
     assert not list(Path(f"/proc/{running}/root{place.parent}").rglob("count")), "no file was put in place"
     assert len(contents_of(second)) == 2, "the program and its library; all else is the same here"
 
@@ -109,7 +115,7 @@ def test_a_program_returns_to_its_own_files(pair: Pair, place: Path) -> None:
     goes_on(second, lambda: robots.failover(first, "handover", "count", "--to", second.name))
     robots.until_protected(second)
     goes_on(first, lambda: robots.failover(second, "failback", "count"))
-    running = robots.host_pid(first, robots.component(first, "count")["pid"])
+    running = process_of(first)
     assert os.readlink(f"/proc/{running}/exe") == str(place / "count")
     assert not contents_of(first)
 
@@ -124,7 +130,7 @@ def test_a_program_that_is_upgraded_while_it_runs_goes_on_as_it_was(pair: Pair, 
     program.unlink()
     program.write_bytes(other)
     robots.until(lambda: contents_of(first), "robot1 to keep what runs there")
-    goes_on(first, lambda: os.kill(robots.host_pid(first, robots.component(first, "count")["pid"]), signal.SIGSEGV))
+    goes_on(first, lambda: os.kill(process_of(first), signal.SIGSEGV))
     robots.until_protected(first)
     assert program.read_bytes() == other
     goes_on(second, first.cut_power)
@@ -189,7 +195,7 @@ def test_a_program_that_keeps_its_state_is_started_from_what_was_brought_of_it(p
     assert len(contents_of(second)) == 3
     robots.until(lambda: robots.component(second, "count").get("warm"), "the program to wait at robot2")
     goes_on(second, first.cut_power)
-    running = robots.host_pid(second, robots.component(second, "count")["pid"])
+    running = process_of(second)
     shown = Path(f"/proc/{running}/root{place}")
     assert sorted(path.name for path in shown.rglob("*.py")) == ["__init__.py", "counter.py", "steps.py"]
     assert not (shown / "secret.txt").exists()
@@ -244,5 +250,5 @@ def test_data_that_is_only_read_is_brought_by_choice(tmp_path: Path, place: Path
         goes_on(second, lambda: robots.failover(first, "handover", "count", "--to", second.name))
         robots.until_protected(second)
         goes_on(first, lambda: robots.failover(second, "failback", "count"))
-        pid = robots.host_pid(first, robots.component(first, "count")["pid"])
+        pid = process_of(first)
         assert str(data) in {os.readlink(one) for one in Path(f"/proc/{pid}/fd").iterdir()}, "its own file again"
