@@ -206,7 +206,10 @@ class Threads:
             self._tend()
 
     def _tend(self) -> None:
-        self._loose = {tid: tracee for tid, tracee in self._loose.items() if not self._is_let_go(tracee)}
+        """Let go of whom can be. SIGCHLD may have `_hear` do the same in the middle of it: what that has let go of stays so."""
+        for tid, tracee in tuple(self._loose.items()):
+            if self._is_let_go(tracee):
+                self._loose.pop(tid, None)
 
     def _is_let_go(self, tracee: Tracee) -> bool:
         """Try once more to let go of a thread; whether it is ours no more."""
