@@ -29,6 +29,7 @@ from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.descriptors import Descriptor
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile, Surroundings
+from checkpoint.resources.rebuilding import number_of
 
 KIND: Final = "pipes"
 
@@ -180,34 +181,47 @@ def _teed(pipe: int, size: int, capacity: int) -> bytes:
         os.close(writer)
 
 
-def rebuild(table: CallTable, ends: Sequence[Resource], first: int) -> dict[tuple[int, int], int]:
-    """Make the pipes at numbers from ``first`` on: the descriptor of each (pipe, end).
+def rebuild(table: CallTable, ends: Sequence[Resource], first: int) -> dict[int, int]:
+    """Make the pipes, filled once each, at numbers from ``first`` on: the descriptor of each open file, by its resource's id().
+
+    An end that was opened again, through /proc/self/fd, is an open file of its own, with flags of its own.
 
     Args:
         ends: every resource of this kind.
     """
-    made: dict[tuple[int, int], int] = {}
-    for held in ends:
-        pipe = int(str(held.facts["pipe"]))
-        if (pipe, 0) not in made:
-            made[pipe, 0], made[pipe, 1] = _make(table, first + len(made))
-    for held in ends:
-        pipe, end = int(str(held.facts["pipe"])), int(str(held.facts["end"]))
-        descriptor, content, capacity = made[pipe, end], held.facts["content"], int(str(held.facts["capacity"]))
-        if capacity != DEFAULT_CAPACITY and not end:
-            table.call(f"size the pipe of {held.name}", "fcntl", descriptor, F_SETPIPE_SZ, capacity, least=capacity)
-        if isinstance(content, bytes) and content:
-            table.call(
-                f"fill the pipe of {held.name}", "write", made[pipe, 1], table.place(content), len(content), least=len(content)
-            )
-        if int(str(held.facts["flags"])) & os.O_NONBLOCK:
-            table.call(f"set the flags of {held.name}", "fcntl", descriptor, fcntl.F_SETFL, os.O_NONBLOCK)
+    made: dict[int, int] = {}
+    for pipe in dict.fromkeys(number_of(held.facts["pipe"]) for held in ends):
+        opened = [held for held in ends if number_of(held.facts["pipe"]) == pipe]
+        pair = table.obtain_pair("make a pipe", "pipe2", table.place(bytes(8)), os.O_CLOEXEC)
+        _fill(table, opened, pair)
+        for held in opened:
+            made[id(held)] = _opened(table, held, pair, opened, first + len(made))
+        for descriptor in pair:
+            table.close(descriptor)
     return made
 
 
-def _make(table: CallTable, target: int) -> tuple[int, int]:
-    reader, writer = table.obtain_pair("make a pipe", "pipe2", table.place(bytes(8)), os.O_CLOEXEC)
-    for number, place in ((reader, target), (writer, target + 1)):
-        table.duplicate(number, place, os.O_CLOEXEC)
-        table.close(number)
-    return target, target + 1
+def _fill(table: CallTable, opened: Sequence[Resource], pair: tuple[int, int]) -> None:
+    """Give a pipe its size and what is in it: every open file that reads has told the same."""
+    name, capacity = opened[0].name, number_of(opened[0].facts["capacity"])
+    if capacity != DEFAULT_CAPACITY:
+        table.call(f"size the pipe of {name}", "fcntl", pair[0], F_SETPIPE_SZ, capacity, least=capacity)
+    content = next((one.facts["content"] for one in opened if one.facts["content"]), b"")
+    assert isinstance(content, bytes)
+    if content:
+        table.call(f"fill the pipe of {name}", "write", pair[1], table.place(content), len(content), least=len(content))
+
+
+def _opened(table: CallTable, held: Resource, pair: tuple[int, int], opened: Sequence[Resource], place: int) -> int:
+    """One open file of a pipe, at a number of its own: the end as it was made, or opened again where that one is given away."""
+    end, flags = number_of(held.facts["end"]), number_of(held.facts["flags"])
+    plain = (os.O_RDONLY, os.O_WRONLY)[end]
+    if held is next((one for one in opened if number_of(one.facts["flags"]) & os.O_ACCMODE == plain), None):
+        table.duplicate(pair[end], place, os.O_CLOEXEC)
+    else:
+        again = table.open(f"/proc/self/fd/{pair[end]}", flags & os.O_ACCMODE)
+        table.duplicate(again, place, os.O_CLOEXEC)
+        table.close(again)
+    if flags & os.O_NONBLOCK:
+        table.call(f"set the flags of {held.name}", "fcntl", place, fcntl.F_SETFL, os.O_NONBLOCK)
+    return place

@@ -210,14 +210,14 @@ def _obtain(
     table: CallTable,
     one: Wanted,
     moved: tuple[int, ...],
-    piped: dict[tuple[int, int], int],
+    piped: Mapping[int, int],
     connected: Mapping[int, int],
     rebuilding: Rebuilding,
 ) -> None:
     """The first descriptor of an open file description."""
     facts = one.resource.facts
     if one.resource.kind == pipes.KIND:
-        _duplicate(table, piped[number_of(facts["pipe"]), number_of(facts["end"])], one)
+        _duplicate(table, piped[id(one.resource)], one)
         return
     if one.resource.kind in SOCKETS:
         _duplicate(table, connected[number_of(facts["socket"])], one)

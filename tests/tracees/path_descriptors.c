@@ -101,6 +101,28 @@ static void fifo_gone(void) {
     EXPECT(read(both, found, 20) == 4, "it is empty");
 }
 
+/* An end that was opened again has flags of its own; what waits in the pipe is there once, and fills it as before. */
+static void pipe_reopened(void) {
+    int ends[2], count = 0;
+    char path[40], found[4096];
+    if (pipe(ends)) cannot("make a pipe");
+    snprintf(path, sizeof path, "/proc/self/fd/%d", ends[0]);
+    int reader = open(path, O_RDONLY | O_NONBLOCK);
+    snprintf(path, sizeof path, "/proc/self/fd/%d", ends[1]);
+    int writer = open(path, O_WRONLY | O_NONBLOCK);
+    if (reader < 0 || writer < 0) cannot("open a pipe again");
+    memset(found, 'x', sizeof found);
+    while (write(writer, found, sizeof found) == sizeof found) count++;
+    wait_here();
+    EXPECT_EQUAL("flags of the reader", fcntl(ends[0], F_GETFL) & O_NONBLOCK, 0);
+    EXPECT_EQUAL("flags of the writer", fcntl(ends[1], F_GETFL) & O_NONBLOCK, 0);
+    EXPECT_EQUAL("flags of the second reader", fcntl(reader, F_GETFL) & O_NONBLOCK, O_NONBLOCK);
+    EXPECT_EQUAL("flags of the second writer", fcntl(writer, F_GETFL) & O_NONBLOCK, O_NONBLOCK);
+    EXPECT(write(writer, found, 1) == -1 && errno == EAGAIN, "it was full");
+    while (read(reader, found, sizeof found) == sizeof found) count--;
+    EXPECT_EQUAL("what waited", count, 0);
+}
+
 static void path_only(void) {
     mkfifo("pipe", 0600), touch("file"), mkdir("some", 0700);
     if (symlink("nowhere", "link")) cannot("make a link");
@@ -178,7 +200,8 @@ int main(int count, char **arguments) {
         const char *name;
         void (*act)(void);
     } cases[] = {{"inotify_directories", inotify_directories}, {"inotify_gaps", inotify_gaps}, {"fifo_both", fifo_both},
-                 {"fifo_reader", fifo_reader}, {"fifo_gone", fifo_gone}, {"path_only", path_only}, {"kernel_files", kernel_files}, {"file_locks", file_locks}};
+                 {"fifo_reader", fifo_reader}, {"fifo_gone", fifo_gone},
+                 {"pipe_reopened", pipe_reopened}, {"path_only", path_only}, {"kernel_files", kernel_files}, {"file_locks", file_locks}};
     go = arguments[1];
     for (size_t index = 0; index < sizeof cases / sizeof *cases; index++)
         if (count > 2 && !strcmp(arguments[2], cases[index].name)) {
