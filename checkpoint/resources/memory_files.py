@@ -139,15 +139,25 @@ def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     """Open it as it was; made and filled if this is the first open file of it, and no mapping has made it."""
     facts = held.facts
     key = _key_of(held)
-    if key not in rebuilding.objects:
+    is_new = key not in rebuilding.objects
+    if is_new:
         made = make(table, str(facts["name"]), number_of(facts["mode"]), number_of(facts["size"]))
         rebuilding.keep(table, key, made)
     for offset, piece in _pieces(facts["content"]):
         size, what = len(piece), f"fill the memory file of {held.name}"
         table.call(what, "pwrite64", rebuilding.objects[key], table.place(piece), size, offset, least=size, most=size)
-    opened = table.open(f"/proc/self/fd/{rebuilding.objects[key]}", number_of(facts["flags"]) & REOPENED)
+    opened = _opened(table, rebuilding.objects[key], number_of(facts["flags"]), is_new)
     offset = number_of(facts["offset"])
     table.call(f"set the offset of {held.name}", "lseek", opened, offset, os.SEEK_SET, least=offset, most=offset)
+    return opened
+
+
+def _opened(table: CallTable, made: int, flags: int, is_new: bool) -> int:
+    """An open file of it: as it was made, which does not keep it from being executed, or opened again."""
+    if not is_new or flags & os.O_ACCMODE != os.O_RDWR:
+        return table.open(f"/proc/self/fd/{made}", flags & REOPENED)
+    opened = table.obtain("open a memory file", "fcntl", made, fcntl.F_DUPFD, 0)
+    table.call("set the flags of a memory file", "fcntl", opened, fcntl.F_SETFL, flags & (os.O_APPEND | os.O_NONBLOCK))
     return opened
 
 

@@ -32,7 +32,7 @@ CASES = {
         "epoll_simple epoll_ready epoll_nested epoll_once epoll_edge epoll_exclusive epoll_renumbered epoll_waiting"
     ),
     "path_descriptors": "inotify_directories inotify_gaps fifo_both fifo_reader pipe_reopened path_only kernel_files file_locks",
-    "memory_objects": "memfd_content memfd_sealed memfd_mapped posix_named posix_unlinked",
+    "memory_objects": "memfd_executed memfd_content memfd_sealed memfd_mapped posix_named posix_unlinked",
     "sockets": (
         "pair_stream pair_datagram pair_packets pair_much pair_options pair_half_closed rights_stream "
         "rights_datagram pair_orphan listener_path "

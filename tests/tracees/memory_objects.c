@@ -21,6 +21,19 @@ static int memory_file(const char *name, size_t size, unsigned flags) {
 }
 
 /* Two open files of one, sparse, with an offset each. */
+/* Nobody has it open to write as the kernel counts that, so it can be executed. */
+static void memfd_executed(void) {
+    int file = memory_file("script", 11, 0), status = -1;
+    if (write(file, "#!/bin/true", 11) != 11) cannot("write");
+    wait_here();
+    if (fork() == 0) {
+        syscall(SYS_execveat, file, "", (char *[]){"true", NULL}, (char *[]){NULL}, AT_EMPTY_PATH);
+        _exit(errno);
+    }
+    wait(&status);
+    EXPECT(WIFEXITED(status) && WEXITSTATUS(status) == 0, "it cannot be executed: %s", strerror(WEXITSTATUS(status)));
+}
+
 static void memfd_content(void) {
     static char page[PAGE], found[PAGE];
     int file = memory_file("scratch", 1000 * PAGE + 123, MFD_CLOEXEC), twin = dup(file), reader;
@@ -133,7 +146,7 @@ int main(int count, char **arguments) {
     static const struct {
         const char *name;
         void (*act)(void);
-    } cases[] = {{"memfd_content", memfd_content}, {"memfd_sealed", memfd_sealed}, {"memfd_mapped", memfd_mapped},
+    } cases[] = {{"memfd_executed", memfd_executed}, {"memfd_content", memfd_content}, {"memfd_sealed", memfd_sealed}, {"memfd_mapped", memfd_mapped},
                  {"posix_named", posix_named}, {"posix_unlinked", posix_unlinked}};
     go = arguments[1];
     for (size_t index = 0; index < sizeof cases / sizeof *cases; index++)
