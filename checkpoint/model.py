@@ -80,7 +80,8 @@ class Vma:
         file: identity of the backing file, for ``kind`` FILE.
         flags: the two-letter codes of VmFlags in smaps that matter on restore ("gd" grows down, "dc" don't copy on
             fork, "dd" don't dump, "wf" wipe on fork, "hg"/"nh" huge page advice, "lo" locked, "nr" no reserve,
-            "sr"/"rr" read advice, "mg" mergeable, "ht" huge pages, "dp" droppable, "sl" sealed), and two-letter codes of our own
+            "sr"/"rr" read advice, "mg" mergeable, "ht" huge pages, "dp" droppable, "sl" sealed, "mw" may be
+            made writable), and two-letter codes of our own
             (``checkpoint.linux.vm_flags``): "gb" huge pages of 1 GiB, "k1" to "kf" a protection key.
         guards: pages that MADV_GUARD_INSTALL (madvise(2)) lets nobody touch, in address order; they hold nothing.
     """

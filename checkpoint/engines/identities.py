@@ -71,7 +71,7 @@ class Identities:
             offset=line.offset,
             name=self._names.get(line.name, line.name),
             file=self.of_mapping(line) if is_file else None,
-            flags=tuple(flag for flag in flags if flag in KEPT_FLAGS),
+            flags=tuple(flag for flag in flags if flag in KEPT_FLAGS or (flag == vm_flags.MAY_WRITE and is_file and line.shared)),
         )
 
     def of_mapping(self, line: MapsLine) -> FileIdentity:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from checkpoint import pages
 from checkpoint.engines import restore_kinds
-from checkpoint.linux import abi
+from checkpoint.linux import abi, vm_flags
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import MapsLine
@@ -175,7 +175,7 @@ def is_file_mapping(vma: Vma) -> bool:
 
 def _file_order(vma: Vma) -> tuple[str, bool]:
     assert vma.file is not None
-    return vma.file.path, vma.shared and bool(vma.protection & abi.PROT_WRITE)
+    return vma.file.path, vma.shared and (bool(vma.protection & abi.PROT_WRITE) or vm_flags.MAY_WRITE in vma.flags)
 
 
 def joined_shared(vmas: Iterable[Vma]) -> list[Vma]:

@@ -23,6 +23,8 @@ HUGE: Final = "ht"
 GIGANTIC: Final = "gb"
 SEALED: Final = "sl"
 DROPPABLE: Final = "dp"
+MAY_WRITE: Final = "mw"
+"""Its protection may be changed to allow writing: what is mapped was open for that. Kept of shared mappings of files only."""
 LOCKED, LOCKED_ON_FAULT = "lo", "lf"
 _KEYS: Final = "123456789abcdef"
 KEYS: Final = frozenset(f"k{digit}" for digit in _KEYS)
