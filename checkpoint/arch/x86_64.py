@@ -70,7 +70,7 @@ SYSCALLS: Final[Mapping[str, int]] = {
     "futex": 202, "io_getevents": 208, "restart_syscall": 219, "semtimedop": 220, "timer_gettime": 224,
     "timer_getoverrun": 225, "clock_gettime": 228, "clock_nanosleep": 230, "epoll_wait": 232, "waitid": 247,
     "pselect6": 270, "ppoll": 271, "get_robust_list": 274, "epoll_pwait": 281, "accept4": 288, "userfaultfd": 323,
-    "io_uring_enter": 426, "epoll_pwait2": 441, "futex_waitv": 449,
+    "membarrier": 324, "io_uring_enter": 426, "epoll_pwait2": 441, "futex_waitv": 449,
 }  # fmt: skip
 """Numbers by name: those that we make or tell of."""
 SYSCALL_NAMES: Final[Mapping[int, str]] = {number: name for name, number in SYSCALLS.items()}

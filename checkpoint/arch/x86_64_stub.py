@@ -97,6 +97,7 @@ SYSTEM_CALLS: Final = {
     "lseek": 8,
     "madvise": 28,
     "memfd_create": 319,
+    "membarrier": 324,
     "mkdirat": 258,
     "mknodat": 259,
     "mlock2": 325,

@@ -1,6 +1,7 @@
 """What a process has switched by prctl(2) and keeps for good: asked in the inquiry, set again by the last calls of a restore.
 
-A switch is kept as the call that sets it: (option, second argument, third argument). Sources: prctl(2), linux/prctl.h.
+A switch is kept as the call that sets it: (option, second argument, third argument). A registration for membarrier(2) is kept
+like one, as (`MEMBARRIER`, command, 0); kernels before 6.3 do not tell it. Sources: prctl(2), linux/prctl.h, membarrier(2).
 """
 
 from __future__ import annotations
@@ -29,12 +30,16 @@ PR_SET_MDWE: Final = 65
 PR_GET_MDWE: Final = 66
 PR_SET_MEMORY_MERGE: Final = 67
 PR_GET_MEMORY_MERGE: Final = 68
+MEMBARRIER: Final = -1
+"""No option of prctl(2): it stands for a call of membarrier(2)."""
+GET_REGISTRATIONS: Final = 1 << 9
 
 NAMES: Final = {
     PR_SET_TSC: "the switch of the time stamp counter",
     PR_MCE_KILL: "what a broken page of memory does",
     PR_SET_SPECULATION_CTRL: "a limit on speculation",
     PR_SET_MEMORY_MERGE: "the merging of equal pages",
+    MEMBARRIER: "a registration for memory barriers",
     PR_SET_MDWE: "that nothing written may become code",
 }
 """Every switch that is kept, in the order in which they are set: the last one forbids what a restore itself does."""
@@ -55,6 +60,7 @@ class Questions:
         self._speculation = [(which, batch.add("prctl", PR_GET_SPECULATION_CTRL, which, 0, 0, 0)) for which in SPECULATIONS]
         self._merge = batch.add("prctl", PR_GET_MEMORY_MERGE, 0, 0, 0, 0)
         self._sealed = batch.add("prctl", PR_GET_MDWE, 0, 0, 0, 0)
+        self._barriers = batch.add("membarrier", GET_REGISTRATIONS, 0, 0)
 
     def read(self, answers: Answers) -> tuple[Switch, ...]:
         """The switches that do not stand as at a program's start."""
@@ -73,6 +79,7 @@ class Questions:
             found.append((PR_SET_MEMORY_MERGE, results[self._merge], 0))
         if results[self._sealed] > 0:
             found.append((PR_SET_MDWE, results[self._sealed], 0))
+        found += [(MEMBARRIER, 1 << bit, 0) for bit in range(32) if max(results[self._barriers], 0) >> bit & 1]
         return tuple(found)
 
 
@@ -84,7 +91,11 @@ def set_again(table: CallTable, switches: Iterable[Switch]) -> None:
     """
     order = list(NAMES)
     for option, second, third in sorted(switches, key=lambda switch: order.index(_known(switch))):
-        table.attempt(f"{NAMES[option]} is not kept", "prctl", option, second, third, 0, 0)
+        lost = f"{NAMES[option]} is not kept"
+        if option == MEMBARRIER:
+            table.attempt(lost, "membarrier", second, 0, 0)
+        else:
+            table.attempt(lost, "prctl", option, second, third, 0, 0)
 
 
 def _known(switch: Switch) -> int:

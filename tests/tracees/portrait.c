@@ -96,6 +96,7 @@ static void paint(int when) {
         prctl(PR_MCE_KILL_GET, 0, 0, 0, 0), prctl(PR_GET_IO_FLUSHER, 0, 0, 0, 0));
     add(when, "store bypass %d, memory write execute %d", prctl(PR_GET_SPECULATION_CTRL, 0, 0, 0, 0),
         prctl(66 /* PR_GET_MDWE */, 0, 0, 0, 0));
+    add(when, "registered for memory barriers %lx", syscall(SYS_membarrier, 1 << 9 /* MEMBARRIER_CMD_GET_REGISTRATIONS */, 0, 0));
     sched_getaffinity(0, sizeof processors, &processors);
     add(when, "processors %d", CPU_COUNT(&processors));
     struct {
@@ -153,6 +154,8 @@ static void tune(const char *what) {
         setrlimit(RLIMIT_STACK, &limit);
     }
     if (!strcmp(what, "personality")) personality(ADDR_NO_RANDOMIZE | UNAME26);
+    if (!strcmp(what, "membarrier") && (syscall(SYS_membarrier, 1 << 4, 0, 0) || syscall(SYS_membarrier, 1 << 6, 0, 0)))
+        cannot("register for memory barriers");
     if (!strcmp(what, "dumpable")) prctl(PR_SET_DUMPABLE, 0);
     if (!strcmp(what, "parent_death_signal")) prctl(PR_SET_PDEATHSIG, SIGUSR2);
     if (!strcmp(what, "subreaper")) prctl(PR_SET_CHILD_SUBREAPER, 1);
