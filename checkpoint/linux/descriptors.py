@@ -23,7 +23,7 @@ class Descriptor:
     Attributes:
         target: where /proc/PID/fd/N leads, in the kernel's words: a path, "pipe:[123]", "anon_inode:[eventpoll]" …
         offset, flags: of fdinfo; flags hold O_CLOEXEC too.
-        mode, device, rdev, inode, size, mtime_ns: of fstat(2).
+        mode, device, rdev, inode, size, mtime_ns, uid, gid: of fstat(2).
         told: everything that fdinfo says, unread.
     """
 
@@ -39,6 +39,8 @@ class Descriptor:
     mtime_ns: int
     links: int
     told: bytes
+    uid: int
+    gid: int
 
     @property
     def name(self) -> str:
@@ -134,6 +136,8 @@ def _descriptor(number: int, links: int, texts: int) -> Descriptor | None:
         mtime_ns=about.st_mtime_ns,
         links=about.st_nlink,
         told=told,
+        uid=about.st_uid,
+        gid=about.st_gid,
     )
 
 

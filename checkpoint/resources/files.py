@@ -84,7 +84,8 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
         "mtime_ns": first.mtime_ns,
     }
     if is_deleted(first):
-        facts |= {"deleted": True, "content": content_of(held) if held.content is None else held.content}
+        content = content_of(held) if held.content is None else held.content
+        facts |= {"deleted": True, "content": content, "uid": first.uid, "gid": first.gid}
     elif is_only_read(first):
         facts["digest"] = digest_of(held)
     return Resource(KIND, held.name, facts)

@@ -14,12 +14,14 @@ from __future__ import annotations
 import fcntl
 import os
 import stat
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Final
 
 from checkpoint.engine import RestoreOptions
 from checkpoint.errors import RestoreError
+from checkpoint.linux.abi import PAGE_SIZE
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource, Snapshot
 from checkpoint.resources import (
@@ -277,12 +279,26 @@ def _open_deleted(table: CallTable, held: Resource, rebuilding: Rebuilding) -> i
         rebuilding.keep(table, key, make_nameless(table, path, number_of(facts.get("mode", 0o600)) & 0o7777))
     made = rebuilding.objects[key]
     if content:
-        size = len(content)
-        table.call(f"fill {path}", "pwrite64", made, table.place(content), size, 0, least=size, most=size)
+        table.call(f"size {path}", "ftruncate", made, len(content))
+        for offset, piece in _written_pieces(content):
+            size = len(piece)
+            table.call(f"fill {path}", "pwrite64", made, table.place(piece), size, offset, least=size, most=size)
+    if "uid" in facts:
+        owner = number_of(facts["uid"]), number_of(facts["gid"])
+        table.attempt(f"the deleted file {path} belongs to whom the program runs as", "fchown", made, *owner)
+        table.attempt("", "fchmod", made, number_of(facts["mode"]) & 0o7777)  # a change of owner takes set-user-ID away
     flags = number_of(facts["flags"]) & REOPENED_FLAGS & ~os.O_DIRECTORY  # part of O_TMPFILE, by which it may have been made
     opened = table.open(f"/proc/self/fd/{made}", flags)
     _seek(table, opened, held)
     return opened
+
+
+def _written_pieces(content: bytes) -> Iterator[tuple[int, bytes]]:
+    """The parts of a file that are not zero, in whole pages: the rest becomes holes."""
+    filled = [start for start in range(0, len(content), PAGE_SIZE) if content[start : start + PAGE_SIZE].strip(b"\0")]
+    for _, run in groupby(enumerate(filled), key=lambda one: one[1] - one[0] * PAGE_SIZE):
+        starts = [start for _, start in run]
+        yield starts[0], content[starts[0] : starts[-1] + PAGE_SIZE]
 
 
 def _seek(table: CallTable, descriptor: int, held: Resource) -> None:

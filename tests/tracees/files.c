@@ -85,9 +85,11 @@ static void holes(const char *go) {
 }
 
 static void deleted(const char *go) {
-    int file = make("doomed", O_RDWR), twin = dup(file);
+    int file = make("doomed", O_RDWR), twin = dup(file), hollow = open("hollow", O_RDWR | O_CREAT, 0600);
     struct stat before, after;
-    unlink("doomed");
+    unlink("doomed"), unlink("hollow");
+    if (fchown(file, 1234, 5678) && geteuid() == 0) cannot("give a file away");
+    if (fchmod(file, 04751) || pwrite(hollow, "in the middle", 13, 64 * PAGE) != 13 || ftruncate(hollow, 128 * PAGE)) cannot("write");
     lseek(file, 10, SEEK_SET);
     fstat(file, &before);
     ready(), wait_for_go(go);
@@ -98,6 +100,11 @@ static void deleted(const char *go) {
     fstat(file, &after);
     EXPECT_EQUAL("size", after.st_size, before.st_size);
     EXPECT_EQUAL("names", after.st_nlink, 0);
+    EXPECT(after.st_uid == before.st_uid && after.st_gid == before.st_gid, "it belongs to %d:%d", after.st_uid, after.st_gid);
+    EXPECT_EQUAL("first byte that is no hole", lseek(hollow, 0, SEEK_DATA), 64 * (long)PAGE);
+    EXPECT_EQUAL("end of what is no hole", lseek(hollow, 64 * PAGE, SEEK_HOLE), 65 * (long)PAGE);
+    EXPECT_EQUAL("size", lseek(hollow, 0, SEEK_END), 128 * (long)PAGE);
+    lseek(hollow, 64 * PAGE, SEEK_SET), expect_read(hollow, "in the middle");
     EXPECT_EQUAL("mode", after.st_mode, before.st_mode);
     EXPECT(access("doomed", F_OK) != 0, "the file has a name again");
 }
