@@ -179,7 +179,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return None
     seen = held.observed
     name = {socket.IPPROTO_TCP: "a TCP socket", socket.IPPROTO_UDP: "a UDP socket"}[number_of(seen["protocol"])]
-    return elsewhere.refuse(held, name)
+    return sockets.refuse_filter(held) or elsewhere.refuse(held, name)
 
 
 def findings(held: Iterable[Resource]) -> Iterator[Finding]:

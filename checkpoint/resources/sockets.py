@@ -2,7 +2,8 @@
 
 Facts of every socket: ``descriptors``; ``flags`` of fcntl(2); ``socket``: its inode number, by which others refer to it;
 ``family``, ``type`` and ``protocol`` of socket(2); ``options``: a list of [level, number, value] of those that are not as in a
-fresh socket; ``queue``: what waits to be read, a list of messages, of a stream the pieces in which it was found.
+fresh socket; ``filter``, where there is one: the classic BPF program that sifts what comes, and ``filter_locked``; ``queue``:
+what waits to be read, a list of messages, of a stream the pieces in which it was found.
 
 A datagram of no bytes that waits is lost by the second capture after it came: it cannot be looked at twice.
 
@@ -12,6 +13,7 @@ Source: socket(7), ip(7), ipv6(7), tcp(7), udp(7).
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import fcntl
 import os
@@ -26,10 +28,21 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
+from checkpoint.capability import Area, refused
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.descriptors import Descriptor, copy_of
 from checkpoint.model import Fact, Resource
+from checkpoint.resources import OpenFile
 from checkpoint.resources.rebuilding import number_of
+
+CAPABILITIES: Final = (
+    refused(
+        Area.SOCKETS,
+        "a socket with a filter of extended BPF (SO_ATTACH_BPF)",
+        "use a classic one (SO_ATTACH_FILTER), which is kept",
+        "with a filter of extended BPF",
+    ),
+)
 
 QUEUE_LIMIT: Final = 4 << 20
 """Bytes that wait in one socket and are carried."""
@@ -46,6 +59,11 @@ RIGHTS_SPACE: Final = socket.CMSG_SPACE(253 * 4)
 OPTION_SIZE: Final = 64
 """Bytes of the longest option that is kept."""
 
+SO_ATTACH_FILTER: Final = 26
+"""To get it back, too: then the length is counted in instructions of eight bytes."""
+SO_LOCK_FILTER: Final = 44
+UNTOLD: Final = b"?"
+"""In place of a filter: it is of extended BPF, which the kernel does not tell."""
 SO_PEEK_OFF: Final = 42
 _GENERAL: Final = (2, 5, 6, 9, 10, 11, 12, 13, 15, 16, 18, 20, 21, 25, 29, 34, 35, 36, 37, 40, SO_PEEK_OFF, 46, 60, 69)
 """SO_REUSEADDR, DONTROUTE, BROADCAST, KEEPALIVE, OOBINLINE, NO_CHECK, PRIORITY, LINGER, REUSEPORT, PASSCRED, RCVLOWAT, RCVTIMEO,
@@ -67,6 +85,8 @@ _TCP: Final = (1, 3, 4, 5, 6, 7, 8, 9, 10, 13, 18, 23, 25, 37)
 FASTOPEN, NOTSENT_LOWAT, TX_DELAY."""
 _UDP: Final = (1, 101, 102, 103, 104)
 """UDP_CORK, NO_CHECK6_TX, NO_CHECK6_RX, SEGMENT, GRO."""
+
+_libc = ctypes.CDLL(None, use_errno=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,13 +148,39 @@ def looked_into(pid: int, number: int) -> Iterator[socket.socket]:
 def general_facts(one: Descriptor, looked: socket.socket) -> dict[str, Fact]:
     """Family, kind and options."""
     form = Form(looked.family, looked.type, looked.proto)
-    return {
+    facts: dict[str, Fact] = {
         "socket": one.inode,
         "family": int(form.family),
         "type": int(form.type),
         "protocol": form.protocol,
         "options": list(_options(looked, form)),
     }
+    if sieve := _filter(looked):
+        facts |= {"filter": sieve, "filter_locked": bool(looked.getsockopt(socket.SOL_SOCKET, SO_LOCK_FILTER))}
+    return facts
+
+
+def _filter(looked: socket.socket) -> bytes:
+    """The classic BPF program that sifts what comes; b"" for none, `UNTOLD` for one of extended BPF.
+
+    Source: sk_get_filter() in net/core/filter.c.
+    """
+    count = ctypes.c_uint32(0)
+    if _libc.getsockopt(looked.fileno(), socket.SOL_SOCKET, SO_ATTACH_FILTER, None, ctypes.byref(count)):
+        return UNTOLD if ctypes.get_errno() == errno.EACCES else b""
+    if not count.value:
+        return b""
+    found = ctypes.create_string_buffer(count.value * 8)
+    if _libc.getsockopt(looked.fileno(), socket.SOL_SOCKET, SO_ATTACH_FILTER, found, ctypes.byref(count)):
+        return UNTOLD
+    return found.raw
+
+
+def refuse_filter(held: OpenFile) -> str | None:
+    """Why a socket's filter cannot be kept."""
+    if held.observed.get("filter") != UNTOLD:
+        return None
+    return f"{held.name} is a socket with a filter of extended BPF, which the kernel does not tell: use a classic one"
 
 
 def _options(looked: socket.socket, form: Form) -> Iterator[list[Fact]]:
@@ -145,16 +191,16 @@ def _options(looked: socket.socket, form: Form) -> Iterator[list[Fact]]:
             value = ask(level, number, OPTION_SIZE)
         except OSError:
             continue
-        if value != usual and _is_chosen(looked, level, number):
+        if _is_chosen(looked, level, number, value != usual):
             yield [level, number, value]
 
 
-def _is_chosen(looked: socket.socket, level: int, number: int) -> bool:
-    """Whether an option is as the program has set it, and not as the kernel has."""
+def _is_chosen(looked: socket.socket, level: int, number: int, differs: bool) -> bool:
+    """Whether an option is as the program has set it, and not as the kernel has: a buffer may be set to what is usual."""
     if level != socket.SOL_SOCKET or number not in _BUFFERS:
-        return True
-    locks = _option(looked, socket.SOL_SOCKET, SO_BUF_LOCK) or b"\3"
-    return bool(int.from_bytes(locks, "little") & _BUFFERS[number])
+        return differs
+    locks = _option(looked, socket.SOL_SOCKET, SO_BUF_LOCK)
+    return differs if locks is None else bool(int.from_bytes(locks, "little") & _BUFFERS[number])
 
 
 @lru_cache(maxsize=32)
@@ -289,6 +335,18 @@ def set_options(table: CallTable, held: Resource, made: int) -> None:
         else:
             lost = f"option {number} of level {level} of {held.name} is not kept"
             table.attempt(lost, "setsockopt", made, level, number, table.place(value), len(value))
+    _set_filter(table, held, made)
+
+
+def _set_filter(table: CallTable, held: Resource, made: int) -> None:
+    sieve = held.facts.get("filter")
+    if not isinstance(sieve, bytes):
+        return
+    program = table.place(struct.pack("<H6xQ", len(sieve) // 8, table.place(sieve)))
+    table.call(f"attach the filter of {held.name}", "setsockopt", made, socket.SOL_SOCKET, SO_ATTACH_FILTER, program, 16)
+    if held.facts.get("filter_locked"):
+        place = table.place(struct.pack("<i", 1))
+        table.call(f"lock the filter of {held.name}", "setsockopt", made, socket.SOL_SOCKET, SO_LOCK_FILTER, place, 4)
 
 
 def _set_buffer(table: CallTable, made: int, number: int, size: int) -> None:

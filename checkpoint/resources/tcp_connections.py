@@ -162,7 +162,9 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
 
 def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     """Why a connection can neither come back nor end."""
-    return elsewhere.refuse(held, "a TCP connection") if is_connection(held.observed) else None
+    if not is_connection(held.observed):
+        return None
+    return sockets.refuse_filter(held) or elsewhere.refuse(held, "a TCP connection")
 
 
 def findings(held: Sequence[Resource], *, standing: bool) -> Iterator[Finding]:

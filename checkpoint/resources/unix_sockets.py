@@ -181,7 +181,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return f"{what} in which more than {sockets.QUEUE_LIMIT >> 20} MiB wait: it is kept as soon as they are read"
     if seen["sources"]:
         return f"{what} with messages of a sender that has a name, which is not kept: it is kept as soon as they are read"
-    return elsewhere.refuse(held, "a unix socket")
+    return sockets.refuse_filter(held) or elsewhere.refuse(held, "a unix socket")
 
 
 def _leads_outside(seen: Mapping[str, Fact]) -> bool:

@@ -1,6 +1,7 @@
 /* Sockets of the program's own: pairs, listeners, datagrams; the case is named by the second argument. */
 #include "tracee.h"
 
+#include <linux/filter.h>
 #include <arpa/inet.h>
 #include <net/if.h>
 #include <netinet/in.h>
@@ -351,6 +352,29 @@ static void udp_options(void) {
     expect_same_name(file, &address);
 }
 
+/* What sifts a socket's messages, and a buffer that was set to what is usual: it does not grow by itself. */
+static void filtered(void) {
+    struct sock_filter wanted[] = {{0x28, 0, 0, 12}, {0x15, 0, 1, 0x0800}, {0x06, 0, 0, 0xffff}, {0x06, 0, 0, 3}}, found[8];
+    struct sock_fprog program = {4, wanted};
+    struct sockaddr_storage address;
+    int receiver = bound(AF_INET, SOCK_DGRAM, "127.0.0.1", 0, &address), stream = socket(AF_INET, SOCK_STREAM, 0), ends[2];
+    socklen_t count = 8, size = sizeof found;
+    if (setsockopt(receiver, SOL_SOCKET, SO_ATTACH_FILTER, &program, sizeof program)) cannot("attach a filter");
+    set(receiver, SOL_SOCKET, SO_LOCK_FILTER, 1);
+    program.len = 1, program.filter = wanted + 3;
+    if (socketpair(AF_UNIX, SOCK_DGRAM, 0, ends)) cannot("make a pair");
+    if (setsockopt(ends[1], SOL_SOCKET, SO_ATTACH_FILTER, &program, sizeof program)) cannot("attach a filter");
+    set(stream, SOL_SOCKET, SO_SNDBUF, option(stream, SOL_SOCKET, SO_SNDBUF) / 2);
+    wait_here();
+    memset(found, 0, sizeof found);
+    EXPECT(getsockopt(receiver, SOL_SOCKET, SO_GET_FILTER, found, &count) == 0 && count == 4, "the filter has %u steps", count);
+    EXPECT(!memcmp(found, wanted, sizeof wanted), "it is another filter");
+    EXPECT_EQUAL("lock", option(receiver, SOL_SOCKET, SO_LOCK_FILTER), 1);
+    EXPECT_EQUAL("locks of the buffers", option(stream, SOL_SOCKET, 72 /* SO_BUF_LOCK */), 1);
+    say(ends[0], "cut off");
+    EXPECT((size = read(ends[1], found, sizeof found)) == 3, "%u bytes came through", size);
+}
+
 static int is_member(int file, const char *group) {
     char line[200];
     struct in_addr wanted;
@@ -397,6 +421,7 @@ int main(int count, char **arguments) {
                  {"tcp_fresh", tcp_fresh},
                  {"udp_queue", udp_queue},
                  {"udp_options", udp_options},
+                 {"filtered", filtered},
                  {"udp_group", udp_group}};
     go = arguments[1];
     for (size_t index = 0; index < sizeof cases / sizeof *cases; index++)
