@@ -152,6 +152,7 @@ SYSTEM_CALLS: Final = {
     "timerfd_settime": 286,
     "umask": 95,
     "unlinkat": 263,
+    "utimensat": 280,
     "write": 1,
 }
 """Numbers of the system calls that a restore makes inside a vessel (asm/unistd_64.h)."""

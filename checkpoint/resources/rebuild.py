@@ -14,6 +14,7 @@ from __future__ import annotations
 import fcntl
 import os
 import stat
+import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import groupby
@@ -49,6 +50,8 @@ from checkpoint.resources import (
 )
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
+NS_PER_S: Final = 1_000_000_000
+UTIME_OMIT: Final = (1 << 30) - 2
 REOPENED_FLAGS: Final = (
     os.O_ACCMODE | os.O_APPEND | os.O_NONBLOCK | os.O_DSYNC | os.O_SYNC | os.O_DIRECT | os.O_NOATIME | os.O_DIRECTORY
 )
@@ -287,6 +290,10 @@ def _open_deleted(table: CallTable, held: Resource, rebuilding: Rebuilding) -> i
         owner = number_of(facts["uid"]), number_of(facts["gid"])
         table.attempt(f"the deleted file {path} belongs to whom the program runs as", "fchown", made, *owner)
         table.attempt("", "fchmod", made, number_of(facts["mode"]) & 0o7777)  # a change of owner takes set-user-ID away
+    if "mtime_ns" in facts:
+        changed = struct.pack("<qq", *divmod(number_of(facts["mtime_ns"]), NS_PER_S))
+        times = table.place(struct.pack("<qq", 0, UTIME_OMIT) + changed)
+        table.attempt("", "utimensat", made, 0, times, 0)
     flags = number_of(facts["flags"]) & REOPENED_FLAGS & ~os.O_DIRECTORY  # part of O_TMPFILE, by which it may have been made
     opened = table.open(f"/proc/self/fd/{made}", flags)
     _seek(table, opened, held)

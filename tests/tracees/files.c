@@ -86,18 +86,20 @@ static void holes(const char *go) {
 
 static void deleted(const char *go) {
     int file = make("doomed", O_RDWR), twin = dup(file), hollow = open("hollow", O_RDWR | O_CREAT, 0600);
-    struct stat before, after;
+    struct stat before, changed, after;
     unlink("doomed"), unlink("hollow");
     if (fchown(file, 1234, 5678) && geteuid() == 0) cannot("give a file away");
     if (fchmod(file, 04751) || pwrite(hollow, "in the middle", 13, 64 * PAGE) != 13 || ftruncate(hollow, 128 * PAGE)) cannot("write");
     lseek(file, 10, SEEK_SET);
     fstat(file, &before);
     ready(), wait_for_go(go);
+    fstat(file, &changed);
     expect_read(file, "abc"), expect_read(twin, "def");
     if (pwrite(file, "ZZ", 2, 0) != 2) differs("cannot write: %s", strerror(errno));
     lseek(file, 0, SEEK_SET);
     expect_read(file, "ZZ2345");
     fstat(file, &after);
+    EXPECT_EQUAL("time of change", changed.st_mtim.tv_nsec, before.st_mtim.tv_nsec);
     EXPECT_EQUAL("size", after.st_size, before.st_size);
     EXPECT_EQUAL("names", after.st_nlink, 0);
     EXPECT(after.st_uid == before.st_uid && after.st_gid == before.st_gid, "it belongs to %d:%d", after.st_uid, after.st_gid);
