@@ -67,6 +67,13 @@ CAPABILITIES: Final = (
         "where a connection waits to be accepted",
     ),
     refused(
+        Area.SOCKETS,
+        "a unix socket whose directory is gone, or whose name is something else by now",
+        "let the program bind a name that stays",
+        "is a unix socket whose directory is gone",
+        "is a unix socket whose name is something else",
+    ),
+    refused(
         Area.THERE,
         "something else has the name of a unix socket, or there is no place for it",
         "end or remove what is there; make the directory",
@@ -181,7 +188,20 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return f"{what} in which more than {sockets.QUEUE_LIMIT >> 20} MiB wait: it is kept as soon as they are read"
     if seen["sources"]:
         return f"{what} with messages of a sender that has a name, which is not kept: it is kept as soon as they are read"
-    return sockets.refuse_filter(held) or elsewhere.refuse(held, "a unix socket")
+    return _refuse_name(held) or sockets.refuse_filter(held) or elsewhere.refuse(held, "a unix socket")
+
+
+def _refuse_name(held: OpenFile) -> str | None:
+    """Why a socket cannot be given its name again: there is no place for it, as the process sees it."""
+    path = str(held.observed["path"])
+    place = f"/proc/{held.pid}/root{path}"
+    if not path:
+        return None
+    if not os.path.isdir(os.path.dirname(place)):
+        return f"{held.name} is a unix socket whose directory is gone ({path}): let the program open it where it stays"
+    if os.path.lexists(place) and not stat.S_ISSOCK(os.lstat(place).st_mode):
+        return f"{held.name} is a unix socket whose name is something else by now ({path}): let the program bind another one"
+    return None
 
 
 def _leads_outside(seen: Mapping[str, Fact]) -> bool:

@@ -36,6 +36,8 @@ REFUSED = {
     "traced_child": "child",
     "unix_rights": "scm_rights",
     "unix_waiting": "accepted",
+    "unix_no_directory": "directory is gone",
+    "unix_other_name": "something else",
     "netlink_socket": r"a socket (netlink",
     "fanotify": "fanotify",
     "io_uring": "io_uring",

@@ -149,6 +149,20 @@ static void take_unix_waiting(void) {
     if (connect(socket(AF_UNIX, SOCK_STREAM, 0), (struct sockaddr *)&address, sizeof address)) cannot("connect");
 }
 
+static void bind_at(const char *path) {
+    struct sockaddr_un address = {.sun_family = AF_UNIX};
+    strcpy(address.sun_path, path);
+    keep(socket(AF_UNIX, SOCK_STREAM, 0), "a socket");
+    if (bind(opened, (struct sockaddr *)&address, sizeof address) || listen(opened, 1) || unlink(path)) cannot("listen");
+}
+
+static void take_unix_no_directory(void) {
+    mkdir("short-lived", 0700), bind_at("short-lived/socket");
+    if (rmdir("short-lived")) cannot("remove a directory");
+}
+
+static void take_unix_other_name(void) { bind_at("name"), close(open("name", O_CREAT | O_WRONLY, 0600)); }
+
 static void take_netlink_socket(void) { keep(socket(AF_NETLINK, SOCK_RAW, 0), "a socket"); }
 
 static void take_fanotify(void) { keep(fanotify_init(FAN_CLASS_NOTIF, O_RDONLY), "fanotify"); }
@@ -324,6 +338,8 @@ static const struct kind {
              {"pipe", take_pipe},
              {"unix_rights", take_unix_rights},
              {"unix_waiting", take_unix_waiting},
+             {"unix_no_directory", take_unix_no_directory},
+             {"unix_other_name", take_unix_other_name},
              {"netlink_socket", take_netlink_socket},
              {"fanotify", take_fanotify},
              {"io_uring", take_io_uring},
