@@ -244,8 +244,13 @@ def prepare(table: CallTable, held: Sequence[Resource], first: int) -> dict[int,
         made[number_of(one.facts["socket"])] = place
         table.duplicate(opened, place, os.O_CLOEXEC)
         table.close(opened)
+    shared = [made[number_of(one.facts["socket"])] for one in held if _shares_its_port(one, held)]
+    for number in shared:
+        _allow(table, number, socket.SO_REUSEPORT, 1)
     for one in held:
         _place(table, one, made[number_of(one.facts["socket"])])
+    for number in shared:
+        _allow(table, number, socket.SO_REUSEPORT, 0)
     for one in held:
         _send_again(table, one, held, made)
     for one in held:
@@ -262,20 +267,27 @@ def size_of(address: Sequence[Fact]) -> int:
     return 28 if ":" in str(address[0]) else 16
 
 
+def _shares_its_port(one: Resource, held: Sequence[Resource]) -> bool:
+    """Whether another one is bound to the same address, which this one did not mind when it was bound, but would now."""
+    if not one.facts["address"] or _has_option(one, socket.SOL_SOCKET, socket.SO_REUSEPORT):
+        return False
+    return any(other is not one and all(other.facts[fact] == one.facts[fact] for fact in ("address", "type")) for other in held)
+
+
 def _place(table: CallTable, one: Resource, made: int) -> None:
     """Bind it, let it listen, join its groups."""
     address = one.facts["address"]
     assert isinstance(address, list)
     shares = number_of(one.facts["state"]) == LISTENING and not _has_option(one, socket.SOL_SOCKET, socket.SO_REUSEADDR)
     if shares:  # its port with connections of the program that are there already
-        _reuse(table, made, 1)
+        _allow(table, made, socket.SO_REUSEADDR, 1)
     if address:
         what = f"bind {one.name} to {in_words(address)}"
         table.call(what, "bind", made, table.place(sockaddr(address)), size_of(address))
     if number_of(one.facts["state"]) == LISTENING:
         table.call(f"listen at {one.name}", "listen", made, number_of(one.facts["backlog"]))
     if shares:
-        _reuse(table, made, 0)
+        _allow(table, made, socket.SO_REUSEADDR, 0)
     for interface, group, packed in _joined(one):
         index = socket.if_nametoindex(interface)
         level = socket.IPPROTO_IPV6 if ":" in group else socket.IPPROTO_IP
@@ -288,9 +300,10 @@ def _place(table: CallTable, one: Resource, made: int) -> None:
             table.call(what, "setsockopt", made, level, MCAST_MSFILTER, table.place(request), len(request))
 
 
-def _reuse(table: CallTable, made: int, value: int) -> None:
+def _allow(table: CallTable, made: int, option: int, value: int) -> None:
+    """Set SO_REUSEADDR or SO_REUSEPORT."""
     place = table.place(value.to_bytes(4, "little"))
-    table.call("set SO_REUSEADDR", "setsockopt", made, socket.SOL_SOCKET, socket.SO_REUSEADDR, place, 4)
+    table.call("let sockets share a port", "setsockopt", made, socket.SOL_SOCKET, option, place, 4)
 
 
 def _send_again(table: CallTable, one: Resource, held: Sequence[Resource], made: Mapping[int, int]) -> None:

@@ -37,7 +37,7 @@ CASES = {
         "pair_stream pair_datagram pair_packets pair_much pair_options pair_half_closed rights_stream "
         "rights_datagram pair_orphan listener_path "
         "listener_abstract unix_with_itself unix_datagrams unix_fresh tcp_listener_4 tcp_listener_6 tcp_fresh udp_queue "
-        "udp_options udp_group filtered"
+        "udp_options udp_group filtered tcp_shared_port"
     ),
 }
 

@@ -313,6 +313,27 @@ static void tcp_fresh(void) {
     expect_same_name(named, &address);
 }
 
+/* Two listeners at one port, of which one would not share it any more. */
+static void tcp_shared_port(void) {
+    struct sockaddr_storage address;
+    socklen_t size = sizeof address;
+    int files[2];
+    memset(&address, 0, size), address.ss_family = AF_INET;
+    for (int index = 0; index < 2; index++) {
+        files[index] = socket(AF_INET, SOCK_STREAM, 0);
+        set(files[index], SOL_SOCKET, SO_REUSEPORT, 1);
+        if (bind(files[index], (struct sockaddr *)&address, 16) || listen(files[index], 3)) cannot("listen");
+        getsockname(files[index], (struct sockaddr *)&address, &size);
+    }
+    set(files[0], SOL_SOCKET, SO_REUSEPORT, 0);
+    wait_here();
+    for (int index = 0; index < 2; index++) {
+        expect_same_name(files[index], &address);
+        EXPECT_EQUAL("listens", option(files[index], SOL_SOCKET, SO_ACCEPTCONN), 1);
+        EXPECT_EQUAL("shares", option(files[index], SOL_SOCKET, SO_REUSEPORT), index);
+    }
+}
+
 static void udp_queue(void) {
     struct sockaddr_storage address, sender_address, from;
     int receiver = bound(AF_INET, SOCK_DGRAM, "127.0.0.1", 0, &address);
@@ -419,6 +440,7 @@ int main(int count, char **arguments) {
                  {"tcp_listener_4", tcp_listener_4},
                  {"tcp_listener_6", tcp_listener_6},
                  {"tcp_fresh", tcp_fresh},
+                 {"tcp_shared_port", tcp_shared_port},
                  {"udp_queue", udp_queue},
                  {"udp_options", udp_options},
                  {"filtered", filtered},
