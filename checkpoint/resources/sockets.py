@@ -86,7 +86,7 @@ FASTOPEN, NOTSENT_LOWAT, TX_DELAY."""
 _UDP: Final = (1, 101, 102, 103, 104)
 """UDP_CORK, NO_CHECK6_TX, NO_CHECK6_RX, SEGMENT, GRO."""
 
-_libc = ctypes.CDLL(None, use_errno=True)
+_getsockopt = ctypes.CDLL(None, use_errno=True).getsockopt
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,12 +166,12 @@ def _filter(looked: socket.socket) -> bytes:
     Source: sk_get_filter() in net/core/filter.c.
     """
     count = ctypes.c_uint32(0)
-    if _libc.getsockopt(looked.fileno(), socket.SOL_SOCKET, SO_ATTACH_FILTER, None, ctypes.byref(count)):
+    if _getsockopt(looked.fileno(), socket.SOL_SOCKET, SO_ATTACH_FILTER, None, ctypes.byref(count)):
         return UNTOLD if ctypes.get_errno() == errno.EACCES else b""
     if not count.value:
         return b""
     found = ctypes.create_string_buffer(count.value * 8)
-    if _libc.getsockopt(looked.fileno(), socket.SOL_SOCKET, SO_ATTACH_FILTER, found, ctypes.byref(count)):
+    if _getsockopt(looked.fileno(), socket.SOL_SOCKET, SO_ATTACH_FILTER, found, ctypes.byref(count)):
         return UNTOLD
     return found.raw
 
@@ -186,21 +186,19 @@ def refuse_filter(held: OpenFile) -> str | None:
 def _options(looked: socket.socket, form: Form) -> Iterator[list[Fact]]:
     """The program stands still meanwhile: some sixty questions to each socket."""
     ask = looked.getsockopt
+    chosen = _option(looked, socket.SOL_SOCKET, SO_BUF_LOCK)
+    locks = None if chosen is None else chosen[0]
     for (level, number), usual in _fresh_options(form).items():
         try:
             value = ask(level, number, OPTION_SIZE)
         except OSError:
             continue
-        if _is_chosen(looked, level, number, value != usual):
+        if level == socket.SOL_SOCKET and number in _BUFFERS and locks is not None:
+            is_chosen = bool(locks & _BUFFERS[number])  # the kernel sizes it by itself, and a program may choose what is usual
+        else:
+            is_chosen = value != usual
+        if is_chosen:
             yield [level, number, value]
-
-
-def _is_chosen(looked: socket.socket, level: int, number: int, differs: bool) -> bool:
-    """Whether an option is as the program has set it, and not as the kernel has: a buffer may be set to what is usual."""
-    if level != socket.SOL_SOCKET or number not in _BUFFERS:
-        return differs
-    locks = _option(looked, socket.SOL_SOCKET, SO_BUF_LOCK)
-    return differs if locks is None else bool(int.from_bytes(locks, "little") & _BUFFERS[number])
 
 
 @lru_cache(maxsize=32)
