@@ -27,7 +27,7 @@ cat >"$1/part.$$" <<END
  "generation": "$FAILOVER_GENERATION", "pid": "$FAILOVER_PID",
  "from": "$FAILOVER_FROM", "age": "$FAILOVER_AGE_MS", "component": "$FAILOVER_COMPONENT", "uid": "$(id -u)"}
 END
-cat "$1/part.$$" | tr -d '\\n' >>"$1/told"; echo >>"$1/told"
+printf '%s\\n' "$(tr -d '\\n' <"$1/part.$$")" >>"$1/told"  # in one write: two hooks may run at once
 """
 
 Pair = tuple[RobotMachine, RobotMachine]
