@@ -16,7 +16,7 @@ from checkpoint.model import Snapshot
 
 
 class PtraceEngine:
-    """Captures and restores single-threaded Linux processes that nobody prepared."""
+    """Captures and restores Linux processes that nobody prepared, with all their threads."""
 
     name = PTRACE
 

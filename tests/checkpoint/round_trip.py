@@ -26,6 +26,9 @@ from checkpoint.linux.vessel import Birth, Born, discard, spawn_program, spawn_v
 from checkpoint.model import Snapshot
 
 ENGINE = engine_named("ptrace")
+LIVES = 3
+"""After so many restores in a row nothing may differ."""
+
 PATIENCE_S = 60.0
 """How long anything awaited here may take; generous, because the machine may be busy with other tests."""
 
@@ -235,6 +238,19 @@ def restored(
         discard(born)
         raise
     return Program(born, directory)
+
+
+def expect_three_lives(tracee: Program, directory: Path) -> None:
+    """Capture, kill and restore a tracee three times, each time captured twice, and have it say what differs."""
+    for _ in range(LIVES):
+        with ended(tracee):
+            captured(tracee)
+            snapshot = captured_and_killed(tracee)
+        tracee = restored(snapshot, directory)
+    with ended(tracee):
+        captured(tracee)
+        tracee.tell()
+        expect_ok(tracee)
 
 
 NOBODY = 65534

@@ -17,13 +17,20 @@ from pathlib import Path
 import pytest
 
 from checkpoint.errors import CheckpointError, UnsupportedError
-from tests.checkpoint.round_trip import ENGINE, captured, captured_and_killed, ended, expect_ok, restored, start, start_tracee
+from tests.checkpoint.round_trip import (
+    ENGINE,
+    captured_and_killed,
+    ended,
+    expect_ok,
+    expect_three_lives,
+    restored,
+    start,
+    start_tracee,
+)
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
 Compiled = Callable[..., Path]
-
-ROUNDS = 3
 
 CASES = {
     "event_descriptors": (
@@ -48,15 +55,7 @@ def test_what_a_program_has_open_is_as_it_was_after_three_restores(
     program: str, case: str, compiled: Compiled, tmp_path: Path
 ) -> None:
     tracee = start_tracee(compiled(program, "-O2"), tmp_path, case)
-    for _ in range(ROUNDS):
-        with ended(tracee):
-            captured(tracee)
-            snapshot = captured_and_killed(tracee)
-        tracee = restored(snapshot, tmp_path)
-    with ended(tracee):
-        captured(tracee)
-        tracee.tell()
-        expect_ok(tracee)
+    expect_three_lives(tracee, tmp_path)
 
 
 def test_a_named_pipe_is_made_where_it_is_missing(compiled: Compiled, tmp_path: Path) -> None:

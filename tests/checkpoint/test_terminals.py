@@ -12,28 +12,30 @@ import pytest
 from checkpoint.engine import RestoreOptions
 from checkpoint.errors import UnsupportedError
 from checkpoint.linux.vessel import Birth, discard, spawn_vessel
-from tests.checkpoint.round_trip import ENGINE, captured, captured_and_killed, ended, expect_ok, restored, start, start_tracee
+from tests.checkpoint.round_trip import (
+    ENGINE,
+    LIVES,
+    captured,
+    captured_and_killed,
+    ended,
+    expect_ok,
+    expect_three_lives,
+    restored,
+    start,
+    start_tracee,
+)
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
 Compiled = Callable[..., Path]
 
-ROUNDS = 3
 CASES = ["plain", "settings", "modes", "several", "controlling", "alone", "hung_up"]
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_a_terminal_of_which_a_program_has_both_ends_comes_back(case: str, compiled: Compiled, tmp_path: Path) -> None:
     tracee = start_tracee(compiled("terminals", "-O2", "-lutil"), tmp_path, case)
-    for _ in range(ROUNDS):
-        with ended(tracee):
-            captured(tracee)
-            snapshot = captured_and_killed(tracee)
-        tracee = restored(snapshot, tmp_path)
-    with ended(tracee):
-        captured(tracee)
-        tracee.tell()
-        expect_ok(tracee)
+    expect_three_lives(tracee, tmp_path)
 
 
 def test_a_terminal_of_an_isolated_program_keeps_its_number_whatever_others_have_open(compiled: Compiled, tmp_path: Path) -> None:
@@ -41,7 +43,7 @@ def test_a_terminal_of_an_isolated_program_keeps_its_number_whatever_others_have
     try:
         tracee = start([compiled("terminals", "-O2", "-lutil"), "go", "named"], tmp_path, isolate=True)
         tracee.wait_for_line("ready")
-        for _ in range(ROUNDS):
+        for _ in range(LIVES):
             with ended(tracee):
                 snapshot = captured_and_killed(tracee)
                 assert [held.facts["terminal"] for held in snapshot.resources if held.kind == "terminals"] == [1, 1]
