@@ -25,8 +25,7 @@ from agent.places import Places, complete_logs, log_directory
 from agent.streams import discard, total_of
 from checkpoint import channel, epoch_variable, format
 from checkpoint.carried import paths_of
-from checkpoint.device_rules import DeviceRule
-from checkpoint.engine import COOPERATIVE, NOTHING_CARRIED, PTRACE, Carry
+from checkpoint.engine import COOPERATIVE, NO_TERMS, PTRACE, Terms
 from checkpoint.engines.cooperative import age_ns as commit_age_ns
 from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
@@ -122,8 +121,7 @@ async def restore(
     laps: Laps | None = None,
     task: guard_messages.Task | None = None,
     epoch: int = 0,
-    carry: Carry = NOTHING_CARRIED,
-    devices: tuple[DeviceRule, ...] = (),
+    terms: Terms = NO_TERMS,
 ) -> Component:
     """Rebuild a component from a chain (descriptors of encoded snapshots, oldest first), stopped, committed to nothing.
 
@@ -134,8 +132,7 @@ async def restore(
         outage_ns: added to the program's monotonic and boot time: how long ago the newest snapshot was taken.
         task: for a program that may still say that it keeps its state.
         owner: uid; None: whoever it ran as. What is not root's opens its files with its owner's rights, and gets no others.
-        carry: limit and places of its carried files on this robot.
-        devices: what becomes of devices that it had open.
+        terms: this robot's.
 
     Raises:
         checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
@@ -161,7 +158,7 @@ async def restore(
         task=task,
     )
     component.engine_wanted = task.engine if task is not None else PTRACE
-    component.keeper.carry, component.keeper.devices = carry_of(outline, carry), devices
+    component.keeper.terms = terms_of(outline, terms)
     component.keeper.names = names_of_contents(needs(outline), places.contents)
     try:
         keeper = await component.keeper.give()
@@ -177,8 +174,7 @@ async def restore(
             own_eyes=owner != ROOT,
             epoch=epoch,
             contents=places.contents,
-            carry=component.keeper.carry,
-            devices=devices,
+            terms=component.keeper.terms,
         )
         restored, _ = await component.keeper.ask(order, (*chain, *component.streams))
         laps.lap("restore")
@@ -189,10 +185,10 @@ async def restore(
     return component
 
 
-def carry_of(outline: Snapshot, here: Carry) -> Carry:
-    """What a component that comes back carries on this robot."""
-    places = dict(here.places)
-    return replace(here, paths=tuple(places.get(path, path) for path in paths_of(outline)))
+def terms_of(outline: Snapshot, here: Terms) -> Terms:
+    """On which terms a component that comes back is followed on this robot: it carries what its snapshot says."""
+    places = dict(here.carry.places)
+    return replace(here, carry=replace(here.carry, paths=tuple(places.get(path, path) for path in paths_of(outline))))
 
 
 async def begin_again(
@@ -206,7 +202,7 @@ async def begin_again(
     epoch: int,
     why: str,
     waiting: Component | None = None,
-    carry: Carry = NOTHING_CARRIED,
+    terms: Terms = NO_TERMS,
 ) -> Component:
     """Prepare a program that keeps its state to go on from a chain of the cooperative engine; `resume` lets it.
 
@@ -215,7 +211,7 @@ async def begin_again(
     Args:
         why: one of `checkpoint.task_channel.REASONS`.
         waiting: the program, started to wait (`start_to_wait`); None: `resume` starts it.
-        carry: limit and places of its carried files on this robot.
+        terms: this robot's.
 
     Raises:
         checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
@@ -231,10 +227,10 @@ async def begin_again(
     await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
     component = waiting or Component(name, await places.nursery.guard(), places)
     component.engine_wanted = COOPERATIVE  # what another engine took before it says Hello would be older than its state
-    component.keeper.carry = carry_of(outline, carry)
+    component.keeper.terms = terms_of(outline, terms)
     try:
         await component.keeper.give()
-        filled, (segment,) = await component.keeper.ask(channel.Fill(name, owner != ROOT, carry.places), tuple(chain))
+        filled, (segment,) = await component.keeper.ask(channel.Fill(name, owner != ROOT, terms.carry.places), tuple(chain))
     except (CheckpointError, GuardError, KeeperLostError):
         await component.undo()
         raise

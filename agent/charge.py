@@ -12,7 +12,7 @@ import logging
 import os
 import signal
 from collections.abc import Coroutine
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from agent import births, clock, comeback
@@ -21,12 +21,11 @@ from agent.errors import TROUBLE, AgentError, GuardError, KeeperLostError
 from agent.figures import Commits, Figures, shortened
 from agent.mistake import end_lanes_on_mistake
 from agent.occasions import Occasions
-from agent.rules import carry_here
+from agent.rules import begun_on
 from agent.snapshots import Snapshots, newest_of
 from agent.standby import Standby
 from agent.surroundings import Surroundings, program_of
 from checkpoint.channel import close_all
-from checkpoint.device_rules import arrived, merged
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CheckpointError, NothingCommittedError, UnsupportedError
 from failover.core import acts, events
@@ -116,10 +115,7 @@ class Charge:
 
     def adopt(self, component: Component, epoch: int) -> None:
         """A guard was found alive after a restart."""
-        component.keeper.carry, component.keeper.devices = (
-            self.around.records.carry(self.name),
-            self.around.records.devices(self.name),
-        )
+        component.keeper.terms = self.around.records.terms(self.name)
         self.component, self.epoch = component, epoch
         self.started.set()
         self._watch_the_end()
@@ -230,15 +226,14 @@ class Charge:
         self.standby.cool()
         adopted = self.component is not None
         self._occasions.runs_here(act.spec)
-        carry = replace(carry_here(self.around.here(self.name)), paths=act.spec.launch.carry)
-        devices = merged(arrived(act.spec.launch.devices), self.around.here(self.name).device_rules())
-        self.around.records.note(self.name, act.epoch, carry, devices)
+        terms = begun_on(act.spec.launch, self.around.here(self.name))
+        self.around.records.note(self.name, act.epoch, terms)
         if self.component is None:
             await self.around.settled(self.name)
             if not act.spec.launch.pid:
                 await self._occasions.before_start(act)
             self.component = await self._begun(act.spec.launch, act.epoch)
-        self.component.keeper.carry, self.component.keeper.devices = carry, devices
+        self.component.keeper.terms = terms
         await self.component.lease(self._lease_until_ns)
         await self._protect(refuse=act.spec.launch.pid != 0)
         self.started.set()
@@ -310,7 +305,7 @@ class Charge:
     async def _let_it_run(self, component: Component, epoch: int, outage_ns: int, laps: clock.Laps) -> tuple[Component, int]:
         """Give it the newest lease, and those that come while it is resumed; then it runs, or nothing of it is left."""
         prepared = component.prepared
-        self.around.records.note(self.name, epoch, component.keeper.carry, component.keeper.devices)
+        self.around.records.note(self.name, epoch, component.keeper.terms)
         self._coming = component
         try:
             if self._lease_until_ns:
@@ -326,7 +321,7 @@ class Charge:
 
     async def _thaw(self, act: acts.Thaw) -> None:
         component = self._present()
-        self.around.records.note(self.name, act.epoch, component.keeper.carry, component.keeper.devices)
+        self.around.records.note(self.name, act.epoch, component.keeper.terms)
         if self._is_held:
             return  # by a newer order
         await component.lease(self._lease_until_ns)

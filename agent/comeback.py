@@ -12,11 +12,10 @@ from agent import births
 from agent.clock import Laps
 from agent.component import Component
 from agent.guard_messages import Task
-from agent.rules import carry_here, started_here
+from agent.rules import started_here, terms_here
 from agent.surroundings import Surroundings, program_of
 from checkpoint import format, needs
 from checkpoint.contents import DIGEST_SIZE, path_in
-from checkpoint.device_rules import arrived, merged
 from checkpoint.engine import AUTO, COOPERATIVE
 from checkpoint.errors import RestoreError
 from checkpoint.model import Snapshot
@@ -46,7 +45,7 @@ async def brought_back(
         CheckpointError, AgentError: as `births.restore` and `births.begin_again`; nothing of it is left.
     """
     name, places, spec = act.component, around.places, act.spec
-    carry = carry_here(around.here(name))
+    terms = terms_here(spec.launch if spec is not None else None, around.here(name))
     newest = await asyncio.to_thread(format.read_outline, chain[-1])
     if newest.engine != COOPERATIVE:
         if waiting is not None:
@@ -62,8 +61,7 @@ async def brought_back(
             laps=laps,
             task=task,
             epoch=act.epoch,
-            carry=carry,
-            devices=merged(arrived(spec.launch.devices if spec is not None else ()), around.here(name).device_rules()),
+            terms=terms,
         )
     if spec is None:
         raise RestoreError(f"cannot start {name} again: this robot was never told its command; start it by failover run")
@@ -78,7 +76,7 @@ async def brought_back(
         epoch=act.epoch,
         why=act.why,
         waiting=waiting,
-        carry=carry,
+        terms=terms,
     )
 
 

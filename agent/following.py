@@ -9,8 +9,7 @@ from agent.nursery import KeeperLink
 from agent.places import Places
 from checkpoint import channel, errors
 from checkpoint.channel import Failed
-from checkpoint.device_rules import DeviceRule
-from checkpoint.engine import NOTHING_CARRIED
+from checkpoint.engine import NO_TERMS
 from checkpoint.errors import CheckpointError, RestoreError, UnsupportedError
 
 
@@ -19,16 +18,14 @@ class Following:
 
     Attributes:
         followed: engine and pid; None while nothing is followed.
-        carry: files that travel with it.
+        terms: under which.
         names: by which the program knows those of its files that were brought here, by their paths here.
-        devices: what becomes of devices that it has open.
     """
 
     def __init__(self, name: str, places: Places) -> None:
         self.followed: tuple[str, int] | None = None
-        self.carry = NOTHING_CARRIED
+        self.terms = NO_TERMS
         self.names: dict[str, str] = {}
-        self.devices: tuple[DeviceRule, ...] = ()
         self._name = name
         self._places = places
         self._link: KeeperLink | None = None
@@ -55,9 +52,7 @@ class Following:
         Raises:
             UnsupportedError, CheckpointError; KeeperLostError.
         """
-        order = channel.Protect(
-            pid, self._name, bool(streams), self._places.robot, engine, self.carry, self.devices, names=self.names
-        )
+        order = channel.Protect(pid, self._name, bool(streams), self._places.robot, engine, self.terms, self.names)
         try:
             protected, _ = await self.ask(order, streams)
         except UnsupportedError:

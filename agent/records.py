@@ -1,4 +1,4 @@
-"""Under which epoch each program on this robot was let run, and what it carries: noted before it runs, read by the next agent.
+"""Under which epoch each program on this robot was let run, and on which terms: noted before it runs, read by the next agent.
 
 One small file a component in the runtime directory: it has to outlive the agent, not the robot.
 """
@@ -10,8 +10,7 @@ from pathlib import Path
 
 import msgspec
 
-from checkpoint.device_rules import DeviceRule
-from checkpoint.engine import NOTHING_CARRIED, Carry
+from checkpoint.engine import NO_TERMS, Terms
 from checkpoint.shelf import folder_name
 
 
@@ -20,8 +19,7 @@ class Running(msgspec.Struct, frozen=True):
 
     component: str
     epoch: int
-    carry: Carry = NOTHING_CARRIED
-    devices: tuple[DeviceRule, ...] = ()
+    terms: Terms = NO_TERMS
 
 
 class Records:
@@ -31,7 +29,7 @@ class Records:
         self._directory = directory
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
 
-    def note(self, component: str, epoch: int, carry: Carry = NOTHING_CARRIED, devices: tuple[DeviceRule, ...] = ()) -> None:
+    def note(self, component: str, epoch: int, terms: Terms = NO_TERMS) -> None:
         """From now on it runs under this epoch.
 
         Raises:
@@ -39,7 +37,7 @@ class Records:
         """
         path = self._path(component)
         aside = path.with_suffix(".new")
-        aside.write_bytes(msgspec.json.encode(Running(component, epoch, carry, devices)))
+        aside.write_bytes(msgspec.json.encode(Running(component, epoch, terms)))
         aside.replace(path)
 
     def epoch(self, component: str) -> int:
@@ -47,15 +45,10 @@ class Records:
         noted = self._noted(component)
         return noted.epoch if noted else 0
 
-    def carry(self, component: str) -> Carry:
-        """Which files travel with it."""
+    def terms(self, component: str) -> Terms:
+        """What its operator has ruled."""
         noted = self._noted(component)
-        return noted.carry if noted else NOTHING_CARRIED
-
-    def devices(self, component: str) -> tuple[DeviceRule, ...]:
-        """What becomes of devices that it has open."""
-        noted = self._noted(component)
-        return noted.devices if noted else ()
+        return noted.terms if noted else NO_TERMS
 
     def _noted(self, component: str) -> Running | None:
         try:

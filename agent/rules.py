@@ -6,7 +6,8 @@ from dataclasses import replace
 
 from agent.config import ComponentConfig, Config, Settings
 from checkpoint import portable
-from checkpoint.engine import Carry
+from checkpoint.device_rules import arrived, merged
+from checkpoint.engine import Carry, Terms
 from checkpoint.history import Retention
 from failover.client.quantities import size_bytes, span_ms
 from failover.core import types
@@ -73,9 +74,19 @@ def level_of(wanted: str, config: Config, component: ComponentConfig) -> str:
     return said if said in portable.LEVELS else ""
 
 
-def carry_here(component: ComponentConfig) -> Carry:
-    """How carried files are kept on this robot, whatever their paths."""
-    return Carry(size_max=size_bytes(component.carry_limit), places=tuple(component.carry_at.items()))
+def terms_here(launch: Launch | None, component: ComponentConfig) -> Terms:
+    """On which terms a component comes back on this robot: what travels with it, and this robot's own, which comes in its place.
+
+    Which files it carries its snapshots say.
+    """
+    carry = Carry(size_max=size_bytes(component.carry_limit), places=tuple(component.carry_at.items()))
+    return Terms(carry, merged(arrived(launch.devices if launch is not None else ()), component.device_rules()))
+
+
+def begun_on(launch: Launch, component: ComponentConfig) -> Terms:
+    """On which terms a component begins here."""
+    terms = terms_here(launch, component)
+    return replace(terms, carry=replace(terms.carry, paths=launch.carry))
 
 
 def started_here(launch: Launch, component: ComponentConfig) -> Launch:

@@ -18,8 +18,7 @@ from typing import Any, Final, Generic, TypeVar
 import msgspec
 
 from checkpoint.capability import Capability
-from checkpoint.device_rules import DeviceRule
-from checkpoint.engine import NOTHING_CARRIED, PTRACE, Carry, Report
+from checkpoint.engine import NO_TERMS, PTRACE, Report, Terms
 from checkpoint.errors import UNDECODABLE, CheckpointError
 from checkpoint.model import Position
 
@@ -207,7 +206,7 @@ class Protect(msgspec.Struct, frozen=True, tag=True):
     With descriptors, if ``streams``: the counters' memfd, two pipe read ends, two log files.
 
     Attributes:
-        names: see `checkpoint.engine.Engine.protect`, which is told them if ``robot`` is one: its agent keeps files by content.
+        names: see `checkpoint.engine.ProtectOrder`, which is told them if ``robot`` is one: its agent keeps files by content.
     """
 
     pid: int
@@ -215,8 +214,7 @@ class Protect(msgspec.Struct, frozen=True, tag=True):
     streams: bool = False
     robot: str = ""
     engine: str = PTRACE
-    carry: Carry = NOTHING_CARRIED
-    devices: tuple[DeviceRule, ...] = ()
+    terms: Terms = NO_TERMS
     names: dict[str, str] = {}
 
 
@@ -245,8 +243,8 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
 
     Attributes:
         streams: the last five descriptors are the streams, as with `Protect`.
-        own_eyes, epoch, contents, devices: see `checkpoint.engine.RestoreOptions`.
-        carry: what it carries from now on.
+        own_eyes, epoch, contents: see `checkpoint.engine.RestoreOptions`.
+        terms: those under which it is restored, and followed from then on.
     """
 
     pid: int
@@ -257,9 +255,8 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
     robot: str = ""
     own_eyes: bool = False
     epoch: int = 0
-    carry: Carry = NOTHING_CARRIED
     contents: str = ""
-    devices: tuple[DeviceRule, ...] = ()
+    terms: Terms = NO_TERMS
 
 
 class OpenFile(msgspec.Struct, frozen=True, tag=True):

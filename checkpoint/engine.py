@@ -112,6 +112,39 @@ class Carry:
 NOTHING_CARRIED: Final = Carry()
 
 
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """What an operator has ruled of what one component holds, for one robot.
+
+    Attributes:
+        carry: its files that travel with it.
+        devices: what becomes of devices that it has open.
+    """
+
+    carry: Carry = NOTHING_CARRIED
+    devices: tuple[DeviceRule, ...] = ()
+
+
+NO_TERMS: Final = Terms()
+
+
+@dataclass(frozen=True, slots=True)
+class ProtectOrder:
+    """How a process is to be followed.
+
+    Attributes:
+        component: its name.
+        streams: the guard's ends of its standard streams, if it lives under a guard; the session owns them from now on.
+        names: of somebody who keeps the program's files by content (`checkpoint.contents`): the paths by which the program
+            knows those that it has from there; snapshots name them so. None: nobody keeps them.
+    """
+
+    component: str
+    streams: Streams | None = None
+    terms: Terms = NO_TERMS
+    names: Mapping[str, str] | None = None
+
+
 def is_carriable(path: str) -> bool:
     """Whether a path names a file or folder in full: absolute, normal, and not the root of everything."""
     return (
@@ -146,7 +179,7 @@ class RestoreOptions:
         elapsed_ns: time between the snapshot and now, as far as known; the program's clocks go on by this much.
         accept_changed: paths of files that may differ from what the snapshot recorded (rule ``shared``).
         epoch: of the primacy under which it goes on; a program that was born with one finds it in its environment. 0: none.
-        devices: this robot's rules for its devices.
+        terms: this robot's, for its devices; its carried files have been named as they are laid down here.
         own_eyes: open its files with its own user's rights, not with ours: that user could have put other files in their place.
         contents: directory of files that were brought along (`checkpoint.contents`), for what this machine lacks or has in
             another version; "": there are none.
@@ -157,7 +190,7 @@ class RestoreOptions:
     own_eyes: bool = False
     epoch: int = 0
     contents: str = ""
-    devices: tuple[DeviceRule, ...] = ()
+    terms: Terms = NO_TERMS
 
 
 class Session(Protocol):
@@ -231,23 +264,8 @@ class Engine(Protocol):
         """
         ...
 
-    def protect(
-        self,
-        pid: int,
-        component: str,
-        streams: Streams | None,
-        carry: Carry = NOTHING_CARRIED,
-        devices: tuple[DeviceRule, ...] = (),
-        names: Mapping[str, str] | None = None,
-    ) -> Session:
+    def protect(self, pid: int, order: ProtectOrder) -> Session:
         """Begin to follow a process.
-
-        Args:
-            carry: its files that travel with it.
-            streams: the guard's ends of its standard streams, if it lives under a guard; the session owns them from now on.
-            devices: what its operator wants to become of devices that it has open.
-            names: of somebody who keeps the program's files by content (`checkpoint.contents`): the paths by which the program
-                knows those that it has from there; snapshots name them so. None: nobody keeps them.
 
         Raises:
             ProbeError: it cannot be looked into at all.

@@ -20,7 +20,7 @@ import msgspec
 
 from checkpoint import carried, chain, channel, engine, format
 from checkpoint.channel import Channel, ChannelClosedError, ChannelError, Failed, Reply, Request
-from checkpoint.engine import CaptureOrder, Engine, Restored, RestoreOptions, Session, Streams
+from checkpoint.engine import CaptureOrder, Engine, ProtectOrder, Restored, RestoreOptions, Session, Streams
 from checkpoint.errors import CaptureError, CheckpointError, RestoreError
 from checkpoint.linux.address import address_of
 from checkpoint.model import Position, Snapshot
@@ -101,7 +101,7 @@ class Keeper:
         streams = streams_of(descriptors) if request.streams else None
         chosen = self._tracer if request.engine == self._tracer.name else engine.engine_named(request.engine)
         names = request.names if request.robot else None
-        self._session = chosen.protect(request.pid, request.component, streams, request.carry, request.devices, names)
+        self._session = chosen.protect(request.pid, ProtectOrder(request.component, streams, request.terms, names))
         return channel.Protected(self._session.notes), ()
 
     def _capture(self, request: channel.Capture, _: Descriptors) -> Answer:
@@ -137,7 +137,7 @@ class Keeper:
         try:
             if self._session is not None or self._restored is not None:
                 raise RestoreError(f"cannot restore into pid {request.pid}: this keeper follows a process already")
-            state = carried.relocated(folded(files), dict(request.carry.places))
+            state = carried.relocated(folded(files), dict(request.terms.carry.places))
         finally:
             channel.close_all(files)
         options = RestoreOptions(
@@ -146,7 +146,7 @@ class Keeper:
             request.own_eyes,
             request.epoch,
             request.contents,
-            devices=request.devices,
+            terms=request.terms,
         )
         self._restored = self._tracer.restore(request.pid, state, options)
         self._revived = request, ends
@@ -182,7 +182,8 @@ class Keeper:
     def _follow(self, pid: int, request: channel.Restore, streams: Streams | None) -> tuple[str, ...]:
         """Protect what has just been let go; that it cannot be protected again must not end it."""
         try:
-            self._session = self._tracer.protect(pid, request.component, streams, request.carry, request.devices, self._names)
+            order = ProtectOrder(request.component, streams, request.terms, self._names)
+            self._session = self._tracer.protect(pid, order)
         except CheckpointError as error:
             return (f"{channel.UNPROTECTED}: {error}",)
         return self._session.notes

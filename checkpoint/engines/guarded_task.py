@@ -7,23 +7,19 @@ nothing, and each capture looks where its commits go now.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from typing import Final
 
 from checkpoint import program_files
-from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import (
     COOPERATIVE,
     NOTED,
-    NOTHING_CARRIED,
     CaptureOrder,
-    Carry,
     Finding,
+    ProtectOrder,
     Report,
     Restored,
     RestoreOptions,
     Session,
-    Streams,
 )
 from checkpoint.engines.cooperative import CooperativeSession, now, open_segment
 from checkpoint.engines.outputs import Outputs
@@ -42,12 +38,12 @@ class GuardedTask:
 
     notes: tuple[str, ...] = ()
 
-    def __init__(self, pid: int, component: str, streams: Streams | None, carry: Carry = NOTHING_CARRIED) -> None:
+    def __init__(self, pid: int, order: ProtectOrder) -> None:
         self.pid = pid
-        self.component = component
-        self._outputs = Outputs(streams) if streams else None
+        self.component = order.component
+        self._outputs = Outputs(order.streams) if order.streams else None
         self._session: CooperativeSession | None = None
-        self._carry = carry
+        self._carry = order.terms.carry
         self._trees: CarriedTrees | None = None
         self._look_at_s = 0.0
 
@@ -145,17 +141,9 @@ class CooperativeEngine:
         text = "only what it commits comes back; the program is started again and resumes from that"
         return Report(pid, command, 0, "versions", (Finding("process", f"pid {pid}", NOTED, text),))
 
-    def protect(
-        self,
-        pid: int,
-        component: str,
-        streams: Streams | None,
-        carry: Carry = NOTHING_CARRIED,
-        devices: tuple[DeviceRule, ...] = (),
-        names: Mapping[str, str] | None = None,
-    ) -> Session:
+    def protect(self, pid: int, order: ProtectOrder) -> Session:
         """See `checkpoint.engine.Engine.protect`."""
-        return GuardedTask(pid, component, streams, carry)
+        return GuardedTask(pid, order)
 
     def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
         """Refused: see the class."""

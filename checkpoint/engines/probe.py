@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from checkpoint import portable
-from checkpoint.device_rules import DeviceRule
-from checkpoint.engine import KEPT, NOTED, REFUSED, Finding, Report, Streams
+from checkpoint.engine import KEPT, NO_TERMS, NOTED, REFUSED, Finding, Report, Streams, Terms
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import dirty, processor, procfs, vm_flags
 from checkpoint.linux.procfs import Status
@@ -50,7 +49,7 @@ def _probe(pid: int, surroundings: Surroundings, files_kept: bool) -> Report:
     return Report(pid, _command(pid, status), status.resident_size, dirty.best_tracking(), findings)
 
 
-def surroundings_of(pid: int, streams: Streams | None, devices: tuple[DeviceRule, ...] = ()) -> Surroundings:
+def surroundings_of(pid: int, streams: Streams | None, terms: Terms = NO_TERMS) -> Surroundings:
     """What the kinds of resources must know about a process, its guard and its operator's rules.
 
     Raises:
@@ -58,7 +57,7 @@ def surroundings_of(pid: int, streams: Streams | None, devices: tuple[DeviceRule
     """
     if not 0 < pid <= _largest_pid():
         raise ProbeError(f"cannot look at pid {pid}: that is not the number of a process")
-    return Surroundings(pipes_of(streams.outputs) if streams else {}, devices)
+    return Surroundings(pipes_of(streams.outputs) if streams else {}, terms.devices)
 
 
 def _largest_pid() -> int:

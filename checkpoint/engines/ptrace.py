@@ -5,10 +5,7 @@ Imported by the keeper alone, and at once: a keeper that waits in advance must n
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
-from checkpoint.device_rules import DeviceRule
-from checkpoint.engine import NOTHING_CARRIED, PTRACE, Carry, Report, Restored, RestoreOptions, Session, Streams
+from checkpoint.engine import PTRACE, ProtectOrder, Report, Restored, RestoreOptions, Session
 from checkpoint.engines.probe import probe
 from checkpoint.engines.ptrace_capture import PtraceSession
 from checkpoint.engines.ptrace_restore import restore
@@ -24,17 +21,9 @@ class PtraceEngine:
         """See ``checkpoint.engine.Engine.probe``."""
         return probe(pid)
 
-    def protect(
-        self,
-        pid: int,
-        component: str,
-        streams: Streams | None,
-        carry: Carry = NOTHING_CARRIED,
-        devices: tuple[DeviceRule, ...] = (),
-        names: Mapping[str, str] | None = None,
-    ) -> Session:
+    def protect(self, pid: int, order: ProtectOrder) -> Session:
         """See ``checkpoint.engine.Engine.protect``."""
-        return PtraceSession.open(pid, component, streams, carry, devices, names)
+        return PtraceSession.open(pid, order)
 
     def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
         """See ``checkpoint.engine.Engine.restore``."""

@@ -20,7 +20,7 @@ import functools
 import gc
 import operator
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -29,8 +29,7 @@ import numpy as np
 from checkpoint import pages, portable
 from checkpoint.arch import x86_64_xstate
 from checkpoint.chain import position_of
-from checkpoint.device_rules import DeviceRule
-from checkpoint.engine import NOTHING_CARRIED, PTRACE, CaptureOrder, Carry, Streams
+from checkpoint.engine import PTRACE, CaptureOrder, ProtectOrder
 from checkpoint.engines import description, entering, waits
 from checkpoint.engines import probe as probing
 from checkpoint.engines.capture_memory import MemoryCapture, RunningCopy, Taken
@@ -88,15 +87,14 @@ class PtraceSession:
     def __init__(
         self,
         pid: int,
-        component: str,
+        order: ProtectOrder,
         threads: Threads,
         entered: Entered,
         surroundings: Surroundings,
         trees: CarriedTrees | None = None,
-        names: Mapping[str, str] | None = None,
     ) -> None:
         self.pid = pid
-        self.component = component
+        self.component = order.component
         self.notes = entered.notes
         self.totals: Totals = (0, 0)
         self.frozen_size = 0
@@ -105,8 +103,8 @@ class PtraceSession:
         self._onlooker = Onlooker(threads, entered, surroundings.devices)
         self._level = portable.level_in(procfs.read_bytes(pid, "environ"))
         self._flags = FlagsReader(pid)
-        self._identities = Identities(pid, names or {})
-        self._files_kept = names is not None
+        self._identities = Identities(pid, order.names or {})
+        self._files_kept = order.names is not None
         self._outputs: Outputs | None = None
         self._carried = trees
         self._table = PageTable.empty(abi.PAGE_SIZE)
@@ -120,22 +118,14 @@ class PtraceSession:
     # Opening and closing
 
     @classmethod
-    def open(
-        cls,
-        pid: int,
-        component: str,
-        streams: Streams | None,
-        carry: Carry = NOTHING_CARRIED,
-        devices: tuple[DeviceRule, ...] = (),
-        names: Mapping[str, str] | None = None,
-    ) -> PtraceSession:
+    def open(cls, pid: int, order: ProtectOrder) -> PtraceSession:
         """See ``checkpoint.engine.Engine.protect``."""
-        outputs = Outputs(streams) if streams else None
+        outputs = Outputs(order.streams) if order.streams else None
         trees = None
         try:
-            surroundings = probing.surroundings_of(pid, streams, devices)
-            report = probing.probe(pid, surroundings, files_kept=names is not None)
-            trees = carried_trees.followed(pid, carry)
+            surroundings = probing.surroundings_of(pid, order.streams, order.terms)
+            report = probing.probe(pid, surroundings, files_kept=order.names is not None)
+            trees = carried_trees.followed(pid, order.terms.carry)
             reasons = (*report.reasons, *(trees.refuse() if trees else ()))
             if reasons:
                 raise UnsupportedError(f"cannot protect pid {pid} ({report.command}): {'; '.join(reasons)}", reasons)
@@ -143,7 +133,7 @@ class PtraceSession:
             threads = Threads(Tracee(pid), interruptions.mend)
             entered = entering.enter(threads, interruptions)
             try:
-                session = cls(pid, component, threads, entered, surroundings, trees, names)
+                session = cls(pid, order, threads, entered, surroundings, trees)
             except BaseException:
                 entered.tracker.close()
                 raise

@@ -271,7 +271,7 @@ def _of_descriptors(state: Snapshot, options: RestoreOptions, brought: dict[str,
             else:
                 yield from (reason + damage for reason in reasons)
         elif held.kind == attached_devices.KIND:
-            yield from attached_devices.mismatches(held, options.devices)
+            yield from attached_devices.mismatches(held, options.terms.devices)
         elif held.kind in rebuild.NEEDED:
             yield from rebuild.NEEDED[held.kind](held)
 

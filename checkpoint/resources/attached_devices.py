@@ -161,7 +161,7 @@ def mismatches(held: Resource, own: Iterable[DeviceRule]) -> Iterator[str]:
 
 def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     """Open it as it was, or hung up."""
-    rule = rule_here(held, rebuilding.options.devices)
+    rule = rule_here(held, rebuilding.options.terms.devices)
     if rule.action == "hook" or (rule.optional and not os.path.exists(rule.place)):
         return _hung_up(table, held)
     flags = number_of(held.facts["flags"]) & REOPENED_FLAGS

@@ -14,6 +14,7 @@ from pathlib import Path
 from checkpoint import channel, format
 from checkpoint.channel import Capture, Captured, Protect, Protected, Release, Released, Restore, Restored, Resume, Resumed
 from checkpoint.device_rules import DeviceRule, rule_from
+from checkpoint.engine import Terms
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import vessel
 from checkpoint.linux.vessel import Birth, Born
@@ -32,7 +33,7 @@ def capture(arguments: argparse.Namespace) -> int:
     if target.exists() and not arguments.force:
         raise FailoverError(f"cannot write {target}: it exists; give another name, or --force to replace it")
     with Keeper.spawn() as keeper:
-        order = Protect(arguments.pid, f"/pid/{arguments.pid}", devices=device_rules(arguments))
+        order = Protect(arguments.pid, f"/pid/{arguments.pid}", terms=Terms(devices=device_rules(arguments)))
         protected, _ = keeper.ask(order, Protected)
         held = not arguments.leave_running
         captured, (content,) = keeper.ask(Capture(base=True, generation=1, sequence=1, hold=held), Captured)
@@ -106,9 +107,9 @@ def restore(arguments: argparse.Namespace) -> int:
     except OSError as error:
         raise FailoverError(f"cannot read {arguments.file}: {error.strerror}") from error
     outline = format.read_outline(file)
-    elapsed_ns, rules = vessel.elapsed_since(outline.clocks), device_rules(arguments)
+    elapsed_ns, terms = vessel.elapsed_since(outline.clocks), Terms(devices=device_rules(arguments))
     with Keeper.spawn() as keeper, _born(birth_of(outline, elapsed_ns, own_session=not arguments.wait)) as born:
-        restored, _ = keeper.ask(Restore(born.pid, outline.component, elapsed_ns, devices=rules), Restored, (file,))
+        restored, _ = keeper.ask(Restore(born.pid, outline.component, elapsed_ns, terms=terms), Restored, (file,))
         resumed, _ = keeper.ask(Resume(), Resumed)
         keeper.ask(Release(), Released)
     _tell_restore(arguments, restored.pid, born.notes + restored.notes + resumed.notes)

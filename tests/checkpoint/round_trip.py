@@ -19,7 +19,7 @@ import pytest
 
 from checkpoint import chain, format
 from checkpoint.device_rules import DeviceRule
-from checkpoint.engine import CaptureOrder, RestoreOptions, Session, engine_named
+from checkpoint.engine import CaptureOrder, ProtectOrder, RestoreOptions, Session, Terms, engine_named
 from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
 from checkpoint.linux.namespaces import prctl
 from checkpoint.linux.vessel import Birth, Born, discard, spawn_program, spawn_vessel
@@ -169,7 +169,7 @@ def ended(program: Program) -> Iterator[Program]:
 @contextlib.contextmanager
 def protected(program: Program, component: str = "/test/tracee", devices: tuple[DeviceRule, ...] = ()) -> Iterator[Session]:
     """Hold a program under protection for the body."""
-    session = at_last(lambda: ENGINE.protect(program.pid, component, None, devices=devices))
+    session = at_last(lambda: ENGINE.protect(program.pid, ProtectOrder(component, terms=Terms(devices=devices))))
     try:
         yield session
     finally:
@@ -231,7 +231,7 @@ def restored(
     with _stdio(directory) as stdio:
         born = spawn_vessel(Birth(inner_pid=whole.process.pid if keep_pid else 0, isolate=isolate, stdio=stdio))
     try:
-        options = RestoreOptions(elapsed_ns, accept_changed, own_eyes, contents=str(contents), devices=devices)
+        options = RestoreOptions(elapsed_ns, accept_changed, own_eyes, contents=str(contents), terms=Terms(devices=devices))
         program = ENGINE.restore(born.pid, whole, options)
         program.resume()
     except BaseException:

@@ -14,7 +14,7 @@ import pytest
 
 from checkpoint.contents import Contents, digest_of_file
 from checkpoint.disk import Disk
-from checkpoint.engine import CaptureOrder
+from checkpoint.engine import CaptureOrder, ProtectOrder
 from checkpoint.engines.identities import Identities
 from checkpoint.errors import MismatchError, UnsupportedError
 from checkpoint.linux import procfs
@@ -107,7 +107,7 @@ def stage() -> Iterator[Stage]:
 
 def captured_by_an_agent(program: Program) -> Snapshot:
     """As by one that keeps its files: those need not be there any more."""
-    session = ENGINE.protect(program.pid, "/test/tracee", None, names={})
+    session = ENGINE.protect(program.pid, ProtectOrder("/test/tracee", names={}))
     try:
         snapshot = transported(session.capture(CaptureOrder()))
     finally:

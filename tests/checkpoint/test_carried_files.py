@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 from checkpoint import carried
-from checkpoint.engine import CaptureOrder, Carry, Session
+from checkpoint.engine import CaptureOrder, Carry, ProtectOrder, Session, Terms
 from checkpoint.errors import MismatchError, RestoreError, UnsupportedError
 from checkpoint.linux.eyes import Eyes
 from checkpoint.model import Snapshot
@@ -46,7 +46,7 @@ SLEEPER = "import time\nprint('ready', flush=True)\nwhile True: time.sleep(0.01)
 @contextlib.contextmanager
 def carrying(program: Program, *paths: Path, size_max: int = 1 << 28) -> Iterator[Session]:
     """Hold a program under protection whose files travel with it."""
-    session = ENGINE.protect(program.pid, "/test/carried", None, Carry(tuple(map(str, paths)), size_max))
+    session = ENGINE.protect(program.pid, ProtectOrder("/test/carried", terms=Terms(Carry(tuple(map(str, paths)), size_max))))
     try:
         yield session
     finally:
@@ -318,7 +318,7 @@ def test_a_path_that_means_another_thing_elsewhere_is_refused(tmp_path: Path, pa
     (tmp_path / "link").symlink_to(tmp_path / "real")
     named = f"{tmp_path}/{path}" if path else "relative"
     with asleep(tmp_path) as program, pytest.raises(UnsupportedError, match=said):
-        ENGINE.protect(program.pid, "/test/carried", None, Carry((named,))).close()
+        ENGINE.protect(program.pid, ProtectOrder("/test/carried", terms=Terms(Carry((named,))))).close()
 
 
 def test_a_folder_above_that_becomes_a_link_is_refused_by_name_until_it_is_a_folder_again(tmp_path: Path) -> None:

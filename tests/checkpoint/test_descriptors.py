@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from checkpoint.engine import ProtectOrder
 from checkpoint.errors import CheckpointError, UnsupportedError
 from tests.checkpoint.round_trip import (
     ENGINE,
@@ -84,7 +85,7 @@ def test_a_named_pipe_that_somebody_else_has_open_is_refused(compiled: Compiled,
             try:
                 tracee.wait_until(lambda: str(tmp_path / "pipe") in _targets(cat.pid), "the other reader")
                 with pytest.raises(UnsupportedError, match=f"pid {cat.pid}"):
-                    ENGINE.protect(tracee.pid, "/test/fifo", None)
+                    ENGINE.protect(tracee.pid, ProtectOrder("/test/fifo"))
             finally:
                 cat.kill()
 
@@ -116,10 +117,10 @@ def test_a_unix_socket_that_leads_to_another_process_is_refused(tmp_path: Path) 
         with ended(start([sys.executable, "-c", connects + "time.sleep(600)"], tmp_path)) as program:
             program.wait_for_line("ready")
             with pytest.raises(UnsupportedError, match="another process"):
-                ENGINE.protect(program.pid, "/test/waiting", None)
+                ENGINE.protect(program.pid, ProtectOrder("/test/waiting"))
             accepted, _ = listener.accept()
             with accepted, pytest.raises(UnsupportedError, match="another process"):
-                ENGINE.protect(program.pid, "/test/connected", None)
+                ENGINE.protect(program.pid, ProtectOrder("/test/connected"))
 
 
 def test_a_listener_whose_name_another_process_has_taken_is_refused_by_name(compiled: Compiled, tmp_path: Path) -> None:
@@ -147,5 +148,5 @@ def test_shared_memory_that_another_process_has_mapped_is_refused(compiled: Comp
         with ended(start([sys.executable, "-c", maps], tmp_path / "other")) as other:
             other.wait_for_line("ready")
             with pytest.raises(UnsupportedError, match=f"pid {other.pid}"):
-                ENGINE.protect(tracee.pid, "/test/shared", None)
+                ENGINE.protect(tracee.pid, ProtectOrder("/test/shared"))
         path.unlink()

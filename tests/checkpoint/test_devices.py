@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from checkpoint.device_rules import DeviceRule, arrived, merged, missing, rule_from, travelling
-from checkpoint.engine import REFUSED
+from checkpoint.engine import REFUSED, ProtectOrder, Terms
 from checkpoint.errors import MismatchError, UnsupportedError
 from checkpoint.linux.descriptors import copy_of
 from checkpoint.resources import attached_devices
@@ -209,7 +209,7 @@ def test_a_device_without_a_rule_is_refused_by_name_with_the_cure(tmp_path: Path
         driver.wait_for_line("ready")
         other = (DeviceRule("/dev/other"),)
         with pytest.raises(UnsupportedError, match=rf"fd 3 is a terminal \({path}\), for which there is no rule: give it one"):
-            ENGINE.protect(driver.pid, "/test/driver", None, devices=other).close()
+            ENGINE.protect(driver.pid, ProtectOrder("/test/driver", terms=Terms(devices=other))).close()
         (refusal,) = [one for one in ENGINE.probe(driver.pid).findings if one.verdict == REFUSED]
         assert refusal.kind == "devices"
         assert told(ours, b"one\n") == b"got one\n"

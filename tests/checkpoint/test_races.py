@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import pytest
 
-from checkpoint.engine import CaptureOrder, Session
+from checkpoint.engine import CaptureOrder, ProtectOrder, Session
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.model import Snapshot
 from tests.checkpoint.round_trip import (
@@ -67,7 +67,7 @@ def at_last(act: Callable[[], Outcome]) -> Outcome:
 @contextlib.contextmanager
 def protected_at_last(tracee: Program) -> Iterator[Session]:
     """As `protected`, where that may be refused."""
-    session = at_last(lambda: ENGINE.protect(tracee.pid, "/test/tracee", None))
+    session = at_last(lambda: ENGINE.protect(tracee.pid, ProtectOrder("/test/tracee")))
     try:
         yield session
     finally:

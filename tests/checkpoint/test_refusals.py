@@ -14,7 +14,7 @@ import pytest
 
 from checkpoint import capabilities
 from checkpoint.capability import Verdict
-from checkpoint.engine import CaptureOrder
+from checkpoint.engine import CaptureOrder, ProtectOrder
 from checkpoint.errors import ProbeError, UnsupportedError
 from tests.checkpoint.round_trip import ENGINE, as_nobody, captured, ended, expect_ok, protected, start, start_tracee
 
@@ -82,7 +82,7 @@ def test_what_cannot_be_preserved_is_refused_by_name_and_not_touched(kind: str, 
         before = _facts(tracee.pid)
         report = ENGINE.probe(tracee.pid)
         with pytest.raises(UnsupportedError) as refusal:
-            ENGINE.protect(tracee.pid, "/test/tracee", None).close()
+            ENGINE.protect(tracee.pid, ProtectOrder("/test/tracee")).close()
         assert _facts(tracee.pid) == before
         text = " ".join(refusal.value.reasons).lower()
         assert any(word in text for word in REFUSED[kind].split("|")), text
@@ -103,7 +103,7 @@ def _is_in_the_table(reason: str) -> bool:
 def test_a_program_whose_first_thread_has_ended_is_refused_by_name(compiled: Compiled, tmp_path: Path) -> None:
     with ended(start_tracee(compiled("refused", "-O2"), tmp_path, "dead_leader")) as tracee:
         tracee.wait_until(lambda: _state(tracee.pid) == "Z", "the first thread's end")
-        for look in (ENGINE.probe, lambda pid: ENGINE.protect(pid, "/test/tracee", None)):
+        for look in (ENGINE.probe, lambda pid: ENGINE.protect(pid, ProtectOrder("/test/tracee"))):
             with pytest.raises(ProbeError, match="first thread has ended while 1 others live"):
                 look(tracee.pid)
         tracee.tell()
@@ -128,7 +128,7 @@ def test_a_program_of_32_bits_is_refused(tmp_path: Path) -> None:
     with ended(start([tmp_path / "small"], tmp_path)) as program:
         program.wait_until(lambda: os.readlink(f"/proc/{program.pid}/exe").endswith("small"), "its executable")
         with pytest.raises((UnsupportedError, ProbeError)) as refusal:
-            ENGINE.protect(program.pid, "/test/small", None).close()
+            ENGINE.protect(program.pid, ProtectOrder("/test/small")).close()
         assert "32" in str(refusal.value) + " ".join(getattr(refusal.value, "reasons", ()))
 
 
@@ -138,7 +138,7 @@ def test_no_such_pid_is_said_so() -> None:
     with pytest.raises(ProbeError, match=str(child.pid)):
         ENGINE.probe(child.pid)
     with pytest.raises(ProbeError, match=str(child.pid)):
-        ENGINE.protect(child.pid, "/test/gone", None)
+        ENGINE.protect(child.pid, ProtectOrder("/test/gone"))
 
 
 @pytest.mark.parametrize("pid", [0, -1, 1 << 40])
@@ -169,7 +169,7 @@ def test_a_zombie_is_refused() -> None:
 
 def test_ourselves_is_refused() -> None:
     with pytest.raises((ProbeError, UnsupportedError)):
-        ENGINE.protect(os.getpid(), "/test/self", None)
+        ENGINE.protect(os.getpid(), ProtectOrder("/test/self"))
 
 
 @pytest.mark.command("strace")
@@ -179,7 +179,7 @@ def test_a_program_that_somebody_else_traces_is_refused(compiled: Compiled, tmp_
         try:
             tracee.wait_until(lambda: _tracer(tracee.pid) == strace.pid, "the other tracer")
             with pytest.raises(ProbeError, match=r"traced|tracer"):
-                ENGINE.protect(tracee.pid, "/test/traced", None)
+                ENGINE.protect(tracee.pid, ProtectOrder("/test/traced"))
         finally:
             strace.send_signal(signal.SIGINT)
             strace.communicate()
@@ -197,7 +197,7 @@ def _tracer(pid: int) -> int:
 def test_a_stranger_is_not_let_in(compiled: Compiled, tmp_path: Path) -> None:
     """An ordinary user and a process of root's."""
     with ended(start_tracee(compiled("refused", "-O2"), tmp_path, "nothing")) as tracee:
-        text = as_nobody(lambda: f"let in: {ENGINE.protect(tracee.pid, '/test/stranger', None)}")
+        text = as_nobody(lambda: f"let in: {ENGINE.protect(tracee.pid, ProtectOrder('/test/stranger'))}")
         assert text.startswith("ProbeError: "), text
         tracee.tell()
         expect_ok(tracee)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint.engine import RestoreOptions
+from checkpoint.engine import ProtectOrder, RestoreOptions
 from checkpoint.errors import UnsupportedError
 from checkpoint.linux.vessel import Birth, discard, spawn_vessel
 from tests.checkpoint.round_trip import (
@@ -80,6 +80,6 @@ def test_a_terminal_whose_number_is_taken_gets_another_which_is_said(compiled: C
 def test_a_terminal_in_which_something_waits_is_refused_until_it_is_read(compiled: Compiled, tmp_path: Path) -> None:
     with ended(start_tracee(compiled("terminals", "-O2", "-lutil"), tmp_path, "unread")) as tracee:
         with pytest.raises(UnsupportedError, match="with 6 bytes that wait"):
-            ENGINE.protect(tracee.pid, "/test/unread", None)
+            ENGINE.protect(tracee.pid, ProtectOrder("/test/unread"))
         tracee.tell()
         expect_ok(tracee)

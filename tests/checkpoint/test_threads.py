@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint.engine import CaptureOrder, RestoreOptions, Session
+from checkpoint.engine import CaptureOrder, ProtectOrder, RestoreOptions, Session
 from checkpoint.errors import CaptureError, MismatchError, ProcessGoneError, UnsupportedError
 from checkpoint.linux.vessel import Birth, discard, spawn_vessel
 from checkpoint.model import Snapshot
@@ -225,7 +225,7 @@ def test_a_descriptor_that_shows_one_of_its_threads_is_refused(way: str, tmp_pat
     with ended(start([sys.executable, "-c", OPENS_A_THREAD, way], tmp_path)) as program:
         program.wait_for_line("ready")
         with pytest.raises(UnsupportedError, match=r"of one of its threads: let the program close it"):
-            ENGINE.protect(program.pid, "/test/thread", None)
+            ENGINE.protect(program.pid, ProtectOrder("/test/thread"))
 
 
 QUEUES = """

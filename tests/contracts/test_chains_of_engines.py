@@ -18,7 +18,7 @@ import pytest
 
 from checkpoint import chain, format, pages
 from checkpoint.channel import memfd_holding
-from checkpoint.engine import CaptureOrder, Session, engine_named
+from checkpoint.engine import CaptureOrder, ProtectOrder, Session, engine_named
 from checkpoint.engines.cooperative import CooperativeSession
 from checkpoint.errors import ChainError, CheckpointError
 from checkpoint.model import Snapshot
@@ -97,7 +97,7 @@ def traced() -> Traced:
     process = subprocess.Popen([sys.executable, "-c", CHILD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout and process.stdout.readline() == "ready\n"
-        return Traced(process, engine_named("ptrace").protect(process.pid, "/lab/r1/program", None))
+        return Traced(process, engine_named("ptrace").protect(process.pid, ProtectOrder("/lab/r1/program")))
     except CheckpointError as error:
         process.kill()
         process.communicate()
