@@ -66,7 +66,7 @@ def _parsed(answer: bytes) -> UnixSocket | None:
     if kind != SOCK_DIAG_BY_FAMILY:
         return None
     _, socket_type, state, _, _, _ = _ANSWER.unpack_from(answer, _HEADER.size)
-    found = dict(_attributes(answer[_HEADER.size + _ANSWER.size : size]))
+    found = dict(attributes(answer[_HEADER.size + _ANSWER.size : size]))
     lengths = struct.unpack("<II", found[_LENGTHS]) if _LENGTHS in found else (0, 0)
     return UnixSocket(
         type=socket_type,
@@ -79,7 +79,8 @@ def _parsed(answer: bytes) -> UnixSocket | None:
     )
 
 
-def _attributes(packed: bytes) -> Iterator[tuple[int, bytes]]:
+def attributes(packed: bytes) -> Iterator[tuple[int, bytes]]:
+    """The attributes of an answer: their number and content. Source: netlink(7), rtnetlink(7)."""
     place = 0
     while place + _ATTRIBUTE.size <= len(packed):
         size, kind = _ATTRIBUTE.unpack_from(packed, place)

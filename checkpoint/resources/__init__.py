@@ -109,6 +109,11 @@ class Opened(tuple[OpenFile, ...]):
         return {}
 
     @functools.cached_property
+    def shut_down(self) -> dict[tuple[int, int], Mapping[int, int]]:
+        """Sockets for datagrams that were shut down, by family and protocol, as far as they were asked for."""
+        return {}
+
+    @functools.cached_property
     def inodes(self) -> frozenset[int]:
         """Their numbers."""
         return frozenset(one.first.inode for one in self)

@@ -6,7 +6,8 @@ reset. Connections of TCP are in ``tcp_connections``.
 
 Facts besides those of every socket: ``state`` of tcp(7), `CLOSED` for UDP; ``address`` and ``peer``: [host, port] or [host, port,
 flow, scope], empty if there is none; ``backlog``; ``waiting``: connections not accepted yet; ``sources``: addresses from which
-what is in the queue came; ``groups``: a list of [interface, group, filter as MCAST_MSFILTER takes it].
+what is in the queue came; ``groups``: a list of [interface, group, filter as MCAST_MSFILTER takes it]; ``shutdown`` of a socket
+for datagrams: 1 what it reads, 2 what it sends; ``foreign``: the machine does not have its address (any more).
 
 Source: tcp(7), udp(7), ip(7); linux/in.h for group_filter.
 """
@@ -16,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import select
 import socket
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,6 +25,7 @@ from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.engine import NOTED, Finding
+from checkpoint.linux import internet_sockets as inet_diag
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
@@ -58,6 +61,8 @@ _TCP_INFO: Final = struct.Struct("<B7x4I2I")
 MCAST_JOIN_GROUP: Final = 42
 MCAST_MSFILTER: Final = 48
 IP_FREEBIND: Final = 15
+SHUT_DOWN_WHOLE: Final = 3
+SO_PEERNAME: Final = 28
 EXCLUDE: Final = 0
 _FILTER: Final = struct.Struct("<I4x128sII")
 """struct group_filter without its sources: interface, group, mode, number of sources."""
@@ -92,7 +97,20 @@ def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: socket
         "queue": list(queue.messages),
         "sources": [list(source) for source in queue.sources if isinstance(source, tuple)],
         "groups": list(_groups(looked, _machine_groups(held.pid, opened, looked.family))) if is_datagram else [],
+        "shutdown": _shutdown(held, looked, opened) if is_datagram else 0,
     }
+
+
+def _shutdown(held: OpenFile, looked: socket.socket, opened: Opened) -> int:
+    """What of a socket for datagrams was shut down; only poll(2) tells of one that is bound to no port, and not that it sends."""
+    key = int(looked.family), looked.proto
+    if key not in opened.shut_down:
+        opened.shut_down[key] = inet_diag.shut_down(*key)
+    poll = select.poll()
+    poll.register(looked, select.POLLRDHUP)
+    seen = dict(poll.poll(0)).get(looked.fileno(), 0)
+    told = opened.shut_down[key].get(held.first.inode, 0)
+    return told | (SHUT_DOWN_WHOLE if seen & select.POLLHUP else bool(seen & select.POLLRDHUP))
 
 
 def _bound(address: Sequence[Fact]) -> list[Fact]:
@@ -105,10 +123,23 @@ def in_words(address: Sequence[Fact]) -> str:
 
 
 def _peer(looked: socket.socket) -> list[Fact]:
-    try:
+    """Whom it is, or was, connected with."""
+    with contextlib.suppress(OSError):
         return list(looked.getpeername())
-    except OSError:
-        return []
+    if looked.proto == socket.IPPROTO_TCP:
+        with contextlib.suppress(OSError):  # a connection that has ended tells it this way alone
+            size = 28 if looked.family == socket.AF_INET6 else 16
+            return _unpacked(looked.getsockopt(socket.SOL_SOCKET, SO_PEERNAME, size))
+    return []
+
+
+def _unpacked(packed: bytes) -> list[Fact]:
+    """An address that the kernel wrote."""
+    family, port = struct.unpack_from("<H", packed)[0], struct.unpack_from(">H", packed, 2)[0]
+    if family == socket.AF_INET:
+        return [socket.inet_ntoa(packed[4:8]), port]
+    flow, scope = struct.unpack_from(">I", packed, 4)[0], struct.unpack_from("<I", packed, 24)[0]
+    return [socket.inet_ntop(socket.AF_INET6, packed[8:24]), port, flow, scope]
 
 
 def _groups(looked: socket.socket, known: Sequence[Group]) -> Iterator[list[Fact]]:
@@ -165,7 +196,9 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
     if not _is_mine(held):
         return None
     facts: dict[str, Fact] = {"descriptors": held.numbers, "flags": held.first.flags & ~os.O_CLOEXEC, **held.observed}
-    return Resource(KIND, held.name, facts)
+    address = held.observed["address"]
+    assert isinstance(address, list)
+    return Resource(KIND, held.name, facts | {"foreign": bool(address) and not is_ours(address)})
 
 
 def _is_mine(held: OpenFile) -> bool:
@@ -195,7 +228,8 @@ def mismatches(held: Resource) -> Iterator[str]:
     """Why its address could not be had here."""
     address = held.facts["address"]
     assert isinstance(address, list)
-    if address and not _has_option(held, socket.IPPROTO_IP, IP_FREEBIND) and not is_ours(address):
+    may_be_foreign = held.facts.get("foreign") or _has_option(held, socket.IPPROTO_IP, IP_FREEBIND)
+    if address and not may_be_foreign and not is_ours(address):
         yield (
             f"{held.name} is bound to {in_words(address)}, and this machine does not have that address: give it to one of its "
             "interfaces, or let the program bind to all (0.0.0.0 or ::)"
@@ -206,9 +240,7 @@ def mismatches(held: Resource) -> Iterator[str]:
 
 
 def _has_option(held: Resource, level: int, number: int) -> bool:
-    options = held.facts["options"]
-    assert isinstance(options, list)
-    return any(isinstance(one, list) and one[:2] == [level, number] for one in options)
+    return any((its_level, its_number) == (level, number) for its_level, its_number, _ in sockets.options_of(held))
 
 
 def is_ours(address: Sequence[Fact]) -> bool:
@@ -259,6 +291,7 @@ def prepare(table: CallTable, held: Sequence[Resource], first: int) -> dict[int,
         if peer:
             what = f"{one.name} is not connected to {in_words(peer)}, where no way leads from here"
             table.attempt(what, "connect", number, table.place(sockaddr(peer)), size_of(peer))
+        sockets.shut_down(table, one, number)
         sockets.set_flags(table, one, number)
     return made
 
@@ -281,9 +314,14 @@ def _place(table: CallTable, one: Resource, made: int) -> None:
     shares = number_of(one.facts["state"]) == LISTENING and not _has_option(one, socket.SOL_SOCKET, socket.SO_REUSEADDR)
     if shares:  # its port with connections of the program that are there already
         _allow(table, made, socket.SO_REUSEADDR, 1)
+    is_free = bool(one.facts.get("foreign")) and not _has_option(one, socket.IPPROTO_IP, IP_FREEBIND)
+    if is_free:  # it had the option when it was bound, or the machine had the address
+        _allow(table, made, IP_FREEBIND, 1, socket.IPPROTO_IP)
     if address:
         what = f"bind {one.name} to {in_words(address)}"
         table.call(what, "bind", made, table.place(sockaddr(address)), size_of(address))
+    if is_free:
+        _allow(table, made, IP_FREEBIND, 0, socket.IPPROTO_IP)
     if number_of(one.facts["state"]) == LISTENING:
         table.call(f"listen at {one.name}", "listen", made, number_of(one.facts["backlog"]))
     if shares:
@@ -300,10 +338,10 @@ def _place(table: CallTable, one: Resource, made: int) -> None:
             table.call(what, "setsockopt", made, level, MCAST_MSFILTER, table.place(request), len(request))
 
 
-def _allow(table: CallTable, made: int, option: int, value: int) -> None:
-    """Set SO_REUSEADDR or SO_REUSEPORT."""
+def _allow(table: CallTable, made: int, option: int, value: int, level: int = socket.SOL_SOCKET) -> None:
+    """Set SO_REUSEADDR, SO_REUSEPORT or IP_FREEBIND for the while that it takes to bind."""
     place = table.place(value.to_bytes(4, "little"))
-    table.call("let sockets share a port", "setsockopt", made, socket.SOL_SOCKET, option, place, 4)
+    table.call("let a socket be bound", "setsockopt", made, level, option, place, 4)
 
 
 def _send_again(table: CallTable, one: Resource, held: Sequence[Resource], made: Mapping[int, int]) -> None:

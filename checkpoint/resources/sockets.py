@@ -77,6 +77,8 @@ _FORCED: Final = {socket.SO_SNDBUF: 32, socket.SO_RCVBUF: 33}
 _IP: Final = (1, 2, 8, 10, 11, 12, 13, 15, 19, 20, 21, 32, 33, 34, 49, 50)
 """IP_TOS, TTL, PKTINFO, MTU_DISCOVER, RECVERR, RECVTTL, RECVTOS, FREEBIND, TRANSPARENT, ORIGDSTADDR, MINTTL, MULTICAST_IF,
 MULTICAST_TTL, MULTICAST_LOOP, MULTICAST_ALL, UNICAST_IF."""
+_OF_DATAGRAMS: Final = tuple((level, number) for level, numbers in ((0, (32, 33)), (41, (17, 18))) for number in numbers)
+"""Options that a stream shows and cannot be given: whereby and how far it would send to groups."""
 _IPV6: Final = (16, 17, 18, 19, 23, 25, 26, 29, 49, 51, 66, 67, 70, 78)
 """IPV6_UNICAST_HOPS, MULTICAST_IF, MULTICAST_HOPS, MULTICAST_LOOP, MTU_DISCOVER, RECVERR, V6ONLY, MULTICAST_ALL, RECVPKTINFO,
 RECVHOPLIMIT, RECVTCLASS, TCLASS, AUTOFLOWLABEL, FREEBIND."""
@@ -216,7 +218,8 @@ def _fresh_options(form: Form) -> Mapping[tuple[int, int], bytes]:
         return {}
     with fresh:
         found = {(level, number): _option(fresh, level, number) for level, numbers in levels for number in numbers}
-    return {place: value for place, value in found.items() if value is not None}
+    left_out = _OF_DATAGRAMS if form.type == socket.SOCK_STREAM else ()
+    return {place: value for place, value in found.items() if value is not None and place not in left_out}
 
 
 def _option(looked: socket.socket, level: int, number: int) -> bytes | None:
@@ -321,19 +324,33 @@ def make(table: CallTable, held: Resource) -> int:
     return made
 
 
-def set_options(table: CallTable, held: Resource, made: int) -> None:
-    """Set the options that are not as in a fresh socket. One that cannot be set here becomes a note."""
-    options = held.facts["options"]
-    assert isinstance(options, list)
-    for one in options:
-        assert isinstance(one, list) and isinstance(one[2], bytes)
-        level, number, value = number_of(one[0]), number_of(one[1]), one[2]
+V6ONLY: Final = (socket.IPPROTO_IPV6, socket.IPV6_V6ONLY)
+
+
+def set_options(table: CallTable, held: Resource, made: int, *, is_bound: bool = False) -> None:
+    """Set the options that are not as in a fresh socket. One that cannot be set here becomes a note.
+
+    Args:
+        is_bound: it has its address already, and so what must come before that.
+    """
+    for level, number, value in options_of(held):
+        if is_bound and (level, number) == V6ONLY:
+            continue
         if level == socket.SOL_SOCKET and number in _BUFFERS:
             _set_buffer(table, made, number, int.from_bytes(value, "little"))
         else:
             lost = f"option {number} of level {level} of {held.name} is not kept"
             table.attempt(lost, "setsockopt", made, level, number, table.place(value), len(value))
     _set_filter(table, held, made)
+
+
+def options_of(held: Resource) -> Iterator[tuple[int, int, bytes]]:
+    """Level, number and value of each option that is not as in a fresh socket."""
+    options = held.facts["options"]
+    assert isinstance(options, list)
+    for one in options:
+        assert isinstance(one, list) and isinstance(one[2], bytes)
+        yield number_of(one[0]), number_of(one[1]), one[2]
 
 
 def _set_filter(table: CallTable, held: Resource, made: int) -> None:
@@ -390,16 +407,23 @@ def _send(table: CallTable, what: str, sender: int, message: bytes, passed: Sequ
 
 def _set_send_buffer_back(table: CallTable, held: Resource, made: int) -> None:
     """Give a socket's send buffer the size that the program had chosen, or else the kernel's own."""
-    options = held.facts["options"]
-    assert isinstance(options, list)
-    place = [socket.SOL_SOCKET, socket.SO_SNDBUF]
-    chosen = [one[2] for one in options if isinstance(one, list) and one[:2] == place and isinstance(one[2], bytes)]
+    chosen = [value for level, number, value in options_of(held) if (level, number) == (socket.SOL_SOCKET, socket.SO_SNDBUF)]
     family, kind, protocol = (number_of(held.facts[name]) for name in ("family", "type", "protocol"))
     usual = _fresh_options(Form(family, kind, protocol))[socket.SOL_SOCKET, socket.SO_SNDBUF]
     _set_buffer(table, made, socket.SO_SNDBUF, int.from_bytes((chosen or [usual])[0], "little"))
     if not chosen:
         free = bytes(4)
         table.attempt("", "setsockopt", made, socket.SOL_SOCKET, SO_BUF_LOCK, table.place(free), len(free))
+
+
+SHUTDOWN_HOW: Final = {1: socket.SHUT_RD, 2: socket.SHUT_WR, 3: socket.SHUT_RDWR}
+"""What shutdown(2) is told, by what the kernel tells afterwards."""
+
+
+def shut_down(table: CallTable, held: Resource, made: int) -> None:
+    """Shut down what was: a socket for datagrams that is not connected is, though the kernel says that it is not."""
+    if how := number_of(held.facts.get("shutdown", 0)):
+        table.attempt("", "shutdown", made, SHUTDOWN_HOW[how])
 
 
 def set_flags(table: CallTable, held: Resource, made: int) -> None:

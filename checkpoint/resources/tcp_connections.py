@@ -67,7 +67,7 @@ FIN_WAIT_2: Final = 5
 CLOSE_WAIT: Final = 8
 LAST_ACK: Final = 9
 CLOSING: Final = 11
-_WE_ENDED: Final = (FIN_WAIT_1, FIN_WAIT_2, LAST_ACK, CLOSING)
+_WE_ENDED: Final = (CLOSED, FIN_WAIT_1, FIN_WAIT_2, LAST_ACK, CLOSING)
 _PEER_ENDED: Final = (CLOSE_WAIT, LAST_ACK, CLOSING)
 
 READ_ENDED: Final = 1
@@ -98,9 +98,7 @@ def observe(held: OpenFile, looked: socket.socket, facts: Mapping[str, Fact]) ->
     peer = _asked_for(held, looked.family) if facts["state"] == SYN_SENT else facts["peer"]
     is_local = _is_local(facts["address"], peer)
     unread = (
-        int.from_bytes(fcntl.ioctl(looked.fileno(), termios.FIONREAD, bytes(4)), "little")
-        if facts["state"] not in (CLOSED, SYN_SENT)
-        else 0
+        int.from_bytes(fcntl.ioctl(looked.fileno(), termios.FIONREAD, bytes(4)), "little") if facts["state"] != SYN_SENT else 0
     )
     sent, again = struct.unpack_from("<QQ", told.ljust(_TCP_INFO_SIZE, b"\0"), _SENT_AT)
     return {
@@ -187,6 +185,8 @@ def findings(held: Sequence[Resource], *, standing: bool) -> Iterator[Finding]:
 
 def _refuse_end(one: Resource, other: Resource) -> Iterator[str]:
     """Why a connection of the program with itself cannot be made again."""
+    if one.facts["state"] == CLOSED:
+        return
     underway = _number(one, "unsent") + _number(one, "sent") - _number(other, "received") + (other.facts["state"] in _PEER_ENDED)
     what = f"{one.name} is a TCP connection of the program with itself"
     if underway > 0:
@@ -197,7 +197,7 @@ def _refuse_end(one: Resource, other: Resource) -> Iterator[str]:
 
 def note(held: Resource) -> str | None:
     """What becomes of a connection whose other end is somebody else's; None of one that had ended, or is asked for anew."""
-    if held.facts["state"] in (CLOSED, SYN_SENT):
+    if held.facts["state"] in (CLOSED, SYN_SENT) and not _number(held, "unread"):
         return None
     peer = held.facts["peer"]
     where = f" with {in_words(peer)}" if isinstance(peer, list) and peer else ""
@@ -217,7 +217,7 @@ def notes(held: Sequence[Resource]) -> tuple[str, ...]:
 
 def pairs(held: Iterable[Resource]) -> dict[int, Resource]:
     """The other end of each connection that has one among these, by the socket's number; this machine has their addresses."""
-    local = [one for one in held if one.kind == KIND and one.facts["local"]]
+    local = [one for one in held if one.kind == KIND and one.facts["local"] and not number_of(one.facts.get("ends", 0)) & FAILED]
     by_ends = {(_plain(one.facts["address"]), _plain(one.facts["peer"])): one for one in local}
     found = {}
     for (address, peer), one in by_ends.items():
@@ -324,6 +324,9 @@ class _Work:
         form = (_number(one, "family"), _number(one, "type") | socket.SOCK_CLOEXEC, _number(one, "protocol"))
         made = table.obtain(f"make the socket of {one.name}", "socket", *form)
         _set(table, made, socket.SO_REUSEADDR, 1)
+        for level, option, value in sockets.options_of(one):
+            if (level, option) == sockets.V6ONLY:
+                table.attempt("", "setsockopt", made, level, option, table.place(value), len(value))
         if room:
             for number, forced in ((socket.SO_SNDBUF, 32), (socket.SO_RCVBUF, 33)):
                 for way in (number, forced):
@@ -385,7 +388,7 @@ def settle(table: CallTable, held: Sequence[Resource], made: Mapping[int, int]) 
         elif other is not None:
             _set(table, number, socket.SO_REUSEADDR, 0)
             _set(table, number, sockets.SO_BUF_LOCK, 0)
-            sockets.set_options(table, one, number)
+            sockets.set_options(table, one, number, is_bound=True)
             if _queue(one):
                 sockets.fill(table, one, made[_number(other, "socket")], other)
     for one in held:

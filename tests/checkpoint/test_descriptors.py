@@ -48,6 +48,7 @@ CASES = {
         "listener_abstract unix_with_itself unix_datagrams unix_fresh tcp_listener_4 tcp_listener_6 tcp_fresh udp_queue "
         "udp_options udp_group filtered tcp_shared_port"
     ),
+    "internet_sockets": "udp_shut_down foreign_address closed_connection_4 closed_connection_6",
 }
 
 

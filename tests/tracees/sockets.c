@@ -1,53 +1,10 @@
 /* Sockets of the program's own: pairs, listeners, datagrams; the case is named by the second argument. */
-#include "tracee.h"
+#include "sockets.h"
 
 #include <linux/filter.h>
-#include <arpa/inet.h>
-#include <net/if.h>
-#include <netinet/in.h>
-#include <netinet/tcp.h>
-#include <poll.h>
-#include <stddef.h>
-#include <sys/ioctl.h>
-#include <sys/socket.h>
-#include <sys/un.h>
-
-static const char *go;
-
-static void wait_here(void) {
-    ready();
-    wait_for_go(go);
-}
-
-static void expect_text(int file, const char *wanted) {
-    char found[200] = "";
-    int size = recv(file, found, sizeof found - 1, MSG_DONTWAIT);
-    EXPECT(size == (int)strlen(wanted) && !memcmp(found, wanted, size), "fd %d: received %d '%s', not '%s' (%s)", file, size,
-           found, wanted, size < 0 ? strerror(errno) : "");
-}
-
-static void expect_nothing(int file) {
-    char byte;
-    EXPECT(recv(file, &byte, 1, MSG_DONTWAIT) == -1 && errno == EAGAIN, "fd %d: something is left", file);
-}
-
-static void say(int file, const char *text) {
-    if (send(file, text, strlen(text), MSG_NOSIGNAL) != (ssize_t)strlen(text)) differs("fd %d: cannot send", file);
-}
 
 static void make_pair(int kind, int ends[2]) {
     if (socketpair(AF_UNIX, kind, 0, ends)) cannot("make a pair of sockets");
-}
-
-static int option(int file, int level, int name) {
-    int value = -1;
-    socklen_t size = sizeof value;
-    getsockopt(file, level, name, &value, &size);
-    return value;
-}
-
-static void set(int file, int level, int name, int value) {
-    if (setsockopt(file, level, name, &value, sizeof value)) cannot("set option %d of level %d", name, level);
 }
 
 /* unix sockets */
@@ -251,29 +208,6 @@ static void unix_fresh(void) {
 
 /* TCP and UDP */
 
-static int bound(int family, int kind, const char *host, int port, struct sockaddr_storage *address) {
-    memset(address, 0, sizeof *address);
-    struct sockaddr_in *four = (void *)address;
-    struct sockaddr_in6 *six = (void *)address;
-    address->ss_family = family;
-    if (family == AF_INET) four->sin_port = htons(port), inet_pton(family, host, &four->sin_addr);
-    else six->sin6_port = htons(port), inet_pton(family, host, &six->sin6_addr);
-    int file = socket(family, kind, 0);
-    set(file, SOL_SOCKET, SO_REUSEADDR, 1);
-    socklen_t size = sizeof *address;
-    if (bind(file, (struct sockaddr *)address, family == AF_INET ? 16 : 28)) cannot("bind to %s", host);
-    getsockname(file, (struct sockaddr *)address, &size);
-    return file;
-}
-
-static void expect_same_name(int file, const struct sockaddr_storage *wanted) {
-    struct sockaddr_storage found;
-    socklen_t size = sizeof found;
-    memset(&found, 0, sizeof found);
-    getsockname(file, (struct sockaddr *)&found, &size);
-    EXPECT(!memcmp(&found, wanted, size), "fd %d: bound to something else", file);
-}
-
 static void tcp_listener(int family, const char *host) {
     struct sockaddr_storage address;
     int listens = bound(family, SOCK_STREAM, host, 0, &address);
@@ -420,36 +354,29 @@ static void udp_group(void) {
 }
 
 int main(int count, char **arguments) {
-    static const struct {
-        const char *name;
-        void (*act)(void);
-    } cases[] = {{"pair_stream", pair_stream},
-                 {"pair_datagram", pair_datagram},
-                 {"pair_packets", pair_packets},
-                 {"pair_much", pair_much},
-                 {"pair_options", pair_options},
-                 {"rights_stream", rights_stream},
-                 {"rights_datagram", rights_datagram},
-                 {"pair_half_closed", pair_half_closed},
-                 {"pair_orphan", pair_orphan},
-                 {"listener_path", listener_path},
-                 {"listener_abstract", listener_abstract},
-                 {"unix_with_itself", unix_with_itself},
-                 {"unix_datagrams", unix_datagrams},
-                 {"unix_fresh", unix_fresh},
-                 {"tcp_listener_4", tcp_listener_4},
-                 {"tcp_listener_6", tcp_listener_6},
-                 {"tcp_fresh", tcp_fresh},
-                 {"tcp_shared_port", tcp_shared_port},
-                 {"udp_queue", udp_queue},
-                 {"udp_options", udp_options},
-                 {"filtered", filtered},
-                 {"udp_group", udp_group}};
-    go = arguments[1];
-    for (size_t index = 0; index < sizeof cases / sizeof *cases; index++)
-        if (count > 2 && !strcmp(arguments[2], cases[index].name)) {
-            cases[index].act();
-            return finish();
-        }
-    cannot("find the case");
+    static const struct socket_case cases[] = {
+        {"pair_stream", pair_stream},
+        {"pair_datagram", pair_datagram},
+        {"pair_packets", pair_packets},
+        {"pair_much", pair_much},
+        {"pair_options", pair_options},
+        {"rights_stream", rights_stream},
+        {"rights_datagram", rights_datagram},
+        {"pair_half_closed", pair_half_closed},
+        {"pair_orphan", pair_orphan},
+        {"listener_path", listener_path},
+        {"listener_abstract", listener_abstract},
+        {"unix_with_itself", unix_with_itself},
+        {"unix_datagrams", unix_datagrams},
+        {"unix_fresh", unix_fresh},
+        {"tcp_listener_4", tcp_listener_4},
+        {"tcp_listener_6", tcp_listener_6},
+        {"tcp_fresh", tcp_fresh},
+        {"tcp_shared_port", tcp_shared_port},
+        {"udp_queue", udp_queue},
+        {"udp_options", udp_options},
+        {"filtered", filtered},
+        {"udp_group", udp_group},
+    };
+    return run_case(count, arguments, cases, sizeof cases / sizeof *cases);
 }

@@ -1,0 +1,49 @@
+"""Sockets: what a restore says of them, and who they say they are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from checkpoint.engine import RestoreOptions
+from checkpoint.linux.vessel import Birth, discard, spawn_vessel
+from checkpoint.model import Snapshot
+from tests.checkpoint.round_trip import ENGINE, Program, captured_and_killed, ended, expect_ok, start_tracee
+
+pytestmark = [pytest.mark.compiler, pytest.mark.root]
+
+Compiled = Callable[..., Path]
+
+
+def restored_with_notes(state: Snapshot, directory: Path) -> tuple[Program, tuple[str, ...]]:
+    """Bring a base back and let it run; and what the restore says of it."""
+    streams = [
+        os.open(os.devnull, os.O_RDONLY),
+        *(os.open(directory / name, os.O_WRONLY | os.O_APPEND) for name in ("out", "err")),
+    ]
+    born = spawn_vessel(Birth(inner_pid=state.process.pid, stdio=(streams[0], streams[1], streams[2])))
+    for stream in streams:
+        os.close(stream)
+    try:
+        program = ENGINE.restore(born.pid, state, RestoreOptions(0))
+        program.resume()
+    except BaseException:
+        discard(born)
+        raise
+    return Program(born, directory), tuple(program.notes)
+
+
+@pytest.mark.parametrize("case", ["accepted_stream_4", "accepted_stream_6"])
+def test_options_that_a_stream_shows_but_cannot_be_given_are_not_noted_as_lost(
+    case: str, compiled: Compiled, tmp_path: Path
+) -> None:
+    with ended(start_tracee(compiled("internet_sockets", "-O2"), tmp_path, case)) as tracee:
+        snapshot = captured_and_killed(tracee)
+    tracee, notes = restored_with_notes(snapshot, tmp_path)
+    with ended(tracee):
+        assert notes == ()
+        tracee.tell()
+        expect_ok(tracee)
