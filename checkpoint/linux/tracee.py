@@ -118,8 +118,14 @@ class Tracee:
 
         Raises:
             ProbeError: not permitted, or traced by somebody else.
+            CaptureError: it did not stop in time for an earlier look of ours, and is not let go of yet.
         """
-        self.request("seize", abi.PTRACE_SEIZE, 0, options)
+        try:
+            self.request("seize", abi.PTRACE_SEIZE, 0, options)
+        except ProbeError as error:
+            if procfs.status(self.pid).tracer != os.getpid():
+                raise
+            raise CaptureError(f"{error}: it is ours since an earlier look, until it stops; capture it again") from error
         self.is_as_found = True
 
     def interrupt(self) -> None:

@@ -63,8 +63,8 @@ THREAD_LIMIT: Final = 4096
 """Threads of one program: the state of each takes 3 to 12 KB, of 32 MiB."""
 
 CLOCK_THREAD_CPUTIME: Final = 3
-_RIGHTS: Final = ("TracerPid:", "Uid:", "Gid:", "Groups:", "Cap", "NoNewPrivs:", "Seccomp:")
-"""Beginnings of the lines that tell them, and who traces a thread."""
+_RIGHTS: Final = ("Uid:", "Gid:", "Groups:", "Cap", "NoNewPrivs:", "Seccomp:")
+"""Beginnings of the lines that tell them."""
 _NAMESPACES: Final = ("net", "ipc", "uts", "cgroup", "mnt", "user", "pid_for_children", "time_for_children")
 _SHARED: Final = ((abi.KCMP_FILES, "open files"), (abi.KCMP_FS, "working directory and root"))
 
@@ -103,8 +103,10 @@ class _Shared:
 
     Attributes:
         rights: lines of /proc/PID/task/TID/status.
+        tracer: 0 also where that is us, who may still hold some of them: those that did not stop in time for an earlier look.
     """
 
+    tracer: int
     rights: tuple[str, ...]
     namespaces: tuple[str, ...]
     personality: bytes
@@ -112,7 +114,9 @@ class _Shared:
     @classmethod
     def of(cls, pid: int, tid: int) -> _Shared:
         status = procfs.read_text(pid, f"task/{tid}/status")
+        tracer = procfs.parse_status(status).tracer
         return cls(
+            tracer=0 if tracer == os.getpid() else tracer,
             rights=tuple(line for line in status.splitlines() if line.startswith(_RIGHTS)),
             namespaces=tuple(_namespace(pid, tid, kind) for kind in _NAMESPACES),
             personality=procfs.read_line(pid, f"task/{tid}/personality"),
@@ -139,8 +143,8 @@ def _refuse_thread(pid: int, first: _Shared, tid: int) -> tuple[str, ...]:
 def _unlike(pid: int, tid: int, shared: _Shared, first: _Shared, own: list[str]) -> Iterator[str]:
     status = procfs.parse_status(procfs.read_text(pid, f"task/{tid}/status"))
     named = f"its thread {tid} ({status.name})"
-    if status.tracer not in (0, os.getpid()):
-        yield f"{named} is traced by pid {status.tracer}: end that debugger"
+    if shared.tracer:
+        yield f"{named} is traced by pid {shared.tracer}: end that debugger"
     elif status.seccomp:
         yield f"{named} runs under a seccomp filter, which forbids what a capture asks of it: run it without the filter"
     elif shared.rights != first.rights:

@@ -14,6 +14,9 @@ import pytest
 
 from checkpoint.engine import CaptureOrder, ProtectOrder, RestoreOptions, Session
 from checkpoint.errors import CaptureError, MismatchError, ProcessGoneError, UnsupportedError
+from checkpoint.linux import procfs
+from checkpoint.linux.threads import thread_ids
+from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.vessel import Birth, discard, spawn_vessel
 from checkpoint.model import Snapshot
 from tests.checkpoint.round_trip import (
@@ -60,6 +63,11 @@ def tracers(pid: int) -> set[str]:
         except (FileNotFoundError, ProcessLookupError):
             continue
     return found
+
+
+def tracer_of(pid: int, tid: int) -> int:
+    """Who traces one of its threads."""
+    return procfs.parse_status((Path(f"/proc/{pid}/task/{tid}/status")).read_text()).tracer
 
 
 def open_descriptors() -> list[str]:
@@ -111,6 +119,10 @@ def test_a_thread_that_does_not_stop_is_let_go_later_and_nobody_else_waits_for_i
             with pytest.raises((CaptureError, UnsupportedError)):
                 session.capture(CaptureOrder(sequence=sequence))
             assert "t" not in states(tracee.pid)
+        assert "other rights" not in " ".join(ENGINE.probe(tracee.pid).reasons)  # we trace one thread still, and not the first
+        late = next(tid for tid in thread_ids(tracee.pid) if tracer_of(tracee.pid, tid) == os.getpid())
+        with pytest.raises(CaptureError, match="is ours since an earlier look"):
+            Tracee(late).seize()
         (tmp_path / "leave").touch()
         tracee.wait_for_line("came out")
         tracee.wait_until(lambda: tracers(tracee.pid) == {"0"}, "nobody to trace it")
