@@ -40,7 +40,7 @@ from checkpoint.engines import (
     switches,
 )
 from checkpoint.engines.restore_checks import Brought
-from checkpoint.engines.restore_process import Vessel
+from checkpoint.engines.restore_process import Vessel, pending_traps
 from checkpoint.errors import CheckpointError, MismatchError, RestoreError
 from checkpoint.linux import abi, call_table, processor, procfs, vdso
 from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
@@ -48,7 +48,7 @@ from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee
 from checkpoint.model import Credentials, Position, Snapshot, ThreadState, Vma
 from checkpoint.resources import files, laying, memory_locks, remembered, system_v_memory
-from checkpoint.resources.rebuild import rebuild_all, rebuild_last
+from checkpoint.resources.rebuild import deleted_directory, rebuild_all, rebuild_last
 from checkpoint.resources.rebuilding import number_of
 
 PTRACE_O_TRACESYSGOOD: Final = 1
@@ -287,6 +287,7 @@ class _Restore:
         self._notes += rebuild_all(table, self._state, self._options, vessel.inner_pid, self._objects, vessel.pid)
         restore_process.signal_actions(table, process.signal_actions)
         restore_process.thread_marks(table, thread)
+        restore_process.enter_directory(table, process.working_directory, deleted_directory(self._state))
         restore_process.surroundings(table, process)
         if set(self._state.machine.features) & set(processor.features()) >= AMX:
             table.attempt("", "arch_prctl", ARCH_REQ_XCOMP_PERM, AMX_TILES)  # it may have asked for them
@@ -335,9 +336,27 @@ class _Restore:
         tracee.memory.write(self._stub.base + abi.PAGE_SIZE, restore_process.packed_action(action))
         arguments = (signal.SIGTRAP, self._stub.base + abi.PAGE_SIZE, 0, abi.SIGSET_SIZE)
         self._single(instruction, "rt_sigaction", *arguments)
+        self._queue_traps(instruction)
         self._single(instruction, "munmap", self._stub.base, -(-self._area_size // abi.PAGE_SIZE) * abi.PAGE_SIZE)
         for one, thread in ((tracee, self._thread), *self._others):
             self._take_place(one, thread)
+
+    def _queue_traps(self, instruction: int) -> None:
+        """Queue each SIGTRAP that was pending, by whom it waits for; blocked, it disturbs none of the calls to come."""
+        state, place = self._state, self._stub.base + abi.PAGE_SIZE
+        inner_pid = procfs.status(self._tracee.pid).pids[-1]
+        for one, thread in ((self._tracee, self._thread), *self._others):
+            tid = inner_pid if one is self._tracee else thread.tid
+            traps = pending_traps(state.process, thread.pending)
+            queued: list[tuple[str, tuple[int, ...], bytes]] = [("rt_tgsigqueueinfo", (inner_pid, tid), trap) for trap in traps]
+            if one is self._tracee:
+                traps = pending_traps(state.process, state.process.pending)
+                queued += [("rt_sigqueueinfo", (inner_pid,), trap) for trap in traps]
+            if queued:
+                one.set_signal_mask(abi.ALL_SIGNALS)
+            for name, whom, siginfo in queued:
+                self._tracee.memory.write(place, siginfo)
+                self._single(instruction, name, *whom, signal.SIGTRAP, place, by=one)
 
     def _take_place(self, tracee: Tracee, thread: ThreadState) -> None:
         """Give a thread its registers and mask; it stands in a stop that it can be let go from."""
@@ -391,9 +410,9 @@ class _Restore:
             raise RestoreError("cannot restore: this kernel's vdso has no syscall instruction to leave by")
         return start + offset
 
-    def _single(self, instruction: int, name: str, *arguments: int) -> None:
+    def _single(self, instruction: int, name: str, *arguments: int, by: Tracee | None = None) -> None:
         number = x86_64_stub.SYSTEM_CALLS[name]
-        result = call_table.single_call(self._tracee, self._start_registers, instruction, number, *arguments)
+        result = call_table.single_call(by or self._tracee, self._start_registers, instruction, number, *arguments)
         if result < 0:
             raise RestoreError(f"cannot {name} as the last step of a restore: {os.strerror(-result)}")
 

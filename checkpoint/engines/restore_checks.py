@@ -155,7 +155,7 @@ def _of_machine(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
         yield f"its root directory is {state.process.root_directory}: programs in a chroot are not supported"
     directory = state.process.working_directory
     is_made = directory in options.accept_changed or (options.contents and missing_directories(state))
-    if not os.path.isdir(directory) and not is_made:
+    if not (os.path.isdir(directory) or procfs.is_gone(directory) or is_made):
         yield f"its working directory {directory} is missing: make it"
 
 
@@ -163,7 +163,7 @@ def missing_directories(state: Snapshot) -> tuple[str, ...]:
     """What must be made so that the program's working directory is there, the outermost first; nothing where that cannot be."""
     directory = Path(state.process.working_directory)
     missing = [one for one in (directory, *directory.parents) if not os.path.lexists(one)]
-    is_plain = directory.is_absolute() and ".." not in directory.parts
+    is_plain = directory.is_absolute() and ".." not in directory.parts and not procfs.is_gone(str(directory))
     return tuple(str(one) for one in reversed(missing)) if is_plain else ()
 
 

@@ -26,7 +26,7 @@ from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.tracking import MEMORY_PLACE
 from checkpoint.model import PageRun, Snapshot, Vma, VmaKind
 from checkpoint.pages import Words
-from checkpoint.resources import memory_files, rebuild, system_v_memory
+from checkpoint.resources import memory_files, nameless, system_v_memory
 
 MREMAP_MAYMOVE_FIXED: Final = 1 | 2
 MAP_LOCKED_ON_FAULT: Final = 1
@@ -163,7 +163,7 @@ def _make_object(table: CallTable, vmas: Sequence[Vma]) -> int:
     size, mode = file.size, file.mode & 0o7777
     if file.path.startswith(memory_files.PREFIX):
         return memory_files.make(table, file.path.removeprefix(memory_files.PREFIX), mode, size)
-    made = rebuild.make_nameless(table, file.path, mode)
+    made = nameless.make_file(table, file.path, mode)
     table.call(f"size {file.path}", "ftruncate", made, size)
     return made
 

@@ -18,9 +18,10 @@ from dataclasses import dataclass
 from typing import Final
 
 from checkpoint.errors import RestoreError
-from checkpoint.linux import abi
+from checkpoint.linux import abi, procfs
 from checkpoint.linux.call_table import AT_FDCWD, CallTable
 from checkpoint.model import Credentials, IntervalTimer, PosixTimer, ProcessState, SignalAction, ThreadState
+from checkpoint.resources import nameless
 
 _NO_FILE: Final = 0xFFFFFFFF
 _MM_MAP: Final = struct.Struct("<12Q2I")
@@ -151,9 +152,10 @@ def trap_action(actions: Iterable[SignalAction]) -> SignalAction:
 def pending_signals(table: CallTable, process: ProcessState, inner_pid: int) -> None:
     """Queue what was pending for the process: every signal is blocked in the vessel, so they wait for the program.
 
-    The signal of a periodic timer is queued by the timer itself, which `posix_timers` lets expire at once.
+    The signal of a periodic timer is queued by the timer itself, which `posix_timers` lets expire at once; SIGTRAP, by which
+    tables end, by `pending_traps`.
     """
-    for number, siginfo in _not_of_periodic_timers(process, process.pending):
+    for number, siginfo in _of_tables(process, process.pending):
         table.call(f"queue signal {number}", "rt_sigqueueinfo", inner_pid, number, table.place(siginfo))
 
 
@@ -162,8 +164,17 @@ def pending_of_thread(table: CallTable, process: ProcessState, thread: ThreadSta
 
     Source: do_rt_tgsigqueueinfo() in kernel/signal.c: nobody pretends to the kernel's own signals but to himself.
     """
-    for number, siginfo in _not_of_periodic_timers(process, thread.pending):
+    for number, siginfo in _of_tables(process, thread.pending):
         table.call(f"queue signal {number}", "rt_tgsigqueueinfo", inner_pid, tid, number, table.place(siginfo))
+
+
+def _of_tables(process: ProcessState, pending: Iterable[bytes]) -> Iterator[tuple[int, bytes]]:
+    return ((number, siginfo) for number, siginfo in _not_of_periodic_timers(process, pending) if number != _SIGTRAP)
+
+
+def pending_traps(process: ProcessState, pending: Iterable[bytes]) -> Iterator[bytes]:
+    """Each SIGTRAP that was pending: queued when no table is run any more, the mask as it was."""
+    return (siginfo for number, siginfo in _not_of_periodic_timers(process, pending) if number == _SIGTRAP)
 
 
 def _not_of_periodic_timers(process: ProcessState, pending: Iterable[bytes]) -> Iterator[tuple[int, bytes]]:
@@ -298,9 +309,24 @@ def make_directories(table: CallTable, directories: Iterable[str]) -> None:
         table.call(f"make the directory {directory}", "mkdirat", AT_FDCWD, table.place_path(directory), DIRECTORY_MODE)
 
 
+def enter_directory(table: CallTable, directory: str, opened: int | None) -> None:
+    """Make a directory the working one; one that is gone is made again, and goes again.
+
+    Args:
+        opened: a descriptor that the program has of it, if it is gone.
+    """
+    if opened is not None:
+        table.call(f"enter the working directory {directory}", "fchdir", opened)
+    elif procfs.is_gone(directory):
+        made = nameless.make_directory(table, directory.removesuffix(procfs.DELETED), DIRECTORY_MODE)
+        table.call(f"enter the working directory {directory}", "fchdir", made)
+        table.close(made)
+    else:
+        table.call(f"enter the working directory {directory}", "chdir", table.place_path(directory))
+
+
 def surroundings(table: CallTable, process: ProcessState) -> None:
-    """Working directory, umask, execution domain, session, and the process's own switches."""
-    table.call(f"enter the working directory {process.working_directory}", "chdir", table.place_path(process.working_directory))
+    """Umask, execution domain, session, and the process's own switches."""
     table.call("set the umask", "umask", process.umask)
     table.call("set the execution domain", "personality", process.personality)
     if process.sid == process.pid:

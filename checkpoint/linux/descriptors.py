@@ -15,6 +15,9 @@ from checkpoint.linux.procfs import READ_SIZE, parse_fields
 
 _HEAD: Final = re.compile(rb"pos:\s*(\d+)\nflags:\s*(\d+)\n")
 
+BLOCK_SIZE: Final = 512
+"""Bytes of what stat(2) counts as a block."""
+
 
 @dataclass(frozen=True, slots=True)
 class Descriptor:
@@ -24,6 +27,7 @@ class Descriptor:
         target: where /proc/PID/fd/N leads, in the kernel's words: a path, "pipe:[123]", "anon_inode:[eventpoll]" …
         offset, flags: of fdinfo; flags hold O_CLOEXEC too.
         mode, device, rdev, inode, size, mtime_ns, uid, gid: of fstat(2).
+        stored: bytes of it that are no holes, as fstat(2) tells blocks.
         told: everything that fdinfo says, unread.
     """
 
@@ -41,6 +45,7 @@ class Descriptor:
     told: bytes
     uid: int
     gid: int
+    stored: int
 
     @property
     def name(self) -> str:
@@ -138,6 +143,7 @@ def _descriptor(number: int, links: int, texts: int) -> Descriptor | None:
         told=told,
         uid=about.st_uid,
         gid=about.st_gid,
+        stored=about.st_blocks * BLOCK_SIZE,
     )
 
 

@@ -18,8 +18,14 @@ from checkpoint.errors import MapsFormatError, ProbeError, ProcessGoneError
 from checkpoint.linux import abi
 
 DELETED: Final = " (deleted)"
+"""What the kernel adds to the path of what no name leads to any more."""
 READ_SIZE: Final = 1 << 15
 """Bytes asked for at once: more than the kernel gives of most files, and less than what is allocated page by page."""
+
+
+def is_gone(path: str) -> bool:
+    """Whether a path of /proc is one that leads nowhere any more; a name that merely ends in " (deleted)" is not."""
+    return path.endswith(DELETED) and not os.path.lexists(path)
 
 
 def read_bytes(pid: int, name: str) -> bytes:

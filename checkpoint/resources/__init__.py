@@ -33,8 +33,7 @@ class OpenFile:
     """One open file description and every descriptor that shares it, lowest number first.
 
     Attributes:
-        content: the whole of a deleted file, or what waits in a pipe, read while the process stood still; None where that was
-            not needed.
+        content: what waits in a pipe, read while the process stood still; None where that was not needed.
         capacity: of a pipe, in bytes.
         both_ends: of a pipe: the process itself has another descriptor for its other end.
         observed: facts that only the process standing still could tell, as its kind's ``observe`` found them.
@@ -181,7 +180,7 @@ def with_contents(opened: Opened, noted: Noted | None, rules: tuple[DeviceRule, 
         elif observe := kinds.observer_of(held.first, noted):
             held = replace(held, observed=observe(held, opened))
         elif files.must_carry(held):
-            held = replace(held, content=files.content_of(held))
+            held = replace(held, observed=files.observe_deleted(held, opened))
         elif pipes.is_pipe(held.first) and held.both_ends:
             capacity, content = pipes.look_into(held)
             held = replace(held, capacity=capacity, content=content)

@@ -1,7 +1,8 @@
 """Named pipes that nobody else has open: opened again by name, with what is in them; made where they are missing.
 
 Facts: ``descriptors``; ``path``; ``flags`` of open(2); ``mode``; ``device`` and ``inode`` at the capture; ``capacity`` in bytes;
-``content``: the bytes in it, with one descriptor of each named pipe, b"" with the others.
+``content``: the bytes in it, with one descriptor of each named pipe, b"" with the others; of one whose name was deleted,
+``deleted`` true, and ``uid`` and ``gid``.
 
 Source: fifo(7), tee(2).
 """
@@ -16,10 +17,11 @@ from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError
+from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.descriptors import Descriptor, copy_of
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings, elsewhere, pipes
+from checkpoint.resources import OpenFile, Surroundings, elsewhere, nameless, pipes
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "fifos"
@@ -28,11 +30,11 @@ CAPABILITIES: Final = (
     preserved(
         Area.PIPES,
         "named pipes (fifo) that nobody else has open",
-        "opened again by name, with what is in them; made where they are missing",
+        "opened again by name, or without one where that was deleted, with what is in them; made where they are missing",
     ),
     refused(
         Area.PIPES,
-        "a named pipe that another process has open, or whose name is gone",
+        "a named pipe that another process has open, or that was renamed or covered since",
         "protect the program when the other has closed it; let it open a name that stays",
         "whose name is gone",
         "has open too",
@@ -48,6 +50,7 @@ CAPABILITIES: Final = (
 
 O_PATH: Final = 0o10000000
 _AT_FDCWD: Final = -100
+AT_EMPTY_PATH: Final = 0x1000
 
 
 def is_fifo(one: Descriptor) -> bool:
@@ -104,6 +107,8 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
         "inode": first.inode,
         **held.observed,
     }
+    if _is_nameless(held):
+        facts |= {"deleted": True, "path": first.target.removesuffix(procfs.DELETED), "uid": first.uid, "gid": first.gid}
     return Resource(KIND, held.name, facts)
 
 
@@ -113,11 +118,15 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     if not is_fifo(first):
         return None
     what = f"{held.name} is the named pipe {first.target}"
-    if not _leads_there(held):
+    if not (_is_nameless(held) or _leads_there(held)):
         return f"{what}, whose name is gone: let the program open it by a name that stays"
     if other := elsewhere.opener_of(held):
         return f"{what}, which pid {other} has open too: protect the program when that has closed it"
     return None
+
+
+def _is_nameless(held: OpenFile) -> bool:
+    return not held.first.links and held.first.target.endswith(procfs.DELETED)
 
 
 def _leads_there(held: OpenFile) -> bool:
@@ -131,6 +140,8 @@ def _leads_there(held: OpenFile) -> bool:
 def mismatches(held: Resource) -> Iterator[str]:
     """Why it could not be opened here: something else has its name, or there is no place for it."""
     path = str(held.facts["path"])
+    if held.facts.get("deleted"):
+        return
     if os.path.lexists(path):
         if not stat.S_ISFIFO(os.stat(path).st_mode):
             yield f"{path}, open as {held.name}, is no named pipe here: remove it"
@@ -141,7 +152,9 @@ def mismatches(held: Resource) -> Iterator[str]:
 def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     """Open it as it was, without waiting for somebody at its other end, and fill it."""
     path, flags, content = str(held.facts["path"]), number_of(held.facts["flags"]), held.facts["content"]
-    if not os.path.lexists(path):
+    if held.facts.get("deleted"):
+        path = f"/proc/self/fd/{_nameless(table, held, rebuilding)}"
+    elif not os.path.lexists(path):
         _make(table, path, number_of(held.facts["mode"]))
     assert isinstance(content, bytes)
     if not content and flags & os.O_ACCMODE == os.O_RDONLY:
@@ -160,6 +173,18 @@ def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
         table.call(f"fill the named pipe {path}", "write", both, table.place(content), size, least=size, most=size)
     table.close(both)
     return made
+
+
+def _nameless(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
+    """A descriptor that leads to a named pipe without a name, made if this is its first open file."""
+    key = number_of(held.facts["device"]), number_of(held.facts["inode"])
+    if key not in rebuilding.objects:
+        made = nameless.make_node(table, str(held.facts["path"]), number_of(held.facts["mode"]))
+        owner = number_of(held.facts["uid"]), number_of(held.facts["gid"])
+        lost = f"the named pipe of {held.name} belongs to whom the program runs as"
+        table.attempt(lost, "fchownat", made, table.place_path(""), *owner, AT_EMPTY_PATH)
+        rebuilding.keep(table, key, made)
+    return rebuilding.objects[key]
 
 
 def _make(table: CallTable, path: str, mode: int) -> None:

@@ -2,7 +2,8 @@
 
 Facts: ``descriptors``; ``path``; ``flags`` of open(2); ``offset`` and ``size`` in bytes, ``mode``, ``device``, ``inode`` and
 ``mtime_ns`` at the capture; ``digest``: blake3 of the content of a file that is open for reading only, b"" where it is longer
-than `DIGEST_LIMIT` or cannot be read; for a file that no name leads to any more ``deleted`` true and its whole ``content``.
+than `DIGEST_LIMIT` or cannot be read; for a file or directory that no name leads to any more ``deleted`` true, ``uid`` and
+``gid``, and ``content``: [offset, bytes] of each part that is no hole, with one of its open files, [] with the others.
 
 A file that is open for writing and only grew since the capture is cut back to ``size``.
 """
@@ -11,7 +12,9 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
+from itertools import islice
 from typing import Final
 
 from blake3 import blake3
@@ -20,6 +23,7 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError
 from checkpoint.linux import procfs
 from checkpoint.linux.descriptors import Descriptor
+from checkpoint.linux.digests import filled_extents
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile, Surroundings
 
@@ -31,14 +35,19 @@ CAPABILITIES: Final = (
         "regular files, directories and paths (O_PATH)",
         "opened again at the same offset; what was only read must be the same, what only grew is cut back",
     ),
-    preserved(Area.FILES, "deleted files", "carried whole, up to 16 MiB"),
+    preserved(
+        Area.FILES,
+        "deleted files and directories",
+        "carried whole, up to 16 MiB without holes; opened by another name where a file still has one near by; pages of private "
+        "mappings are carried too, so what is written to the file later does not show in those that were never touched",
+    ),
     refused(
         Area.FILES,
-        "a deleted file over 16 MiB, or with another name; a deleted directory",
+        "a deleted file over 16 MiB, or with another name far away; a deleted symbolic link",
         "give it a name",
         "cannot be opened again; let the program close it",
         "still has another name",
-        "a deleted file is carried up to",
+        "deleted files are carried up to",
     ),
     refused(
         Area.FILES,
@@ -61,6 +70,13 @@ CONTENT_LIMIT: Final = 16 << 20
 DIGESTS_KEPT: Final = 1024
 """Digests remembered; a file is digested again only when its device, inode, size or time of change differ."""
 
+LEVELS: Final = 3
+"""In how many directories, from its own upwards, another name of a deleted file is looked for."""
+ENTRIES_MAX: Final = 10_000
+"""Entries of each that are looked at: some milliseconds."""
+LOOKS: Final = 5
+"""How often a file is looked for that seems to have no name."""
+
 CHUNK: Final = 1 << 20
 
 O_PATH: Final = 0o10000000
@@ -72,9 +88,10 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
     first = held.first
     if not is_file(first):
         return None
+    is_lost, other = is_deleted(first), other_name(held)
     facts: dict[str, Fact] = {
         "descriptors": held.numbers,
-        "path": first.target.removesuffix(procfs.DELETED) if is_deleted(first) else first.target,
+        "path": other or (first.target.removesuffix(procfs.DELETED) if is_lost else first.target),
         "flags": first.flags & ~os.O_CLOEXEC,
         "offset": first.offset,
         "size": first.size,
@@ -83,9 +100,8 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
         "inode": first.inode,
         "mtime_ns": first.mtime_ns,
     }
-    if is_deleted(first):
-        content = content_of(held) if held.content is None else held.content
-        facts |= {"deleted": True, "content": content, "uid": first.uid, "gid": first.gid}
+    if is_lost and not other:
+        facts |= {"deleted": True, "content": held.observed.get("content", []), "uid": first.uid, "gid": first.gid}
     elif is_only_read(first):
         facts["digest"] = digest_of(held)
     return Resource(KIND, held.name, facts)
@@ -99,7 +115,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     what = f"{held.name} is {first.target}"
     if first.target.startswith("/secretmem"):
         return f"{what}: secret memory cannot be read, that is its purpose; run the program without it"
-    if not (_was_found(held) if is_deleted(first) else _is_found(held) or _has_just_lost_its_name(held)):
+    if not (_was_found(held) if is_deleted(first) else _is_or_was_found(held)):
         return f"{what}, which no path leads to from here (a message queue, for one): that is not kept; run without it"
     return _refuse_deleted(held) if is_deleted(first) else None
 
@@ -112,12 +128,12 @@ def is_file(one: Descriptor) -> bool:
 
 def _refuse_deleted(held: OpenFile) -> str | None:
     first, what = held.first, f"{held.name} is {held.first.target}"
-    if not stat.S_ISREG(first.mode):
-        return f"{what}: a deleted directory, device or the like cannot be opened again; let the program close it"
-    if first.links:
+    if not (stat.S_ISREG(first.mode) or stat.S_ISDIR(first.mode)):
+        return f"{what}: a deleted symbolic link, device or the like cannot be opened again; let the program close it"
+    if first.links and not other_name(held):
         return f"{what}, but it still has another name, which is not known: let the program open it under that name"
-    if first.size > CONTENT_LIMIT:
-        return f"{what} with {first.size >> 20} MiB; a deleted file is carried up to {CONTENT_LIMIT >> 20} MiB: give it a name"
+    if not first.links and first.stored > CONTENT_LIMIT:
+        return f"{what} with {first.stored >> 20} MiB; deleted files are carried up to {CONTENT_LIMIT >> 20} MiB: give it a name"
     return None
 
 
@@ -129,7 +145,47 @@ def is_deleted(one: Descriptor) -> bool:
 def must_carry(held: OpenFile) -> bool:
     """Whether its content must travel with the snapshot."""
     first = held.first
-    return stat.S_ISREG(first.mode) and not first.links and first.size <= CONTENT_LIMIT and is_deleted(first)
+    return stat.S_ISREG(first.mode) and not first.links and first.stored <= CONTENT_LIMIT and is_deleted(first)
+
+
+def other_name(held: OpenFile) -> str:
+    """Another name of a file whose own was deleted: beside it, above, or where the process works; "" without one.
+
+    Source: a hard link is most often made beside its file, and then renamed over another, or kept as a backup.
+    """
+    first = held.first
+    if not (first.links and stat.S_ISREG(first.mode) and is_deleted(first)):
+        return ""
+    for directory in (*_above(first.target), procfs.read_link(held.pid, "cwd")):
+        if found := _entry_of(held, directory):
+            return found
+    return ""
+
+
+def _above(path: str) -> Iterator[str]:
+    for _ in range(LEVELS):
+        path = os.path.dirname(path)
+        yield path
+
+
+def _entry_of(held: OpenFile, directory: str) -> str:
+    try:
+        with os.scandir(f"/proc/{held.pid}/root{directory}") as entries:
+            for entry in islice(entries, ENTRIES_MAX):
+                if entry.inode() == held.first.inode and entry.stat(follow_symlinks=False).st_dev == held.first.device:
+                    return os.path.join(directory, entry.name)
+    except OSError:  # it is gone, or closed to us
+        return ""
+    return ""
+
+
+def _is_or_was_found(held: OpenFile) -> bool:
+    """Whether its path leads to it, or did until a program that runs meanwhile deleted it.
+
+    Two looks may fall between a deletion and the making of another file of the same name, which often gets the same inode, as a
+    database's journals do: a file that is where it was and has no name has one at the next look.
+    """
+    return any(_is_found(held) or _has_just_lost_its_name(held) for _ in range(LOOKS))
 
 
 def _is_found(held: OpenFile) -> bool:
@@ -169,16 +225,22 @@ def is_only_read(one: Descriptor) -> bool:
     return stat.S_ISREG(one.mode) and one.flags & os.O_ACCMODE == os.O_RDONLY and not one.flags & O_PATH
 
 
-def content_of(held: OpenFile) -> bytes:
-    """The whole of a deleted file, through the process that still holds it.
+def observe_deleted(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
+    """The content of a deleted file, with the first open file of it.
 
     Raises:
         CaptureError: it cannot be read.
     """
+    first = next(one for one in opened if (one.first.device, one.first.inode) == (held.first.device, held.first.inode))
+    return {"content": _content_of(held) if first is held else []}
+
+
+def _content_of(held: OpenFile) -> list[Fact]:
+    """[offset, bytes] of each part that is no hole, through the process that still holds it."""
     try:
         descriptor = os.open(f"/proc/{held.pid}/fd/{held.first.number}", os.O_RDONLY | os.O_CLOEXEC)
         try:
-            return os.pread(descriptor, CONTENT_LIMIT, 0)
+            return [[first, os.pread(descriptor, last - first, first)] for first, last in filled_extents(descriptor)]
         finally:
             os.close(descriptor)
     except OSError as error:

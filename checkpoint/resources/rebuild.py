@@ -22,6 +22,7 @@ from typing import Final
 
 from checkpoint.engine import RestoreOptions
 from checkpoint.errors import RestoreError
+from checkpoint.linux import procfs
 from checkpoint.linux.abi import PAGE_SIZE
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource, Snapshot
@@ -37,6 +38,7 @@ from checkpoint.resources import (
     locks,
     memory_files,
     memory_locks,
+    nameless,
     pipes,
     signalfds,
     signalling,
@@ -58,6 +60,7 @@ REOPENED_FLAGS: Final = (
 """Flags of open(2) that belong to an open file; O_CREAT, O_TRUNC and the like belong to the moment of opening."""
 
 O_PATH: Final = 0o10000000
+AT_EMPTY_PATH: Final = 0x1000
 STREAMS: Final = (0, 1, 2)
 MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
     eventfds.KIND: eventfds.rebuild,
@@ -65,6 +68,7 @@ MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
     signalfds.KIND: signalfds.rebuild,
     epolls.KIND: epolls.rebuild,
     watches.KIND: watches.rebuild,
+    devices.KIND: devices.rebuild,
     fifos.KIND: fifos.rebuild,
     kernel_files.KIND: kernel_files.rebuild,
     memory_files.KIND: memory_files.rebuild,
@@ -83,7 +87,7 @@ NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
 SOCKETS: Final = (unix_sockets.KIND, tcp_connections.KIND, internet_sockets.KIND)
 NOT_OPEN: Final = (memory_locks.KIND, system_v_memory.KIND)
 """Kinds of what no descriptor stands for."""
-KINDS: Final = (files.KIND, devices.KIND, streams.KIND, pipes.KIND, terminals.KIND, *NOT_OPEN, *MADE, *SOCKETS)
+KINDS: Final = (files.KIND, streams.KIND, pipes.KIND, terminals.KIND, *NOT_OPEN, *MADE, *SOCKETS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,12 +154,21 @@ def rebuild_all(
     return tcp_connections.notes(state.resources)
 
 
+def deleted_directory(state: Snapshot) -> int | None:
+    """A descriptor that the program has of its working directory, if that was deleted."""
+    directory = state.process.working_directory
+    if not procfs.is_gone(directory):
+        return None
+    named = [one for one in descriptors_of(state) if one.resource.facts.get("path") == directory.removesuffix(procfs.DELETED)]
+    return next((one.number for one in named if one.resource.kind == files.KIND and one.resource.facts.get("deleted")), None)
+
+
 def _prepare_sockets(table: CallTable, state: Snapshot, first: int) -> tuple[unix_sockets.Work, dict[int, int]]:
     """Make all sockets at numbers from ``first`` on, in the working directory: names may be relative to it."""
     of_unix = [held for held in state.resources if held.kind == unix_sockets.KIND]
     of_internet = [held for held in state.resources if held.kind == internet_sockets.KIND]
     of_tcp = [held for held in state.resources if held.kind == tcp_connections.KIND]
-    if of_unix:
+    if of_unix and not procfs.is_gone(state.process.working_directory):
         directory = state.process.working_directory
         table.call(f"enter the working directory {directory}", "chdir", table.place_path(directory))
     unix = unix_sockets.Work(table, of_unix, first)
@@ -263,49 +276,54 @@ def _open(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     return descriptor
 
 
-def make_nameless(table: CallTable, path: str, mode: int) -> int:
-    """Make an empty file that no name leads to, where it had its name."""
-    if os.path.lexists(path):
-        return table.open(os.path.dirname(path), os.O_TMPFILE | os.O_RDWR, mode)
-    made = table.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR, mode)
-    table.call(f"unlink {path}", "unlinkat", -100, table.place_path(path), 0)
-    return made
-
-
 def _open_deleted(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     """Make a file that no name leads to, with the content that it had, opened as it was; it may be mapped already."""
-    facts = held.facts
-    path, content = str(facts["path"]), facts.get("content", b"")
-    assert isinstance(content, bytes)
-    key = number_of(facts["device"]), number_of(facts["inode"])
+    facts, mode = held.facts, number_of(held.facts.get("mode", 0o600))
+    path, key = str(facts["path"]), (number_of(facts["device"]), number_of(facts["inode"]))
     if key not in rebuilding.objects:
-        rebuilding.keep(table, key, make_nameless(table, path, number_of(facts.get("mode", 0o600)) & 0o7777))
+        make = nameless.make_directory if stat.S_ISDIR(mode) else nameless.make_file
+        rebuilding.keep(table, key, make(table, path, stat.S_IMODE(mode)))
     made = rebuilding.objects[key]
-    if content:
-        table.call(f"size {path}", "ftruncate", made, len(content))
-        for offset, piece in _written_pieces(content):
-            size = len(piece)
-            table.call(f"fill {path}", "pwrite64", made, table.place(piece), size, offset, least=size, most=size)
+    if stat.S_ISREG(mode):
+        _fill(table, made, held)
+    again, flags = f"/proc/self/fd/{made}", number_of(facts["flags"])
     if "uid" in facts:
         owner = number_of(facts["uid"]), number_of(facts["gid"])
-        table.attempt(f"the deleted file {path} belongs to whom the program runs as", "fchown", made, *owner)
-        table.attempt("", "fchmod", made, number_of(facts["mode"]) & 0o7777)  # a change of owner takes set-user-ID away
+        lost = f"the deleted file {path} belongs to whom the program runs as"
+        table.attempt(lost, "fchownat", made, table.place_path(""), *owner, AT_EMPTY_PATH)
+        table.attempt("", "fchmodat", -1, table.place_path(again), stat.S_IMODE(mode))  # a change of owner takes set-user-ID away
     if "mtime_ns" in facts:
         changed = struct.pack("<qq", *divmod(number_of(facts["mtime_ns"]), NS_PER_S))
         times = table.place(struct.pack("<qq", 0, UTIME_OMIT) + changed)
-        table.attempt("", "utimensat", made, 0, times, 0)
-    flags = number_of(facts["flags"]) & REOPENED_FLAGS & ~os.O_DIRECTORY  # part of O_TMPFILE, by which it may have been made
-    opened = table.open(f"/proc/self/fd/{made}", flags)
+        table.attempt("", "utimensat", -1, table.place_path(again), times, 0)
+    if flags & O_PATH:
+        return table.open(again, O_PATH | (flags & os.O_DIRECTORY))
+    is_temporary = stat.S_ISREG(mode)  # O_DIRECTORY is a part of O_TMPFILE, by which it may have been made
+    opened = table.open(again, flags & REOPENED_FLAGS & ~(os.O_DIRECTORY if is_temporary else 0))
     _seek(table, opened, held)
     return opened
 
 
-def _written_pieces(content: bytes) -> Iterator[tuple[int, bytes]]:
-    """The parts of a file that are not zero, in whole pages: the rest becomes holes."""
+def _fill(table: CallTable, made: int, held: Resource) -> None:
+    """Give a file that was deleted its size and its content; with one of its open files the snapshot has that."""
+    path, content = str(held.facts["path"]), held.facts.get("content", [])
+    table.call(f"size {path}", "ftruncate", made, number_of(held.facts["size"]))
+    if isinstance(content, bytes):
+        content = [[0, content]]  # as versions before carried it
+    assert isinstance(content, list)
+    for part in content:
+        assert isinstance(part, list) and isinstance(part[1], bytes)
+        for offset, piece in _written_pieces(number_of(part[0]), part[1]):
+            size = len(piece)
+            table.call(f"fill {path}", "pwrite64", made, table.place(piece), size, offset, least=size, most=size)
+
+
+def _written_pieces(begin: int, content: bytes) -> Iterator[tuple[int, bytes]]:
+    """What of a part of a file is not zero, in whole pages, and where: the rest becomes holes."""
     filled = [start for start in range(0, len(content), PAGE_SIZE) if content[start : start + PAGE_SIZE].strip(b"\0")]
     for _, run in groupby(enumerate(filled), key=lambda one: one[1] - one[0] * PAGE_SIZE):
         starts = [start for _, start in run]
-        yield starts[0], content[starts[0] : starts[-1] + PAGE_SIZE]
+        yield begin + starts[0], content[starts[0] : starts[-1] + PAGE_SIZE]
 
 
 def _seek(table: CallTable, descriptor: int, held: Resource) -> None:

@@ -1,14 +1,17 @@
 """Who gets which signal when a descriptor becomes ready: F_SETOWN and F_SETSIG of fcntl(2), kept of every kind of open file.
 
 Facts, added to a resource's own: ``signal`` (0 for SIGIO) and ``owner``: 1 if it is the process itself, 2 if its first thread
-alone (F_OWNER_TID), 0 if nobody. Directory notifications (F_NOTIFY) cannot be asked for; they are lost with the descriptor's next
-opening.
+alone (F_OWNER_TID), 0 if nobody. Directory notifications (F_NOTIFY) cannot be asked for; but nothing else gives a directory an
+owner, so one that has an owner is refused.
+
+Source: fcntl_dirnotify() in fs/notify/dnotify/dnotify.c.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import stat
 import struct
 from typing import Final
 
@@ -26,6 +29,7 @@ CAPABILITIES: Final = (
         "let the program own them itself",
         "sends its signals to",
     ),
+    refused(Area.PIPES, "notifications of a directory by signals (F_NOTIFY)", "use inotify, which is kept", "(F_NOTIFY)"),
 )
 
 F_SETOWN_EX: Final = 15
@@ -54,6 +58,8 @@ def refuse(held: OpenFile) -> str | None:
     asked = _asked(held)
     if asked is None or asked[2] == 0:
         return None
+    if stat.S_ISDIR(held.first.mode):
+        return f"{held.name} is a directory whose changes are told by a signal (F_NOTIFY), which is not kept: use inotify"
     _, kind, owner = asked
     if owner == held.pid and kind in _OWNERS:
         return None

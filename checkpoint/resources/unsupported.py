@@ -11,7 +11,6 @@ import os
 import re
 import stat
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
@@ -91,6 +90,7 @@ CAPABILITIES: Final = (
         "it runs under a seccomp filter",
     ),
     refused(Area.PROCESS, "programs of 32 bits", "use a 64-bit build", "it is a program of 32 bits"),
+    refused(Area.PROCESS, "a program without the kernel’s vdso", "do not unmap it", "it has no vdso"),
     refused(
         Area.PROCESS,
         "a program whose own file is gone",
@@ -99,7 +99,7 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.PROCESS,
-        "a working directory that is gone, a root directory of its own (chroot)",
+        "a working directory of /proc or /sys that is gone, a root directory of its own (chroot)",
         "change the directory; run it without the chroot",
         "its working directory",
         "its root directory is",
@@ -160,6 +160,9 @@ HUGE_NAME: Final = "/anon_hugepage"
 """What the kernel calls memory of huge pages that has no file."""
 ORPHAN_LIMIT: Final = 64 << 20
 """Bytes of one mapping of a deleted file that are carried: every freeze reads them all, a millisecond for 4 MiB."""
+
+KERNEL_PLACES: Final = ("/proc/", "/sys/")
+"""Where nobody can make a directory."""
 
 _KERNEL_PAGES: Final = ("[vvar", "[vdso", "[vsyscall")
 """Mappings that the kernel gives every process: they move, see ``restore_memory``."""
@@ -310,6 +313,7 @@ def refuse_process(pid: int, status: Status, *, files_kept: bool = False, had_ch
         yield "it runs under a seccomp filter, which forbids what a capture asks of it: run it without the filter"
     yield from shared_objects.refuse(pid)
     yield from _refuse_image(pid, files_kept)
+    yield from _refuse_memory(pid)
     yield from _refuse_places(pid)
     yield from _refuse_namespaces(pid)
 
@@ -324,9 +328,15 @@ def _refuse_image(pid: int, files_kept: bool) -> Iterator[str]:
             yield f"it is a program of 32 bits ({executable}), which is not supported: use a 64-bit build"
 
 
+def _refuse_memory(pid: int) -> Iterator[str]:
+    """What our own calls inside it need."""
+    if "[vdso]" not in procfs.read_text(pid, "maps"):
+        yield "it has no vdso (it unmapped it, or the kernel was started with vdso=0), by which a capture enters it"
+
+
 def _refuse_places(pid: int) -> Iterator[str]:
     directory = procfs.read_link(pid, "cwd")
-    if directory.endswith(procfs.DELETED) and not Path(directory).exists():
+    if procfs.is_gone(directory) and directory.startswith(KERNEL_PLACES):
         yield f"its working directory {directory} is gone: let it change to another one"
     root = procfs.read_link(pid, "root")
     if root != "/":

@@ -3,7 +3,8 @@
 Events that it has not read yet cannot be put back: while there are any, nothing is captured. What happens to the files between
 the capture and the restore it does not hear of.
 
-Facts: ``descriptors``; ``flags`` of fcntl(2); ``watches``: a list of [number, path, mask].
+Facts: ``descriptors``; ``flags`` of fcntl(2); ``watches``: a list of [number, path, mask]; the path of a file without a
+name that the program has open is /proc/self/fd/N.
 
 Source: inotify_fdinfo() in fs/notify/fdinfo.c; open_by_handle_at(2).
 """
@@ -45,7 +46,7 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.PIPES,
-        "an inotify watch of a file without a name, or the ten thousandth",
+        "an inotify watch of a file without a name that is not open, or the ten thousandth",
         "remove the watch, or open another instance",
         "is of a file that no path leads to",
         "whose watch has number",
@@ -59,6 +60,7 @@ IN_DELETE_SELF: Final = 0x400
 IN_DONT_FOLLOW: Final = 0x02000000
 KEPT_MASK: Final = 0x00000FFF | 0x04000000 | 0x80000000
 """IN_ALL_EVENTS, IN_EXCL_UNLINK and IN_ONESHOT."""
+OPENED: Final = "/proc/self/fd/"
 NUMBER_MAX: Final = 10_000
 """Greatest number of a watch: the kernel counts up, so the ones before are made and removed."""
 EVENT_SIZE: Final = 16
@@ -74,14 +76,29 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
-    """How many bytes of events were not read."""
+    """How many bytes of events were not read, and which watches are of files that the program has open."""
     waiting = array.array("i", [0])
     try:
         with copy_of(held.pid, held.first.number) as descriptor:
             fcntl.ioctl(descriptor, termios.FIONREAD, waiting)
     except OSError as error:
         raise CaptureError(f"cannot look into the inotify instance {held.name}: {error.strerror}; try again") from error
-    return {"unread": waiting[0]}
+    numbers: dict[tuple[int, str], int] = {}
+    for one in opened:
+        numbers.setdefault((one.first.inode, _major_minor(one.first.device)), one.first.number)
+    watched = (
+        (int(match[1], 16), (int(match[2], 16), _kernels(int(match[3], 16)))) for match in _WATCH.finditer(held.first.text)
+    )
+    return {"unread": waiting[0], "opened": [[number, numbers[place]] for number, place in watched if place in numbers]}
+
+
+def _major_minor(device: int) -> str:
+    return f"{os.major(device)}:{os.minor(device)}"
+
+
+def _kernels(device: int) -> str:
+    """Of a device as the kernel packs it, 12 bits and 20."""
+    return f"{device >> 20}:{device & 0xFFFFF}"
 
 
 def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
@@ -111,9 +128,19 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
 def _watches(held: OpenFile) -> Iterator[tuple[int, str, int]]:
     """(number, path, mask), numbers ascending; the path "" where it is not known."""
     found = sorted((int(match[1], 16), match) for match in _WATCH.finditer(held.first.text))
+    opened = dict(_pairs(held.observed.get("opened", [])))
     for number, match in found:
         device, inode, kind = (int(match[index], 16) for index in (3, 2, 5))
-        yield number, _path_of(held.pid, device, inode, kind, match[6]), int(match[4], 16) & KEPT_MASK
+        path = _path_of(held.pid, device, inode, kind, match[6])
+        if not path and number in opened:
+            path = f"{OPENED}{opened[number]}"
+        yield number, path, int(match[4], 16) & KEPT_MASK
+
+
+def _pairs(fact: Fact) -> Iterator[tuple[int, int]]:
+    for pair in fact if isinstance(fact, list) else ():
+        assert isinstance(pair, list)
+        yield number_of(pair[0]), number_of(pair[1])
 
 
 def _path_of(pid: int, device: int, inode: int, kind: int, handle: str) -> str:
@@ -133,13 +160,13 @@ def _known_path(pid: int, device: int, inode: int, kind: int, handle: str) -> st
     Raises:
         LookupError: none was found.
     """
-    major_minor = f"{device >> 20}:{device & 0xFFFFF}"
+    major_minor = _kernels(device)
     for path in (*_by_handle(pid, major_minor, kind, bytes.fromhex(handle)), *_near(pid)):
         try:
             about = os.lstat(f"/proc/{pid}/root{path}")
         except OSError:
             continue
-        if about.st_ino == inode and f"{os.major(about.st_dev)}:{os.minor(about.st_dev)}" == major_minor:
+        if about.st_ino == inode and _major_minor(about.st_dev) == major_minor:
             return path
     raise LookupError(inode)
 
@@ -178,7 +205,7 @@ def _by_handle(pid: int, device: str, kind: int, handle: bytes) -> Iterator[str]
 def mismatches(held: Resource) -> Iterator[str]:
     """Paths that are not there."""
     for _, path, _ in _listed(held):
-        if not os.path.lexists(path):
+        if not (path.startswith(OPENED) or os.path.lexists(path)):
             yield f"{path}, which the program watches by {held.name} (inotify), is missing here: make it"
 
 
@@ -210,7 +237,8 @@ def settle(table: CallTable, held: Resource, descriptor: int) -> None:
             if unread == EVENTS_AT_ONCE:
                 _read_away(table, descriptor, buffer, unread)
                 unread = 0
-        table.call(what, "inotify_add_watch", descriptor, place, mask | IN_DONT_FOLLOW, least=number, most=number)
+        whole_mask = mask if path.startswith(OPENED) else mask | IN_DONT_FOLLOW
+        table.call(what, "inotify_add_watch", descriptor, place, whole_mask, least=number, most=number)
         last = number
     if unread:
         _read_away(table, descriptor, buffer, unread)

@@ -40,7 +40,10 @@ CASES = {
         "timer_disarmed signalfd_waiting "
         "epoll_simple epoll_ready epoll_nested epoll_once epoll_edge epoll_exclusive epoll_renumbered epoll_waiting"
     ),
-    "path_descriptors": "inotify_directories inotify_gaps fifo_both fifo_reader pipe_reopened path_only kernel_files file_locks",
+    "path_descriptors": (
+        "inotify_directories inotify_gaps inotify_deleted fifo_both fifo_reader fifo_deleted pipe_reopened path_only "
+        "kernel_files file_locks"
+    ),
     "memory_objects": "memfd_executed memfd_content memfd_sealed memfd_mapped posix_named posix_unlinked",
     "sockets": (
         "pair_stream pair_datagram pair_packets pair_much pair_options pair_half_closed rights_stream "

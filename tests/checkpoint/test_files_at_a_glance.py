@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from checkpoint.resources import Surroundings, files, gather
+import pytest
+
+from checkpoint.resources import OpenFile, Surroundings, files, gather
 
 
 def test_a_file_that_is_deleted_between_two_looks_is_not_refused(tmp_path: Path) -> None:
@@ -13,6 +15,24 @@ def test_a_file_that_is_deleted_between_two_looks_is_not_refused(tmp_path: Path)
     with path.open("wb"):
         (held,) = (one for one in gather(os.getpid()) if one.first.target == str(path))
         path.unlink()
+        assert files.refuse(held, Surroundings()) is None
+
+
+def test_a_file_that_gets_its_name_back_between_two_looks_is_not_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a database's journal does, which is deleted and made again, mostly of the same inode and under the same number."""
+    path, away = tmp_path / "journal", tmp_path / "away"
+    with path.open("wb"):
+        (held,) = (one for one in gather(os.getpid()) if one.first.target == str(path))
+        path.rename(away)
+        really_is_found = files._is_found
+
+        def is_found_and_comes_back(held: OpenFile) -> bool:
+            found = really_is_found(held)
+            if away.exists():
+                away.rename(path)
+            return found
+
+        monkeypatch.setattr(files, "_is_found", is_found_and_comes_back)
         assert files.refuse(held, Surroundings()) is None
 
 

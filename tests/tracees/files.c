@@ -120,6 +120,102 @@ static void deleted_read_only(const char *go) {
     EXPECT(write(file, "x", 1) == -1 && errno == EBADF, "a read-only descriptor takes writes");
 }
 
+static void deleted_sparse(const char *go) {
+    int files[3];
+    struct stat before, after;
+    for (int index = 0; index < 3; index++) {
+        files[index] = make("doomed", O_RDWR), unlink("doomed");
+        if (pwrite(files[index], "far away", 8, (1L << 30) + index) != 8) cannot("write");
+    }
+    fstat(files[1], &before);
+    int again = open("/proc/self/fd/3", O_RDONLY);
+    if (again < 0) cannot("open a deleted file again");
+    ready(), wait_for_go(go);
+    fstat(files[1], &after);
+    EXPECT_EQUAL("size", after.st_size, before.st_size);
+    EXPECT_EQUAL("blocks", after.st_blocks, before.st_blocks);
+    for (int index = 0; index < 3; index++) {
+        lseek(files[index], (1L << 30) + index, SEEK_SET);
+        expect_read(files[index], "far away");
+        EXPECT(pwrite(files[index], "x", 1, 0) == 1, "cannot write");
+    }
+    expect_read(again, "x123");
+}
+
+static void deleted_with_a_link(const char *go) {
+    int file = make("doomed", O_RDWR), read_only = open("doomed", O_RDONLY), deep;
+    struct stat before, after;
+    if (link("doomed", "kept") || unlink("doomed")) cannot("link");
+    mkdir("deep", 0700), deep = make("deep/doomed", O_RDWR);
+    if (link("deep/doomed", "high") || unlink("deep/doomed") || rmdir("deep")) cannot("link");
+    lseek(file, 10, SEEK_SET);
+    fstat(file, &before);
+    ready(), wait_for_go(go);
+    fstat(file, &after);
+    EXPECT(after.st_ino == before.st_ino && after.st_nlink == before.st_nlink, "it is another file");
+    expect_read(file, "abc"), expect_read(read_only, "012"), expect_read(deep, "012");
+    int kept = open("kept", O_RDONLY);
+    if (pwrite(file, "ZZ", 2, 0) != 2) differs("cannot write: %s", strerror(errno));
+    expect_read(kept, "ZZ2345");
+    EXPECT(access("doomed", F_OK) != 0, "the file has its name again");
+}
+
+static void deleted_directory(const char *go) {
+    int top = open(".", O_RDONLY | O_DIRECTORY), here, other;
+    struct stat about, working;
+    char before[4096] = "", after[4096] = "";
+    if (mkdir("gone", 0750) || mkdir("gone/other", 0700) || chdir("gone")) cannot("make directories");
+    here = open(".", O_RDONLY | O_DIRECTORY), other = open("other", O_RDONLY | O_DIRECTORY);
+    if (rmdir("other") || rmdir("../gone")) cannot("delete the working directory");
+    if (readlink("/proc/self/cwd", before, sizeof before) < 0) cannot("read a link");
+    ready();
+    while (faccessat(top, go, F_OK, 0)) usleep(2000);
+    if (readlink("/proc/self/cwd", after, sizeof after) < 0 || strcmp(before, after)) differs("works in %s, not in %s", after, before);
+    EXPECT(!fstat(other, &about) && S_ISDIR(about.st_mode) && !about.st_nlink, "the other one is not a deleted directory");
+    EXPECT(!fstat(here, &about) && S_ISDIR(about.st_mode) && !about.st_nlink, "it is not deleted");
+    EXPECT_EQUAL("mode", about.st_mode & 07777, 0750);
+    EXPECT(!stat(".", &working) && working.st_ino == about.st_ino, "it works in another directory than the one that is open");
+    EXPECT(openat(here, "new", O_CREAT | O_WRONLY, 0600) == -1 && errno == ENOENT, "files can be made there");
+    EXPECT(fchdir(top) == 0 && access("gone", F_OK), "the directory has its name again");
+}
+
+/* As the other, but nothing is open there. */
+static void deleted_working_directory(const char *go) {
+    char before[4096] = "", after[4096] = "";
+    int top = open(".", O_RDONLY | O_DIRECTORY);
+    if (mkdir("gone", 0700) || chdir("gone") || rmdir("../gone")) cannot("delete the working directory");
+    if (readlink("/proc/self/cwd", before, sizeof before) < 0) cannot("read a link");
+    ready();
+    while (faccessat(top, go, F_OK, 0)) usleep(2000);
+    if (readlink("/proc/self/cwd", after, sizeof after) < 0 || strcmp(before, after)) differs("works in %s, not in %s", after, before);
+    EXPECT(fchdir(top) == 0 && access("gone", F_OK), "the directory has its name again");
+}
+
+static void deleted_device(const char *go) {
+    struct stat before, after;
+    if (mknod("null", S_IFCHR | 0640, 0x103)) cannot("make a device");
+    int file = open("null", O_RDWR);
+    if (file < 0 || unlink("null")) cannot("open a device");
+    fstat(file, &before);
+    ready(), wait_for_go(go);
+    fstat(file, &after);
+    EXPECT_EQUAL("mode", after.st_mode, before.st_mode);
+    EXPECT_EQUAL("device", after.st_rdev, before.st_rdev);
+    EXPECT_EQUAL("names", after.st_nlink, 0);
+    EXPECT(write(file, "x", 1) == 1, "nothing can be written");
+}
+
+/* Its directory is gone, too. */
+static void deleted_place(const char *go) {
+    mkdir("place", 0700);
+    int file = make("place/doomed", O_RDWR);
+    if (unlink("place/doomed") || rmdir("place")) cannot("delete the directory");
+    lseek(file, 5, SEEK_SET);
+    ready(), wait_for_go(go);
+    expect_read(file, "567");
+    EXPECT(write(file, "x", 1) == 1 && access("place", F_OK), "the directory is there again, or nothing can be written");
+}
+
 static void devices(const char *go) {
     static const char *const paths[] = {"/dev/null", "/dev/zero", "/dev/full", "/dev/urandom", "/dev/random"};
     int files[5];
@@ -215,6 +311,9 @@ int main(int count, char **arguments) {
     } kinds[] = {{"read_offset", read_offset}, {"write_offset", write_offset}, {"append", append},
                  {"odd_flags", odd_flags},     {"shared_offset", shared_offset}, {"holes", holes},
                  {"deleted", deleted},         {"deleted_read_only", deleted_read_only}, {"devices", devices},
+                 {"deleted_sparse", deleted_sparse}, {"deleted_with_a_link", deleted_with_a_link},
+                 {"deleted_directory", deleted_directory}, {"deleted_working_directory", deleted_working_directory},
+                 {"deleted_device", deleted_device}, {"deleted_place", deleted_place},
                  {"directory", directory},     {"path_only", path_only}, {"beyond_end", beyond_end},
                  {"memory_file", memory_file}, {"odd_name", odd_name}, {"owner_signal", owner_signal},
                  {"owner_thread", owner_thread}};

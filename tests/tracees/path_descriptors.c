@@ -80,6 +80,40 @@ static void fifo_both(void) {
     EXPECT(write(other, "name", 4) == 4 && read(reader, found, 20) == 4, "its name leads elsewhere");
 }
 
+static void fifo_deleted(void) {
+    struct stat before, after;
+    mkfifo("doomed", 0640);
+    int both = open("doomed", O_RDWR), reader = open("doomed", O_RDONLY | O_NONBLOCK), writer = open("doomed", O_WRONLY);
+    if (both < 0 || write(writer, "what waits", 10) != 10 || unlink("doomed")) cannot("fill a named pipe");
+    close(both);
+    mkfifo("doomed", 0600);
+    int lonely = open("doomed", O_RDONLY | O_NONBLOCK);
+    unlink("doomed");
+    fstat(reader, &before);
+    wait_here();
+    char found[20] = "";
+    EXPECT(poll(&(struct pollfd){lonely, POLLIN, 0}, 1, 0) == 0, "the lonely reader was told of something");
+    EXPECT(read(reader, found, 20) == 10 && !strcmp(found, "what waits"), "found '%s'", found);
+    EXPECT(read(reader, found, 20) == -1 && errno == EAGAIN, "there is more");
+    EXPECT(write(writer, "again", 5) == 5 && read(reader, found, 20) == 5, "it is another pipe");
+    fstat(writer, &after);
+    EXPECT(after.st_mode == before.st_mode && !after.st_nlink, "mode %o, %d names", after.st_mode, (int)after.st_nlink);
+    close(writer);
+    EXPECT(read(reader, found, 20) == 0, "somebody else writes to it");
+    EXPECT(access("doomed", F_OK) != 0, "it has its name again");
+}
+
+static void inotify_deleted(void) {
+    touch("doomed");
+    int notices = inotify_init1(IN_NONBLOCK), file = open("doomed", O_RDWR);
+    int watch = inotify_add_watch(notices, "doomed", IN_CLOSE_WRITE | IN_DELETE_SELF);
+    unlink("doomed");
+    wait_here();
+    expect_no_notice(notices);
+    close(file);
+    expect_notice(notices, watch, IN_CLOSE_WRITE, ""), expect_notice(notices, watch, IN_DELETE_SELF, "");
+}
+
 /* A reader whom nobody has written to yet waits for a writer, and is not told that one hung up. */
 static void fifo_reader(void) {
     mkfifo("pipe", 0640);
@@ -201,6 +235,7 @@ int main(int count, char **arguments) {
         void (*act)(void);
     } cases[] = {{"inotify_directories", inotify_directories}, {"inotify_gaps", inotify_gaps}, {"fifo_both", fifo_both},
                  {"fifo_reader", fifo_reader}, {"fifo_gone", fifo_gone},
+                 {"fifo_deleted", fifo_deleted}, {"inotify_deleted", inotify_deleted},
                  {"pipe_reopened", pipe_reopened}, {"path_only", path_only}, {"kernel_files", kernel_files}, {"file_locks", file_locks}};
     go = arguments[1];
     for (size_t index = 0; index < sizeof cases / sizeof *cases; index++)

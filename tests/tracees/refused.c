@@ -282,8 +282,14 @@ static void take_memory_file(void) {
         cannot("map a memory file");
 }
 
-static void take_deleted_directory(void) {
-    if (mkdir("gone", 0700) || chdir("gone") || rmdir("../gone")) cannot("delete the working directory");
+static void take_no_vdso(void) {
+    unsigned long start = 0, end = 0;
+    char line[600];
+    FILE *maps = fopen("/proc/self/maps", "r");
+    while (maps && fgets(line, sizeof line, maps))
+        if (strstr(line, "[vdso]") && sscanf(line, "%lx-%lx", &start, &end) == 2) break;
+    if (maps) fclose(maps);
+    if (!end || munmap((void *)start, end - start)) cannot("unmap the vdso");
 }
 
 static void take_root(void) {
@@ -314,7 +320,7 @@ static void take_directory_notice(void) {
 }
 
 static void take_owner_group(void) {
-    keep(open(".", O_RDONLY | O_DIRECTORY), "the directory");
+    keep(open("owned", O_RDONLY | O_CREAT, 0600), "a file");
     if (getpgrp() != getpid() && setpgid(0, 0)) cannot("lead a process group");
     if (fcntl(opened, F_SETOWN, -getpgrp())) cannot("own signals as a group");
 }
@@ -364,7 +370,7 @@ static const struct kind {
              {"kernel_switch", take_kernel_switch},
              {"secret_memory", take_secret_memory},
              {"memory_file", take_memory_file},
-              {"deleted_directory", take_deleted_directory},
+              {"no_vdso", take_no_vdso},
              {"root", take_root},
              {"own_namespace", take_own_namespace},
              {"owner_group", take_owner_group},

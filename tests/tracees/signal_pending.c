@@ -32,6 +32,11 @@ int main(int count, char **arguments) {
     kill(getpid(), SIGTERM);
     syscall(SYS_tgkill, getpid(), gettid(), SIGHUP);
     kill(getpid(), SIGRTMIN + 6);
+    siginfo_t trap = {.si_code = SI_QUEUE};
+    trap.si_pid = pid, trap.si_uid = getuid(), trap.si_value.sival_int = pid * 1000000 + 7;
+    syscall(SYS_rt_sigqueueinfo, getpid(), SIGTRAP, &trap);
+    trap.si_value.sival_int++;
+    syscall(SYS_rt_tgsigqueueinfo, getpid(), gettid(), SIGTRAP, &trap);
     ready();
     wait_for_go(arguments[1]);
     sigemptyset(&one);
@@ -45,6 +50,8 @@ int main(int count, char **arguments) {
     for (int index = 0; index < 5; index++) expect_next(&one, SIGRTMIN + 4, SI_QUEUE, pid * 1000000 + 100 + index);
     sigaddset(&one, SIGRTMIN + 6);
     expect_next(&one, SIGRTMIN + 6, SI_USER, 0);
+    sigemptyset(&one), sigaddset(&one, SIGTRAP);
+    for (int last = 1; last >= 0; last--) expect_next(&one, SIGTRAP, SI_QUEUE, pid * 1000000 + 7 + last);
     sigpending(&left);
     for (int number = 1; number <= 64; number++)
         EXPECT(!sigismember(&left, number), "signal %d is pending and nobody sent it", number);
