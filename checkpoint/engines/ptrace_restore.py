@@ -306,7 +306,7 @@ class _Restore:
         restore_process.posix_timers(table, process, state.threads, vessel, elapsed_ns)
         restore_process.interval_timers(table, process.interval_timers, elapsed_ns)
         restore_process.last_marks(table, process)
-        rebuild_last(table, self._state)
+        rebuild_last(table, self._state, vessel.inner_pid)
         switches.set_again(table, process.switches)
         return table
 

@@ -25,7 +25,7 @@ from checkpoint.linux import procfs
 from checkpoint.linux.descriptors import Descriptor
 from checkpoint.linux.digests import filled_extents
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings
+from checkpoint.resources import OpenFile, Surroundings, locks
 
 KIND: Final = "files"
 
@@ -232,6 +232,8 @@ def observe_deleted(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, 
         CaptureError: it cannot be read.
     """
     first = next(one for one in opened if (one.first.device, one.first.inode) == (held.first.device, held.first.inode))
+    if locks.has_lease(held):
+        return {}  # to read it would break that
     return {"content": _content_of(held) if first is held else []}
 
 

@@ -188,7 +188,7 @@ def _settle(table: CallTable, wanted: list[Wanted], holders: Mapping[int, int]) 
             epolls.settle(table, one.resource, one.number, marked, spare=wanted[-1].number + 1)
 
 
-def rebuild_last(table: CallTable, state: Snapshot) -> None:
+def rebuild_last(table: CallTable, state: Snapshot, inner_pid: int) -> None:
     """Add the calls that must come after everything else of a restore: watches would tell of it, locks would be lost."""
     terminals.settle(table, state.resources, state.process.pid)
     for held in state.resources:
@@ -196,7 +196,7 @@ def rebuild_last(table: CallTable, state: Snapshot) -> None:
         if not numbers:
             continue  # nothing that is open
         first = number_of(numbers[0][0])
-        locks.settle(table, held, first)
+        locks.settle(table, held, first, inner_pid)
         if held.kind == watches.KIND:
             watches.settle(table, held, first)
 

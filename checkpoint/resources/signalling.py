@@ -77,6 +77,11 @@ def rebuild(table: CallTable, descriptor: int, held: Resource, inner_pid: int) -
         table.call(f"choose the signal of {held.name}", "fcntl", descriptor, fcntl.F_SETSIG, int(str(held.facts["signal"])))
 
 
+def disown(table: CallTable, descriptor: int) -> None:
+    """Have nobody own them for now."""
+    table.call("disown the signals of a descriptor", "fcntl", descriptor, fcntl.F_SETOWN, 0)
+
+
 def _asked(held: OpenFile) -> tuple[int, int, int] | None:
     """(signal, kind of owner, owner) if anything was set, asked through a copy of the descriptor; None where there is none."""
     if held.first.flags & O_PATH:

@@ -46,7 +46,7 @@ REFUSED = {
     "userfaultfd": "userfaultfd",
     "userfaultfd_registered": "userfaultfd",
     "seccomp": "seccomp",
-    "lease": "lease|lock",
+    "lease_deleted": "lease",
     "kernel_log": "/dev/kmsg",
     "tun": "tun",
     "fuse": "fuse",

@@ -229,13 +229,46 @@ static void file_locks(void) {
     EXPECT(is_locked("whole", 0, all) == 0, "flock cannot be given back");
 }
 
+static volatile int broken;
+static void note_break(int number) { broken += number; }
+
+/* Opens a file elsewhere, which a lease holds back. */
+static int is_held_back(const char *name, int flags) {
+    int file = open(name, flags | O_NONBLOCK);
+    if (file >= 0) close(file);
+    return file < 0 && errno == EWOULDBLOCK;
+}
+
+static void leases(void) {
+    signal(SIGIO, note_break), signal(SIGUSR2, note_break);
+    touch("shared"), touch("alone"), touch("going"), touch("sinking");
+    int shared = open("shared", O_RDONLY), alone = open("alone", O_RDWR), going = open("going", O_RDONLY);
+    int sinking = open("sinking", O_WRONLY), none = open("shared", O_RDONLY);
+    if (fcntl(shared, F_SETLEASE, F_RDLCK) || fcntl(alone, F_SETLEASE, F_WRLCK) || fcntl(going, F_SETLEASE, F_RDLCK) ||
+        fcntl(sinking, F_SETLEASE, F_WRLCK) || fcntl(sinking, F_SETSIG, SIGUSR2))
+        cannot("take leases");
+    if (!is_held_back("going", O_WRONLY) || !is_held_back("sinking", O_RDONLY)) cannot("break leases");
+    EXPECT_EQUAL("signals", broken, SIGIO + SIGUSR2);
+    wait_here();
+    EXPECT_EQUAL("signals", broken, SIGIO + SIGUSR2);
+    EXPECT_EQUAL("shared", fcntl(shared, F_GETLEASE), F_RDLCK);
+    EXPECT_EQUAL("none", fcntl(none, F_GETLEASE), F_UNLCK);
+    EXPECT_EQUAL("alone", fcntl(alone, F_GETLEASE), F_WRLCK);
+    EXPECT_EQUAL("going", fcntl(going, F_GETLEASE), F_UNLCK);
+    EXPECT_EQUAL("sinking", fcntl(sinking, F_GETLEASE), F_RDLCK);
+    EXPECT(is_held_back("alone", O_RDONLY), "nobody waits for the lease");
+    EXPECT_EQUAL("signals", broken, SIGIO + SIGUSR2 + SIGIO);
+    EXPECT_EQUAL("owner", fcntl(sinking, F_GETOWN), getpid());
+    EXPECT(fcntl(sinking, F_SETLEASE, F_UNLCK) == 0 && !is_held_back("sinking", O_RDONLY), "it cannot be given up");
+}
+
 int main(int count, char **arguments) {
     static const struct {
         const char *name;
         void (*act)(void);
     } cases[] = {{"inotify_directories", inotify_directories}, {"inotify_gaps", inotify_gaps}, {"fifo_both", fifo_both},
                  {"fifo_reader", fifo_reader}, {"fifo_gone", fifo_gone},
-                 {"fifo_deleted", fifo_deleted}, {"inotify_deleted", inotify_deleted},
+                 {"leases", leases}, {"fifo_deleted", fifo_deleted}, {"inotify_deleted", inotify_deleted},
                  {"pipe_reopened", pipe_reopened}, {"path_only", path_only}, {"kernel_files", kernel_files}, {"file_locks", file_locks}};
     go = arguments[1];
     for (size_t index = 0; index < sizeof cases / sizeof *cases; index++)

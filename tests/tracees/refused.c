@@ -216,9 +216,9 @@ static void take_thread_seccomp(void) {
     take_unlike_thread(install_filter);
 }
 
-static void take_lease(void) {
-    keep(open("leased", O_RDONLY | O_CREAT, 0600), "a file");
-    if (fcntl(opened, F_SETLEASE, F_RDLCK)) cannot("take a lease");
+static void take_lease_deleted(void) {
+    keep(open("leased", O_RDWR | O_CREAT, 0600), "a file");
+    if (fcntl(opened, F_SETLEASE, F_WRLCK) || unlink("leased")) cannot("take a lease");
 }
 
 static void take_kernel_log(void) { keep(open("/dev/kmsg", O_RDONLY), "/dev/kmsg"); }
@@ -354,7 +354,7 @@ static const struct kind {
              {"userfaultfd", take_userfaultfd},
              {"userfaultfd_registered", take_userfaultfd_registered},
              {"seccomp", take_seccomp},
-              {"lease", take_lease},
+              {"lease_deleted", take_lease_deleted},
              {"kernel_log", take_kernel_log},
              {"tun", take_tun},
              {"fuse", take_fuse},
