@@ -2,8 +2,8 @@
 
 Facts: ``descriptors``; ``path``; ``flags`` of open(2); ``offset`` and ``size`` in bytes, ``mode``, ``device``, ``inode`` and
 ``mtime_ns`` at the capture; ``digest``: blake3 of the content of a file that is open for reading only, b"" where it is longer
-than `DIGEST_LIMIT` or cannot be read; for a file or directory that no name leads to any more ``deleted`` true, ``uid`` and
-``gid``, and ``content``: [offset, bytes] of each part that is no hole, with one of its open files, [] with the others.
+than `DIGEST_LIMIT` or cannot be read. Of what no name leads to any more ``deleted`` true, ``uid`` and ``gid``; ``link``: where a
+symbolic link leads; ``content``: [offset, bytes] of each part that is no hole, with one of its open files, [] with the others.
 
 A file that is open for writing and only grew since the capture is cut back to ``size``.
 """
@@ -37,15 +37,15 @@ CAPABILITIES: Final = (
     ),
     preserved(
         Area.FILES,
-        "deleted files and directories",
+        "deleted files, directories and symbolic links",
         "carried whole, up to 16 MiB without holes; opened by another name where a file still has one near by; pages of private "
         "mappings are carried too, so what is written to the file later does not show in those that were never touched",
     ),
     refused(
         Area.FILES,
-        "a deleted file over 16 MiB, or with another name far away; a deleted symbolic link",
+        "a deleted file over 16 MiB, or with another name far away; the mere path (O_PATH) of a deleted device, socket or pipe",
         "give it a name",
-        "cannot be opened again; let the program close it",
+        "cannot be opened again; let it close that",
         "still has another name",
         "deleted files are carried up to",
     ),
@@ -102,6 +102,8 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
     }
     if is_lost and not other:
         facts |= {"deleted": True, "content": held.observed.get("content", []), "uid": first.uid, "gid": first.gid}
+        if stat.S_ISLNK(first.mode):
+            facts["link"] = _link_of(held)
     elif is_only_read(first):
         facts["digest"] = digest_of(held)
     return Resource(KIND, held.name, facts)
@@ -128,8 +130,8 @@ def is_file(one: Descriptor) -> bool:
 
 def _refuse_deleted(held: OpenFile) -> str | None:
     first, what = held.first, f"{held.name} is {held.first.target}"
-    if not (stat.S_ISREG(first.mode) or stat.S_ISDIR(first.mode)):
-        return f"{what}: a deleted symbolic link, device or the like cannot be opened again; let the program close it"
+    if stat.S_IFMT(first.mode) not in (stat.S_IFREG, stat.S_IFDIR, stat.S_IFLNK):
+        return f"{what}: a deleted device or the like, of which only the path is open, cannot be opened again; let it close that"
     if first.links and not other_name(held):
         return f"{what}, but it still has another name, which is not known: let the program open it under that name"
     if not first.links and first.stored > CONTENT_LIMIT:
@@ -235,6 +237,17 @@ def observe_deleted(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, 
     if locks.has_lease(held):
         return {}  # to read it would break that
     return {"content": _content_of(held) if first is held else []}
+
+
+def _link_of(held: OpenFile) -> str:
+    """Where a symbolic link leads, of which only the path is open."""
+    link = os.open(f"/proc/{held.pid}/fd/{held.first.number}", O_PATH | os.O_CLOEXEC)
+    try:
+        return os.readlink("", dir_fd=link)
+    except OSError as error:
+        raise CaptureError(f"cannot read the deleted link {held.first.target} of pid {held.pid}: {error.strerror}") from error
+    finally:
+        os.close(link)
 
 
 def _content_of(held: OpenFile) -> list[Fact]:

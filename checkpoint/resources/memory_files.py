@@ -1,5 +1,7 @@
 """Memory files of memfd_create(2), with name, content, size and seals; several open files may be of the same one.
 
+Memory that was mapped shared without a file, and was opened through /proc/self/map_files, comes back as a memory file, too.
+
 Facts: ``descriptors``; ``name``; ``flags`` of open(2); ``offset``, ``size``; ``mode``; ``device`` and ``inode``, which open files
 and mappings of the same one have in common; ``seals`` of F_ADD_SEALS; ``content``: a list of [offset, bytes], with one of its
 open files, empty with the others.
@@ -32,15 +34,18 @@ CAPABILITIES: Final = (
     preserved(Area.FILES, "memory files (memfd)", "with name, content, size and seals, up to 16 MiB"),
     refused(
         Area.FILES,
-        "memory files over 16 MiB, of huge pages, or sealed against writing and mapped",
+        "memory files over 16 MiB, of huge pages, or sealed against writing and mapped; shared memory that is opened and mapped",
         "use a file in /dev/shm",
         "of huge pages, which are not kept",
         "MiB, which is the limit",
         "sealed against writing and mapped",
+        "opened through /proc/self/map_files and mapped",
     ),
 )
 
 PREFIX: Final = "/memfd:"
+ANONYMOUS: Final = "/dev/zero (deleted)"
+"""What the kernel calls shared memory without a file."""
 CONTENT_LIMIT: Final = 16 << 20
 """Bytes of one that a snapshot carries: it is copied while the program stands still."""
 HUGE: Final = 2 << 20
@@ -55,7 +60,8 @@ REOPENED: Final = os.O_ACCMODE | os.O_APPEND | os.O_NONBLOCK
 
 def is_memory_file(one: Descriptor) -> bool:
     """Whether a descriptor is one."""
-    return stat.S_ISREG(one.mode) and one.target.startswith(PREFIX) and not one.flags & O_PATH
+    is_memory = one.target.startswith(PREFIX) or (one.target == ANONYMOUS and not one.links)
+    return stat.S_ISREG(one.mode) and is_memory and not one.flags & O_PATH
 
 
 def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
@@ -93,7 +99,7 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
         return None
     facts: dict[str, Fact] = {
         "descriptors": held.numbers,
-        "name": first.target.removeprefix(PREFIX).removesuffix(procfs.DELETED),
+        "name": first.target.removeprefix(PREFIX).removesuffix(procfs.DELETED).lstrip("/"),
         "flags": first.flags & ~os.O_CLOEXEC,
         "offset": first.offset,
         "size": first.size,
@@ -115,6 +121,8 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return f"{what} of more than {CONTENT_LIMIT >> 20} MiB, which is the limit: let the program use a file with a name"
     if number_of(seen.get("seals", 0)) & F_SEAL_WRITE and _is_mapped(held):
         return f"{what} that is sealed against writing and mapped, which is not kept: let the program unmap it"
+    if held.first.target == ANONYMOUS and _is_mapped(held):
+        return f"{what} that was opened through /proc/self/map_files and mapped, which is not kept: let the program close it"
     return elsewhere.refuse(held, "a memory file")
 
 

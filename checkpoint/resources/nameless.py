@@ -55,6 +55,16 @@ def make_directory(table: CallTable, path: str, mode: int) -> int:
     return made
 
 
+def make_link(table: CallTable, path: str, target: str) -> int:
+    """Make a symbolic link: a descriptor that leads to it itself (O_PATH)."""
+    name = _name_for(path)
+    place = table.place_path(name)
+    table.call(f"make the link {name}", "symlinkat", table.place_path(target), AT_FDCWD, place)
+    made = table.open(name, O_PATH | os.O_NOFOLLOW)
+    table.call(f"unlink {name}", "unlinkat", AT_FDCWD, place, 0)
+    return made
+
+
 def _name_for(path: str) -> str:
     """A name that is free: its own, or one like it.
 

@@ -39,6 +39,7 @@ from checkpoint.resources import (
     memory_files,
     memory_locks,
     nameless,
+    pidfds,
     pipes,
     signalfds,
     signalling,
@@ -66,6 +67,7 @@ MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
     eventfds.KIND: eventfds.rebuild,
     timerfds.KIND: timerfds.rebuild,
     signalfds.KIND: signalfds.rebuild,
+    pidfds.KIND: pidfds.rebuild,
     epolls.KIND: epolls.rebuild,
     watches.KIND: watches.rebuild,
     devices.KIND: devices.rebuild,
@@ -281,8 +283,11 @@ def _open_deleted(table: CallTable, held: Resource, rebuilding: Rebuilding) -> i
     facts, mode = held.facts, number_of(held.facts.get("mode", 0o600))
     path, key = str(facts["path"]), (number_of(facts["device"]), number_of(facts["inode"]))
     if key not in rebuilding.objects:
-        make = nameless.make_directory if stat.S_ISDIR(mode) else nameless.make_file
-        rebuilding.keep(table, key, make(table, path, stat.S_IMODE(mode)))
+        if stat.S_ISLNK(mode):
+            rebuilding.keep(table, key, nameless.make_link(table, path, str(facts["link"])))
+        else:
+            make = nameless.make_directory if stat.S_ISDIR(mode) else nameless.make_file
+            rebuilding.keep(table, key, make(table, path, stat.S_IMODE(mode)))
     made = rebuilding.objects[key]
     if stat.S_ISREG(mode):
         _fill(table, made, held)

@@ -28,7 +28,6 @@ CAPABILITIES: Final = (
     refused(Area.PIPES, "fanotify", "use inotify, which is kept", "a fanotify group"),
     refused(Area.PIPES, "asynchronous I/O (io_setup)", "use threads", "a ring of asynchronous I/O (aio)"),
     refused(Area.PIPES, "perf events", "run it without", "a perf event", "the buffer of a perf event"),
-    refused(Area.PIPES, "pidfds", "let the program close them, or wait by number", "a pidfd"),
     refused(Area.PIPES, "namespaces that are held open", "let the program close them", "a namespace ({})"),
     refused(
         Area.PIPES,
@@ -132,7 +131,6 @@ ANONYMOUS_INODES: Final[Mapping[str, str]] = {
     "io_uring": "an io_uring",
     "userfaultfd": "a userfaultfd",
     "perf_event": "a perf event",
-    "pidfd": "a pidfd",
 }
 """What /proc calls a descriptor without a path → what people call it."""
 

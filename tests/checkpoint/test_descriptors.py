@@ -35,7 +35,7 @@ Compiled = Callable[..., Path]
 
 CASES = {
     "event_descriptors": (
-        "eventfd_counter eventfd_semaphore eventfd_full eventfd_many "
+        "eventfd_counter eventfd_semaphore eventfd_full eventfd_many pidfd_self "
         "timer_relative timer_absolute_monotonic timer_absolute_realtime timer_absolute_boottime timer_periodic timer_unread "
         "timer_disarmed signalfd_waiting "
         "epoll_simple epoll_ready epoll_nested epoll_once epoll_edge epoll_exclusive epoll_renumbered epoll_waiting"

@@ -56,7 +56,7 @@ REFUSED = {
     "message_queue": "queue",
     "bpf_map": "bpf",
     "perf_event": "perf",
-    "pidfd": "pidfd",
+    "pidfd_other": "pidfd of pid 1",
     "namespace": "namespace|net:",
     "proc_file": "/proc",
     "kernel_switch": "for writing",
@@ -247,7 +247,7 @@ def step(name):
     while not os.path.exists(os.path.join(sys.argv[1], "after " + name)):
         libc.usleep(2000)
 step("ready")
-epoll, pidfd = select.epoll(), os.pidfd_open(os.getpid())
+epoll, pidfd = select.epoll(), os.pidfd_open(1)
 print("waits", flush=True)
 while not os.path.exists(os.path.join(sys.argv[1], "after waits")):
     if libc.epoll_wait(epoll.fileno(), events, 1, 100) < 0:

@@ -65,6 +65,21 @@ static void eventfd_many(void) {
     for (int index = 0; index < 400; index++) EXPECT_EQUAL("count", take(files[index]), index);
 }
 
+static void pidfd_self(void) {
+    int self = syscall(SYS_pidfd_open, getpid(), O_NONBLOCK), events = epoll_create1(0);
+    struct stat before, after;
+    if (self < 0 || epoll_ctl(events, EPOLL_CTL_ADD, self, &(struct epoll_event){EPOLLIN, {.u32 = 7}})) cannot("open a pidfd");
+    fstat(self, &before);
+    signal(SIGUSR2, SIG_IGN);
+    wait_here();
+    EXPECT(syscall(SYS_pidfd_send_signal, self, SIGUSR2, NULL, 0) == 0, "it takes no signal: %s", strerror(errno));
+    EXPECT(fcntl(self, F_GETFL) & O_NONBLOCK, "it waits");
+    EXPECT(fcntl(self, F_GETFD) == FD_CLOEXEC, "it is not closed by exec");
+    int again = syscall(SYS_pidfd_open, getpid(), 0);
+    fstat(self, &before), fstat(again, &after);
+    EXPECT(before.st_ino == after.st_ino, "it stands for somebody else");
+}
+
 /* timerfd */
 
 static void timer_relative(void) {
@@ -287,7 +302,7 @@ int main(int count, char **arguments) {
     } cases[] = {{"eventfd_counter", eventfd_counter},
                  {"eventfd_semaphore", eventfd_semaphore},
                  {"eventfd_full", eventfd_full},
-                 {"eventfd_many", eventfd_many},
+                 {"eventfd_many", eventfd_many}, {"pidfd_self", pidfd_self},
                  {"timer_relative", timer_relative},
                  {"timer_absolute_monotonic", timer_absolute_monotonic},
                  {"timer_absolute_realtime", timer_absolute_realtime},

@@ -191,6 +191,33 @@ static void deleted_working_directory(const char *go) {
     EXPECT(fchdir(top) == 0 && access("gone", F_OK), "the directory has its name again");
 }
 
+static void deleted_link(const char *go) {
+    char target[20] = "";
+    struct stat about;
+    if (symlink("somewhere/else", "link")) cannot("make a link");
+    int link = open("link", O_PATH | O_NOFOLLOW);
+    if (link < 0 || unlink("link")) cannot("open a link");
+    ready(), wait_for_go(go);
+    EXPECT(readlinkat(link, "", target, 19) == 14 && !strcmp(target, "somewhere/else"), "it leads to '%s'", target);
+    EXPECT(!fstat(link, &about) && S_ISLNK(about.st_mode) && !about.st_nlink, "it is not a deleted link");
+}
+
+/* Shared memory without a file, opened through the kernel's view of mappings, which is another one by now. */
+static void mapped_memory(const char *go) {
+    char path[64];
+    char *place = mmap(NULL, 4 * PAGE, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
+    snprintf(path, sizeof path, "/proc/self/map_files/%lx-%lx", (long)place, (long)place + 4 * PAGE);
+    strcpy(place + PAGE, "hello");
+    int file = open(path, O_RDWR);
+    if (file < 0) cannot("open a mapping");
+    munmap(place, 4 * PAGE);
+    ready(), wait_for_go(go);
+    EXPECT_EQUAL("size", lseek(file, 0, SEEK_END), 4 * PAGE);
+    lseek(file, PAGE, SEEK_SET), expect_read(file, "hello");
+    place = mmap(NULL, 4 * PAGE, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
+    EXPECT(place != MAP_FAILED && !strcmp(place + PAGE, "hello"), "it cannot be mapped");
+}
+
 static void deleted_device(const char *go) {
     struct stat before, after;
     if (mknod("null", S_IFCHR | 0640, 0x103)) cannot("make a device");
@@ -314,6 +341,7 @@ int main(int count, char **arguments) {
                  {"deleted_sparse", deleted_sparse}, {"deleted_with_a_link", deleted_with_a_link},
                  {"deleted_directory", deleted_directory}, {"deleted_working_directory", deleted_working_directory},
                  {"deleted_device", deleted_device}, {"deleted_place", deleted_place},
+                 {"deleted_link", deleted_link}, {"mapped_memory", mapped_memory},
                  {"directory", directory},     {"path_only", path_only}, {"beyond_end", beyond_end},
                  {"memory_file", memory_file}, {"odd_name", odd_name}, {"owner_signal", owner_signal},
                  {"owner_thread", owner_thread}};

@@ -262,7 +262,7 @@ static void take_perf_event(void) {
     keep(syscall(SYS_perf_event_open, &event, 0, -1, -1, 0), "a performance event");
 }
 
-static void take_pidfd(void) { keep(pidfd_open(getpid(), 0), "a pidfd"); }
+static void take_pidfd_other(void) { keep(pidfd_open(1, 0), "a pidfd"); }
 static void take_namespace(void) { keep(open("/proc/self/ns/net", O_RDONLY), "a namespace"); }
 static void take_proc_file(void) { keep(open("/proc/1/status", O_RDONLY), "a file of /proc"); }
 static void take_kernel_switch(void) { keep(open("/proc/sys/kernel/hostname", O_RDWR), "a switch of the kernel"); }
@@ -364,7 +364,7 @@ static const struct kind {
              {"message_queue", take_message_queue},
              {"bpf_map", take_bpf_map},
              {"perf_event", take_perf_event},
-             {"pidfd", take_pidfd},
+             {"pidfd_other", take_pidfd_other},
              {"namespace", take_namespace},
              {"proc_file", take_proc_file},
              {"kernel_switch", take_kernel_switch},
