@@ -2,8 +2,9 @@
 
 A *chain* is a tuple of snapshots of one component: a base, then deltas, each the child of the one before it.
 
-A delta changes the state of its parent in three steps: pages outside its own mappings go, pages in ``cleared`` go,
-pages in ``runs`` are set. A position's digest covers the result (``state_digest``), so a fold proves itself.
+A delta changes the state of its parent in steps: pages outside its own mappings go, pages in ``cleared`` go, pages in
+``runs`` are set, pages in ``copies`` as those that they name. A position's digest covers the result (``state_digest``), so a
+fold proves itself.
 """
 
 from __future__ import annotations
@@ -17,12 +18,13 @@ import numpy as np
 from checkpoint import pages
 from checkpoint.errors import ChainError
 from checkpoint.gathering import gathered
-from checkpoint.model import OutputPiece, Position, Snapshot
-from checkpoint.pages import PageMap
+from checkpoint.model import OutputPiece, PageCopy, Position, Snapshot
+from checkpoint.pages import PageMap, PageTable
 from checkpoint.state import state_digest
+from checkpoint.tree import every_mapping
 from checkpoint.validity import STREAMS, place
 
-__all__ = ["append", "check_continues", "check_state", "fold", "position_of", "state_digest"]
+__all__ = ["append", "applied", "check_continues", "check_state", "fold", "position_of", "state_digest"]
 
 
 def position_of(snapshot: Snapshot, generation: int, sequence: int) -> Position:
@@ -66,6 +68,12 @@ def append(chain: Sequence[Snapshot], snapshot: Snapshot) -> tuple[Snapshot, ...
     return (*chain[: places[-1] + 1], snapshot)
 
 
+def applied(table: PageTable, snapshot: Snapshot) -> PageTable:
+    """The page table of a state after one more snapshot."""
+    contents = memoryview(snapshot.contents)
+    return table.apply(snapshot.cleared, snapshot.runs, contents, every_mapping(snapshot), snapshot.copies)
+
+
 def check_state(snapshot: Snapshot, page_sum: bytes) -> None:
     """Refuse a snapshot that does not lead to the state that its position names.
 
@@ -103,17 +111,29 @@ def fold(chain: Sequence[Snapshot]) -> Snapshot:
     newest = chain[-1]
     page_size = newest.machine.page_size
     sources = _newest_sources(chain, page_size)
-    contents = gathered([snapshot.contents for snapshot in chain], sources, page_size)
-    check_state(newest, pages.sum_of(pages.digest_pages(contents, sources.addresses, page_size)))
+    carried, copies = _told_once(sources, page_size) if any(snapshot.copies for snapshot in chain) else (sources, ())
+    contents = gathered([snapshot.contents for snapshot in chain], carried, page_size)
+    runs = pages.page_runs(pages.extents_of_addresses(carried.addresses, page_size))
+    check_state(newest, PageTable.empty(page_size).apply((), runs, contents, every_mapping(newest), copies).page_sum)
     return replace(
         newest,
         parent=None,
         cleared=(),
-        runs=pages.page_runs(pages.extents_of_addresses(sources.addresses, page_size)),
+        runs=runs,
         contents=contents,
+        copies=copies,
         output=_joined_output(chain),
         notes=tuple(dict.fromkeys(note for snapshot in chain for note in snapshot.notes)),
     )
+
+
+def _told_once(sources: PageMap, page_size: int) -> tuple[PageMap, tuple[PageCopy, ...]]:
+    """Pages that lie at different places, and copies of them: those that lie at the same one."""
+    _, firsts, which = np.unique(sources.words, axis=0, return_index=True, return_inverse=True)
+    source = sources.addresses[firsts[which.reshape(-1)]]
+    is_copy = source != sources.addresses
+    kept = PageMap(sources.addresses[~is_copy], sources.words[~is_copy])
+    return kept, pages.copies_of(sources.addresses[is_copy], source[is_copy], page_size)
 
 
 def _check_chain(chain: Sequence[Snapshot]) -> None:
@@ -145,8 +165,11 @@ def _newest_sources(chain: Sequence[Snapshot], page_size: int) -> PageMap:
         places = np.empty((len(addresses), 2), dtype=np.uint64)
         places[:, 0] = index
         places[:, 1] = np.arange(len(addresses))
-        kept, _ = state.without(pages.extents(snapshot.vmas), pages.extents(snapshot.cleared))
+        kept, _ = state.without(pages.extents(every_mapping(snapshot)), pages.extents(snapshot.cleared))
         state, _ = kept.overlaid(addresses, places)
+        if snapshot.copies:
+            copied, taken_from = pages.copied_pages(snapshot.copies, addresses, page_size)
+            state, _ = state.overlaid(copied, places[taken_from])
     return state
 
 

@@ -25,7 +25,7 @@ from blake3 import blake3
 from checkpoint import layout, state
 from checkpoint.errors import FormatError
 from checkpoint.layout import Codec, FrameHead, Preamble, Section, SectionKind
-from checkpoint.model import PageRun, Snapshot
+from checkpoint.model import PageCopy, PageRun, Snapshot
 from checkpoint.state import Header
 from checkpoint.validity import check_snapshot
 
@@ -47,6 +47,8 @@ WORTH_COMPRESSING = 15 / 16
 
 _COUNTS = struct.Struct("<QQ")  # of the run table: cleared runs, carried runs
 _RUN_SIZE = 16
+_COPY_COUNT = struct.Struct("<Q")
+_COPY_SIZE = 24
 
 
 # Writing
@@ -66,7 +68,7 @@ def encode(snapshot: Snapshot, file: Sink) -> int:
     contents = memoryview(snapshot.contents).cast("B")
     compressor = zstandard.ZstdCompressor(level=COMPRESSION_LEVEL)
     sections, stored = _pack_sections(snapshot, compressor)
-    preamble = Preamble(len(contents), sections)
+    preamble = Preamble(len(contents), sections, layout.TREE_VERSION if snapshot.is_tree else layout.VERSION)
     seal = blake3(preamble.pack())
     _write_all(file, preamble.pack() + b"".join(stored))
     offset = preamble.frames_offset
@@ -90,7 +92,7 @@ def _pack_sections(snapshot: Snapshot, compressor: zstandard.ZstdCompressor) -> 
     raw = {
         SectionKind.HEADER: state.encode_header(state.header_of(snapshot)),
         SectionKind.STATE: state.encode_state(snapshot),
-        SectionKind.RUNS: _pack_runs(snapshot.cleared, snapshot.runs),
+        SectionKind.RUNS: _pack_runs(snapshot),
         SectionKind.OUTPUT: state.encode_output(snapshot.output),
     }
     sections: list[Section] = []
@@ -139,10 +141,15 @@ def _write_all(file: Sink, content: bytes | memoryview) -> None:
         rest = rest[taken:]
 
 
-def _pack_runs(cleared: tuple[PageRun, ...], runs: tuple[PageRun, ...]) -> bytes:
-    """The run table: two counts, then (start, end) of every cleared and every carried run."""
+def _pack_runs(snapshot: Snapshot) -> bytes:
+    """The run table: two counts, then (start, end) of every cleared and every carried run; of trees also the copies."""
+    cleared, runs = snapshot.cleared, snapshot.runs
     pairs = np.array([(run.start, run.end) for run in (*cleared, *runs)], dtype="<u8")
-    return _COUNTS.pack(len(cleared), len(runs)) + pairs.tobytes()
+    packed = _COUNTS.pack(len(cleared), len(runs)) + pairs.tobytes()
+    if not snapshot.is_tree:
+        return packed
+    copies = np.array([(copy.start, copy.end, copy.source) for copy in snapshot.copies], dtype="<u8")
+    return packed + _COPY_COUNT.pack(len(snapshot.copies)) + copies.tobytes()
 
 
 # Reading
@@ -220,8 +227,9 @@ def _read_header(reader: _Reader, preamble: Preamble) -> Header:
 def _read_outline(reader: _Reader, preamble: Preamble) -> Snapshot:
     """Every section, checked against one another."""
     header = _read_header(reader, preamble)
-    decoded = state.decode_state(_read_section(reader, preamble, SectionKind.STATE))
-    cleared, runs = _parse_runs(_read_section(reader, preamble, SectionKind.RUNS))
+    is_tree = preamble.version == layout.TREE_VERSION
+    decoded = state.decode_state(_read_section(reader, preamble, SectionKind.STATE), is_tree=is_tree)
+    cleared, runs, copies = _parse_runs(_read_section(reader, preamble, SectionKind.RUNS), is_tree=is_tree)
     output = state.decode_output(_read_section(reader, preamble, SectionKind.OUTPUT))
     snapshot = Snapshot(
         component=decoded.component,
@@ -241,7 +249,12 @@ def _read_outline(reader: _Reader, preamble: Preamble) -> Snapshot:
         epoch=decoded.epoch,
         freeze_us=header.freeze_us,
         notes=header.notes,
+        members=decoded.members,
+        zombies=decoded.zombies,
+        copies=copies,
     )
+    if is_tree and not snapshot.is_tree:
+        raise FormatError(f"format version {layout.TREE_VERSION}: one process alone has version {layout.VERSION}")
     if state.header_of(snapshot) != header:
         raise FormatError("header: does not describe what the other sections hold")
     check_snapshot(snapshot, contents_size=preamble.contents_size)
@@ -276,16 +289,27 @@ def _decompressed(stored: bytes | memoryview, raw_size: int, where: str, decompr
     return raw
 
 
-def _parse_runs(table: bytes | memoryview) -> tuple[tuple[PageRun, ...], tuple[PageRun, ...]]:
-    """The cleared and the carried runs of a run table."""
+Runs = tuple[PageRun, ...]
+
+
+def _parse_runs(table: bytes | memoryview, *, is_tree: bool) -> tuple[Runs, Runs, tuple[PageCopy, ...]]:
+    """The cleared and the carried runs of a run table, and the copies."""
     if len(table) < _COUNTS.size:
         raise FormatError(f"section runs: {len(table)} bytes are too few")
     cleared_count, run_count = _COUNTS.unpack_from(table)
-    if len(table) != _COUNTS.size + (cleared_count + run_count) * _RUN_SIZE:
+    end = _COUNTS.size + (cleared_count + run_count) * _RUN_SIZE
+    if end > len(table) or (end != len(table) and not is_tree):
         raise FormatError(f"section runs: {len(table)} bytes cannot hold {cleared_count} cleared and {run_count} carried runs")
-    pairs = np.frombuffer(table, dtype="<u8", offset=_COUNTS.size).reshape(-1, 2)
+    pairs = np.frombuffer(table[_COUNTS.size : end], dtype="<u8").reshape(-1, 2)
     runs = tuple(map(PageRun, pairs[:, 0].tolist(), pairs[:, 1].tolist()))
-    return runs[:cleared_count], runs[cleared_count:]
+    return runs[:cleared_count], runs[cleared_count:], _parse_copies(table[end:]) if is_tree else ()
+
+
+def _parse_copies(table: bytes | memoryview) -> tuple[PageCopy, ...]:
+    if len(table) < _COPY_COUNT.size or len(table) != _COPY_COUNT.size + _COPY_COUNT.unpack_from(table)[0] * _COPY_SIZE:
+        raise FormatError(f"section runs: {len(table)} bytes after the runs are not copies")
+    rows = np.frombuffer(table[_COPY_COUNT.size :], dtype="<u8").reshape(-1, 3)
+    return tuple(map(PageCopy, rows[:, 0].tolist(), rows[:, 1].tolist(), rows[:, 2].tolist()))
 
 
 @dataclass(frozen=True, slots=True)

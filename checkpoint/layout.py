@@ -21,7 +21,10 @@ END_MAGIC = b"FOVR.END"
 """First bytes of the trailer."""
 
 VERSION = 1
-"""Version of the format that is written; the only one that is read."""
+"""Version of the format for a component of one process."""
+
+TREE_VERSION = 2
+"""Version for one of several processes; both are written and read."""
 
 DIGEST_SIZE = 32
 """Bytes of a blake3 digest."""
@@ -111,10 +114,12 @@ class Preamble:
     Attributes:
         contents_size: bytes of page contents, all frames together, before compression.
         sections: one of each kind, in the order of SectionKind, without gaps.
+        version: `VERSION` or `TREE_VERSION`.
     """
 
     contents_size: int
     sections: tuple[Section, ...]
+    version: int = VERSION
 
     @property
     def frames_offset(self) -> int:
@@ -133,7 +138,7 @@ class Preamble:
 
     def pack(self) -> bytes:
         """The preamble's bytes, its own digest last."""
-        fixed = _PREAMBLE.pack(MAGIC, VERSION, len(self.sections), self.contents_size, FRAME_SIZE, self.frame_count)
+        fixed = _PREAMBLE.pack(MAGIC, self.version, len(self.sections), self.contents_size, FRAME_SIZE, self.frame_count)
         body = fixed + b"".join(section.pack() for section in self.sections)
         return body + digest_of(body)
 
@@ -150,13 +155,14 @@ class Preamble:
         if len(packed) < PREAMBLE_SIZE:
             raise FormatError(f"the file ends inside its preamble, after {len(packed)} of {PREAMBLE_SIZE} bytes: it is cut off")
         _, version, section_count, contents_size, frame_size, frame_count = _PREAMBLE.unpack_from(packed)
-        if version != VERSION:
-            raise FormatError(f"format version {version}: this program reads version {VERSION}; use the one that wrote it")
+        if version not in (VERSION, TREE_VERSION):
+            known = f"versions {VERSION} and {TREE_VERSION}"
+            raise FormatError(f"format version {version}: this program reads {known}; use the one that wrote it")
         if digest_of(packed[:-DIGEST_SIZE]) != packed[-DIGEST_SIZE:]:
             raise FormatError("the preamble does not match its digest: the file was altered or damaged")
         if section_count != len(SectionKind) or frame_size != FRAME_SIZE:
-            raise FormatError(f"preamble: {section_count} sections and frames of {frame_size} bytes are not of version {VERSION}")
-        preamble = cls(contents_size, _parse_sections(packed))
+            raise FormatError(f"preamble: {section_count} sections and frames of {frame_size} bytes are not of version {version}")
+        preamble = cls(contents_size, _parse_sections(packed), version)
         if frame_count != preamble.frame_count:
             raise FormatError(f"preamble: {frame_count} frames cannot hold {contents_size} bytes of contents")
         return preamble

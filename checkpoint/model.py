@@ -68,6 +68,20 @@ class PageRun:
         return self.end - self.start
 
 
+@dataclass(frozen=True, slots=True, order=True)
+class PageCopy:
+    """Consecutive pages ``[start, end)`` that hold what as many pages from ``source`` on hold."""
+
+    start: int
+    end: int
+    source: int
+
+    @property
+    def size(self) -> int:
+        """Bytes covered."""
+        return self.end - self.start
+
+
 @dataclass(frozen=True, slots=True)
 class Vma:
     """One mapping of the address space.
@@ -286,6 +300,43 @@ class Resource:
 
 
 @dataclass(frozen=True, slots=True)
+class Member:
+    """One more process of a component, besides the first: a child, or a child's child.
+
+    Attributes:
+        slot: from 1; its own pages stand in the snapshot's runs at address + slot × 2⁴⁸ (see ``checkpoint.tree``).
+        exit_signal: what its parent is sent when it ends; SIGCHLD as a rule.
+        process: its ``ppid`` is a pid of the component; 0 when its parent has ended.
+    """
+
+    slot: int
+    exit_signal: int
+    process: ProcessState
+    threads: tuple[ThreadState, ...]
+    vmas: tuple[Vma, ...]
+    resources: tuple[Resource, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Zombie:
+    """A process that has ended, and whose parent has not asked for it yet.
+
+    Attributes:
+        pid, ppid, pgid, sid: as in `ProcessState`.
+        status: as wait(2) tells it.
+        exit_signal: as in `Member`.
+    """
+
+    name: str
+    pid: int
+    ppid: int
+    pgid: int
+    sid: int
+    status: int
+    exit_signal: int
+
+
+@dataclass(frozen=True, slots=True)
 class Machine:
     """Where a snapshot was taken.
 
@@ -351,6 +402,8 @@ class Snapshot:
         contents: the bytes of ``runs``, concatenated in the same order; ``sum(run.size)`` bytes.
         epoch: number of the primacy under which it was taken; 0 for a one-shot capture.
         freeze_us: how long the program stood still for it.
+        members, zombies: of a component of several processes, those besides the first, which the other fields are of.
+        copies: pages that it carries by naming others that it carries, of processes that have memory in common since a fork.
     """
 
     component: str
@@ -371,8 +424,16 @@ class Snapshot:
     epoch: int = 0
     freeze_us: int = 0
     notes: tuple[str, ...] = ()
+    members: tuple[Member, ...] = ()
+    zombies: tuple[Zombie, ...] = ()
+    copies: tuple[PageCopy, ...] = ()
 
     @property
     def is_base(self) -> bool:
         """Whether it stands alone."""
         return self.parent is None
+
+    @property
+    def is_tree(self) -> bool:
+        """Whether it is of several processes."""
+        return bool(self.members or self.zombies)

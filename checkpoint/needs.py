@@ -12,6 +12,7 @@ from typing import Final
 
 from checkpoint import carried
 from checkpoint.model import Fact, FileIdentity, Snapshot, Vma, VmaKind
+from checkpoint.tree import views
 
 OPEN_FILES: Final = "files"
 """The kind of resource that open files are, `checkpoint.resources.files`."""
@@ -53,10 +54,12 @@ def needs(state: Snapshot, *, opened: bool = True) -> tuple[Need, ...]:
     """
     if not state.threads:
         return tuple(Need(file.path, file.size, file.digest, exact=False) for file in program_of(state))
-    found = [_need(state.process.executable)]
-    found += [_need(vma.file) for vma in state.vmas if vma.file is not None and _is_run(vma)]
-    if opened:
-        found += _opened(state)
+    found: list[Need] = []
+    for view in views(state):
+        found.append(_need(view.process.executable))
+        found += [_need(vma.file) for vma in view.vmas if vma.file is not None and _is_run(vma)]
+        if opened:
+            found += _opened(view)
     carry = carried.paths_of(state)
     return tuple({need.path: need for need in found if not _is_below(need.path, carry)}.values())
 

@@ -10,14 +10,14 @@ accidents and diverged histories; it is no guard against a stranger (the file's 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
-from checkpoint.model import PageRun, Vma
+from checkpoint.model import PageCopy, PageRun, Vma
 
 Words = NDArray[np.uint64]
 """Unsigned 64-bit words: addresses (count,), extents (count, 2) or lanes of digests (count, 2)."""
@@ -41,7 +41,7 @@ DIGESTED = 1024
 # Sets of pages
 
 
-def extents(runs: Iterable[PageRun | Vma]) -> Words:
+def extents(runs: Iterable[PageRun | PageCopy | Vma]) -> Words:
     """The set that runs or mappings cover, whatever their order and overlap."""
     pairs = sorted((run.start, run.end) for run in runs if run.start < run.end)
     ordered = np.array(pairs, dtype=np.uint64).reshape(-1, 2)
@@ -108,6 +108,33 @@ def addresses_of(pages: Words, page_size: int) -> Words:
     firsts = np.repeat(pages[:, 0], counts)
     index_in_run = np.arange(len(firsts)) - np.repeat(np.cumsum(counts) - counts, counts)
     return firsts + index_in_run.astype(np.uint64) * np.uint64(page_size)
+
+
+def copied_pages(copies: Sequence[PageCopy], carried: Words, page_size: int) -> tuple[Words, NDArray[np.intp]]:
+    """The addresses of copied pages, and the place of each one's source among the carried ones.
+
+    Args:
+        carried: addresses of the carried pages, in order.
+    """
+    targets = addresses_of(np.array([(copy.start, copy.end) for copy in copies], dtype=np.uint64).reshape(-1, 2), page_size)
+    pairs = np.array([(copy.source, copy.source + copy.size) for copy in copies], dtype=np.uint64).reshape(-1, 2)
+    return targets, np.searchsorted(carried, addresses_of(pairs, page_size))
+
+
+def copies_of(targets: Words, sources: Words, page_size: int) -> tuple[PageCopy, ...]:
+    """Pages and those whose content they have, as few copies as there can be.
+
+    Args:
+        targets, sources: addresses, pair by pair; the former in order.
+    """
+    if not len(targets):
+        return ()
+    step = np.uint64(page_size)
+    breaks = np.flatnonzero((targets[1:] != targets[:-1] + step) | (sources[1:] != sources[:-1] + step)) + 1
+    firsts = np.concatenate(([0], breaks))
+    lasts = np.concatenate((breaks, [len(targets)])) - 1
+    rows = zip(targets[firsts].tolist(), targets[lasts].tolist(), sources[firsts].tolist(), strict=True)
+    return tuple(PageCopy(start, last + page_size, source) for start, last, source in rows)
 
 
 def extents_of_addresses(addresses: Words, page_size: int) -> Words:
@@ -254,14 +281,29 @@ class PageTable:
         """The table of a state without pages."""
         return cls(page_size, PageMap.empty(), EMPTY_SUM)
 
-    def apply(self, cleared: Iterable[PageRun], runs: Iterable[PageRun], contents: Buffer, vmas: Iterable[Vma]) -> PageTable:
+    def apply(
+        self,
+        cleared: Iterable[PageRun],
+        runs: Iterable[PageRun],
+        contents: Buffer,
+        vmas: Iterable[Vma | PageRun],
+        copies: Sequence[PageCopy] = (),
+    ) -> PageTable:
         """The table after a snapshot: drop what lies outside ``vmas`` or in ``cleared``, then set the pages of ``runs``.
 
         Args:
             contents: bytes of ``runs``, in address order.
+            copies: pages with the bytes of others of ``runs``.
         """
         addresses = addresses_of(extents(runs), self.page_size)
         digests = digest_pages(contents, addresses, self.page_size)
+        if copies:
+            copied, places = copied_pages(copies, addresses, self.page_size)
+            rows = np.frombuffer(contents, dtype=np.uint8).reshape(-1, self.page_size)[places]
+            digests = np.concatenate((digests, digest_pages(rows.tobytes(), copied, self.page_size)))
+            addresses = np.concatenate((addresses, copied))
+            order = np.argsort(addresses)
+            addresses, digests = addresses[order], digests[order]
         kept, dropped = self.pages.without(extents(vmas), extents(cleared))
         pages, replaced = kept.overlaid(addresses, digests)
         page_sum = add_to_sum(self.page_sum, digests, np.concatenate((dropped, replaced)))

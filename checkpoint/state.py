@@ -19,6 +19,7 @@ from checkpoint.errors import FormatError
 from checkpoint.model import (
     Clocks,
     Machine,
+    Member,
     OutputPiece,
     Position,
     ProcessState,
@@ -26,7 +27,9 @@ from checkpoint.model import (
     Snapshot,
     ThreadState,
     Vma,
+    Zombie,
 )
+from checkpoint.tree import every_mapping
 
 _Value = TypeVar("_Value")
 
@@ -89,6 +92,24 @@ class _State(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     resources: tuple[_ResourceRecord, ...]
 
 
+class _MemberRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A ``Member``; see `_ResourceRecord`."""
+
+    slot: int
+    exit_signal: int
+    process: ProcessState
+    threads: tuple[ThreadState, ...]
+    vmas: tuple[Vma, ...]
+    resources: tuple[_ResourceRecord, ...]
+
+
+class _TreeState(_State, frozen=True, forbid_unknown_fields=True):
+    """The same of several processes: what version 2 holds."""
+
+    members: tuple[_MemberRecord, ...]
+    zombies: tuple[Zombie, ...]
+
+
 class State(msgspec.Struct, frozen=True):
     """The decoded state section: the fields of ``Snapshot`` with the same names."""
 
@@ -101,6 +122,8 @@ class State(msgspec.Struct, frozen=True):
     threads: tuple[ThreadState, ...]
     vmas: tuple[Vma, ...]
     resources: tuple[Resource, ...]
+    members: tuple[Member, ...] = ()
+    zombies: tuple[Zombie, ...] = ()
 
 
 def header_of(snapshot: Snapshot) -> Header:
@@ -116,8 +139,8 @@ def header_of(snapshot: Snapshot) -> Header:
         contents_size=sum(run.size for run in snapshot.runs),
         run_count=len(snapshot.runs),
         cleared_count=len(snapshot.cleared),
-        vma_count=len(snapshot.vmas),
-        thread_count=len(snapshot.threads),
+        vma_count=len(every_mapping(snapshot)),
+        thread_count=len(snapshot.threads) + sum(len(member.threads) for member in snapshot.members),
         output_size=sum(len(piece.content) for piece in snapshot.output),
         freeze_us=snapshot.freeze_us,
         notes=snapshot.notes,
@@ -150,26 +173,54 @@ def encode_state(snapshot: Snapshot) -> bytes:
         epoch=snapshot.epoch,
         machine=snapshot.machine,
         clocks=snapshot.clocks,
-        process=replace(snapshot.process, limits=_sorted(snapshot.process.limits)),
-        threads=tuple(replace(thread, registers=_sorted(thread.registers)) for thread in snapshot.threads),
+        process=_canonical_process(snapshot.process),
+        threads=_canonical_threads(snapshot.threads),
         vmas=snapshot.vmas,
-        resources=tuple(_ResourceRecord(held.kind, held.name, _sorted(held.facts)) for held in snapshot.resources),
+        resources=_records(snapshot.resources),
     )
+    if snapshot.is_tree:
+        members = tuple(map(_member_record, snapshot.members))
+        state = _TreeState(**msgspec.structs.asdict(state), members=members, zombies=snapshot.zombies)
     return _encoded(state, "state")
 
 
-def decode_state(packed: bytes | memoryview) -> State:
+def _member_record(member: Member) -> _MemberRecord:
+    return _MemberRecord(
+        slot=member.slot,
+        exit_signal=member.exit_signal,
+        process=_canonical_process(member.process),
+        threads=_canonical_threads(member.threads),
+        vmas=member.vmas,
+        resources=_records(member.resources),
+    )
+
+
+def _canonical_process(process: ProcessState) -> ProcessState:
+    return replace(process, limits=_sorted(process.limits))
+
+
+def _canonical_threads(threads: tuple[ThreadState, ...]) -> tuple[ThreadState, ...]:
+    return tuple(replace(thread, registers=_sorted(thread.registers)) for thread in threads)
+
+
+def _records(resources: tuple[Resource, ...]) -> tuple[_ResourceRecord, ...]:
+    return tuple(_ResourceRecord(held.kind, held.name, _sorted(held.facts)) for held in resources)
+
+
+def decode_state(packed: bytes | memoryview, *, is_tree: bool = False) -> State:
     """The state in these bytes.
+
+    Args:
+        is_tree: of several processes.
 
     Raises:
         FormatError: not a state, or not in canonical form; names the field.
     """
-    state = _decoded(packed, _State, "state")
-    for record in state.resources:
-        _check_fact(record.facts, f"state: facts of {record.kind} {record.name!r}", MAX_FACT_DEPTH)
-    mappings = (state.process.limits, *(thread.registers for thread in state.threads), *(held.facts for held in state.resources))
-    if not all(map(_is_sorted, mappings)):
-        raise FormatError("state: not in canonical form (keys out of order)")
+    state: _State = _decoded(packed, _TreeState if is_tree else _State, "state")
+    members = state.members if isinstance(state, _TreeState) else ()
+    _check_canonical(state)
+    for record in members:
+        _check_canonical(record)
     return State(
         component=state.component,
         engine=state.engine,
@@ -179,7 +230,33 @@ def decode_state(packed: bytes | memoryview) -> State:
         process=state.process,
         threads=state.threads,
         vmas=state.vmas,
-        resources=tuple(Resource(record.kind, record.name, record.facts) for record in state.resources),
+        resources=_resources(state.resources),
+        members=tuple(map(_member, members)),
+        zombies=state.zombies if isinstance(state, _TreeState) else (),
+    )
+
+
+def _check_canonical(state: _State | _MemberRecord) -> None:
+    """Refuse facts that cannot be, and keys that are out of order."""
+    for record in state.resources:
+        _check_fact(record.facts, f"state: facts of {record.kind} {record.name!r}", MAX_FACT_DEPTH)
+    mappings = (state.process.limits, *(thread.registers for thread in state.threads), *(held.facts for held in state.resources))
+    if not all(map(_is_sorted, mappings)):
+        raise FormatError("state: not in canonical form (keys out of order)")
+
+
+def _resources(records: tuple[_ResourceRecord, ...]) -> tuple[Resource, ...]:
+    return tuple(Resource(record.kind, record.name, record.facts) for record in records)
+
+
+def _member(record: _MemberRecord) -> Member:
+    return Member(
+        slot=record.slot,
+        exit_signal=record.exit_signal,
+        process=record.process,
+        threads=record.threads,
+        vmas=record.vmas,
+        resources=_resources(record.resources),
     )
 
 

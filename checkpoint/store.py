@@ -256,7 +256,7 @@ class Store:
     def _prove(self, shelf: Shelf, snapshot: Snapshot) -> _Proved:
         """Apply a snapshot to the page table of its parent and compare."""
         table = PageTable.empty(snapshot.machine.page_size) if snapshot.parent is None else self._table_at(shelf, snapshot.parent)
-        table = table.apply(snapshot.cleared, snapshot.runs, memoryview(snapshot.contents), snapshot.vmas)
+        table = chain.applied(table, snapshot)
         chain.check_state(snapshot, table.page_sum)
         return _Proved(snapshot.position, table)
 
@@ -269,7 +269,7 @@ class Store:
         for entry in shelf.chain_to(position):
             snapshot = self._decoded(shelf.component, entry)
             table = table or PageTable.empty(snapshot.machine.page_size)
-            table = table.apply(snapshot.cleared, snapshot.runs, memoryview(snapshot.contents), snapshot.vmas)
+            table = chain.applied(table, snapshot)
         assert table is not None, "a chain has a base"
         return table
 

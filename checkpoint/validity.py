@@ -9,8 +9,9 @@ import numpy as np
 
 from checkpoint import pages
 from checkpoint.errors import FormatError
-from checkpoint.model import OutputPiece, PageRun, Position, Snapshot, Vma
+from checkpoint.model import OutputPiece, PageCopy, PageRun, Position, Snapshot, ThreadState, Vma
 from checkpoint.state import STATE_DIGEST_SIZE
+from checkpoint.tree import SLOT_LIMIT, SLOT_SHIFT, every_mapping, shifted_runs
 
 MIN_PAGE_SIZE = 4096
 MAX_PAGE_SIZE = 1 << 16
@@ -42,10 +43,12 @@ def check_snapshot(snapshot: Snapshot, contents_size: int | None = None) -> None
     _check_extents(snapshot.vmas, page_size, "vmas")
     _check_extents(snapshot.cleared, page_size, "cleared runs")
     _check_extents(snapshot.runs, page_size, "runs")
-    _check_runs_mapped(snapshot.runs, snapshot.vmas)
+    _check_members(snapshot, page_size)
+    _check_runs_mapped(snapshot.runs, every_mapping(snapshot))
+    _check_copies(snapshot, page_size)
     _check_guards(snapshot, page_size)
     _check_contents(snapshot, len(memoryview(snapshot.contents).cast("B")) if contents_size is None else contents_size)
-    _check_threads(snapshot)
+    _check_threads(snapshot.process.pid, snapshot.threads)
     _check_output(snapshot.output)
 
 
@@ -75,7 +78,7 @@ def place(position: Position) -> str:
     return f"{position.generation}.{position.sequence}"
 
 
-def _check_extents(items: Iterable[PageRun | Vma], page_size: int, name: str) -> None:
+def _check_extents(items: Iterable[PageRun | PageCopy | Vma], page_size: int, name: str) -> None:
     """Aligned, not empty, in address order, without overlap."""
     pairs = [(item.start, item.end) for item in items]
     outside = [pair for pair in pairs if not 0 <= pair[0] < pair[1] <= ADDRESS_END]
@@ -94,23 +97,65 @@ def _span(bounds: pages.Words, index: np.intp) -> str:
     return f"{int(bounds[index, 0]):#x}-{int(bounds[index, 1]):#x}"
 
 
-def _check_runs_mapped(runs: tuple[PageRun, ...], vmas: tuple[Vma, ...]) -> None:
+def _check_members(snapshot: Snapshot, page_size: int) -> None:
+    """Slots in order, addresses inside them, ids once, parents that are there."""
+    slots = [0, *(member.slot for member in snapshot.members)]
+    if any(later <= earlier for earlier, later in pairwise(slots)) or slots[-1] >= SLOT_LIMIT:
+        raise FormatError(f"members: slots {slots[1:]} are not in order, from 1 to {SLOT_LIMIT - 1}")
+    processes = [snapshot.process, *(member.process for member in snapshot.members)]
+    pids = [process.pid for process in processes]
+    every = [*pids, *(zombie.pid for zombie in snapshot.zombies)]
+    if len(set(every)) != len(every):
+        raise FormatError("members: two have the same pid")
+    for pid, parent in (
+        *((process.pid, process.ppid) for process in processes[1:]),
+        *((zombie.pid, zombie.ppid) for zombie in snapshot.zombies),
+    ):
+        if parent not in (0, *pids) or parent == pid:
+            raise FormatError(f"members: the parent {parent} of {pid} is none of them")
+    for member in snapshot.members:
+        _check_extents(member.vmas, page_size, f"vmas of {member.process.pid}")
+        if member.vmas and member.vmas[-1].end > 1 << SLOT_SHIFT:
+            raise FormatError(f"vmas of {member.process.pid}: beyond its slot")
+        _check_threads(member.process.pid, member.threads)
+
+
+def _check_runs_mapped(runs: Iterable[PageRun | PageCopy], vmas: Iterable[PageRun | Vma]) -> None:
     stray = pages.difference(pages.extents(runs), pages.extents(vmas))
     if len(stray):
         raise FormatError(f"runs: {_span(stray, np.intp(0))} lies in no mapping")
 
 
+def _check_copies(snapshot: Snapshot, page_size: int) -> None:
+    """Copies are of several processes, lie in mappings and not among the carried runs, and each is of a part of one of those."""
+    if not snapshot.copies:
+        return
+    if not snapshot.is_tree:
+        raise FormatError("copies: one process alone has none")
+    _check_extents(snapshot.copies, page_size, "copies")
+    targets, carried = pages.extents(snapshot.copies), pages.extents(snapshot.runs)
+    _check_runs_mapped(snapshot.copies, every_mapping(snapshot))
+    if len(twice := pages.intersection(targets, carried)):
+        raise FormatError(f"copies: {_span(twice, np.intp(0))} is carried, too")
+    sources = [PageRun(copy.source, copy.source + copy.size) for copy in snapshot.copies]
+    if any(run.start < 0 or run.end > ADDRESS_END or run.start & (page_size - 1) for run in sources):
+        raise FormatError("copies: a source is not of whole pages, or beyond the address space")
+    if len(stray := pages.difference(pages.extents(sources), carried)):
+        raise FormatError(f"copies: {_span(stray, np.intp(0))}, of which one is, is not carried")
+
+
 def _check_guards(snapshot: Snapshot, page_size: int) -> None:
     """Guards lie inside their own mapping and hold nothing."""
-    for vma in snapshot.vmas:
-        if vma.guards:
-            _check_extents(vma.guards, page_size, "guards")
-            if vma.guards[0].start < vma.start or vma.guards[-1].end > vma.end:
-                raise FormatError(f"guards: not all inside their mapping {vma.start:#x}-{vma.end:#x}")
-    every = pages.extents(guard for vma in snapshot.vmas for guard in vma.guards)
-    carried = pages.intersection(every, pages.extents(snapshot.runs)) if len(every) else every
-    if len(carried):
-        raise FormatError(f"guards: {_span(carried, np.intp(0))} is carried, too")
+    for slot, vmas in ((0, snapshot.vmas), *((member.slot, member.vmas) for member in snapshot.members)):
+        for vma in vmas:
+            if vma.guards:
+                _check_extents(vma.guards, page_size, "guards")
+                if vma.guards[0].start < vma.start or vma.guards[-1].end > vma.end:
+                    raise FormatError(f"guards: not all inside their mapping {vma.start:#x}-{vma.end:#x}")
+        every = pages.extents(shifted_runs((guard for vma in vmas for guard in vma.guards), slot))
+        carried = pages.intersection(every, pages.extents(snapshot.runs)) if len(every) else every
+        if len(carried):
+            raise FormatError(f"guards: {_span(carried, np.intp(0))} is carried, too")
 
 
 def _check_contents(snapshot: Snapshot, contents_size: int) -> None:
@@ -119,12 +164,12 @@ def _check_contents(snapshot: Snapshot, contents_size: int) -> None:
         raise FormatError(f"contents: {contents_size} bytes where the runs need {needed}")
 
 
-def _check_threads(snapshot: Snapshot) -> None:
-    tids = [thread.tid for thread in snapshot.threads]
+def _check_threads(pid: int, threads: tuple[ThreadState, ...]) -> None:
+    tids = [thread.tid for thread in threads]
     if len(set(tids)) != len(tids):
         raise FormatError("threads: two have the same id")
-    if tids and tids[0] != snapshot.process.pid:
-        raise FormatError(f"threads: the first is {tids[0]}, of process {snapshot.process.pid}")
+    if tids and tids[0] != pid:
+        raise FormatError(f"threads: the first is {tids[0]}, of process {pid}")
 
 
 def _check_output(output: tuple[OutputPiece, ...]) -> None:

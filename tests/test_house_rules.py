@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 FLOORS = ("checkpoint", "failover", "agent")
 
-PURE_CHECKPOINT = ("errors", "model", "pages", "layout", "state", "validity", "chain", "gathering", "task_channel")
+PURE_CHECKPOINT = ("errors", "model", "pages", "layout", "state", "validity", "chain", "gathering", "task_channel", "tree")
 
 PURE_FILES = (
     *(f"checkpoint/{name}.py" for name in PURE_CHECKPOINT),

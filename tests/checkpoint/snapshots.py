@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from checkpoint import pages
-from checkpoint.chain import position_of
+from checkpoint import pages, tree
+from checkpoint.chain import applied, position_of
 from checkpoint.model import (
     Clocks,
     Credentials,
     FileIdentity,
     Machine,
+    Member,
     MemoryLayout,
     OutputPiece,
     PageRun,
@@ -22,6 +23,7 @@ from checkpoint.model import (
     ThreadState,
     Vma,
     VmaKind,
+    Zombie,
 )
 
 PAGE = 4096
@@ -110,6 +112,37 @@ def snapshot(
 
 def _joined(state: Pages) -> bytes:
     return b"".join(state[number] for number in sorted(state))
+
+
+def family(count: int) -> list[Snapshot]:
+    """A base and deltas of a program with a child, which has the same addresses, and one that has ended."""
+    made: list[Snapshot] = []
+    table = pages.PageTable.empty(PAGE)
+    for sequence in range(1, count + 1):
+        alone = snapshot(
+            {0: page("both"), 1: page(f"parent {sequence}")}, sequence=sequence, parent=made[-1].position if made else None
+        )
+        child = Member(
+            slot=1,
+            exit_signal=17,
+            process=replace(process(), pid=3, ppid=2),
+            threads=(replace(alone.threads[0], tid=3),),
+            vmas=(vma(0, 128),),
+            resources=(Resource("shared", "fd 3", {"descriptors": [[3, 0]], "description": 1, "path": "/tmp/map"}),),
+        )
+        whole = replace(
+            alone,
+            members=(child,),
+            zombies=(Zombie("mapper", 4, 2, 2, 2, 3 << 8, 17),),
+            runs=(*alone.runs, *tree.shifted_runs(alone.runs, 1)),
+            contents=b"".join((alone.contents, page("both"), page(f"child {sequence}"))),
+        )
+        runs, contents, copies = tree.told_once(whole.runs, memoryview(whole.contents), PAGE)
+        whole = replace(whole, runs=runs, contents=bytes(contents), copies=copies)
+        table = applied(table, whole)
+        whole = replace(whole, page_sum=table.page_sum)
+        made.append(replace(whole, position=position_of(whole, 1, sequence)))
+    return made
 
 
 def pages_of(made: Snapshot) -> dict[int, bytes]:

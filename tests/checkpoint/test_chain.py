@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from checkpoint import chain
+from checkpoint import chain, tree
 from checkpoint.errors import ChainError
 from checkpoint.model import Position, Snapshot
-from tests.checkpoint.snapshots import history, page, pages_of, snapshot, vma
+from tests.checkpoint.snapshots import PAGE, family, history, page, pages_of, snapshot, vma
 
 STEPS = st.lists(
     st.tuples(st.dictionaries(st.integers(0, 30), st.integers(0, 9), max_size=6), st.frozensets(st.integers(0, 30), max_size=6)),
@@ -89,3 +89,13 @@ def test_a_delta_whose_siblings_were_never_acknowledged_replaces_them() -> None:
     base, second, third = history(3)
     other = replace(third, parent=base.position)
     assert chain.append((base, second), other) == (base, other)
+
+
+def test_a_chain_of_several_processes_folds_to_what_each_of_them_has() -> None:
+    snapshots = family(3)
+    assert snapshots[0].copies and len(snapshots[0].contents) == 3 * PAGE
+    folded = chain.fold(snapshots)
+    assert folded.copies and len(folded.contents) == 3 * PAGE, "what both have is there once"
+    parent, child = tree.views(folded)
+    assert pages_of(parent) == {0: page("both"), 1: page("parent 3")}
+    assert pages_of(child) == {0: page("both"), 1: page("child 3")}

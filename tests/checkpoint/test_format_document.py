@@ -11,19 +11,21 @@ import msgspec
 import pytest
 
 from checkpoint import format, layout, model, state
-from tests.samples.make import SAMPLE, sample
+from tests.samples.make import SAMPLE, TREE_SAMPLE, sample, tree_sample
 
 DOCUMENT = (Path(layout.__file__).parent / "FORMAT.md").read_text()
 MAPS = {
     "Header": state.Header,
     "State": state._State,
+    "TreeState": state._TreeState,
+    "Member": state._MemberRecord,
     "Resource": state._ResourceRecord,
     **{
         kind.__name__: kind
         for kind in (
             *(model.Position, model.Machine, model.Clocks, model.ProcessState, model.FileIdentity, model.MemoryLayout),
             *(model.Credentials, model.SignalAction, model.IntervalTimer, model.PosixTimer, model.ThreadState, model.Rseq),
-            *(model.Vma, model.PageRun, model.OutputPiece),
+            *(model.Vma, model.PageRun, model.OutputPiece, model.Zombie),
         )
     },
 }
@@ -85,3 +87,8 @@ def test_the_worked_example_is_the_sample_file() -> None:
 
 def test_the_sample_file_is_still_read() -> None:
     assert format.decode(SAMPLE) == sample()
+
+
+def test_the_sample_file_of_several_processes_is_still_read() -> None:
+    assert TREE_SAMPLE.read_bytes()[8] == layout.TREE_VERSION
+    assert format.decode(TREE_SAMPLE) == tree_sample()

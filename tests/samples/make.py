@@ -1,4 +1,4 @@
-"""Write the sample file of the current format version: ``python -m tests.samples.make`` (only when the version changes)."""
+"""Write the sample files of the format's versions: ``python -m tests.samples.make`` (only when a version changes)."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from pathlib import Path
 
 from checkpoint import format, layout
 from checkpoint.model import Snapshot
-from tests.checkpoint.snapshots import history
+from tests.checkpoint.snapshots import family, history
 
 SAMPLE = Path(__file__).parent / f"version-{layout.VERSION}.snapshot"
+TREE_SAMPLE = Path(__file__).parent / f"version-{layout.TREE_VERSION}.snapshot"
 
 
 def sample() -> Snapshot:
@@ -16,6 +17,12 @@ def sample() -> Snapshot:
     return history(2)[1]
 
 
+def tree_sample() -> Snapshot:
+    """A delta of two processes, and of one that has ended, with pages of each that lives."""
+    return family(2)[1]
+
+
 if __name__ == "__main__":
-    with SAMPLE.open("wb") as file:
-        format.encode(sample(), file)
+    for path, made in ((SAMPLE, sample()), (TREE_SAMPLE, tree_sample())):
+        with path.open("wb") as file:
+            format.encode(made, file)

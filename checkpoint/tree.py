@@ -1,0 +1,132 @@
+"""A component of several processes as one snapshot, and as a snapshot of each.
+
+Every process has an address space of its own, and the snapshot one set of pages: page ``address`` of the process in slot ``n``
+stands there as ``address + n × 2⁴⁸``. The first process has slot 0, so that a snapshot of one process is as it always was, and
+what is known of chains, sums and frames holds for trees as it stands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from checkpoint import pages
+from checkpoint.model import PageCopy, PageRun, Snapshot, Vma
+from checkpoint.pages import Words
+
+SLOT_SHIFT: Final = 48
+"""Addresses of programs are below 2⁴⁷ on x86-64 (and below 2⁴⁸ on aarch64)."""
+SLOT_LIMIT: Final = 1 << 14
+"""Processes of one component."""
+
+
+def base_of(slot: int) -> int:
+    """Where the pages of a slot begin."""
+    return slot << SLOT_SHIFT
+
+
+def whole(slot: int) -> PageRun:
+    """All pages of a slot."""
+    return PageRun(base_of(slot), base_of(slot + 1))
+
+
+def shifted(words: Words, slot: int) -> Words:
+    """Addresses, or extents, of a slot's process as the snapshot has them."""
+    return words + np.uint64(base_of(slot))
+
+
+def shifted_runs(runs: Iterable[PageRun], slot: int) -> tuple[PageRun, ...]:
+    """The same of runs."""
+    base = base_of(slot)
+    return tuple(PageRun(run.start + base, run.end + base) for run in runs)
+
+
+def every_mapping(snapshot: Snapshot) -> Sequence[Vma | PageRun]:
+    """What is mapped by any of its processes, in the order of the snapshot's pages."""
+    if not snapshot.members:
+        return snapshot.vmas
+    found: list[Vma | PageRun] = [*snapshot.vmas]
+    for member in snapshot.members:
+        base = base_of(member.slot)
+        found += [PageRun(vma.start + base, vma.end + base) for vma in member.vmas]
+    return found
+
+
+def expanded(snapshot: Snapshot) -> Snapshot:
+    """The same, with every page told by its bytes; an outline, which has none, as it is."""
+    if not snapshot.copies or not len(snapshot.contents):
+        return replace(snapshot, copies=())
+    page_size = snapshot.machine.page_size
+    carried = pages.addresses_of(pages.extents(snapshot.runs), page_size)
+    copied, places = pages.copied_pages(snapshot.copies, carried, page_size)
+    addresses = np.concatenate((carried, copied))
+    rows = np.frombuffer(snapshot.contents, dtype=np.uint8).reshape(-1, page_size)
+    order = np.argsort(addresses)
+    contents = rows[np.concatenate((np.arange(len(carried)), places))[order]]
+    runs = pages.page_runs(pages.extents_of_addresses(addresses[order], page_size))
+    return replace(snapshot, runs=runs, contents=contents.reshape(-1).data, copies=())
+
+
+def told_once(runs: Iterable[PageRun], contents: memoryview, page_size: int) -> tuple[Runs, memoryview, tuple[PageCopy, ...]]:
+    """The same pages, each content once: runs and bytes of those that are carried, and the copies."""
+    addresses = pages.addresses_of(pages.extents(runs), page_size)
+    rows = np.frombuffer(contents, dtype=np.uint8).reshape(-1, page_size)
+    digests = pages.digest_pages(contents, np.zeros_like(addresses), page_size)
+    _, firsts, which = np.unique(digests, axis=0, return_index=True, return_inverse=True)
+    places = firsts[which.reshape(-1)]
+    is_copy = np.flatnonzero(places != np.arange(len(addresses)))
+    is_copy = is_copy[(rows[is_copy] == rows[places[is_copy]]).all(axis=1)]
+    if not len(is_copy):
+        return tuple(runs), contents, ()
+    kept = np.ones(len(addresses), dtype=np.bool_)
+    kept[is_copy] = False
+    copies = pages.copies_of(addresses[is_copy], addresses[places[is_copy]], page_size)
+    return pages.page_runs(pages.extents_of_addresses(addresses[kept], page_size)), rows[kept].reshape(-1).data, copies
+
+
+def views(snapshot: Snapshot) -> tuple[Snapshot, ...]:
+    """Each process of a base as a snapshot of its own, the first one first. Pages are not copied, but for ``copies``."""
+    if not snapshot.is_tree:
+        return (snapshot,)
+    snapshot = expanded(snapshot)
+    contents = memoryview(snapshot.contents).cast("B")
+    places = _places(snapshot.runs)
+    first = replace(snapshot, members=(), zombies=())
+    others = [
+        replace(
+            first,
+            process=member.process,
+            threads=member.threads,
+            vmas=member.vmas,
+            resources=member.resources,
+            output=(),
+        )
+        for member in snapshot.members
+    ]
+    slots = [0, *(member.slot for member in snapshot.members)]
+    return tuple(_with_pages(view, places, contents, slot) for view, slot in zip((first, *others), slots, strict=True))
+
+
+Runs = tuple[PageRun, ...]
+Places = dict[int, tuple[list[PageRun], int]]
+"""By slot: its runs, at the process's own addresses, and where their bytes begin."""
+
+
+def _places(runs: Sequence[PageRun]) -> Places:
+    found: Places = {}
+    position = 0
+    for run in runs:
+        slot = run.start >> SLOT_SHIFT
+        base = base_of(slot)
+        found.setdefault(slot, ([], position))[0].append(PageRun(run.start - base, run.end - base))
+        position += run.size
+    return found
+
+
+def _with_pages(view: Snapshot, places: Places, contents: memoryview, slot: int) -> Snapshot:
+    runs, begin = places.get(slot, ([], 0))
+    size = sum(run.size for run in runs)
+    return replace(view, runs=tuple(runs), contents=contents[begin : begin + size])
