@@ -56,6 +56,35 @@ def thread_ids(pid: int) -> list[int]:
         raise ProcessGoneError(f"there is no process {pid} any more") from error
 
 
+class Ear:
+    """SIGCHLD, heard for all who want to hear it: a process has one such signal."""
+
+    def __init__(self) -> None:
+        self._listeners: list[Threads] = []
+        self._before: Any = None
+
+    def add(self, listener: Threads) -> None:
+        """Have `Threads.hear` called; from the first thread of ours only."""
+        if not self._listeners:
+            self._before = signal.signal(signal.SIGCHLD, lambda *_: self._hear()) or signal.SIG_DFL
+        if listener not in self._listeners:
+            self._listeners.append(listener)
+
+    def remove(self, listener: Threads) -> None:
+        """Have it called no more."""
+        if listener in self._listeners:
+            self._listeners.remove(listener)
+            if not self._listeners:
+                signal.signal(signal.SIGCHLD, self._before)
+
+    def _hear(self) -> None:
+        for listener in tuple(self._listeners):
+            listener.hear()
+
+
+EAR: Final = Ear()
+
+
 class Threads:
     """The threads of one process; every call from the thread of ours that makes the first one.
 
@@ -63,6 +92,8 @@ class Threads:
 
     Attributes:
         leader: the first thread, whose id is the process's.
+        is_one_of_many: other processes stand still meanwhile: one that waits inside the kernel (for a child of vfork, for one) is
+            not waited for.
 
     Args:
         mend: what is done to each thread that is let go as it was found, of which nothing else was asked.
@@ -75,7 +106,7 @@ class Threads:
         self._held: dict[int, Tracee] = {}
         self._moving: set[int] = set()
         self._loose: dict[int, Tracee] = {}
-        self._before: Any = None
+        self.is_one_of_many = False
 
     @property
     def pid(self) -> int:
@@ -164,7 +195,8 @@ class Threads:
         except ProcessGoneError:
             raise
         except CaptureError:
-            if thread_count(self.pid) > 1 and procfs.thread_stat(self.pid, tracee.pid).state == "D":
+            is_alone = thread_count(self.pid) == 1 and not self.is_one_of_many
+            if not is_alone and procfs.thread_stat(self.pid, tracee.pid).state == "D":
                 raise
             tracee.await_stop(left_s)
 
@@ -206,7 +238,7 @@ class Threads:
             self._tend()
 
     def _tend(self) -> None:
-        """Let go of whom can be. SIGCHLD may have `_hear` do the same in the middle of it: what that has let go of stays so."""
+        """Let go of whom can be. SIGCHLD may have `hear` do the same in the middle of it: what that has let go of stays so."""
         for tid, tracee in tuple(self._loose.items()):
             if self._is_let_go(tracee):
                 self._loose.pop(tid, None)
@@ -251,17 +283,14 @@ class Threads:
         """Have the kernel tell us; False where it cannot: signals go to our first thread."""
         if threading.current_thread() is not threading.main_thread():
             return False
-        if self._before is None:
-            self._before = signal.signal(signal.SIGCHLD, lambda *_: self._hear()) or signal.SIG_DFL
+        EAR.add(self)
         return True
 
     def _listen_no_more(self) -> None:
-        if self._before is not None:
-            signal.signal(signal.SIGCHLD, self._before)
-            self._before = None
+        EAR.remove(self)
 
-    def _hear(self) -> None:
-        """One of them has stopped or ended."""
+    def hear(self) -> None:
+        """One of somebody's has stopped or ended."""
         for tracee in self._held.values():
             if not self._is_our_child(tracee):
                 with contextlib.suppress(ChildProcessError):
