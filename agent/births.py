@@ -141,7 +141,8 @@ async def restore(
     outline = await asyncio.to_thread(format.read_outline, chain[-1])
     theirs = outline.process.credentials
     owner = theirs.uids[0] if owner is None else owner
-    check_rights(name, theirs, owner)
+    for one in (theirs, *(member.process.credentials for member in outline.members)):
+        check_rights(name, one, owner)
     await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
     laps.lap("reading the newest")
     component = Component(name, await places.nursery.guard(), places)

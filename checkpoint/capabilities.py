@@ -9,7 +9,7 @@ from types import ModuleType
 from typing import Final
 
 from checkpoint.capability import Area, Capability, Verdict
-from checkpoint.engines import preserved, restore_checks, restore_kinds, restore_vdso
+from checkpoint.engines import births, preserved, restore_checks, restore_kinds, restore_vdso
 from checkpoint.resources import (
     attached_devices,
     carried_trees,
@@ -28,7 +28,9 @@ from checkpoint.resources import (
     pipes,
     refused_devices,
     refused_threads,
+    shared,
     shared_objects,
+    sharing,
     signalfds,
     signalling,
     sockets,
@@ -44,6 +46,9 @@ from checkpoint.resources import (
 
 CARRIERS: Final[tuple[ModuleType, ...]] = (
     preserved,
+    births,
+    shared,
+    sharing,
     refused_threads,
     shared_objects,
     files,

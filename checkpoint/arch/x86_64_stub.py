@@ -95,6 +95,7 @@ SYSTEM_CALLS: Final = {
     "ioctl": 16,
     "ioprio_set": 251,
     "linkat": 265,
+    "kill": 62,
     "listen": 50,
     "lseek": 8,
     "madvise": 28,
@@ -157,6 +158,7 @@ SYSTEM_CALLS: Final = {
     "umask": 95,
     "unlinkat": 263,
     "utimensat": 280,
+    "wait4": 61,
     "write": 1,
 }
 """Numbers of the system calls that a restore makes inside a vessel (asm/unistd_64.h)."""

@@ -41,6 +41,19 @@ UNACKNOWLEDGED_LIMIT: Final = 64
 standby whose disk is full for a week must not make every freeze longer."""
 
 
+SharedPlaces = frozenset[tuple[int, int, int, int]]
+"""Parts of shared memory: device and inode number of the object, first and last offset of the part."""
+
+
+def _place_of(line: MapsLine) -> tuple[int, int, int, int]:
+    return line.device, line.inode, line.offset, line.offset + line.size
+
+
+def _is_within(line: MapsLine, places: SharedPlaces) -> bool:
+    device, inode, first, last = _place_of(line)
+    return any(place[:2] == (device, inode) and place[2] <= first and last <= place[3] for place in places)
+
+
 @dataclass(frozen=True, slots=True)
 class Unacknowledged:
     """What one scan found, kept until a position that holds it is acknowledged."""
@@ -134,6 +147,7 @@ class MemoryCapture:
         self._has_moved = False
         self._private: list[MapsLine] = []
         self._shared_lines: list[MapsLine] = []
+        self._told_elsewhere: SharedPlaces = frozenset()
         self._had_shared = False
         self._mapped: Words = NONE
         self._vdso: Words = NONE
@@ -263,6 +277,23 @@ class MemoryCapture:
             copies=(*copied.copies, Copy(missing, content)),
         )
 
+    def leave_out(self, places: SharedPlaces) -> None:
+        """Do not tell of shared memory that another process of the component tells of."""
+        if places != self._told_elsewhere:
+            self._told_elsewhere = places
+            self._sort_shared()
+
+    def shared_places(self) -> SharedPlaces:
+        """The shared memory that this process has, as `leave_out` takes it."""
+        return frozenset(map(_place_of, filter(tracking.is_shared, self.lines)))
+
+    def _sort_shared(self) -> None:
+        self._shared_lines = [
+            line
+            for line in self.lines
+            if (tracking.is_shared(line) and not _is_within(line, self._told_elsewhere)) or tracking.is_orphan(line)
+        ]
+
     def refresh(self) -> None:
         """Read and sort the mappings; that they have changed is kept until the tracker has been told."""
         if not self._maps.refresh():
@@ -270,7 +301,7 @@ class MemoryCapture:
         self._has_moved = True
         self.lines = tuple(line for line in self._maps.lines if not self.borrowed.holds(line.start))
         self._private = [line for line in self.lines if tracking.is_private(line)]
-        self._shared_lines = [line for line in self.lines if tracking.is_shared(line) or tracking.is_orphan(line)]
+        self._sort_shared()
         self._followed = tracking.extents_of(self._private)
         self._mapped = tracking.extents_of([line for line in self.lines if line.name not in tracking.NOT_CARRIED])
         self._vdso = tracking.extents_of([line for line in self.lines if line.name == VDSO])

@@ -38,6 +38,19 @@ class Entered:
     notes: tuple[str, ...]
 
 
+def enter_standing(threads: Threads, interruptions: Interruptions) -> Entered:
+    """As `enter`, for a process that stands still for us already, and goes on standing.
+
+    Raises:
+        CaptureError: also when it stands in the code of a tracer that died.
+    """
+    entered = _enter_once(threads, interruptions, last=False)
+    if entered is None:
+        raise CaptureError(f"pid {threads.pid} stands in code of an earlier tracer; capture it again in a moment")
+    tracker, notes = _tracker_for(threads.pid, entered)
+    return Entered(entered.pages, tracker, interruptions, notes)
+
+
 def enter(threads: Threads, interruptions: Interruptions) -> Entered:
     """Borrow pages, choose how to track, and let go again.
 
@@ -57,41 +70,45 @@ def _try_to_enter(threads: Threads, interruptions: Interruptions, *, last: bool)
     Args:
         last: waiting has helped nothing: pages that somebody was in are left to the program.
     """
-    tracee = threads.leader
     with stopped(threads):
-        mask = tracee.signal_mask()
-        decoded = where_it_stands(tracee, interruptions, tracee.rseq())
-        lines = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
-        left = entry.leftovers(tracee.memory, lines)
-        places = [decoded[arch.INSTRUCTION_POINTER], *map(_instruction_pointer, threads.others)]
-        stands_inside = any(
-            entry.is_in_stub(place, tracee.memory, lines) or any(borrowed.holds(place) for borrowed in left) for place in places
-        )
-        if stands_inside or (not last and any(borrowed.state() == remote.ARMED for borrowed in left)):
-            if last:
-                raise CaptureError(f"pid {tracee.pid} does not leave the code of an earlier tracer; protect it again")
-            return None
-        interruptions.of(tracee).settled(decoded)  # remembers the call that it stands in
-        registers = arch.encode_registers(decoded)
-        for borrowed in left:
-            if borrowed.state() == remote.ARMED:
-                borrowed.abandon()
-            _put_back(threads.pid, borrowed)
-        free = [borrowed for borrowed in left if borrowed.state() != remote.ABANDONED]
-        if free:
-            entered = entry.reenter(tracee, free[0], registers, mask)
-        else:
-            entered = entry.enter(tracee, lines, registers, mask)
-        batch = remote.Batch(entered.pages.table)
-        for number in {entered.inside, *entry.left_open(tracee.pid)}:
-            batch.add("close", number)
-        try:
-            entered.pages.run(tracee, batch, registers, mask)
-        except BaseException:
-            if entered.faults is not None:
-                os.close(entered.faults)
-            raise
-        return entered
+        return _enter_once(threads, interruptions, last=last)
+
+
+def _enter_once(threads: Threads, interruptions: Interruptions, *, last: bool) -> entry.Entered | None:
+    tracee = threads.leader
+    mask = tracee.signal_mask()
+    decoded = where_it_stands(tracee, interruptions, tracee.rseq())
+    lines = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
+    left = entry.leftovers(tracee.memory, lines)
+    places = [decoded[arch.INSTRUCTION_POINTER], *map(_instruction_pointer, threads.others)]
+    stands_inside = any(
+        entry.is_in_stub(place, tracee.memory, lines) or any(borrowed.holds(place) for borrowed in left) for place in places
+    )
+    if stands_inside or (not last and any(borrowed.state() == remote.ARMED for borrowed in left)):
+        if last:
+            raise CaptureError(f"pid {tracee.pid} does not leave the code of an earlier tracer; protect it again")
+        return None
+    interruptions.of(tracee).settled(decoded)  # remembers the call that it stands in
+    registers = arch.encode_registers(decoded)
+    for borrowed in left:
+        if borrowed.state() == remote.ARMED:
+            borrowed.abandon()
+        _put_back(threads.pid, borrowed)
+    free = [borrowed for borrowed in left if borrowed.state() != remote.ABANDONED]
+    if free:
+        entered = entry.reenter(tracee, free[0], registers, mask)
+    else:
+        entered = entry.enter(tracee, lines, registers, mask)
+    batch = remote.Batch(entered.pages.table)
+    for number in {entered.inside, *entry.left_open(tracee.pid)}:
+        batch.add("close", number)
+    try:
+        entered.pages.run(tracee, batch, registers, mask)
+    except BaseException:
+        if entered.faults is not None:
+            os.close(entered.faults)
+        raise
+    return entered
 
 
 def _instruction_pointer(tracee: Tracee) -> int:

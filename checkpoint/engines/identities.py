@@ -35,7 +35,11 @@ KINDS: Final = {
 
 
 class Identities:
-    """Identities of one process's files; each file is looked at once while it stays mapped."""
+    """Identities of one process's files; each file is looked at once while it stays mapped.
+
+    Attributes:
+        is_kin: other processes may share its anonymous memory, so that it is told which is which.
+    """
 
     def __init__(self, pid: int, names: Mapping[str, str]) -> None:
         """
@@ -44,6 +48,7 @@ class Identities:
         """
         self._pid = pid
         self._names = names
+        self.is_kin = False
         self._known: dict[tuple[int, int, str], FileIdentity] = {}
 
     def vmas(self, lines: Sequence[MapsLine], flags: Mapping[int, tuple[str, ...]], guards: Words) -> tuple[Vma, ...]:
@@ -70,7 +75,7 @@ class Identities:
             kind=VmaKind.FILE if is_file else KINDS.get(line.name, VmaKind.ANONYMOUS),
             offset=line.offset,
             name=self._names.get(line.name, line.name),
-            file=self.of_mapping(line) if is_file else None,
+            file=self.of_mapping(line) if is_file else _of_shared(line) if self.is_kin and line.shared else None,
             flags=tuple(flag for flag in flags if flag in KEPT_FLAGS or (flag == vm_flags.MAY_WRITE and is_file and line.shared)),
         )
 
@@ -147,6 +152,11 @@ class Identities:
             digest=b"" if is_memory else files.digest_at(through, (about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns)),
             deleted=deleted,
         )
+
+
+def _of_shared(line: MapsLine) -> FileIdentity:
+    """What tells anonymous shared memory (MAP_SHARED) from other such memory."""
+    return FileIdentity(line.name.removesuffix(DELETED), line.device, line.inode, deleted=True)
 
 
 def _key(line: MapsLine) -> tuple[int, int, str]:

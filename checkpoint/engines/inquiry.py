@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -28,11 +26,7 @@ TIMER_LIMIT: Final = 40
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What the process said about itself; the fields are those of ``checkpoint.model``.
-
-    Attributes:
-        has_children: dead ones that nobody has waited for included.
-    """
+    """What the process said about itself; the fields are those of ``checkpoint.model``."""
 
     clocks: Clocks
     actions: tuple[SignalAction, ...]
@@ -49,7 +43,6 @@ class Told:
     thp_disabled: bool
     securebits: int
     timer_slack_ns: int
-    has_children: bool
     switches: tuple[Switch, ...]
 
 
@@ -86,7 +79,6 @@ class Inquiry:
         self._securebits = self.batch.add("prctl", abi.PR_GET_SECUREBITS)
         self._switches = Questions(self.batch)
         self._slack = self.batch.add("prctl", abi.PR_GET_TIMERSLACK)
-        self._children = self.batch.add("waitid", os.P_ALL, 0, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT | abi.WALL, 0)
 
     @property
     def has_timers(self) -> bool:
@@ -134,7 +126,6 @@ class Inquiry:
             thp_disabled=result[self._thp] == 1,
             securebits=max(result[self._securebits], 0),
             timer_slack_ns=max(result[self._slack], 0),
-            has_children=result[self._children] != -errno.ECHILD,
             switches=self._switches.read(answers),
         )
 

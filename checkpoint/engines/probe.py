@@ -2,17 +2,36 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Final
 
 from checkpoint import portable
 from checkpoint.engine import KEPT, NO_TERMS, NOTED, REFUSED, Finding, Report, Streams, Terms
-from checkpoint.errors import ProbeError, ProcessGoneError
-from checkpoint.linux import dirty, processor, procfs, vm_flags
+from checkpoint.errors import CheckpointError, ProbeError, ProcessGoneError
+from checkpoint.linux import dirty, kinship, processor, procfs, vm_flags
 from checkpoint.linux.procfs import Status
-from checkpoint.resources import Surroundings, glance, kinds, look, pipes_of, system_v_memory, unsupported
+from checkpoint.resources import (
+    Held,
+    Opened,
+    Surroundings,
+    glance,
+    kinds,
+    look,
+    pipes_of,
+    refused_threads,
+    sharing,
+    streams,
+    system_v_memory,
+    unsupported,
+)
 
+LOOKS: Final = 10
+"""How often a component whose processes come and go is looked at until it stays the same meanwhile."""
+LOOK_PAUSE_S: Final = 0.01
 COMMAND_LENGTH: Final = 200
 """Characters of a command line that a report shows."""
 
@@ -38,15 +57,97 @@ def _probe(pid: int, surroundings: Surroundings, files_kept: bool) -> Report:
     status = procfs.status(pid)
     unsupported.require_traceable(pid, status)
     _require_permission(pid, status)
-    held = look(glance(pid), surroundings)
+    kin, opened = _all_opened(pid, is_guarded=bool(surroundings.pipes))
+    looked = _looked(opened, pid, surroundings)
     findings = (
-        *_process_findings(pid, status, files_kept),
+        *_process_findings(pid, status, kin, files_kept),
         *_processor_findings(pid),
         *_memory_findings(pid),
-        *held.findings,
-        *kinds.findings_of_all(held.resources, standing=False),
+        *looked[pid].findings,
+        *kinds.findings_of_all([held for one in looked.values() for held in one.resources], standing=False),
+        *_others_findings(opened, pid, looked),
     )
     return Report(pid, _command(pid, status), status.resident_size, dirty.best_tracking(), findings)
+
+
+def reasons_of(pid: int, surroundings: Surroundings, *, files_kept: bool = False) -> tuple[str, ...]:
+    """Why a component cannot be captured, as far as it can be told without stopping it.
+
+    Raises:
+        ProbeError, ProcessGoneError: it cannot be looked at.
+    """
+    kin, opened = _all_opened(pid, is_guarded=bool(surroundings.pipes))
+    looked = _looked(opened, pid, surroundings)
+    others = [found.text for found in _others_findings(opened, pid, looked) if found.verdict == REFUSED]
+    of_first = unsupported.refuse_process(pid, procfs.status(pid), kin, files_kept=files_kept)
+    return (*looked[pid].reasons, *of_first, *others)
+
+
+def _all_opened(pid: int, *, is_guarded: bool) -> tuple[tuple[int, ...], sharing.OpenedByAll]:
+    """The processes of a component that live, and what they have open; again where some came or went meanwhile."""
+    stubborn: set[int] | None = None
+    for _ in range(LOOKS):
+        kin = _kin(pid, is_guarded=is_guarded)
+        opened = _opened(kin)
+        young = set(filter(_has_still_to_execute, kin[1:]))
+        stubborn = young if stubborn is None else stubborn & young
+        if kin == _kin(pid, is_guarded=is_guarded) and not young:
+            break
+        time.sleep(LOOK_PAUSE_S)
+    about_to = young - (stubborn or set())  # they will be what they are to be when somebody stops them
+    return tuple(one for one in kin if one not in about_to), {one: held for one, held in opened.items() if one not in about_to}
+
+
+def _has_still_to_execute(pid: int) -> bool:
+    """Whether a process has its parent's memory, as between vfork(2) and execve(2)."""
+    with contextlib.suppress(CheckpointError):
+        return bool(list(refused_threads.refuse_shared_memory(pid, procfs.status(pid))))
+    return False
+
+
+def _opened(kin: tuple[int, ...]) -> sharing.OpenedByAll:
+    """What each of these has open; one that ends meanwhile is left out, but for the first."""
+    found = {kin[0]: glance(kin[0])}
+    for pid in kin[1:]:
+        with contextlib.suppress(ProcessGoneError):
+            found[pid] = glance(pid)
+    return sharing.together(found) if len(found) > 1 else {kin[0]: Opened(found[kin[0]])}
+
+
+def _kin(pid: int, *, is_guarded: bool) -> tuple[int, ...]:
+    """The processes of a component that live, the first one first."""
+    found = [pid]
+    for other in kinship.others(pid, kinship.reaper_of(pid, is_guarded=is_guarded)):
+        with contextlib.suppress(CheckpointError):
+            if procfs.stat(other).state not in "ZX":
+                found.append(other)
+    return tuple(found)
+
+
+def _looked(opened: sharing.OpenedByAll, first: int, surroundings: Surroundings) -> dict[int, Held]:
+    """What each process has open, sorted into the kinds."""
+    around = replace(surroundings, pipes={**streams.of_first(opened[first], surroundings), **surroundings.pipes}, is_first=False)
+    return {pid: look(held, surroundings if pid == first else around) for pid, held in opened.items()}
+
+
+def _others_findings(opened: sharing.OpenedByAll, first: int, looked: Mapping[int, Held]) -> Iterator[Finding]:
+    """What stands against the processes besides the first; one that ends meanwhile does not."""
+    for pid, held in looked.items():
+        if pid == first:
+            continue
+        try:
+            status = procfs.status(pid)
+            reasons = [*held.reasons, *unsupported.refuse_process(pid, status, tuple(opened))]
+            smaps = procfs.read_text(pid, "smaps")
+            flags = vm_flags.parse(smaps)
+            lines = procfs.parse_maps(procfs.read_text(pid, "maps"))
+        except (CheckpointError, FileNotFoundError, ProcessLookupError):
+            continue
+        reasons += [why for line in lines if (why := unsupported.refuse_mapping(line, flags.get(line.start, ())))]
+        for reason in reasons:
+            yield Finding("process", f"pid {pid}", REFUSED, f"its process {pid} ({status.name}): {reason}")
+    for reason in sharing.refuse(opened):
+        yield Finding("process", "shared", REFUSED, reason)
 
 
 def surroundings_of(pid: int, streams: Streams | None, terms: Terms = NO_TERMS) -> Surroundings:
@@ -76,8 +177,8 @@ def _require_permission(pid: int, status: Status) -> None:
         ) from error
 
 
-def _process_findings(pid: int, status: Status, files_kept: bool) -> Iterator[Finding]:
-    for reason in unsupported.refuse_process(pid, status, files_kept=files_kept):
+def _process_findings(pid: int, status: Status, kin: tuple[int, ...], files_kept: bool) -> Iterator[Finding]:
+    for reason in unsupported.refuse_process(pid, status, kin, files_kept=files_kept):
         yield Finding("process", f"pid {pid}", REFUSED, reason)
     if status.ppid and len(status.pids) == 1:
         text = "its PID is kept where it is free on the other side: failover run gives a program a PID namespace of its own"

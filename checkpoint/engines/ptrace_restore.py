@@ -23,6 +23,7 @@ import os
 import resource
 import signal
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -69,12 +70,14 @@ class RestoredProgram:
     """A program that was brought back; see ``checkpoint.engine.Restored``.
 
     Attributes:
-        threads: all of it; they stand still for us until `resume`.
+        threads: all of its first process; they stand still for us until `resume`.
+        others: those of its other processes.
     """
 
     threads: Threads
     position: Position
     notes: tuple[str, ...]
+    others: tuple[Threads, ...] = ()
 
     @property
     def pid(self) -> int:
@@ -83,11 +86,14 @@ class RestoredProgram:
 
     def resume(self) -> None:
         """Let it go on, without us: all of its threads at once. Should we die halfway, it dies, too, or all of it goes on."""
+        everybody = (*self.others, self.threads)
         try:
-            for tracee in (*self.threads.others, self.threads.leader):
-                tracee.request("let go of", abi.PTRACE_SETOPTIONS, 0, 0)
+            for threads in everybody:
+                for tracee in (*threads.others, threads.leader):
+                    tracee.request("let go of", abi.PTRACE_SETOPTIONS, 0, 0)
         finally:
-            self.threads.thaw()
+            for threads in everybody:
+                threads.thaw()
 
 
 def restore(vessel_pid: int, state: Snapshot, options: RestoreOptions) -> RestoredProgram:
@@ -101,7 +107,11 @@ def restore(vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restor
     laid = laying.lay_down_for(state, vessel_pid, own_eyes=options.own_eyes)
     program, _ = remembered.renewed(program, laid.identities)
     try:
-        restored = _Restore(vessel_pid, program, options, brought).run()
+        restored = (
+            _run_tree(vessel_pid, program, options, brought)
+            if state.is_tree
+            else _run_one(vessel_pid, program, options, brought[0])
+        )
         restored.notes += laid.notes
         return restored
     except RestoreError:
@@ -110,40 +120,96 @@ def restore(vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restor
         raise RestoreError(f"cannot restore {state.component} into pid {vessel_pid}: {error}") from error
 
 
-class _Restore:
-    """One restore, from the seizing of the vessel to the program's own registers."""
+def _run_one(vessel_pid: int, state: Snapshot, options: RestoreOptions, brought: Brought) -> RestoredProgram:
+    restoring = ProcessRestore(Tracee(vessel_pid), state, options, brought)
+    try:
+        restoring.prepare()
+        restoring.build()
+        restoring.become_program()
+    except BaseException:
+        restoring.end()
+        raise
+    return RestoredProgram(restoring.held(), state.position, tuple(restoring.notes))
 
-    def __init__(self, vessel_pid: int, state: Snapshot, options: RestoreOptions, brought: Brought) -> None:
+
+def _run_tree(vessel_pid: int, state: Snapshot, options: RestoreOptions, brought: tuple[Brought, ...]) -> RestoredProgram:
+    from checkpoint.engines.restore_tree import TreeRestore
+
+    restoring = TreeRestore(vessel_pid, state, options, brought)
+    try:
+        restoring.run()
+    except BaseException:
+        restoring.end()
+        raise
+    first, *others = restoring.held()
+    return RestoredProgram(first, state.position, restoring.notes(), tuple(others))
+
+
+@dataclass(frozen=True, slots=True)
+class Estate:
+    """What a process of a component of several finds when it is born, and shares with others (`restore_tree`).
+
+    Attributes:
+        base, size: the stretch of addresses that is ours in all of them; the stub lies at its beginning.
+        descriptions: open files by their number in the snapshot: a descriptor of each.
+        objects: files without a name, by (device, inode): a descriptor of each.
+        anonymous: shared memory without a file, by the same: its address.
+    """
+
+    base: int
+    size: int
+    descriptions: Mapping[int, int]
+    objects: Mapping[tuple[int, int], int]
+    anonymous: Mapping[tuple[int, int], int]
+
+
+class ProcessRestore:
+    """The restore of one process, from the seizing of its vessel to the program's own registers.
+
+    Args:
+        state: of this process alone.
+        estate: None for a component of one process.
+    """
+
+    def __init__(
+        self, tracee: Tracee, state: Snapshot, options: RestoreOptions, brought: Brought, estate: Estate | None = None
+    ) -> None:
         self._state = state
         self._brought = brought
         self._executable: int | None = None
         self._options = options
+        self._estate = estate
         self._thread = state.threads[0]
-        self._tracee = Tracee(vessel_pid)
+        self._tracee = tracee
         self._others: list[tuple[Tracee, ThreadState]] = []
-        self._notes: list[str] = []
+        self.notes: list[str] = []
         self._objects: dict[tuple[int, int], int] = {}
         self._foreign: tuple[Vma, ...] = ()
         self._segments = system_v_memory.Segments()
         self._own_functions: tuple[vdso.Function, ...] = ()
 
-    def run(self) -> RestoredProgram:
-        try:
-            self._run()
-        except BaseException:
-            restore_threads.end(self._tracee, [tracee for tracee, _ in self._others])
-            self._segments.undo()
-            raise
+    def end(self) -> None:
+        """Kill what will be no program."""
+        restore_threads.end(self._tracee, [tracee for tracee, _ in self._others])
+        self._segments.undo()
+
+    def held(self) -> Threads:
+        """Its threads, standing still for us."""
         threads = Threads(self._tracee)
         threads.adopt(tuple(tracee for tracee, _ in self._others))
         threads.hold()
-        return RestoredProgram(threads, self._state.position, tuple(self._notes))
+        return threads
 
-    def _run(self) -> None:
+    def prepare(self) -> None:
+        """Seize a vessel that waits by itself."""
         tracee = self._tracee
         tracee.seize(OPTIONS)
         tracee.freeze()
         tracee.set_signal_mask(abi.ALL_SIGNALS & ~(1 << (signal.SIGTRAP - 1)))
+
+    def build(self) -> None:
+        """Everything but the registers."""
+        tracee = self._tracee
         vessel = look_at_vessel(tracee.pid)
         self._require_identity(vessel)
         if not vessel.may_choose_executable:
@@ -151,9 +217,14 @@ class _Restore:
         self._own_xstate = tracee.xstate()
         self._start_registers = tracee.registers()
         mappings = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
+        if self._estate is not None:
+            mappings = tuple(line for line in mappings if not self._is_estate(line))
         self._adapt(mappings)
         self._build_and_run(vessel, mappings)
-        self._become_program()
+
+    def _is_estate(self, line: procfs.MapsLine) -> bool:
+        assert self._estate is not None
+        return self._estate.base <= line.start < self._estate.base + self._estate.size
 
     def _adapt(self, mappings: tuple[procfs.MapsLine, ...]) -> None:
         """Have a program of another kernel use this one's vdso."""
@@ -193,9 +264,9 @@ class _Restore:
         state, tracee = self._state, self._tracee
         taken = [(line.start, line.end) for line in mappings] + [(vma.start, vma.end) for vma in state.vmas]
         self._segments.make(state.resources)
-        base = call_table.find_hole(taken, AREA_SIZE + REFUGE_SIZE)
+        base = self._estate.base if self._estate else call_table.find_hole(taken, AREA_SIZE + REFUGE_SIZE)
         kernel_pages = restore_memory.kernel_pages(mappings)
-        first = self._mappings_table(CallTable(base), vessel, mappings, base + AREA_SIZE)
+        first = self._mappings_table(CallTable(base, descriptors=self._inherited()), vessel, mappings, base + AREA_SIZE)
         second = self._state_table(CallTable(base, descriptors=set(first.descriptors)), vessel)
         third = self._rights_table(CallTable(base, descriptors=set(second.descriptors)), vessel)
         tables = [self._thread_table(CallTable(base), thread, vessel) for thread in self._state.threads[1:]]
@@ -204,24 +275,30 @@ class _Restore:
             raise RestoreError(
                 f"cannot restore: its {len(state.vmas)} mappings need {size >> 20} MiB of calls; the limit is 64 MiB"
             )
-        self._area_size = size
         stub = Stub(tracee, base)
-        stub.install(self._syscall_instruction(kernel_pages[-1].start, kernel_pages[-1].size), size)
-        self._notes += stub.run(first)
+        if self._estate is None:
+            stub.install(self._syscall_instruction(kernel_pages[-1].start, kernel_pages[-1].size), size)
+        self._area_size = self._estate.size if self._estate else size
+        self.notes += stub.run(first)
         self._segments.attached()
-        self._notes += self._segments.notes
+        self.notes += self._segments.notes
         restore_memory.fill(tracee.memory, state)
         if self._own_functions:
             self._leave_old_vdso()
             tracee.memory.write_each(restore_vdso.jumps(state, self._vdso, self._own_functions))
         if self._options.epoch:
             _renew_token(tracee, state, self._options.epoch)
-        self._notes += stub.run(second)
+        self.notes += stub.run(second)
         self._start_threads(base, tables)
-        self._notes += stub.run(third)
+        self.notes += stub.run(third)
         self._stub = stub
-        _write_oom_score(tracee.pid, state.process.oom_score_adj, self._notes)
-        _write_coredump_filter(tracee.pid, state.process.coredump_filter, self._notes)
+        _write_oom_score(tracee.pid, state.process.oom_score_adj, self.notes)
+        _write_coredump_filter(tracee.pid, state.process.coredump_filter, self.notes)
+
+    def _inherited(self) -> set[int]:
+        """Descriptors that the vessel has."""
+        shared = {*self._estate.descriptions.values(), *self._estate.objects.values()} if self._estate else set()
+        return {0, 1, 2} | shared
 
     def _leave_old_vdso(self) -> None:
         """Lead whatever thread stands in the middle of another kernel's vdso out of it."""
@@ -252,6 +329,8 @@ class _Restore:
         if self._options.own_eyes:
             restore_process.own_eyes(table, self._state.process, vessel)
         restore_process.make_directories(table, restore_checks.missing_directories(self._state))
+        if self._estate is not None:
+            restore_process.begin_member(table)
         restore_memory.clear(table, mappings)
         ours, theirs = restore_memory.kernel_pages(mappings), restore_memory.kernel_pages_of(vmas)
         self._vdso = restore_memory.move_kernel_pages(table, ours, theirs, refuge)
@@ -259,7 +338,9 @@ class _Restore:
         restore_kinds.allocate_keys(table, restore_kinds.keys_of(self._state))
         attached = [vma for vma in vmas if system_v_memory.is_segment(vma)]
         system_v_memory.attach(table, attached, self._segments.ids, system_v_memory.sizes_of(self._state.resources))
-        self._objects |= restore_memory.map_program(table, vmas, runs, brought)
+        inherited = (self._estate.objects, self._estate.anonymous) if self._estate else ({}, {})
+        self._objects |= restore_memory.map_program(table, vmas, runs, brought, *inherited)
+        self._objects |= inherited[0]
         self._executable = brought.pop(self._state.process.executable.path, None)
         for descriptor in brought.values():
             table.close(descriptor)
@@ -275,7 +356,7 @@ class _Restore:
             if content is not None and held.kind == files.KIND and key not in self._objects:
                 self._objects[key] = table.open(content, flags)
         elsewhere = sorted({**self._brought.run, **self._brought.opened})
-        self._notes += [f"{path} is not this machine's: the program goes on with what was brought of it" for path in elsewhere]
+        self.notes += [f"{path} is not this machine's: the program goes on with what was brought of it" for path in elsewhere]
         return run
 
     def _state_table(self, table: CallTable, vessel: Vessel) -> CallTable:
@@ -284,7 +365,15 @@ class _Restore:
         restore_process.memory_layout(
             table, process, with_executable=vessel.may_choose_executable, brought=self._executable
         )  # before the program's own descriptors take their numbers
-        self._notes += rebuild_all(table, self._state, self._options, vessel.inner_pid, self._objects, vessel.pid)
+        self.notes += rebuild_all(
+            table,
+            self._state,
+            self._options,
+            vessel.inner_pid,
+            self._objects,
+            vessel.pid,
+            self._estate.descriptions if self._estate else None,
+        )
         restore_process.signal_actions(table, process.signal_actions)
         restore_process.thread_marks(table, thread)
         restore_process.enter_directory(table, process.working_directory, deleted_directory(self._state))
@@ -299,8 +388,8 @@ class _Restore:
         process = state.process
         memory_locks.rebuild(table, state.resources)  # which takes a right, or a limit
         restore_process.scheduling(table, thread, vessel)
-        self._notes += restore_process.limits(table, process, vessel)
-        self._notes += restore_process.rights(table, process, vessel)
+        self.notes += restore_process.limits(table, process, vessel)
+        self.notes += restore_process.rights(table, process, vessel)
         restore_process.pending_signals(table, process, vessel.inner_pid)
         restore_process.pending_of_thread(table, process, thread, vessel.inner_pid, vessel.inner_pid)
         restore_process.posix_timers(table, process, state.threads, vessel, elapsed_ns)
@@ -326,9 +415,9 @@ class _Restore:
             born = restore_threads.spawn(self._tracee, self._start_registers, base, thread.tid)
             self._others.append((born, thread))
         for (tracee, _), table in zip(self._others, tables, strict=True):
-            self._notes += Stub(tracee, base).run(table)
+            self.notes += Stub(tracee, base).run(table)
 
-    def _become_program(self) -> None:
+    def become_program(self) -> None:
         """SIGTRAP's action, our area gone, then the program's own registers and masks."""
         tracee, state = self._tracee, self._state
         instruction = self._syscall_instruction(self._vdso, self._vdso_size)

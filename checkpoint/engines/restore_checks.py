@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from checkpoint import portable
+from checkpoint import portable, tree
 from checkpoint.arch import x86_64, x86_64_xstate
 from checkpoint.arch.x86_64_xstate import Layout
 from checkpoint.capability import Area, by_rule, refused
@@ -108,8 +108,8 @@ class Brought:
     opened: Mapping[str, str] = field(default_factory=dict)
 
 
-def require(state: Snapshot, options: RestoreOptions, vessel_pid: int) -> Brought:
-    """Refuse a snapshot that cannot come back here; answers with what must come from elsewhere than its own path.
+def require(state: Snapshot, options: RestoreOptions, vessel_pid: int) -> tuple[Brought, ...]:
+    """Refuse a snapshot that cannot come back here; answers with what must come from elsewhere than its own path, by process.
 
     Args:
         vessel_pid: what is to become the program; it, we and our forebears may hold files that the program writes to.
@@ -117,12 +117,16 @@ def require(state: Snapshot, options: RestoreOptions, vessel_pid: int) -> Brough
     Raises:
         MismatchError: with one reason for each difference.
     """
-    reasons, brought = _compare(state, options)
-    reasons = (*reasons, *_of_writers(state, options, vessel_pid))
+    reasons: list[str] = []
+    brought = []
+    for view in tree.views(state):
+        differing, one = _compare(view, options)
+        reasons += (*differing, *_of_writers(view, options, vessel_pid))
+        brought.append(one)
     if reasons:
-        listed = "; ".join(reasons)
-        raise MismatchError(f"cannot restore {state.component} here: {listed}", reasons)
-    return brought
+        each = tuple(dict.fromkeys(reasons))
+        raise MismatchError(f"cannot restore {state.component} here: {'; '.join(each)}", each)
+    return tuple(brought)
 
 
 def _compare(state: Snapshot, options: RestoreOptions) -> tuple[tuple[str, ...], Brought]:

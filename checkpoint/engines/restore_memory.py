@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -87,17 +88,29 @@ def _move(table: CallTable, start: int, target: int, size: int) -> None:
     )
 
 
+Object = tuple[int, int]
+"""Device and inode number of a file without a name, or of shared memory."""
+
+
 def map_program(
-    table: CallTable, vmas: Iterable[Vma], runs: Sequence[PageRun], brought: Mapping[str, int]
-) -> dict[tuple[int, int], int]:
+    table: CallTable,
+    vmas: Iterable[Vma],
+    runs: Sequence[PageRun],
+    brought: Mapping[str, int],
+    inherited: Mapping[Object, int] = MappingProxyType({}),
+    anonymous: Mapping[Object, int] = MappingProxyType({}),
+) -> dict[Object, int]:
     """Map everything that the program had, but for attached segments; what will be filled is writable for now.
 
     Answers with a descriptor of each shared object without a name, by (device, inode): open files may be of the same one.
 
     Args:
         brought: descriptors of what is mapped in place of this machine's files, by path; they stay open.
+        inherited: those that are there already: a descriptor of each, which is left as it is.
+        anonymous: shared memory that is there already: where it is mapped whole.
     """
     carried = Carried(runs)
+    vmas = tuple(vmas)
     mapped = [vma for vma in vmas if vma.kind not in KERNEL_KINDS and not system_v_memory.is_segment(vma)]
     files = [vma for vma in mapped if is_file_mapping(vma)]
     for (path, writable), group in groupby(sorted(files, key=_file_order), key=_file_order):
@@ -114,12 +127,33 @@ def map_program(
             _map(table, vma, _first_protection(vma, carried), descriptor)
         table.close(descriptor)
     objects = [vma for vma in mapped if is_object_mapping(vma)]
-    made = {key: _make_object(table, list(group)) for key, group in groupby(sorted(objects, key=_object), key=_object)}
+    made = {
+        key: make_object(table, list(group))
+        for key, group in groupby(sorted(objects, key=object_of), key=object_of)
+        if key not in inherited
+    }
     for vma in objects:
-        _map(table, vma, _first_protection(vma, carried), made[_object(vma)])
-    for piece in joined_shared(vma for vma in mapped if not is_file_mapping(vma) and not is_object_mapping(vma)):
+        key = object_of(vma)
+        _map(table, vma, _first_protection(vma, carried), inherited[key] if key in inherited else made[key])
+    for vma in mapped:
+        if is_anonymous_object(vma) and object_of(vma) in anonymous:
+            _map_again(table, vma, anonymous[object_of(vma)])
+    others = (vma for vma in mapped if not is_file_mapping(vma) and not is_object_mapping(vma))
+    for piece in joined_shared(vma for vma in others if not (is_anonymous_object(vma) and object_of(vma) in anonymous)):
         _map(table, piece, _first_protection(piece, carried), -1)
     return made
+
+
+def is_anonymous_object(vma: Vma) -> bool:
+    """Whether it is shared memory without a file, of which it is told which: other processes may have it, too."""
+    return vma.kind is VmaKind.ANONYMOUS and vma.shared and vma.file is not None
+
+
+def _map_again(table: CallTable, vma: Vma, whole: int) -> None:
+    """Map a part of shared memory once more. Source: mremap(2): an old size of zero makes a second mapping of the same pages."""
+    what = f"map {vma.size >> 10} KiB of shared memory at {vma.start:#x}"
+    arguments = (whole + vma.offset, 0, vma.size, MREMAP_MAYMOVE_FIXED, vma.start)
+    table.call(what, "mremap", *arguments, least=vma.start, most=vma.start)
 
 
 def _make_shared_memory(table: CallTable, vma: Vma) -> int:
@@ -151,12 +185,12 @@ def is_object_mapping(vma: Vma) -> bool:
     return is_named_nowhere and vma.shared and not restore_kinds.is_huge(vma)
 
 
-def _object(vma: Vma) -> tuple[int, int]:
+def object_of(vma: Vma) -> tuple[int, int]:
     assert vma.file is not None
     return vma.file.device, vma.file.inode
 
 
-def _make_object(table: CallTable, vmas: Sequence[Vma]) -> int:
+def make_object(table: CallTable, vmas: Sequence[Vma]) -> int:
     """Make what they are mappings of, long enough for all; its content is written through them."""
     file = vmas[0].file
     assert file is not None

@@ -330,13 +330,22 @@ def surroundings(table: CallTable, process: ProcessState) -> None:
     table.call("set the umask", "umask", process.umask)
     table.call("set the execution domain", "personality", process.personality)
     if process.sid == process.pid:
-        table.attempt("", "setsid")
+        table.attempt("", "setsid")  # of several processes each has come to its session when it was born (`births`)
     elif process.pgid == process.pid:
         table.attempt("", "setpgid", 0, 0)
     if process.child_subreaper:
         table.call("become a subreaper", "prctl", abi.PR_SET_CHILD_SUBREAPER, 1)
     if process.thp_disabled:
         table.call("switch huge pages off", "prctl", abi.PR_SET_THP_DISABLE, 1)
+
+
+def begin_member(table: CallTable) -> None:
+    """One process of several: what the end of others has sent it is forgotten, and it ends with its parent until it is complete.
+
+    Source: do_sigaction() in kernel/signal.c: setting an action that ignores a signal forgets those that are pending.
+    """
+    table.call("forget whose end was told", "rt_sigaction", signal.SIGCHLD, table.place(bytes(32)), 0, abi.SIGSET_SIZE)
+    table.call("end with the parent", "prctl", abi.PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def raise_limits(table: CallTable, vessel: Vessel) -> None:

@@ -31,6 +31,7 @@ CLONE_SYSVSEM: Final = 0x40000
 FLAGS: Final = CLONE_VM | CLONE_FS | CLONE_FILES | CLONE_SIGHAND | CLONE_THREAD | CLONE_SYSVSEM
 """What pthread_create(3) shares; what it sets (thread-local storage, addresses for its id) comes with registers and table."""
 
+PTRACE_EVENT_FORK: Final = 1
 _ARGUMENTS: Final = struct.Struct("<10Q")
 """struct clone_args of linux/sched.h, as far as set_tid_size: the ids wanted are a list of their own."""
 
@@ -45,24 +46,45 @@ def spawn(leader: Tracee, registers: bytes, base: int, tid: int) -> Tracee:
     Raises:
         RestoreError: that id cannot be had.
     """
-    place = base + abi.PAGE_SIZE
-    wanted = place + _ARGUMENTS.size
-    leader.memory.write(place, _ARGUMENTS.pack(FLAGS, 0, 0, 0, 0, 0, 0, 0, wanted, 1) + struct.pack("<i", tid))
-    instruction = base + x86_64_stub.CALL_LOOP.index(x86_64.SYSCALL)
-    call = x86_64_stub.SYSTEM_CALLS["clone3"], (place, _ARGUMENTS.size)
-    leader.set_registers(x86_64_stub.at_call(registers, instruction, *call))
-    born = 0
-    for _ in ("entry", "birth or exit"):
-        leader.request("step", abi.PTRACE_SYSCALL)
-        if leader.wait(call_table.RUN_TIMEOUT_S).event == abi.PTRACE_EVENT_CLONE:
-            born = _born(leader)
-            leader.request("step", abi.PTRACE_SYSCALL)
-            leader.wait(call_table.RUN_TIMEOUT_S)
-    if not born:
-        raise RestoreError(f"cannot restore its thread {tid}: {_reason(-x86_64_stub.call_result(leader.registers()))}")
-    thread = Tracee(born, leader.memory)
+    thread = Tracee(_birth(leader, registers, base, (FLAGS, 0, tid), f"thread {tid}"), leader.memory)
     thread.wait(call_table.RUN_TIMEOUT_S)
     return thread
+
+
+def spawn_process(parent: Tracee, registers: bytes, base: int, pid: int, exit_signal: int) -> Tracee:
+    """Have a process give birth to one with the id ``pid``; it stands still at its first instruction. As `spawn`.
+
+    Args:
+        exit_signal: what the parent is sent when it ends.
+    """
+    process = Tracee(_birth(parent, registers, base, (0, exit_signal, pid), f"process {pid}"))
+    process.wait(call_table.RUN_TIMEOUT_S)
+    return process
+
+
+def _birth(parent: Tracee, registers: bytes, base: int, wanted: tuple[int, int, int], what: str) -> int:
+    """The id, as we see it, of who was born.
+
+    Args:
+        wanted: flags of clone3(2), exit signal, id.
+    """
+    place = base + abi.PAGE_SIZE
+    flags, exit_signal, tid = wanted
+    arguments = _ARGUMENTS.pack(flags, 0, 0, 0, exit_signal, 0, 0, 0, place + _ARGUMENTS.size, 1)
+    parent.memory.write(place, arguments + struct.pack("<i", tid))
+    instruction = base + x86_64_stub.CALL_LOOP.index(x86_64.SYSCALL)
+    call = x86_64_stub.SYSTEM_CALLS["clone3"], (place, _ARGUMENTS.size)
+    parent.set_registers(x86_64_stub.at_call(registers, instruction, *call))
+    born = 0
+    for _ in ("entry", "birth or exit"):
+        parent.request("step", abi.PTRACE_SYSCALL)
+        if parent.wait(call_table.RUN_TIMEOUT_S).event in (abi.PTRACE_EVENT_CLONE, PTRACE_EVENT_FORK):
+            born = _born(parent)
+            parent.request("step", abi.PTRACE_SYSCALL)
+            parent.wait(call_table.RUN_TIMEOUT_S)
+    if not born:
+        raise RestoreError(f"cannot restore its {what}: {_reason(-x86_64_stub.call_result(parent.registers()))}")
+    return born
 
 
 def _born(leader: Tracee) -> int:

@@ -21,7 +21,7 @@ from checkpoint.linux.remote import Answers
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.timers import parse_timers
 from checkpoint.model import Rseq
-from checkpoint.resources import OpenFile, gather, with_contents
+from checkpoint.resources import Opened, OpenFile, gather, with_contents
 from checkpoint.stream_counts import Totals
 
 NOTHING_WRITTEN: Final[Totals] = (0, 0)
@@ -132,8 +132,12 @@ class Onlooker:
         others = self._others.places()
         return Place(registers, mask, special, pending, shared_pending, rseq, status, others)
 
-    def ask(self, place: Place, outputs: Outputs | None) -> Standing:
-        """Everything else. Its system calls are made inside the process: the memory has been taken before."""
+    def ask(self, place: Place, outputs: Outputs | None, opened: Opened | None = None) -> Standing:
+        """Everything else. Its system calls are made inside the process: the memory has been taken before.
+
+        Args:
+            opened: what it has open, if that is known already.
+        """
         tracee = self._tracee
         inquiry = self._questions(place.special)
         answers = self._borrowed.run(tracee, inquiry.batch, arch.encode_registers(place.registers), place.mask)
@@ -152,7 +156,7 @@ class Onlooker:
             inquiry=inquiry,
             answers=answers,
             waiting=waiting,
-            opened=with_contents(gather(tracee.pid), self._borrowed.noted, self._devices),
+            opened=with_contents(gather(tracee.pid) if opened is None else opened, self._borrowed.noted, self._devices),
             totals=outputs.totals() if outputs else NOTHING_WRITTEN,
         )
 

@@ -302,6 +302,8 @@ class Stat:
 
     Attributes:
         state: one letter, as `Status.state`.
+        exit_signal: what its parent is sent when it ends.
+        exit_code: of one that has ended: as wait(2) tells it.
     """
 
     name: str
@@ -321,6 +323,9 @@ class Stat:
     arg_end: int
     env_start: int
     env_end: int
+    ppid: int
+    exit_signal: int
+    exit_code: int
 
 
 PF_EXITING: Final = 0x00000004
@@ -356,6 +361,9 @@ def parse_stat(text: str) -> Stat:
         arg_end=field(49),
         env_start=field(50),
         env_end=field(51),
+        ppid=field(4),
+        exit_signal=field(38),
+        exit_code=field(52),
     )
 
 

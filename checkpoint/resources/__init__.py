@@ -29,14 +29,35 @@ GLANCES_MORE: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
+class Kin:
+    """The processes of one component, and what they have among them.
+
+    Attributes:
+        pids: of all; none if there is but one.
+        sockets: inode numbers of all their sockets.
+        pipes: as /proc names them, those of which both ends are theirs.
+    """
+
+    pids: frozenset[int] = frozenset()
+    sockets: frozenset[int] = frozenset()
+    pipes: frozenset[str] = frozenset()
+
+
+ALONE: Final = Kin()
+
+
+@dataclass(frozen=True, slots=True)
 class OpenFile:
     """One open file description and every descriptor that shares it, lowest number first.
 
     Attributes:
         content: what waits in a pipe, read while the process stood still; None where that was not needed.
         capacity: of a pipe, in bytes.
-        both_ends: of a pipe: the process itself has another descriptor for its other end.
+        both_ends: of a pipe: the process itself has another descriptor for its other end, or nobody has.
         observed: facts that only the process standing still could tell, as its kind's ``observe`` found them.
+        kin: the other processes of its component.
+        description: the number of an open file that several processes of a component share (`sharing`); 0: it is this one's.
+        is_echo: another process of the component has told of it already.
     """
 
     pid: int
@@ -45,6 +66,9 @@ class OpenFile:
     capacity: int = 0
     both_ends: bool = False
     observed: Mapping[str, Fact] = field(default_factory=dict)
+    kin: Kin = ALONE
+    description: int = 0
+    is_echo: bool = False
 
     @property
     def first(self) -> Descriptor:
@@ -67,12 +91,14 @@ class Surroundings:
     """What the kinds must know about the process's guard.
 
     Attributes:
-        pipes: "pipe:[123]" or a terminal's path → stream 1 or 2, of a component under a guard.
+        pipes: "pipe:[123]" or a terminal's path → stream 0, 1 or 2: of a component under a guard, or what its first process has.
         devices: what the operator wants to become of devices.
+        is_first: it is about the first process of a component.
     """
 
     pipes: Mapping[str, int] = field(default_factory=dict)
     devices: tuple[DeviceRule, ...] = ()
+    is_first: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,17 +201,24 @@ def with_contents(opened: Opened, noted: Noted | None, rules: tuple[DeviceRule, 
 
     found = []
     for held in opened:
-        if rules and attached_devices.is_ruled(held.first, rules):
+        if held.is_echo:
+            pass
+        elif rules and attached_devices.is_ruled(held.first, rules):
             held = replace(held, observed=attached_devices.observe(held, opened))
         elif observe := kinds.observer_of(held.first, noted):
             held = replace(held, observed=observe(held, opened))
         elif files.must_carry(held):
             held = replace(held, observed=files.observe_deleted(held, opened))
-        elif pipes.is_pipe(held.first) and held.both_ends:
+        elif pipes.is_pipe(held.first) and (held.both_ends or (_may_be_half(held) and pipes.is_half(held))):
             capacity, content = pipes.look_into(held)
-            held = replace(held, capacity=capacity, content=content)
+            held = replace(held, both_ends=True, capacity=capacity, content=content)
         found.append(held)
     return tuple(found)
+
+
+def _may_be_half(held: OpenFile) -> bool:
+    """Whether it is worth asking: the standard streams of a program that is by itself lead elsewhere."""
+    return bool(held.kin.pids) or held.first.number not in (0, *STREAM_NUMBERS)
 
 
 def glance(pid: int) -> tuple[OpenFile, ...]:
@@ -211,7 +244,7 @@ def _is_still_there(held: OpenFile) -> bool:
 
 
 def _glanced(pid: int) -> tuple[OpenFile, ...]:
-    from checkpoint.resources import kinds
+    from checkpoint.resources import kinds, pipes
 
     opened = gather(pid)
     found = []
@@ -219,6 +252,8 @@ def _glanced(pid: int) -> tuple[OpenFile, ...]:
         if observe := kinds.observer_of(held.first, None):
             with contextlib.suppress(CaptureError):  # closed meanwhile
                 held = replace(held, observed=observe(held, opened))
+        elif pipes.is_pipe(held.first) and not held.both_ends and pipes.is_half(held):
+            held = replace(held, both_ends=True)
         found.append(held)
     return tuple(found)
 
@@ -232,12 +267,23 @@ def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
 
     resources, findings = [], []
     for held in opened:
+        of_any = locks.refuse(held) or (None if held.is_echo else signalling.refuse(held))
         for kind in kinds.ASKED:
-            if reason := kind.refuse(held, surroundings) or signalling.refuse(held) or locks.refuse(held):
+            if reason := kind.refuse(held, surroundings) or of_any:
                 findings.append(Finding(kind.KIND, held.name, REFUSED, reason))
                 break
             if resource := kind.describe(held, surroundings):
-                resources.append(replace(resource, facts={**resource.facts, **signalling.describe(held), **locks.describe(held)}))
+                resources.append(replace(resource, facts={**resource.facts, **_of_every_kind(held, resource)}))
                 findings.append(Finding(kind.KIND, held.name, KEPT, f"{held.name} is {held.first.target}"))
                 break
     return Held(tuple(resources), tuple(findings))
+
+
+def _of_every_kind(held: OpenFile, resource: Resource) -> dict[str, Fact]:
+    """Facts that any kind may have."""
+    from checkpoint.resources import locks, shared, signalling, streams
+
+    if resource.kind == shared.KIND:
+        return locks.describe(held, kinds=locks.OF_PROCESSES)
+    facts = {**signalling.describe(held), **locks.describe(held)}
+    return facts | ({"description": held.description} if held.description and resource.kind != streams.KIND else {})

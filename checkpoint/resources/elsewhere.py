@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import Final
 
@@ -28,6 +28,10 @@ CAPABILITIES: Final = (
     ),
 )
 
+AGE_NS: Final = 1_000_000_000
+"""How old a census may be: it costs some ten milliseconds."""
+KIN_AGE_NS: Final = 5_000_000_000
+"""The same while several processes stand still: `look_around` came before."""
 PRIVATE_KNOWN: Final = 8192
 """Open files remembered as held by nobody else."""
 
@@ -41,7 +45,9 @@ class _HeldElsewhereError(Exception):
 
 
 def holder_of(held: OpenFile) -> int | None:
-    """Another process that has the same open file; None where there is none, or none that we may look at."""
+    """Another process, not of the same component, that has the same open file; None where there is none that we may look at."""
+    if held.kin.pids:
+        return _holder_besides(held)
     try:
         _require_private(held.pid, held.first.number, held.first.target)
     except _HeldElsewhereError as error:
@@ -49,9 +55,37 @@ def holder_of(held: OpenFile) -> int | None:
     return None
 
 
+def _holder_besides(held: OpenFile) -> int | None:
+    for other, number in _others(held):
+        if abi.kcmp(held.pid, other, abi.KCMP_FILE, held.first.number, number) == 0:
+            return other
+    return None
+
+
+def _others(held: OpenFile, name: str = "") -> Iterator[tuple[int, int]]:
+    """Who else had something of the same name, or of another, open when we last looked, and still has."""
+    name = name or held.first.target
+    age_ns, asker = (KIN_AGE_NS, 0) if held.kin.pids else (AGE_NS, held.pid)
+    for other, number in CENSUS.holders(name, age_ns, asker):
+        if other != held.pid and other not in held.kin.pids and _target(other, number) == name:
+            yield other, number
+
+
+def _target(pid: int, number: int) -> str:
+    try:
+        return os.readlink(f"/proc/{pid}/fd/{number}")
+    except OSError:
+        return ""
+
+
+def has_end(held: OpenFile) -> bool:
+    """Whether a process of no component of ours holds an end of a pipe; one born within the last second may be missed."""
+    return next(_others(held), None) is not None
+
+
 def opener_of(held: OpenFile) -> int | None:
     """Another process that has a file of the same name open; what was opened in the last second may be missed."""
-    return next((other for other, _ in _holders(held.pid, _second()).get(held.first.target, ())), None)
+    return next((other for other, _ in _others(held)), None)
 
 
 def opener_at(held: OpenFile, name: str, place: tuple[int, int]) -> int | None:
@@ -60,7 +94,7 @@ def opener_at(held: OpenFile, name: str, place: tuple[int, int]) -> int | None:
     Args:
         place: its device and inode number.
     """
-    for other, number in _holders(held.pid, _second()).get(name, ()):
+    for other, number in _others(held, name):
         with contextlib.suppress(OSError):  # closed meanwhile
             about = os.stat(f"/proc/{other}/fd/{number}")
             if (about.st_dev, about.st_ino) == place:
@@ -77,28 +111,43 @@ def refuse(held: OpenFile, what: str) -> str | None:
 
 @lru_cache(maxsize=PRIVATE_KNOWN)
 def _require_private(pid: int, number: int, target: str) -> None:
-    for other, its_number in _holders(pid, _second()).get(target, ()):
-        if abi.kcmp(pid, other, abi.KCMP_FILE, number, its_number) == 0:
+    for other, its_number in CENSUS.holders(target, asker=pid):
+        if other != pid and abi.kcmp(pid, other, abi.KCMP_FILE, number, its_number) == 0:
             raise _HeldElsewhereError(other)
 
 
-def _second() -> int:
-    return time.monotonic_ns() // 1_000_000_000
+class _Census:
+    """What all processes but ours have open: (process, number) by the kernel's name for it."""
+
+    def __init__(self) -> None:
+        self._taken_ns = 0
+        self._asker = 0
+        self._found: dict[str, list[tuple[int, int]]] = {}
+
+    def holders(self, target: str, age_ns: int = AGE_NS, asker: int = 0) -> list[tuple[int, int]]:
+        """Who had it, as far back as is allowed.
+
+        Args:
+            asker: about which process it is asked: another one than last time takes a census of its own; 0: of several.
+        """
+        now_ns = time.monotonic_ns()
+        if not self._taken_ns or now_ns - self._taken_ns > age_ns or (asker and asker != self._asker):
+            self._asker = asker
+            self._found = {}
+            for other in os.listdir("/proc"):
+                if other.isdigit() and int(other) != os.getpid():
+                    for number, name in _descriptors(other):
+                        self._found.setdefault(name, []).append((int(other), number))
+            self._taken_ns = now_ns
+        return self._found.get(target, [])
 
 
-@lru_cache(maxsize=1)
-def _holders(pid: int, second: int) -> Mapping[str, list[tuple[int, int]]]:
-    """What all other processes have open: (process, number) by the kernel's name for it.
+CENSUS: Final = _Census()
 
-    Args:
-        second: of our clock; all that is asked within one second looks once.
-    """
-    found: dict[str, list[tuple[int, int]]] = {}
-    for other in os.listdir("/proc"):
-        if other.isdigit() and int(other) not in (pid, os.getpid()):
-            for number, target in _descriptors(other):
-                found.setdefault(target, []).append((int(other), number))
-    return found
+
+def look_around() -> None:
+    """Take the census now if it is old, so that nobody has to while a program stands still."""
+    CENSUS.holders("")
 
 
 def _descriptors(pid: str) -> Iterator[tuple[int, str]]:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Iterator, Mapping, Sequence
-from functools import lru_cache
 from itertools import islice
 from typing import Final
 
@@ -286,8 +285,19 @@ class _ChangedError(Exception):
     """The path leads to another version of the file."""
 
 
-@lru_cache(maxsize=DIGESTS_KEPT)
 def _digest(path: str, version: tuple[int, int, int, int]) -> bytes:
+    """The same file may be reached by many paths: through the descriptors of every process that has it open."""
+    if version not in _digests:
+        if len(_digests) >= DIGESTS_KEPT:
+            _digests.pop(next(iter(_digests)))
+        _digests[version] = _digested(path, version)
+    return _digests[version]
+
+
+_digests: Final[dict[tuple[int, int, int, int], bytes]] = {}
+
+
+def _digested(path: str, version: tuple[int, int, int, int]) -> bytes:
     with open(path, "rb") as file:
         about = os.fstat(file.fileno())
         if (about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns) != version:

@@ -17,7 +17,7 @@ import fcntl
 import os
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
@@ -43,6 +43,8 @@ F_OFD_SETLK: Final = 37
 F_SETLEASE: Final = 1024
 KINDS: Final = ("FLOCK", "POSIX", "OFDLCK")
 LEASE: Final = "LEASE"
+OF_PROCESSES: Final = ("POSIX",)
+"""Those that a process has for itself; the others belong to an open file, whoever shares it."""
 _TYPES: Final = {"READ": fcntl.F_RDLCK, "WRITE": fcntl.F_WRLCK, "UNLCK": fcntl.F_UNLCK}
 
 _LOCK: Final = re.compile(r"^lock:\s*\d+: (\w+)\s+(\w+)\s+(\w+)\s+-?\d+ \S+ (\d+) (\d+|EOF)$", re.MULTILINE)
@@ -50,14 +52,15 @@ _FLOCK: Final = struct.Struct("<hh4xqqi4x")
 """struct flock of fcntl(2)."""
 
 
-def describe(held: OpenFile) -> dict[str, Fact]:
+def describe(held: OpenFile, kinds: Collection[str] = (*KINDS, LEASE)) -> dict[str, Fact]:
     """The fact of one open file; none where it has no lock."""
     locks: list[Fact] = [
         [kind, int(mode == "WRITE"), int(first), 0 if last == "EOF" else int(last) - int(first) + 1]
         for kind, _, mode, first, last in _locks(held)
-        if kind != LEASE
+        if kind in kinds and kind != LEASE
     ]
-    locks += ([LEASE, *_lease(held, advice, mode), 0] for kind, advice, mode, *_ in _locks(held) if kind == LEASE)
+    if LEASE in kinds:
+        locks += ([LEASE, *_lease(held, advice, mode), 0] for kind, advice, mode, *_ in _locks(held) if kind == LEASE)
     return {"locks": locks} if locks else {}
 
 

@@ -16,19 +16,19 @@ import ctypes
 import errno
 import fcntl
 import os
+import select
 import stat
 import termios
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError
 from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
-from checkpoint.linux.descriptors import Descriptor
+from checkpoint.linux.descriptors import Descriptor, copy_of
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings
+from checkpoint.resources import OpenFile, Surroundings, elsewhere
 from checkpoint.resources.rebuilding import number_of
 
 KIND: Final = "pipes"
@@ -49,8 +49,6 @@ F_SETPIPE_SZ: Final = 1031
 F_GETPIPE_SZ: Final = 1032
 SPLICE_F_NONBLOCK: Final = 2
 DEFAULT_CAPACITY: Final = 65536
-PIPES_KNOWN: Final = 1024
-"""Pipes remembered as held by nobody else: others can only get hold of one by a fork or a socket, which are refused."""
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _libc.tee.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_size_t, ctypes.c_uint)
@@ -81,7 +79,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return f"{what} in packet mode, which is not kept: let the program use an ordinary one"
     if not held.both_ends:
         return f"{what} to somebody else: only pipes of which the program holds both ends are kept; redirect it to a file"
-    if held_elsewhere(held.pid, held.first.target):
+    if elsewhere.has_end(held):
         return f"{what} that another process holds too: protect the program when that has ended"
     return None
 
@@ -96,28 +94,18 @@ def writes(one: Descriptor) -> bool:
     return one.flags & os.O_ACCMODE == os.O_WRONLY
 
 
-@lru_cache(maxsize=PIPES_KNOWN)
-def held_elsewhere(pid: int, target: str) -> bool:
-    """Whether another process that we may look at holds an end of a pipe.
+def is_half(held: OpenFile) -> bool:
+    """Whether nobody has the other end of a pipe any more.
 
-    Args:
-        target: its name in /proc/PID/fd.
+    Source: pipe(7): POLLHUP for a reader without writers, POLLERR for a writer without readers.
     """
-    return any(other.isdigit() and int(other) != pid and target in _targets(other) for other in os.listdir("/proc"))
-
-
-def _targets(pid: str) -> set[str]:
-    found = set()
     try:
-        with os.scandir(f"/proc/{pid}/fd") as entries:
-            for entry in entries:
-                try:
-                    found.add(os.readlink(entry.path))
-                except OSError:  # closed meanwhile
-                    continue
-    except OSError:  # ended meanwhile, or another user's
-        return found
-    return found
+        with copy_of(held.pid, held.first.number) as pipe:
+            asked = select.poll()
+            asked.register(pipe, 0)
+            return bool(asked.poll(0))
+    except OSError:
+        return False  # closed meanwhile
 
 
 def look_into(held: OpenFile) -> tuple[int, bytes]:
@@ -126,16 +114,15 @@ def look_into(held: OpenFile) -> tuple[int, bytes]:
     Raises:
         CaptureError: it cannot be looked into.
     """
-    path, reads = f"/proc/{held.pid}/fd/{held.first.number}", not writes(held.first)
+    reads = not writes(held.first)
     try:
-        pipe = os.open(path, (os.O_RDONLY if reads else os.O_WRONLY) | os.O_NONBLOCK | os.O_CLOEXEC)
-        try:
+        with copy_of(held.pid, held.first.number) as pipe:
             capacity = fcntl.fcntl(pipe, F_GETPIPE_SZ)
             return capacity, copy_of_content(pipe, capacity) if reads else b""
-        finally:
-            os.close(pipe)
     except OSError as error:
-        raise CaptureError(f"cannot look into the pipe {path}: {error.strerror}; capture it again") from error
+        raise CaptureError(
+            f"cannot look into the pipe {held.name} of pid {held.pid}: {error.strerror}; capture it again"
+        ) from error
 
 
 def copy_of_content(pipe: int, capacity: int) -> bytes:

@@ -41,6 +41,7 @@ from checkpoint.resources import (
     nameless,
     pidfds,
     pipes,
+    shared,
     signalfds,
     signalling,
     streams,
@@ -89,7 +90,7 @@ NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
 SOCKETS: Final = (unix_sockets.KIND, tcp_connections.KIND, internet_sockets.KIND)
 NOT_OPEN: Final = (memory_locks.KIND, system_v_memory.KIND)
 """Kinds of what no descriptor stands for."""
-KINDS: Final = (files.KIND, streams.KIND, pipes.KIND, terminals.KIND, *NOT_OPEN, *MADE, *SOCKETS)
+KINDS: Final = (files.KIND, streams.KIND, shared.KIND, pipes.KIND, terminals.KIND, *NOT_OPEN, *MADE, *SOCKETS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +109,7 @@ def rebuild_all(
     inner_pid: int,
     objects: Mapping[tuple[int, int], int],
     vessel_pid: int,
+    descriptions: Mapping[int, int] | None = None,
 ) -> tuple[str, ...]:
     """Add the calls that bring all descriptors back: a note for each difference.
 
@@ -115,6 +117,7 @@ def rebuild_all(
         inner_pid: what the process itself will know as its PID.
         objects: files without a name that were made for its mappings: a descriptor of each, by (device, inode).
         vessel_pid: the process, as we know it.
+        descriptions: of a component of several processes, the open files that it has by birth: a descriptor of each.
 
     Raises:
         RestoreError: a resource of a kind that this version does not know.
@@ -125,15 +128,19 @@ def rebuild_all(
                 f"cannot restore {held.name}: kind {held.kind!r} is unknown here; use the version that captured it"
             )
     wanted = sorted(descriptors_of(state), key=lambda one: one.number)
+    given = descriptions or {}
+    inherited = sorted(given.values())
     if not wanted:
-        for number in objects.values():
+        for number in (*objects.values(), *inherited, *(STREAMS if descriptions is not None else ())):
             table.close(number)
         return ()
-    moved = _move_streams_away(table, max(wanted[-1].number, *objects.values(), 0) + 1)
-    piped = pipes.rebuild(table, [held for held in state.resources if held.kind == pipes.KIND], moved[-1] + 1)
-    unix, connected = _prepare_sockets(table, state, moved[-1] + 1 + len(piped))
+    moved = _move_streams_away(table, max(wanted[-1].number, *table.descriptors, 0) + 1)
+    piped = pipes.rebuild(table, [held for held in state.resources if _is_own(held, given, pipes.KIND)], moved[-1] + 1)
+    unix, connected = _prepare_sockets(table, state, moved[-1] + 1 + len(piped), given)
     last = max((moved[-1] + len(piped), unix.end, *connected.values()))
-    lines = terminals.prepare(table, [held for held in state.resources if held.kind == terminals.KIND], last + 1, vessel_pid)
+    lines = terminals.prepare(
+        table, [held for held in state.resources if _is_own(held, given, terminals.KIND)], last + 1, vessel_pid
+    )
     rebuilding = Rebuilding(options, state.clocks, inner_pid, max((last, *lines.values())) + 1)
     for key, number in objects.items():
         rebuilding.keep(table, key, number)
@@ -142,15 +149,17 @@ def rebuild_all(
         if id(one.resource) in holders:
             _duplicate(table, holders[id(one.resource)], one)
         else:
-            if id(one.resource) in lines:
+            if (description := number_of(one.resource.facts.get("description", 0))) in given:
+                _duplicate(table, given[description], one)
+            elif id(one.resource) in lines:
                 _duplicate(table, lines[id(one.resource)], one)
             else:
                 _obtain(table, one, moved, piped, connected, rebuilding)
             holders[id(one.resource)] = one.number
             signalling.rebuild(table, one.number, one.resource, inner_pid)
-    memory_files.seal(table, [held for held in state.resources if held.kind == memory_files.KIND], rebuilding)
+    memory_files.seal(table, [held for held in state.resources if _is_own(held, given, memory_files.KIND)], rebuilding)
     unix.fill()
-    for number in (*moved, *piped.values(), *connected.values(), *lines.values(), *rebuilding.objects.values()):
+    for number in (*moved, *piped.values(), *connected.values(), *lines.values(), *rebuilding.objects.values(), *inherited):
         table.close(number)
     _settle(table, wanted, holders)
     return tcp_connections.notes(state.resources)
@@ -165,11 +174,18 @@ def deleted_directory(state: Snapshot) -> int | None:
     return next((one.number for one in named if one.resource.kind == files.KIND and one.resource.facts.get("deleted")), None)
 
 
-def _prepare_sockets(table: CallTable, state: Snapshot, first: int) -> tuple[unix_sockets.Work, dict[int, int]]:
+def _is_own(held: Resource, given: Mapping[int, int], kind: str) -> bool:
+    """Whether it is of a kind, and not there by birth."""
+    return held.kind == kind and number_of(held.facts.get("description", 0)) not in given
+
+
+def _prepare_sockets(
+    table: CallTable, state: Snapshot, first: int, given: Mapping[int, int]
+) -> tuple[unix_sockets.Work, dict[int, int]]:
     """Make all sockets at numbers from ``first`` on, in the working directory: names may be relative to it."""
-    of_unix = [held for held in state.resources if held.kind == unix_sockets.KIND]
-    of_internet = [held for held in state.resources if held.kind == internet_sockets.KIND]
-    of_tcp = [held for held in state.resources if held.kind == tcp_connections.KIND]
+    of_unix = [held for held in state.resources if _is_own(held, given, unix_sockets.KIND)]
+    of_internet = [held for held in state.resources if _is_own(held, given, internet_sockets.KIND)]
+    of_tcp = [held for held in state.resources if _is_own(held, given, tcp_connections.KIND)]
     if of_unix and not procfs.is_gone(state.process.working_directory):
         directory = state.process.working_directory
         table.call(f"enter the working directory {directory}", "chdir", table.place_path(directory))

@@ -8,7 +8,7 @@ Source: pthreads(7), credentials(7), unshare(2), kcmp(2).
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -53,9 +53,9 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.PROCESS,
-        "a process that shares the memory of its parent (vfork, CLONE_VM)",
+        "a process that shares memory, open files or directory with its parent (vfork, clone(2))",
         "it is kept as soon as it has executed a program",
-        "it shares its memory with its parent",
+        "it shares its {} with its parent",
     ),
 )
 
@@ -69,15 +69,16 @@ _NAMESPACES: Final = ("net", "ipc", "uts", "cgroup", "mnt", "user", "pid_for_chi
 _SHARED: Final = ((abi.KCMP_FILES, "open files"), (abi.KCMP_FS, "working directory and root"))
 
 
-def refuse(pid: int, status: Status) -> Iterator[str]:
+def refuse(pid: int, status: Status, kin: Collection[int] = ()) -> Iterator[str]:
     """Why the threads of a process cannot be captured.
 
     Args:
         status: of the first one.
+        kin: all processes of its component, if there are several.
     """
-    parent = status.ppid
-    if parent > 1 and abi.kcmp(pid, parent, abi.KCMP_VM) == 0:
-        yield f"it shares its memory with its parent {parent}, a process of its own (vfork, CLONE_VM), which is not kept yet"
+    yield from refuse_shared_memory(pid, status)
+    if status.ppid in kin:
+        yield from _refuse_shared(pid, status.ppid, _SHARED)
     if status.threads == 1:
         return
     if status.threads > THREAD_LIMIT:
@@ -95,6 +96,18 @@ def refuse(pid: int, status: Status) -> Iterator[str]:
                 continue  # this one has ended
     if any(timer.clock == CLOCK_THREAD_CPUTIME for timer in parse_timers(procfs.read_text(pid, "timers"))):
         yield "it has a timer that counts the processor time of one of its threads, and nobody tells which: use another clock"
+
+
+def refuse_shared_memory(pid: int, status: Status) -> Iterator[str]:
+    """Why a process that has its memory from its parent cannot be captured: what is asked of it would be asked of both."""
+    if status.ppid > 1:
+        yield from _refuse_shared(pid, status.ppid, ((abi.KCMP_VM, "memory"),))
+
+
+def _refuse_shared(pid: int, parent: int, kinds: Iterable[tuple[int, str]]) -> Iterator[str]:
+    for kind, what in kinds:
+        if abi.kcmp(pid, parent, kind) == 0:
+            yield f"it shares its {what} with its parent {parent}, a process of its own (vfork, clone), which is not kept yet"
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,14 +169,3 @@ def _unlike(pid: int, tid: int, shared: _Shared, first: _Shared, own: list[str])
         yield f"{named} lives in a namespace of its own ({', '.join(differing)}), which is not kept yet"
     if shared.personality != first.personality:
         yield f"{named} has an execution domain of its own (personality), which is not kept yet"
-
-
-def children(pid: int) -> list[str]:
-    """The child processes of all its threads."""
-    found: list[str] = []
-    for tid in thread_ids(pid):
-        try:
-            found += procfs.read_text(pid, f"task/{tid}/children").split()
-        except (ProcessGoneError, ProbeError):
-            continue  # it has ended; its children are those of another one now
-    return found

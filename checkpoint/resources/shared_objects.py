@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import lru_cache
 from typing import Final
 
@@ -33,10 +33,16 @@ _MAPPED: Final = re.compile(rb"^\S+ ...s \S+ (\S+ [1-9]\d*) +(/dev/shm/.*|.* \(d
 _ANONYMOUS: Final = b"/dev/zero (deleted)"
 
 
-def refuse(pid: int) -> Iterator[str]:
-    """Why shared memory of a process cannot be kept: one sentence for each object that another one has mapped as well."""
+def refuse(pid: int, kin: Collection[int] = ()) -> Iterator[str]:
+    """Why shared memory of a process cannot be kept: one sentence for each object that another one has mapped as well.
+
+    Args:
+        kin: all processes of its component.
+    """
     for key, name in dict(_objects(pid)).items():
-        others = [other for other in _mappers(pid, time.monotonic_ns() // 1_000_000_000).get(key, ()) if other != pid]
+        others = [
+            other for other in _mappers(time.monotonic_ns() // 1_000_000_000).get(key, ()) if other != pid and other not in kin
+        ]
         if others:
             yield (
                 f"the shared memory {os.fsdecode(name)} is mapped by pid {others[0]} too, which stays behind: protect the "
@@ -51,16 +57,15 @@ def _objects(pid: int) -> Iterator[tuple[bytes, bytes]]:
 
 
 @lru_cache(maxsize=1)
-def _mappers(pid: int, second: int) -> dict[bytes, list[int]]:
+def _mappers(second: int) -> dict[bytes, list[int]]:
     """Who has mapped which object: processes by device and inode number.
 
     Args:
-        pid: whose question it is; that one and we are not looked at.
         second: of our clock; all that is asked within one second looks once.
     """
     found: dict[bytes, list[int]] = {}
     for other in os.listdir("/proc"):
-        if not other.isdigit() or int(other) in (pid, os.getpid()):
+        if not other.isdigit() or int(other) == os.getpid():
             continue
         try:
             objects = dict(_objects(int(other)))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Sequence
 from typing import Final
 
 from checkpoint.capability import Area, preserved
@@ -46,6 +47,8 @@ def _stream_of(held: OpenFile, surroundings: Surroundings) -> int | None:
     guarded = surroundings.pipes.get(held.first.target)
     if guarded is not None:
         return guarded
+    if not surroundings.is_first or held.first.target in held.kin.pipes or (held.kin.pids and held.observed.get("peer_is_ours")):
+        return None  # the component's own: it leads from one of its processes to another
     standard = next((one.number for one in held.descriptors if one.number in STANDARD), None)
     if standard is not None and (stat.S_ISFIFO(held.first.mode) or stat.S_ISSOCK(held.first.mode) or _is_terminal(held)):
         return standard
@@ -56,3 +59,8 @@ def _is_terminal(held: OpenFile) -> bool:
     """Whether it is a terminal: /dev/tty, a console or serial line, or the inside of a pseudo-terminal."""
     majors = (4, 5, *range(136, 144))  # Documentation/admin-guide/devices.txt
     return stat.S_ISCHR(held.first.mode) and os.major(held.first.rdev) in majors and held.first.rdev != os.makedev(5, 2)
+
+
+def of_first(opened: Sequence[OpenFile], surroundings: Surroundings) -> dict[str, int]:
+    """What leads outside from the first process of a component, by the kernel's name: its other processes have the same."""
+    return {held.first.target: stream for held in opened if (stream := _stream_of(held, surroundings)) is not None}

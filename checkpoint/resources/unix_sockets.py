@@ -110,7 +110,7 @@ def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: socket
         "state": told.state,
         "name": told.name,
         "peer": told.peer,
-        "peer_is_ours": told.peer in opened.inodes,
+        "peer_is_ours": told.peer in opened.inodes or told.peer in held.kin.sockets,
         "peer_name": _peer_name(looked),
         "backlog": told.backlog,
         "shutdown": told.shutdown,

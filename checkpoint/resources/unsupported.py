@@ -10,7 +10,7 @@ import contextlib
 import os
 import re
 import stat
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
@@ -78,12 +78,6 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.PROCESS,
-        "child processes",
-        "protect it while it has none; start each as a component of its own",
-        "it has child processes",
-    ),
-    refused(
-        Area.PROCESS,
         "a seccomp filter",
         "run it without: a capture asks system calls of it that the filter forbids",
         "it runs under a seccomp filter",
@@ -119,6 +113,7 @@ CAPABILITIES: Final = (
         "it has ended and is a zombie",
         "a process cannot trace itself",
         "is its tracer already",
+        "it is traced by pid",
     ),
 )
 
@@ -295,25 +290,28 @@ def require_traceable(pid: int, status: Status) -> None:
         )
 
 
-def refuse_process(pid: int, status: Status, *, files_kept: bool = False, had_children: bool | None = None) -> Iterator[str]:
+def refuse_process(pid: int, status: Status, kin: Collection[int] = (), *, files_kept: bool = False) -> Iterator[str]:
     """Why a process as a whole cannot be captured.
 
     Args:
-        had_children: whether it had any when it stood still; None where it did not: what it has now counts.
+        kin: all processes of its component, if there are several.
         files_kept: somebody keeps its program file by content, so that it need not be there any more.
     """
-    yield from refused_threads.refuse(pid, status)
-    children = [] if had_children is False else refused_threads.children(pid)
-    if children or had_children:
-        listed = f" ({', '.join(children)})" if children else ""
-        yield f"it has child processes{listed}, which are not kept yet: protect it while it has none"
-    if status.seccomp:
-        yield "it runs under a seccomp filter, which forbids what a capture asks of it: run it without the filter"
-    yield from shared_objects.refuse(pid)
-    yield from _refuse_image(pid, files_kept)
-    yield from _refuse_memory(pid)
+    yield from refused_threads.refuse(pid, status, kin)
+    yield from shared_objects.refuse(pid, kin)
+    yield from refuse_entering(pid, status, files_kept=files_kept)
     yield from _refuse_places(pid)
     yield from _refuse_namespaces(pid)
+
+
+def refuse_entering(pid: int, status: Status, *, files_kept: bool = False) -> Iterator[str]:
+    """Why a process cannot even be asked."""
+    if status.tracer not in (0, os.getpid()):
+        yield f"it is traced by pid {status.tracer}: end that debugger"
+    if status.seccomp:
+        yield "it runs under a seccomp filter, which forbids what a capture asks of it: run it without the filter"
+    yield from _refuse_image(pid, files_kept)
+    yield from _refuse_memory(pid)
 
 
 def _refuse_image(pid: int, files_kept: bool) -> Iterator[str]:

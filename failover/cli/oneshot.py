@@ -16,7 +16,7 @@ from checkpoint.channel import Capture, Captured, Protect, Protected, Release, R
 from checkpoint.device_rules import DeviceRule, rule_from
 from checkpoint.engine import Terms
 from checkpoint.errors import CheckpointError
-from checkpoint.linux import vessel
+from checkpoint.linux import kinship, vessel
 from checkpoint.linux.vessel import Birth, Born
 from checkpoint.model import Snapshot
 from failover.cli import picture, render
@@ -42,10 +42,17 @@ def capture(arguments: argparse.Namespace) -> int:
         finally:
             os.close(content)
         if held:
-            os.kill(arguments.pid, signal.SIGKILL)
+            _end(arguments.pid)
         with contextlib.suppress(CheckpointError):  # it was killed a moment ago: nothing is left to let go of
             keeper.ask(Release(), Released)
     return _tell_capture(arguments, captured, tuple(dict.fromkeys(protected.notes + captured.notes)))
+
+
+def _end(pid: int) -> None:
+    """Kill a program that stands still, its children first, so that none of them runs on without it."""
+    for one in (*reversed(kinship.descendants(pid)), pid):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(one, signal.SIGKILL)
 
 
 def _tell_capture(arguments: argparse.Namespace, captured: Captured, notes: tuple[str, ...]) -> int:

@@ -132,13 +132,13 @@ def start(argv: Sequence[str | Path], directory: Path, *, env: Mapping[str, str]
         return Program(spawn_program(words, dict(os.environ if env is None else env), directory, 0o022, birth), directory)
 
 
-def start_tracee(program: Path, directory: Path, *arguments: str) -> Program:
+def start_tracee(program: Path, directory: Path, *arguments: str, isolate: bool = False) -> Program:
     """Start a tracee and wait until it is ready; skips the test where the tracee says that it cannot.
 
     It looks for the go file by its relative name, so that it finds it as whatever user it has become.
     """
     directory.chmod(0o755)
-    tracee = start([program, "go", *arguments], directory)
+    tracee = start([program, "go", *arguments], directory, isolate=isolate)
     try:
         tracee.wait_for_line("ready")
     except EndedError:
@@ -229,7 +229,10 @@ def restored(
     whole = chain.fold(snapshots) if len(snapshots) > 1 else snapshots[0]
     elapsed_ns = max(time.time_ns() - whole.clocks.realtime_ns, 0)
     with _stdio(directory) as stdio:
-        born = spawn_vessel(Birth(inner_pid=whole.process.pid if keep_pid else 0, isolate=isolate, stdio=stdio))
+        isolate = isolate or whole.process.isolated
+        clocks = whole.clocks if isolate else None
+        inner_pid = whole.process.pid if keep_pid else 0
+        born = spawn_vessel(Birth(inner_pid=inner_pid, isolate=isolate, clocks=clocks, elapsed_ns=elapsed_ns, stdio=stdio))
     try:
         options = RestoreOptions(elapsed_ns, accept_changed, own_eyes, contents=str(contents), terms=Terms(devices=devices))
         program = ENGINE.restore(born.pid, whole, options)

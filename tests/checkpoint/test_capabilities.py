@@ -13,12 +13,24 @@ import pytest
 
 from checkpoint import capabilities
 from checkpoint.capability import Area, Verdict, refused
-from checkpoint.engines import preserved, probe, ptrace_restore, restore_process, restore_threads
+from checkpoint.engines import (
+    births,
+    captured_tree,
+    preserved,
+    probe,
+    ptrace_restore,
+    restore_process,
+    restore_threads,
+    restore_tree,
+)
 from tests import capability_table
 
 RESOURCES = Path(capabilities.__file__).parent / "resources"
 
-SPEAKS_FOR = {preserved: (probe, ptrace_restore, restore_threads, restore_process)}
+SPEAKS_FOR = {
+    preserved: (probe, ptrace_restore, restore_threads, restore_process),
+    births: (captured_tree, restore_tree),
+}
 """Rows that stand in one file for sentences in others."""
 
 NO_KIND = (
@@ -27,6 +39,7 @@ NO_KIND = (
     "not permitted; run as that user",
     "cannot protect pid {} ({}): {}",
     "cannot capture {} (pid {}): {}",
+    "cannot capture pid {}: {}",
     "has become another program (exec)",
     "cannot restore {} as pid {}: {}",
     "cannot restore {} here: {}",

@@ -1,0 +1,283 @@
+"""In which order the processes of a component are born again, so that parents, sessions and process groups are what they were.
+
+A child is born into the session of its parent, and into its group; a session cannot be joined, a group only within its session.
+So a leader makes its session when those of its children are born that have an older one, and before the others. Whoever has lost
+its parent, and whoever lives in a session or group whose leader has ended, is born with the help of a *stand-in*: a process that
+ends again when it has done its part, as the one that it stands for has.
+
+Pure: no process is touched here. Sources: fork(2), setsid(2), setpgid(2), credentials(7).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from checkpoint.capability import Area, preserved, refused
+from checkpoint.errors import RestoreError
+from checkpoint.linux.procfs import Status
+from checkpoint.model import Member, ProcessState, Snapshot, Zombie
+
+CAPABILITIES: Final = (
+    preserved(
+        Area.PROCESS,
+        "child processes, zombies and orphans: who is whose parent, process groups, sessions, exit statuses",
+        "all together, under the PIDs that they had; orphans of a program that `failover run` started",
+    ),
+    preserved(
+        Area.MEMORY,
+        "shared memory of the processes of one program",
+        "one object again, carried once",
+    ),
+    refused(
+        Area.PROCESS,
+        "a session that is older than its leader's children, a namespace that only a child lives in",
+        "start such processes as components of their own",
+        "namespace of its own, which is not kept yet",
+    ),
+    refused(
+        Area.PROCESS,
+        "child processes on a kernel without kcmp(2); more than 16,383",
+        "boot a kernel with CONFIG_KCMP; start fewer",
+        "and this kernel does not tell what they share",
+        "processes, which is the limit",
+    ),
+    refused(
+        Area.THERE,
+        "the PIDs of a program of several processes where they are taken, or nobody may choose them",
+        "free them, or start the program with `failover run`, in PIDs of its own",
+        "by which they know it, cannot be had",
+        "processes, which takes the right to choose their pids",
+    ),
+)
+
+SIGCHLD: Final = 17
+
+
+@dataclass(frozen=True, slots=True)
+class Birth:
+    """``parent`` gives birth to ``pid``.
+
+    Attributes:
+        exit_signal: what the parent is sent at its end.
+    """
+
+    parent: int
+    pid: int
+    exit_signal: int = SIGCHLD
+
+
+@dataclass(frozen=True, slots=True)
+class NewSession:
+    """``pid`` becomes the leader of a session."""
+
+    pid: int
+
+
+@dataclass(frozen=True, slots=True)
+class Join:
+    """``pid`` goes to a process group, or makes it when that is its own."""
+
+    pid: int
+    group: int
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """``pid`` ends, and nothing is left of it: its parent takes note."""
+
+    parent: int
+    pid: int
+
+
+Step = Birth | NewSession | Join | End
+
+
+@dataclass(frozen=True, slots=True)
+class Person:
+    """What matters of a process here; pids are as the component sees them."""
+
+    pid: int
+    ppid: int
+    pgid: int
+    sid: int
+    exit_signal: int = SIGCHLD
+
+
+class NoWayError(RestoreError):
+    """Processes that cannot be born into what they were in."""
+
+
+def steps_of(state: Snapshot) -> list[Step]:
+    """Every step, beginning with the first process alone.
+
+    Raises:
+        NoWayError: there is none.
+    """
+    return steps(_person(state.process), _persons(state.members, state.zombies), _numbers(state))
+
+
+def _persons(members: Sequence[Member], zombies: Sequence[Zombie]) -> list[Person]:
+    living = [_person(member.process, member.exit_signal) for member in members]
+    return [*living, *(Person(one.pid, one.ppid, one.pgid, one.sid, one.exit_signal) for one in zombies)]
+
+
+def _person(process: ProcessState, exit_signal: int = SIGCHLD) -> Person:
+    return Person(process.pid, process.ppid, process.pgid, process.sid, exit_signal)
+
+
+def _numbers(state: Snapshot) -> set[int]:
+    """Ids that are wanted for something."""
+    threads = [*state.threads, *(thread for member in state.members for thread in member.threads)]
+    return {thread.tid for thread in threads}
+
+
+def refuse(first: Status, members: Sequence[Member], zombies: Sequence[Zombie]) -> Iterator[str]:
+    """Why processes could not be born again.
+
+    Args:
+        first: of the first process.
+    """
+    person = Person(first.pids[-1], 0, first.pgids[-1], first.sids[-1])
+    try:
+        steps(person, _persons(members, zombies), set())
+    except NoWayError as error:
+        yield str(error)
+
+
+def steps(first: Person, others: Sequence[Person], numbers: set[int]) -> list[Step]:
+    """As `steps_of`.
+
+    Args:
+        numbers: ids that no stand-in may take, besides those of the processes.
+    """
+    return _Plan(first, others, numbers).made()
+
+
+@dataclass(slots=True)
+class _Plan:
+    """One plan in the making.
+
+    Attributes:
+        session: the one that a process is in by now.
+        standins: who stands for the leader of a session that has ended, and is not ended itself yet; their parents.
+    """
+
+    first: Person
+    others: Sequence[Person]
+    numbers: set[int]
+    steps: list[Step] = field(default_factory=list)
+    session: dict[int, int] = field(default_factory=dict)
+    standins: dict[int, int] = field(default_factory=dict)
+
+    def made(self) -> list[Step]:
+        everybody = {person.pid: person for person in (self.first, *self.others)}
+        self._everybody = everybody
+        self._spare = itertools.count(max((*everybody, *self.numbers, *(one.sid for one in self.others))) + 1)
+        self.session[self.first.pid] = self.first.sid
+        self._grow(self.first)
+        for orphan in [one for one in self.others if one.ppid not in everybody]:
+            self._bear_orphan(orphan)
+        for person in self.others:
+            assert person.pid in self.session, "everybody has a parent, or none that lives"
+        self._group()
+        for pid, parent in reversed(self.standins.items()):
+            self.steps.append(End(parent, pid))
+        return self.steps
+
+    _everybody: dict[int, Person] = field(default_factory=dict)
+    _spare: Iterator[int] = field(default_factory=itertools.count)
+
+    # Sessions
+
+    def _children(self, person: Person) -> list[Person]:
+        return [one for one in self.others if one.ppid == person.pid]
+
+    def _needed(self, person: Person) -> int | None:
+        """The session that a process must be born in; None: any."""
+        if person.sid != person.pid:
+            return person.sid
+        older = {need for child in self._children(person) if (need := self._needed(child)) not in (None, person.pid)}
+        if len(older) > 1:
+            raise NoWayError(f"the children of process {person.pid} are of several sessions that it was never in itself")
+        return next(iter(older), None)
+
+    def _grow(self, person: Person) -> None:
+        """Have a process, which is born, come to its session and give birth to its children."""
+        children = self._children(person)
+        leads_already = self.session[person.pid] == person.pid
+        later = [child for child in children if self._needed(child) in (None, person.sid)]
+        for child in children:
+            if child not in later:
+                self._bear(person.pid, child)
+        if person.sid == person.pid and not leads_already:
+            self.steps.append(NewSession(person.pid))
+            self.session[person.pid] = person.pid
+        for child in later:
+            self._bear(person.pid, child)
+
+    def _bear(self, parent: int, child: Person) -> None:
+        needed = self._needed(child)
+        if needed is not None and self.session[parent] != needed:
+            raise NoWayError(
+                f"process {child.pid} is of session {needed}, in which its parent {child.ppid} is not (any more), which is not "
+                "kept yet"
+            )
+        self._birth(parent, child.pid, child.exit_signal)
+        self._grow(child)
+
+    def _birth(self, parent: int, pid: int, exit_signal: int) -> None:
+        self.steps.append(Birth(parent, pid, exit_signal))
+        self.session[pid] = self.session[parent]
+
+    # Who has lost somebody
+
+    def _bear_orphan(self, orphan: Person) -> None:
+        """By a stand-in for its parent, in the session that it must be born in."""
+        source = self._in_session(self._needed(orphan))
+        if source in self.standins:
+            self._bear(source, orphan)
+            return
+        parent = next(self._spare)
+        self._birth(source, parent, 0)
+        self._bear(parent, orphan)
+        self.steps.append(End(source, parent))
+
+    def _in_session(self, session: int | None) -> int:
+        """Who may give birth in a session: its leader, a stand-in for it, or the first process for its own."""
+        if session is None or session == self.session[self.first.pid]:
+            return self.first.pid
+        if session not in self._everybody and session not in self.standins:
+            self._birth(self.first.pid, session, 0)
+            self.steps.append(NewSession(session))
+            self.session[session] = session
+            self.standins[session] = self.first.pid
+        if self.session.get(session) != session:
+            raise NoWayError(f"session {session} has lost its leader in a way that is not kept yet")
+        return session
+
+    # Groups
+
+    def _group(self) -> None:
+        """Everybody to its group, whose leader makes it first."""
+        ours = {self.first.pid: self.session[self.first.pid], **self.session}
+        waiting = []
+        for person in self.others:
+            if person.pgid == person.pid and person.sid != person.pid:
+                self.steps.append(Join(person.pid, person.pid))
+            elif person.pgid not in (person.pid, self._inherited(person)):
+                waiting.append(person)
+        for person in waiting:
+            if person.pgid not in self._everybody and person.pgid not in self.standins:
+                source = self._in_session(ours[person.pid])
+                self._birth(source, person.pgid, 0)
+                self.steps.append(Join(person.pgid, person.pgid))
+                self.standins[person.pgid] = source
+            self.steps.append(Join(person.pid, person.pgid))
+
+    def _inherited(self, person: Person) -> int:
+        """The group that a process has if it joins none: of its session's leader, or what the first process brought along."""
+        session = self.session[person.pid]
+        return self.first.pgid if session == self.session[self.first.pid] else session

@@ -1,0 +1,194 @@
+"""One process of a component under protection: how it is entered, stopped, looked at and described.
+
+`ptrace_capture.PtraceSession` has one of these for each process of its component.
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+
+from checkpoint.arch import x86_64_xstate
+from checkpoint.engine import ProtectOrder
+from checkpoint.engines import entering, waits
+from checkpoint.engines.capture_memory import MemoryCapture, RunningCopy, SharedPlaces, Taken
+from checkpoint.engines.capture_process import process_state, thread_states
+from checkpoint.engines.entering import Entered
+from checkpoint.engines.identities import Identities
+from checkpoint.engines.outputs import Outputs
+from checkpoint.engines.restart import Interruptions
+from checkpoint.engines.standing import Onlooker, Standing
+from checkpoint.errors import ProcessGoneError
+from checkpoint.linux import procfs
+from checkpoint.linux.procfs import MapsLine
+from checkpoint.linux.threads import Threads
+from checkpoint.linux.tracee import Tracee
+from checkpoint.linux.tracking import NONE, NOT_CARRIED
+from checkpoint.linux.vm_flags import FlagsReader
+from checkpoint.model import Position, ProcessState, Resource, ThreadState, Vma
+from checkpoint.resources import Opened, memory_locks, system_v_memory, unsupported
+
+NOBODY: SharedPlaces = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Everything that one freeze brought home of one process; nothing in it needs the process any more."""
+
+    standing: Standing
+    taken: Taken
+
+    @property
+    def xstate_mask(self) -> int:
+        """Which parts of the processor's state any thread uses."""
+        standing = self.standing
+        return functools.reduce(
+            operator.or_, map(x86_64_xstate.in_use, (standing.xstate, *(one.xstate for one in standing.others)))
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Met:
+    """A process that was found, and may be stopped; whoever could not let go of it yet must keep this.
+
+    Attributes:
+        born: when it began, which tells it from a later process with its pid.
+    """
+
+    threads: Threads
+    interruptions: Interruptions
+    born: int
+
+    @classmethod
+    def of(cls, pid: int) -> Met:
+        """Nothing is touched.
+
+        Raises:
+            ProcessGoneError: it has ended.
+        """
+        interruptions = Interruptions(makes_again=waits.makes_calls_again(pid))
+        return cls(Threads(Tracee(pid), interruptions.mend), interruptions, procfs.stat(pid).start_time)
+
+
+class CapturedProcess:
+    """One process, followed from the entering to `close`.
+
+    Attributes:
+        slot: see ``checkpoint.tree``.
+        born: when it began, which tells it from a later process with its pid.
+        is_new: no snapshot tells of it yet.
+    """
+
+    def __init__(self, threads: Threads, entered: Entered, order: ProtectOrder, slot: int = 0, born: int = 0) -> None:
+        self.pid = threads.pid
+        self.slot = slot
+        self.threads = threads
+        self.notes = entered.notes
+        self.born = born
+        self.is_new = True
+        self.order = order
+        self.onlooker = Onlooker(threads, entered, order.terms.devices)
+        try:
+            self.memory = MemoryCapture(threads.leader.memory, entered.tracker, entered.pages)
+        except BaseException:
+            entered.tracker.close()
+            raise
+        self.identities = Identities(self.pid, order.names or {})
+        self._flags = FlagsReader(self.pid)
+
+    @classmethod
+    def entered(cls, met: Met, order: ProtectOrder, slot: int = 0) -> CapturedProcess:
+        """Enter a process that runs."""
+        return cls(met.threads, entering.enter(met.threads, met.interruptions), order, slot, met.born)
+
+    @classmethod
+    def entered_standing(cls, met: Met, order: ProtectOrder, slot: int) -> CapturedProcess:
+        """Enter one that stands still for us."""
+        return cls(met.threads, entering.enter_standing(met.threads, met.interruptions), order, slot, met.born)
+
+    def close(self) -> None:
+        """Let go; the process is not changed."""
+        self.memory.close()
+
+    def settle(self, position: Position) -> None:
+        """The last look has become part of the snapshot with this position."""
+        self.memory.settle(position)
+        self.is_new = False
+
+    @property
+    def files_kept(self) -> bool:
+        """Whether somebody keeps its program files by content."""
+        return self.order.names is not None
+
+    def is_still(self, born: int) -> bool:
+        """Whether a process with our pid is ours."""
+        return self.born == born
+
+    # Before the freeze
+
+    def copy_running(self, *, base: bool) -> RunningCopy:
+        """Do beforehand what is worth it; for a base the files are looked at before, too, for that takes long."""
+        self.onlooker.prepare()
+        if base:
+            self.memory.refresh()
+            self._flags.refresh(self.memory.lines, anew=True)
+            self.identities.vmas(self.memory.lines, self._flags.flags, NONE)
+        return self.memory.copy_running(base=base)
+
+    # While it stands still
+
+    def look(self, copied: RunningCopy, outputs: Outputs | None, *, base: bool, opened: Opened | None = None) -> Look:
+        """Everything that needs it to stand still.
+
+        Args:
+            opened: see `Onlooker.ask`.
+        """
+        place = self.onlooker.place()
+        taken = self.memory.take(copied, base=base)
+        return Look(self.onlooker.ask(place, outputs, opened), taken)
+
+    # Afterwards
+
+    def process(self, look: Look) -> ProcessState:
+        """The process as a whole."""
+        return process_state(self.pid, look.standing, self.identities)
+
+    def thread_states(self, look: Look) -> tuple[ThreadState, ...]:
+        """Its threads, the first one first."""
+        return thread_states(self.pid, look.standing)
+
+    def mappings(self, look: Look, *, is_kin: bool = False) -> tuple[Vma, ...]:
+        """Its mappings.
+
+        Args:
+            is_kin: see `Identities`.
+        """
+        self.identities.is_kin = is_kin
+        return self.identities.vmas(look.taken.lines, self._flags.flags, look.taken.guards)
+
+    def reasons(self, look: Look, kin: Collection[int] = ()) -> tuple[str, ...]:
+        """Why what it has turned into cannot be captured."""
+        try:
+            self._flags.refresh(self.memory.lines)
+            of_mappings = (unsupported.refuse_mapping(line, self._foreign_flags(line)) for line in look.taken.lines)
+            of_process = unsupported.refuse_process(self.pid, look.standing.status, kin, files_kept=self.files_kept)
+            return (*of_process, *(reason for reason in of_mappings if reason), *system_v_memory.refuse(look.taken.lines))
+        except ProcessGoneError:
+            return ()  # the picture was taken before it ended
+
+    def known(self, resources: Iterable[Resource]) -> tuple[Resource, ...]:
+        """What it has open, by the names that it knows."""
+        return tuple(map(self.identities.as_known, resources))
+
+    def unopened(self, look: Look) -> tuple[Resource, ...]:
+        """What no descriptor stands for: whether what it maps from now on is locked in memory, and System V shared memory."""
+        told = self._flags.flags
+        ours = [codes for start, codes in told.items() if self.memory.borrowed.holds(start)]
+        of_program = (told.get(line.start, ()) for line in look.taken.lines if line.name not in NOT_CARRIED)
+        return (*memory_locks.describe(of_program, ours), *system_v_memory.describe(look.taken.lines))
+
+    def _foreign_flags(self, line: MapsLine) -> tuple[str, ...]:
+        """VmFlags without those that our own write protection sets."""
+        return tuple(flag for flag in self._flags.flags.get(line.start, ()) if flag not in ("um", "uw"))

@@ -1,0 +1,284 @@
+"""The restore of a component of several processes: born in order, then each restored as one process is, then let go together.
+
+::
+
+    estate       the first vessel makes what several of them share: open files, files without a name, shared memory
+    births       processes, sessions, groups, in the order of `births`; they inherit the estate, and are vessels themselves
+    ends         zombies end as they had ended, stand-ins without a trace
+    each         as `ptrace_restore.ProcessRestore` does it, up to the registers
+    registers    of all; nobody runs before everybody is what it was
+
+They are traced from their birth, and end with us (PTRACE_O_EXITKILL) until `RestoredProgram.resume`.
+
+Source: ptrace(2) (PTRACE_O_TRACEFORK), clone(2), wait(2), setsid(2), setpgid(2).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import signal
+import struct
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import groupby
+from typing import Final
+
+from checkpoint import tree
+from checkpoint.arch import x86_64, x86_64_stub
+from checkpoint.engine import RestoreOptions
+from checkpoint.engines import births, restore_memory, restore_process, restore_threads
+from checkpoint.engines.births import Birth, End, Join, NewSession, Step
+from checkpoint.engines.ptrace_restore import OPTIONS, REFUGE_SIZE, Estate, ProcessRestore, look_at_vessel
+from checkpoint.engines.restore_checks import Brought
+from checkpoint.engines.restore_process import Vessel
+from checkpoint.errors import CheckpointError, MismatchError, ProcessGoneError, RestoreError
+from checkpoint.linux import abi, call_table, procfs
+from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
+from checkpoint.linux.threads import Threads
+from checkpoint.linux.tracee import Tracee
+from checkpoint.model import Resource, Snapshot, Vma, Zombie
+from checkpoint.resources import files, rebuild, shared, streams
+from checkpoint.resources.rebuilding import number_of
+
+PTRACE_O_TRACEFORK: Final = 2
+TREE_OPTIONS: Final = OPTIONS | PTRACE_O_TRACEFORK
+WALL: Final = 0x40000000
+NO_CORE: Final = struct.pack("<2Q", 0, 0)
+STOPPED_BY: Final = 0x7F
+"""Bits of a wait status that hold the signal that ended a process; 0: it exited."""
+
+
+class TreeRestore:
+    """One restore, from the seizing of the vessel to everybody's own registers."""
+
+    def __init__(self, vessel_pid: int, state: Snapshot, options: RestoreOptions, brought: tuple[Brought, ...]) -> None:
+        self._state = state
+        self._brought = brought
+        self._options = options
+        self._first = Tracee(vessel_pid)
+        self._born: dict[int, Tracee] = {state.process.pid: self._first}
+        self._restoring: list[ProcessRestore] = []
+        self._notes: list[str] = []
+
+    def end(self) -> None:
+        """Kill everybody; who was born here is reaped for its parent, who may have ended before."""
+        for restoring in self._restoring[1:]:
+            restoring.end()
+        for tracee in reversed(self._born.values()):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(tracee.pid, signal.SIGKILL)
+        for restoring in self._restoring[:1]:
+            restoring.end()
+        for tracee in self._born.values():
+            if tracee is not self._first:
+                _await_end(tracee)
+
+    def held(self) -> tuple[Threads, ...]:
+        """All of them, the first process first, standing still for us."""
+        return tuple(restoring.held() for restoring in self._restoring)
+
+    def notes(self) -> tuple[str, ...]:
+        """What differs, each once."""
+        return tuple(dict.fromkeys(note for notes in (self._notes, *(one.notes for one in self._restoring)) for note in notes))
+
+    def run(self) -> None:
+        """All of it, up to the registers; everybody stands still."""
+        first = self._first
+        first.seize(TREE_OPTIONS)
+        first.freeze()
+        first.set_signal_mask(abi.ALL_SIGNALS & ~(1 << (signal.SIGTRAP - 1)))
+        vessel = look_at_vessel(first.pid)
+        self._require_rights(vessel)
+        self._registers = first.registers()
+        estate = self._make_estate(vessel)
+        self._instruction = estate.base + x86_64_stub.CALL_LOOP.index(x86_64.SYSCALL)
+        for step in births.steps_of(self._state):
+            self._take(step, estate.base)
+        for zombie in self._state.zombies:
+            self._end_as(zombie, estate.base)
+        self._restoring = [
+            ProcessRestore(self._born[view.process.pid], view, self._options, brought, estate)
+            for view, brought in zip(tree.views(self._state), self._brought, strict=True)
+        ]
+        for restoring in self._restoring:
+            restoring.build()
+        for restoring in self._restoring:
+            restoring.become_program()
+
+    def _require_rights(self, vessel: Vessel) -> None:
+        """Its processes know each other by their pids, so these must be had.
+
+        Raises:
+            MismatchError: they cannot.
+        """
+        wanted = self._state.process.pid
+        count = 1 + len(self._state.members) + len(self._state.zombies)
+        if vessel.inner_pid != wanted:
+            reason = f"it has {count} processes, and pid {wanted}, by which they know it, cannot be had"
+        elif not vessel.may_choose_executable:
+            reason = f"it has {count} processes, which takes the right to choose their pids (CAP_CHECKPOINT_RESTORE)"
+        else:
+            return
+        raise MismatchError(
+            f"cannot restore {self._state.component} as pid {vessel.inner_pid}: {reason}; "
+            "run it in PIDs of its own (failover run isolates)",
+            (reason,),
+        )
+
+    # What they share
+
+    def _make_estate(self, vessel: Vessel) -> Estate:
+        mappings = procfs.parse_maps(procfs.read_text(self._first.pid, "maps"))
+        views = tree.views(self._state)
+        vmas = [vma for view in views for vma in view.vmas]
+        sizes = {
+            key: max(vma.offset + vma.size for vma in group) for key, group in _grouped(vmas, restore_memory.is_anonymous_object)
+        }
+        size = AREA_SIZE + REFUGE_SIZE + sum(sizes.values())
+        taken = [(line.start, line.end) for line in mappings] + [(vma.start, vma.end) for vma in vmas]
+        base = call_table.find_hole(taken, size)
+        resources = _first_told(views)
+        objects = dict(_grouped(vmas, restore_memory.is_object_mapping))
+        first_number = max((one.number for view in views for one in rebuild.descriptors_of(view)), default=2) + 1
+        estate = Estate(
+            base=base,
+            size=size,
+            objects={key: first_number + index for index, key in enumerate(objects)},
+            descriptions={number: first_number + len(objects) + index for index, number in enumerate(resources)},
+            anonymous=dict(zip(sizes, _places(base + AREA_SIZE + REFUGE_SIZE, sizes.values()), strict=True)),
+        )
+        stub = Stub(self._first, base)
+        image = restore_memory.kernel_pages(mappings)[-1]
+        stub.install(image.start + self._first.memory.read(image.start, image.size).find(x86_64.SYSCALL), AREA_SIZE)
+        table = self._estate_table(vessel, estate, sizes, objects, resources)
+        if table.end - base > AREA_SIZE:
+            raise RestoreError(f"cannot restore: what its processes share takes more than {AREA_SIZE >> 20} MiB")
+        self._notes += stub.run(table)
+        return estate
+
+    def _estate_table(
+        self,
+        vessel: Vessel,
+        estate: Estate,
+        sizes: dict[restore_memory.Object, int],
+        objects: dict[restore_memory.Object, list[Vma]],
+        resources: dict[int, Resource],
+    ) -> CallTable:
+        """The calls that make all that is shared, at the numbers and addresses that the estate says."""
+        table = CallTable(estate.base)
+        restore_process.raise_limits(table, vessel)
+        opened = self._open_brought(table, resources)  # with our rights, from a place of ours
+        if self._options.own_eyes:
+            restore_process.own_eyes(table, self._state.process, vessel)
+        for key, size in sizes.items():
+            what, place = f"map {size >> 10} KiB of shared memory", estate.anonymous[key]
+            flags = abi.MAP_SHARED | abi.MAP_ANONYMOUS | abi.MAP_FIXED_NOREPLACE
+            arguments = (place, size, abi.PROT_READ | abi.PROT_WRITE, flags, -1, 0)
+            table.call(what, "mmap", *arguments, least=place, most=place)
+        made = opened | {key: restore_memory.make_object(table, vmas) for key, vmas in objects.items()}
+        for key, number in estate.objects.items():
+            table.duplicate(made[key], number, os.O_CLOEXEC)
+        kept = [Resource(streams.KIND, f"fd {n}", {"descriptors": [[n, 0]], "stream": n, "flags": 0}) for n in streams.STANDARD]
+        told = [_at(held, estate.descriptions[number]) for number, held in resources.items()]
+        bag = replace(self._state, resources=(*kept, *told))
+        self._notes += rebuild.rebuild_all(table, bag, self._options, vessel.inner_pid, made, vessel.pid)
+        return table
+
+    def _open_brought(self, table: CallTable, resources: dict[int, Resource]) -> dict[restore_memory.Object, int]:
+        """Open what was brought along of files that several processes have open for reading."""
+        contents = {path: content for one in self._brought for path, content in one.opened.items()}
+        found: dict[restore_memory.Object, int] = {}
+        for held in resources.values():
+            content = contents.get(str(held.facts.get("path")))
+            key = number_of(held.facts.get("device", 0)), number_of(held.facts.get("inode", 0))
+            if content is not None and held.kind == files.KIND and key not in found:
+                found[key] = table.open(content, os.O_RDONLY | os.O_CLOEXEC)
+        return found
+
+    # Births and ends
+
+    def _take(self, step: Step, base: int) -> None:
+        match step:
+            case Birth(parent, pid, exit_signal):
+                mother = self._born[parent]
+                self._born[pid] = restore_threads.spawn_process(mother, self._registers, base, pid, exit_signal)
+            case NewSession(pid):
+                self._call(pid, f"make session {pid}", "setsid")
+            case Join(pid, group):
+                self._call(pid, f"have process {pid} join group {group}", "setpgid", 0, group)
+            case End(parent, pid):
+                self._exit(pid, 0)
+                self._call(parent, f"take note of the end of {pid}", "wait4", pid, 0, WALL, 0)
+                del self._born[pid]
+
+    def _call(self, pid: int, what: str, name: str, *arguments: int) -> None:
+        number = x86_64_stub.SYSTEM_CALLS[name]
+        result = call_table.single_call(self._born[pid], self._registers, self._instruction, number, *arguments)
+        if result < 0:
+            raise RestoreError(f"cannot {what}: {os.strerror(-result)}")
+
+    def _exit(self, pid: int, status: int) -> None:
+        tracee = self._born[pid]
+        number = x86_64_stub.SYSTEM_CALLS["exit_group"]
+        tracee.set_registers(x86_64_stub.at_call(self._registers, self._instruction, number, (status,)))
+        tracee.cont()
+        _await_end(tracee)
+
+    def _end_as(self, zombie: Zombie, base: int) -> None:
+        """End a process as it had ended; its parent does not ask for it before it is what it was."""
+        tracee = self._born[zombie.pid]
+        tracee.memory.write(base + abi.PAGE_SIZE, zombie.name.encode()[:15] + b"\0")
+        self._call(zombie.pid, "set a name", "prctl", abi.PR_SET_NAME, base + abi.PAGE_SIZE)
+        number = zombie.status & STOPPED_BY
+        if not number:
+            self._exit(zombie.pid, zombie.status >> 8)
+            return
+        resource.prlimit(tracee.pid, resource.RLIMIT_CORE, (0, 0))
+        tracee.set_signal_mask(0)
+        tracee.set_registers(self._registers)
+        os.kill(tracee.pid, number)
+        tracee.cont(number if number != signal.SIGKILL else 0)
+        _await_end(tracee)
+
+
+def _await_end(tracee: Tracee) -> None:
+    """Take note of the end of one that we trace: its parent hears of it afterwards. Signals on their way are let through."""
+    with contextlib.suppress(ProcessGoneError, CheckpointError):
+        while True:
+            stop = tracee.wait(call_table.RUN_TIMEOUT_S)
+            tracee.cont(stop.signal if stop.is_delivery else 0)
+
+
+def _grouped(vmas: list[Vma], belongs: object) -> Iterator[tuple[restore_memory.Object, list[Vma]]]:
+    """Mappings of a kind, by what they are of."""
+    assert callable(belongs)
+    found = sorted(filter(belongs, vmas), key=restore_memory.object_of)
+    for key, group in groupby(found, key=restore_memory.object_of):
+        yield key, list(group)
+
+
+def _places(begin: int, sizes: object) -> Iterator[int]:
+    """Addresses for pieces of these sizes, one after the other."""
+    assert hasattr(sizes, "__iter__")
+    for size in sizes:
+        yield begin
+        begin += size
+
+
+def _first_told(views: tuple[Snapshot, ...]) -> dict[int, Resource]:
+    """What is told of each open file that several processes have, or that leads from one to another."""
+    found: dict[int, Resource] = {}
+    for view in views:
+        for held in view.resources:
+            number = int(str(held.facts.get("description", 0)))
+            if number and held.kind != shared.KIND:
+                found.setdefault(number, held)
+    return found
+
+
+def _at(held: Resource, number: int) -> Resource:
+    """The same, to be made at one number only; who owns its signals is said by its process."""
+    facts = {name: fact for name, fact in held.facts.items() if name not in ("signal", "owner", "locks", "description")}
+    return Resource(held.kind, held.name, {**facts, "descriptors": [[number, 1]]})

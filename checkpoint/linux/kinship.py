@@ -1,0 +1,138 @@
+"""The processes of a component: the first one, its children, theirs, and those whose parent has ended.
+
+Source: proc_pid_task(5) (children), credentials(7), pid_namespaces(7); PR_SET_CHILD_SUBREAPER of prctl(2).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from typing import Final
+
+from checkpoint.errors import CheckpointError
+from checkpoint.linux import procfs
+
+CHILDREN_SIZE: Final = 1 << 16
+"""Bytes that one read of a list of children may have: nine thousand of them."""
+
+
+class Children:
+    """Reads the children of one process again and again, its threads' included."""
+
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+        self._files: dict[int, int] = {}
+
+    def read(self, tids: list[int]) -> list[int]:
+        """Those that these threads have given birth to, oldest first; zombies among them."""
+        found: list[int] = []
+        for tid in tids:
+            with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended; its children are another one's now
+                found += map(int, os.pread(self._file(tid), CHILDREN_SIZE, 0).split())
+        if len(self._files) > len(tids):
+            for tid in set(self._files) - set(tids):
+                os.close(self._files.pop(tid))
+        return found
+
+    def _file(self, tid: int) -> int:
+        if tid not in self._files:
+            self._files[tid] = os.open(f"/proc/{self.pid}/task/{tid}/children", os.O_RDONLY | os.O_CLOEXEC)
+        return self._files[tid]
+
+    def close(self) -> None:
+        """Give descriptors back."""
+        for file in self._files.values():
+            os.close(file)
+        self._files.clear()
+
+
+class Kinship:
+    """Who belongs to the component of a process.
+
+    Args:
+        pid: of its first process.
+        reaper: who is given the orphans: the first process of their PID namespace, or their guard; 0: nobody that we know.
+    """
+
+    def __init__(self, pid: int, reaper: int) -> None:
+        self._pid = pid
+        self._reaper = reaper
+        self._of_first = Children(pid)
+        self._of_reaper = Children(reaper)
+
+    def has_others(self, tids: list[int]) -> bool:
+        """Whether there is anybody besides the first process.
+
+        Args:
+            tids: its threads.
+        """
+        return bool(self._of_first.read(tids)) or bool(self._reaper and self._orphans())
+
+    def _orphans(self) -> list[int]:
+        return [pid for pid in self._of_reaper.read([self._reaper]) if pid != self._pid]
+
+    def others(self) -> list[int]:
+        """Everybody besides the first process, parents before children, zombies included."""
+        return list(self._walk([*children(self._pid), *(self._orphans() if self._reaper else ())]))
+
+    def _walk(self, waiting: list[int]) -> Iterator[int]:
+        seen: set[int] = set()
+        while waiting:
+            pid = waiting.pop(0)
+            if pid not in seen:
+                seen.add(pid)
+                yield pid
+                waiting += children(pid)
+
+    def close(self) -> None:
+        """Give descriptors back."""
+        self._of_first.close()
+        self._of_reaper.close()
+
+
+def children(pid: int) -> list[int]:
+    """The child processes of all its threads, zombies included; none of one that has ended."""
+    found: list[int] = []
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        for tid in os.listdir(f"/proc/{pid}/task"):
+            with contextlib.suppress(CheckpointError):  # it has ended; its children are those of another one now
+                found += map(int, procfs.read_line(pid, f"task/{tid}/children").split())
+    return found
+
+
+def reaper_of(pid: int, *, is_guarded: bool) -> int:
+    """Who is given the orphans of a component; 0: nobody that we know.
+
+    Args:
+        is_guarded: its parent is its guard, which has no other children.
+    """
+    status = procfs.status(pid)
+    if len(status.pids) > 1:
+        return next((other for other in children(status.ppid) if _is_first_of_namespace(other, pid)), 0)
+    return status.ppid if is_guarded else 0
+
+
+def _is_first_of_namespace(other: int, pid: int) -> bool:
+    try:
+        return procfs.status(other).pids[-1] == 1 and _namespace(other) == _namespace(pid)
+    except (CheckpointError, OSError):
+        return False
+
+
+def _namespace(pid: int) -> str:
+    return os.readlink(f"/proc/{pid}/ns/pid")
+
+
+def others(pid: int, reaper: int) -> list[int]:
+    """As `Kinship.others`, asked once."""
+    kin = Kinship(pid, reaper)
+    try:
+        return kin.others()
+    finally:
+        kin.close()
+
+
+def descendants(pid: int) -> list[int]:
+    """Everybody whom a process has given birth to, and they, parents before children."""
+    return others(pid, 0)

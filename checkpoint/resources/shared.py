@@ -1,0 +1,33 @@
+"""An open file that several processes of a component share: the first of them tells what it is, the others that it is the same.
+
+Facts: ``descriptors``; ``description``: the number that it has in all of them; ``path``: the kernel's name for it.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from checkpoint.capability import Area, preserved
+from checkpoint.model import Resource
+from checkpoint.resources import OpenFile, Surroundings
+
+KIND: Final = "shared"
+CAPABILITIES: Final = (
+    preserved(
+        Area.PIPES,
+        "open files, pipes and sockets that several processes of a program share, or that lead from one to the other",
+        "shared as before, with one offset; what waits in them comes back",
+    ),
+)
+
+
+def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
+    """That it is the same one."""
+    if not held.is_echo:
+        return None
+    return Resource(KIND, held.name, {"descriptors": held.numbers, "description": held.description, "path": held.first.target})
+
+
+def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
+    """What can be shared is said by the first of them."""
+    return None

@@ -1,0 +1,107 @@
+"""Which open files several processes of a component have in common.
+
+An open file (its offset, its flags) that several of them share comes back as one that they share; pipes and sockets lead from one
+to the other. All of these get a number, and are made before the processes are (``restore_tree``): those inherit them.
+
+Source: kcmp(2), KCMP_FILE; pipe(7).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Final
+
+from checkpoint.capability import Area, refused
+from checkpoint.linux import abi
+from checkpoint.resources import Kin, Opened, OpenFile, epolls, pipes, sockets, watches
+
+CAPABILITIES: Final = (
+    refused(
+        Area.PIPES,
+        "an epoll or inotify instance that several processes of a program share",
+        "let the child close it",
+        "that another of its processes has too, which is not kept yet",
+        "an epoll instance",
+        "an inotify instance",
+    ),
+)
+
+_OTHER_END: Final = {os.O_RDONLY: os.O_WRONLY, os.O_WRONLY: os.O_RDONLY}
+_UNSHARED: Final[Mapping[str, str]] = {
+    epolls.TARGET: "an epoll instance",
+    watches.TARGET: "an inotify instance",
+}
+"""Kinds that are made of what one process alone has."""
+
+OpenedByAll = dict[int, Opened]
+"""By process, the first process of the component first."""
+
+
+def together(opened: Mapping[int, Sequence[OpenFile]]) -> OpenedByAll:
+    """The same, each open file knowing who shares it, and each pipe whether its other end is one of theirs."""
+    every = [held for ours in opened.values() for held in ours]
+    kin = _kin(opened, every)
+    numbers, echoes = _numbered(every)
+    return {
+        pid: Opened(
+            replace(
+                held,
+                kin=kin,
+                both_ends=held.both_ends or held.first.target in kin.pipes,
+                description=numbers.get((pid, held.first.number), 0),
+                is_echo=(pid, held.first.number) in echoes,
+            )
+            for held in ours
+        )
+        for pid, ours in opened.items()
+    }
+
+
+def _kin(opened: Iterable[int], every: Sequence[OpenFile]) -> Kin:
+    ends = {(held.first.target, held.first.flags & os.O_ACCMODE) for held in every if pipes.is_pipe(held.first)}
+    whole = {target for target, mode in ends if (target, _OTHER_END.get(mode)) in ends}
+    inodes = (held.first.inode for held in every if sockets.is_socket(held.first))
+    return Kin(frozenset(opened), frozenset(inodes), frozenset(whole))
+
+
+Place = tuple[int, int]
+"""A process and the number of a descriptor there."""
+
+
+def _numbered(every: Sequence[OpenFile]) -> tuple[dict[Place, int], set[Place]]:
+    """The number of every open file that needs one, and those that were told of before."""
+    groups: list[list[OpenFile]] = []
+    alike: dict[tuple[int | str, ...], list[list[OpenFile]]] = {}
+    for held in every:
+        one = held.first
+        bucket = alike.setdefault((one.device, one.inode, one.offset, one.flags & ~os.O_CLOEXEC, one.target), [])
+        group = next((group for group in bucket if group[0].pid != held.pid and _is_same(group[0], held)), None)
+        if group is None:
+            group = []
+            bucket.append(group)
+            groups.append(group)
+        group.append(held)
+    numbers: dict[Place, int] = {}
+    echoes: set[Place] = set()
+    for group in groups:
+        if len(group) > 1 or pipes.is_pipe(group[0].first) or sockets.is_socket(group[0].first):
+            number = len(numbers) + 1
+            numbers |= {(held.pid, held.first.number): number for held in group}
+            echoes |= {(held.pid, held.first.number) for held in group[1:]}
+    return numbers, echoes
+
+
+def _is_same(one: OpenFile, other: OpenFile) -> bool:
+    return abi.kcmp(one.pid, other.pid, abi.KCMP_FILE, one.first.number, other.first.number) == 0
+
+
+def refuse(opened: Mapping[int, Sequence[OpenFile]]) -> Iterator[str]:
+    """Why what they share cannot be kept."""
+    for held in (held for ours in opened.values() for held in ours if held.is_echo):
+        if what := _UNSHARED.get(held.first.target):
+            yield (
+                f"{held.name} of pid {held.pid} is {what} that another of its processes has too, which is not kept yet: "
+                "let the child close it"
+            )

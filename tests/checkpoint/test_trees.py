@@ -1,0 +1,226 @@
+"""Programs of several processes: all of them are captured together, and come back as what they were to each other."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from checkpoint import tree
+from checkpoint.engine import CaptureOrder
+from checkpoint.linux import kinship, procfs
+from checkpoint.model import Snapshot
+from tests.checkpoint.round_trip import (
+    Program,
+    captured_at_last,
+    ended,
+    expect_ok,
+    protected,
+    restored,
+    start,
+    start_tracee,
+    transported,
+)
+
+pytestmark = pytest.mark.root
+
+
+FAMILY = Path(__file__).parent.parent / "tracees" / "family.py"
+LIVES = 3
+CAPTURES = int(os.environ.get("FAILOVER_TEST_TREE_RACES", "50"))
+"""Captures that race with births and ends of processes; a thousand take some minutes."""
+
+
+def captured_and_ended(program: Program) -> Snapshot:
+    """One base, then the end of all of its processes."""
+    with protected(program) as session:
+        snapshot = captured_at_last(session, CaptureOrder(hold=True))
+        program.kill()
+    return transported(snapshot)
+
+
+def three_lives(program: Program, is_ready: Callable[[Program], bool]) -> tuple[Program, list[Snapshot]]:
+    """Bring a program back three times, each time that it is ready."""
+    taken = []
+    for _ in range(LIVES):
+        with ended(program):
+            program.wait_until(lambda: is_ready(program), "that it is ready to be captured")  # noqa: B023
+            taken.append(captured_and_ended(program))
+        program = restored(taken[-1], program.directory)
+    return program, taken
+
+
+def grown_by(count: int) -> Callable[[Program], bool]:
+    """Whether a program has written so many lines more than when this was asked last."""
+    seen = [0]
+
+    def is_ready(program: Program) -> bool:
+        lines = program.output.count("\n")
+        if lines < seen[0] + count:
+            return False
+        seen[0] = lines
+        return True
+
+    return is_ready
+
+
+def test_a_shell_loop_with_pipelines_counts_on(tmp_path: Path) -> None:
+    loop = "i=0; while [ $i -lt 40 ]; do i=$((i+1)); echo $i; sleep 0.05 | cat; done"
+    program, _ = three_lives(start(["/bin/sh", "-c", loop], tmp_path, isolate=True), grown_by(4))
+    with ended(program):
+        assert (program.finish(), program.output) == (0, "".join(f"{i}\n" for i in range(1, 41)))
+
+
+def processor_time(pid: int) -> int:
+    """In ticks, of a process and its descendants."""
+    total = 0
+    for one in (pid, *kinship.descendants(pid)):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            words = Path(f"/proc/{one}/stat").read_text().rpartition(")")[2].split()
+            total += int(words[11]) + int(words[12])
+    return total
+
+
+def test_a_pipeline_of_the_shell_computes_the_same(tmp_path: Path) -> None:
+    pipeline = "seq 6000000 | sort | sha256sum"
+    undisturbed, disturbed = tmp_path / "undisturbed", tmp_path / "disturbed"
+    undisturbed.mkdir()
+    disturbed.mkdir()
+    with ended(start(["/bin/sh", "-c", pipeline], undisturbed, isolate=True)) as alone:
+        assert alone.finish() == 0
+
+    def has_worked(program: Program) -> bool:
+        return processor_time(program.pid) > 10 and len(kinship.descendants(program.pid)) >= 2
+
+    program, taken = three_lives(start(["/bin/sh", "-c", pipeline], disturbed, isolate=True), has_worked)
+    with ended(program):
+        assert (program.finish(), program.output) == (0, alone.output)
+    assert any(held.kind == "pipes" for held in taken[0].members[0].resources)
+
+
+def test_a_family_of_processes_finds_itself_as_it_was(tmp_path: Path) -> None:
+    program = start([sys.executable, FAMILY, "go"], tmp_path, isolate=True)
+    program, taken = three_lives(program, grown_by(10))
+    with ended(program):
+        goes_on = grown_by(program.output.count("\n") + 10)
+        program.wait_until(lambda: goes_on(program), "that it goes on")
+        program.tell()
+        assert (program.finish(), program.output.splitlines()[-1]) == (0, "ok"), program.output[-500:] + program.complaints
+    assert [zombie.status for zombie in taken[-1].zombies] == [3 << 8, signal.SIGTERM]
+    assert len(taken[-1].members) == 4
+    alone = sum(run.size for run in tree.views(taken[0])[0].runs)
+    assert len(taken[0].contents) < 2 * alone, "what five processes have in common is there once"
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("kind", ["child", "child_of_thread", "zombie_child"])
+def test_a_child_is_still_there_after_three_lives(kind: str, compiled: Callable[..., Path], tmp_path: Path) -> None:
+    tracee = start_tracee(compiled("refused", "-O2"), tmp_path, kind, isolate=True)
+    tracee, taken = three_lives(tracee, lambda _: True)
+    with ended(tracee):
+        tracee.tell()
+        expect_ok(tracee)
+    assert len(taken[-1].members) + len(taken[-1].zombies) == 1
+
+
+def test_captures_that_race_with_births_and_ends_of_processes_lose_nothing(tmp_path: Path) -> None:
+    loop = "i=0; while :; do i=$((i+1)); (:); /bin/true; echo $i | cat >> lines & wait; done"
+    program = start(["/bin/sh", "-c", loop], tmp_path, isolate=True)
+    before = sorted(os.listdir("/proc/self/fd"))
+    with ended(program):
+        with protected(program) as session:
+            for sequence in range(1, CAPTURES + 1):
+                snapshot = captured_at_last(session, CaptureOrder(base=sequence % 10 == 1, sequence=sequence))
+                if sequence % 2:
+                    session.acknowledge(snapshot.position)
+        assert sorted(os.listdir("/proc/self/fd")) == before
+        states = [
+            procfs.status(pid).tracer for pid in (program.pid, *kinship.descendants(program.pid)) if Path(f"/proc/{pid}").exists()
+        ]
+        assert not any(states)
+        size = (tmp_path / "lines").stat().st_size
+        program.wait_until(lambda: (tmp_path / "lines").stat().st_size > size + 20, "that it goes on")
+        last = captured_and_ended(program)
+    lines = (tmp_path / "lines").read_text()
+    program = restored(last, tmp_path)
+    with ended(program):
+        program.wait_until(lambda: (tmp_path / "lines").stat().st_size > len(lines) + 20, "that it goes on")
+    numbers = [int(line) for line in (tmp_path / "lines").read_text().split()]
+    assert numbers == list(range(1, len(numbers) + 1)), "none is missing, none came twice"
+
+
+POOL = """
+import multiprocessing, os, time
+from multiprocessing import shared_memory
+
+def work(asked, answers, counted, name):
+    shared = shared_memory.SharedMemory(name=name)
+    while (number := asked.get()) is not None:
+        with counted.get_lock():
+            counted.value += 1
+            shared.buf[0] = (shared.buf[0] + 1) % 256
+        answers.put(number * number)
+
+context = multiprocessing.get_context("fork")
+asked, answers, counted = context.Queue(), context.Queue(), context.Value("i", 0)
+shared = shared_memory.SharedMemory(create=True, size=4096)
+workers = [context.Process(target=work, args=(asked, answers, counted, shared.name)) for _ in range(3)]
+for worker in workers:
+    worker.start()
+total = 0
+number = 0
+while not os.path.exists("go"):
+    asked.put(number)
+    total += answers.get()
+    print(number, total, flush=True)
+    number += 1
+    time.sleep(0.005)
+for worker in workers:
+    asked.put(None)
+for worker in workers:
+    worker.join()
+print([worker.exitcode for worker in workers], counted.value, shared.buf[0], flush=True)
+shared.close()
+shared.unlink()
+"""
+"""Three workers with queues, a lock, a value and shared memory; every parent of a queue has a thread that feeds it."""
+
+
+def test_workers_of_multiprocessing_count_on(tmp_path: Path) -> None:
+    program, taken = three_lives(start([sys.executable, "-c", POOL], tmp_path, isolate=True), grown_by(40))
+    with ended(program):
+        program.tell()
+        assert program.finish() == 0, program.complaints
+    *counted, end = program.output.splitlines()
+    assert counted == [f"{number} {sum(n * n for n in range(number + 1))}" for number in range(len(counted))]
+    assert end == f"[0, 0, 0] {len(counted)} {len(counted) % 256}"
+    assert len(taken[0].members) >= 3
+
+
+@pytest.mark.compiler
+@pytest.mark.command("make")
+def test_make_builds_on(tmp_path: Path) -> None:
+    for number in range(24):
+        (tmp_path / f"f{number}.c").write_text(f"#include <stdio.h>\nint f{number}(int x) {{ return x + {number}; }}\n")
+    (tmp_path / "main.c").write_text('#include <stdio.h>\nint f7(int);\nint main(void) { return printf("%d\\n", f7(35)) < 0; }\n')
+    objects = " ".join(f"f{number}.o" for number in range(24))
+    (tmp_path / "Makefile").write_text(f"prog: main.o {objects}\n\tgcc -o $@ $^\n%.o: %.c\n\tgcc -O2 -c -o $@ $<\n")
+    built = [0]
+
+    def has_built(program: Program) -> bool:
+        count = len(list(tmp_path.glob("*.o")))
+        if count < built[0] + 2:
+            return False
+        built[0] = count
+        return True
+
+    program, _ = three_lives(start(["make", "-j2"], tmp_path, isolate=True), has_built)
+    with ended(program):
+        assert program.finish() == 0, program.complaints
+    assert subprocess.run([tmp_path / "prog"], capture_output=True, text=True, check=True).stdout == "42\n"
