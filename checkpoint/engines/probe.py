@@ -16,8 +16,11 @@ from checkpoint.linux import dirty, kinship, processor, procfs, vm_flags
 from checkpoint.linux.procfs import Status
 from checkpoint.resources import (
     Held,
+    Kin,
     Opened,
+    OpenFile,
     Surroundings,
+    gather,
     glance,
     kinds,
     look,
@@ -26,6 +29,7 @@ from checkpoint.resources import (
     sharing,
     streams,
     system_v_memory,
+    terminals,
     unsupported,
 )
 
@@ -107,11 +111,20 @@ def _has_still_to_execute(pid: int) -> bool:
 
 def _opened(kin: tuple[int, ...]) -> sharing.OpenedByAll:
     """What each of these has open; one that ends meanwhile is left out, but for the first."""
-    found = {kin[0]: glance(kin[0])}
+    if len(kin) == 1:
+        return {kin[0]: Opened(glance(kin[0]))}
+    known = Kin(terminals=terminals.masters([held for pid in kin for held in _gathered(pid)]))
+    found = {kin[0]: glance(kin[0], known)}
     for pid in kin[1:]:
         with contextlib.suppress(ProcessGoneError):
-            found[pid] = glance(pid)
-    return sharing.together(found) if len(found) > 1 else {kin[0]: Opened(found[kin[0]])}
+            found[pid] = glance(pid, known)
+    return sharing.together(found)
+
+
+def _gathered(pid: int) -> tuple[OpenFile, ...]:
+    with contextlib.suppress(ProcessGoneError):
+        return gather(pid)
+    return ()
 
 
 def _kin(pid: int, *, is_guarded: bool) -> tuple[int, ...]:

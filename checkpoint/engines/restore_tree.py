@@ -20,6 +20,7 @@ import os
 import resource
 import signal
 import struct
+import termios
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import groupby
@@ -39,7 +40,7 @@ from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Tracee
 from checkpoint.model import Resource, Snapshot, Vma, Zombie
-from checkpoint.resources import files, rebuild, shared, streams
+from checkpoint.resources import files, rebuild, shared, streams, terminals
 from checkpoint.resources.rebuilding import number_of
 
 PTRACE_O_TRACEFORK: Final = 2
@@ -61,6 +62,7 @@ class TreeRestore:
         self._born: dict[int, Tracee] = {state.process.pid: self._first}
         self._restoring: list[ProcessRestore] = []
         self._notes: list[str] = []
+        self._terminals: dict[int, terminals.Controlling] = {}
 
     def end(self) -> None:
         """Kill everybody; who was born here is reaped for its parent, who may have ended before."""
@@ -94,8 +96,10 @@ class TreeRestore:
         self._registers = first.registers()
         estate = self._make_estate(vessel)
         self._instruction = estate.base + x86_64_stub.CALL_LOOP.index(x86_64.SYSCALL)
+        self._take_terminal(self._state.process.pid)
         for step in births.steps_of(self._state):
             self._take(step, estate.base)
+        self._set_foreground(estate.base)
         for zombie in self._state.zombies:
             self._end_as(zombie, estate.base)
         self._restoring = [
@@ -149,6 +153,7 @@ class TreeRestore:
             descriptions={number: first_number + len(objects) + index for index, number in enumerate(resources)},
             anonymous=dict(zip(sizes, _places(base + AREA_SIZE + REFUGE_SIZE, sizes.values()), strict=True)),
         )
+        self._terminals = terminals.controlling({estate.descriptions[number]: held for number, held in resources.items()})
         stub = Stub(self._first, base)
         image = restore_memory.kernel_pages(mappings)[-1]
         stub.install(image.start + self._first.memory.read(image.start, image.size).find(x86_64.SYSCALL), AREA_SIZE)
@@ -206,12 +211,26 @@ class TreeRestore:
                 self._born[pid] = restore_threads.spawn_process(mother, self._registers, base, pid, exit_signal)
             case NewSession(pid):
                 self._call(pid, f"make session {pid}", "setsid")
+                self._take_terminal(pid)
             case Join(pid, group):
                 self._call(pid, f"have process {pid} join group {group}", "setpgid", 0, group)
             case End(parent, pid):
                 self._exit(pid, 0)
                 self._call(parent, f"take note of the end of {pid}", "wait4", pid, 0, WALL, 0)
                 del self._born[pid]
+
+    def _take_terminal(self, pid: int) -> None:
+        """Give a session its controlling terminal, which all who are born into it from now on have as well."""
+        if found := self._terminals.get(pid):
+            self._call(pid, f"take the controlling terminal of session {pid}", "ioctl", found.slave, termios.TIOCSCTTY, 0)
+
+    def _set_foreground(self, base: int) -> None:
+        """Say which group is in the foreground of each terminal, now that the groups are there."""
+        for pid, found in self._terminals.items():
+            if pid in self._born and found.foreground not in (0, pid):
+                self._born[pid].memory.write(base + abi.PAGE_SIZE, struct.pack("<i", found.foreground))
+                what = f"bring group {found.foreground} to the foreground"
+                self._call(pid, what, "ioctl", found.slave, termios.TIOCSPGRP, base + abi.PAGE_SIZE)
 
     def _call(self, pid: int, what: str, name: str, *arguments: int) -> None:
         number = x86_64_stub.SYSTEM_CALLS[name]

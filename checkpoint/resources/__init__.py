@@ -36,11 +36,13 @@ class Kin:
         pids: of all; none if there is but one.
         sockets: inode numbers of all their sockets.
         pipes: as /proc names them, those of which both ends are theirs.
+        terminals: numbers of the pseudo-terminals of which they have the master.
     """
 
     pids: frozenset[int] = frozenset()
     sockets: frozenset[int] = frozenset()
     pipes: frozenset[str] = frozenset()
+    terminals: frozenset[int] = frozenset()
 
 
 ALONE: Final = Kin()
@@ -221,18 +223,21 @@ def _may_be_half(held: OpenFile) -> bool:
     return bool(held.kin.pids) or held.first.number not in (0, *STREAM_NUMBERS)
 
 
-def glance(pid: int) -> tuple[OpenFile, ...]:
+def glance(pid: int, kin: Kin = ALONE) -> tuple[OpenFile, ...]:
     """Read every descriptor of a process that runs on: enough to tell what is refused.
 
     What it closes between two of our looks is neither there nor gone: then all is looked at again.
+
+    Args:
+        kin: what is known of the other processes of its component.
     """
     from checkpoint.resources import epolls
 
-    found = _glanced(pid)
+    found = _glanced(pid, kin)
     for _ in range(GLANCES_MORE):
         if all(map(_is_still_there, found)) and not any(map(epolls.watches_what_is_gone, found)):
             break
-        found = _glanced(pid)
+        found = _glanced(pid, kin)
     return tuple(filter(_is_still_there, found))
 
 
@@ -243,10 +248,10 @@ def _is_still_there(held: OpenFile) -> bool:
         return not os.path.exists(f"/proc/{held.pid}")  # it has ended as a whole
 
 
-def _glanced(pid: int) -> tuple[OpenFile, ...]:
+def _glanced(pid: int, kin: Kin) -> tuple[OpenFile, ...]:
     from checkpoint.resources import kinds, pipes
 
-    opened = gather(pid)
+    opened = Opened(replace(held, kin=kin) for held in gather(pid))
     found = []
     for held in opened:
         if observe := kinds.observer_of(held.first, None):

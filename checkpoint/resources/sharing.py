@@ -15,7 +15,8 @@ from typing import Final
 
 from checkpoint.capability import Area, refused
 from checkpoint.linux import abi
-from checkpoint.resources import Kin, Opened, OpenFile, epolls, pipes, sockets, watches
+from checkpoint.linux.descriptors import Descriptor
+from checkpoint.resources import Kin, Opened, OpenFile, epolls, pipes, sockets, terminals, watches
 
 CAPABILITIES: Final = (
     refused(
@@ -63,7 +64,7 @@ def _kin(opened: Iterable[int], every: Sequence[OpenFile]) -> Kin:
     ends = {(held.first.target, held.first.flags & os.O_ACCMODE) for held in every if pipes.is_pipe(held.first)}
     whole = {target for target, mode in ends if (target, _OTHER_END.get(mode)) in ends}
     inodes = (held.first.inode for held in every if sockets.is_socket(held.first))
-    return Kin(frozenset(opened), frozenset(inodes), frozenset(whole))
+    return Kin(frozenset(opened), frozenset(inodes), frozenset(whole), terminals.masters(every))
 
 
 Place = tuple[int, int]
@@ -86,11 +87,16 @@ def _numbered(every: Sequence[OpenFile]) -> tuple[dict[Place, int], set[Place]]:
     numbers: dict[Place, int] = {}
     echoes: set[Place] = set()
     for group in groups:
-        if len(group) > 1 or pipes.is_pipe(group[0].first) or sockets.is_socket(group[0].first):
+        if len(group) > 1 or _leads_somewhere(group[0].first):
             number = len(numbers) + 1
             numbers |= {(held.pid, held.first.number): number for held in group}
             echoes |= {(held.pid, held.first.number) for held in group[1:]}
     return numbers, echoes
+
+
+def _leads_somewhere(one: Descriptor) -> bool:
+    """Whether it may have another end, which another of the processes has."""
+    return pipes.is_pipe(one) or sockets.is_socket(one) or terminals.is_terminal(one)
 
 
 def _is_same(one: OpenFile, other: OpenFile) -> bool:

@@ -25,6 +25,7 @@ import stat
 import struct
 import termios
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
@@ -100,9 +101,14 @@ def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
     if held.first.rdev == _MULTIPLEXER:
         return _asked(held, _master_number(held.first), MASTER)
     number = _slave_number(held)
-    if number is not None and (_is_hung_up(held) or any(_master_number(one.first) == number for one in opened)):
+    if number is not None and (number in held.kin.terminals or number in masters(opened) or _is_hung_up(held)):
         return _asked(held, number, SLAVE)
     return {}
+
+
+def masters(opened: Iterable[OpenFile]) -> frozenset[int]:
+    """The numbers of all terminals of which one of these is the master."""
+    return frozenset(number for one in opened if (number := _master_number(one.first)) is not None)
 
 
 def _master_number(one: Descriptor) -> int | None:
@@ -330,6 +336,34 @@ class _Work:
 def _numbers_in_use(pid: int) -> Iterator[int]:
     with contextlib.suppress(OSError):
         yield from (int(name) for name in os.listdir(f"/proc/{pid}/root/dev/pts") if name.isdigit())
+
+
+@dataclass(frozen=True, slots=True)
+class Controlling:
+    """The controlling terminal of a session.
+
+    Attributes:
+        slave: a descriptor of it.
+        foreground: the process group in its foreground, 0 for none.
+    """
+
+    slave: int
+    foreground: int
+
+
+def controlling(made: Mapping[int, Resource]) -> dict[int, Controlling]:
+    """The controlling terminal of each session that has one, by the session's leader.
+
+    Args:
+        made: ends of terminals, by a descriptor of each.
+    """
+    ends = {number: one for number, one in made.items() if one.kind == KIND}
+    slaves = {number_of(one.facts["terminal"]): number for number, one in ends.items() if one.facts["end"] == SLAVE}
+    led = [one.facts for one in ends.values() if one.facts.get("session") and one.facts["terminal"] in slaves]
+    return {
+        number_of(facts["session"]): Controlling(slaves[number_of(facts["terminal"])], number_of(facts["foreground"]))
+        for facts in led
+    }
 
 
 def settle(table: CallTable, held: Sequence[Resource], pid: int) -> None:

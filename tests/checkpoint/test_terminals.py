@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import pty
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,9 +14,12 @@ import pytest
 from checkpoint.engine import ProtectOrder, RestoreOptions
 from checkpoint.errors import UnsupportedError
 from checkpoint.linux.vessel import Birth, discard, spawn_vessel
+from checkpoint.model import Snapshot
 from tests.checkpoint.round_trip import (
     ENGINE,
     LIVES,
+    PATIENCE_S,
+    Program,
     captured,
     captured_and_killed,
     ended,
@@ -83,3 +88,55 @@ def test_a_terminal_in_which_something_waits_is_refused_until_it_is_read(compile
             ENGINE.protect(tracee.pid, ProtectOrder("/test/unread"))
         tracee.tell()
         expect_ok(tracee)
+
+
+TERMINAL_OF_A_CHILD = """
+import os, pty, sys, time
+child, master = pty.fork()
+if not child:
+    print("here", flush=True)
+    for line in sys.stdin:
+        with open("/dev/tty", "w") as own:
+            print(line.strip().upper(), os.ttyname(0) == os.ttyname(1), os.tcgetpgrp(0) == os.getpgrp(), os.isatty(2), file=own)
+    os._exit(0)
+def read_line():
+    found = b""
+    while not found.endswith(b"\\n"):
+        found += os.read(master, 1000)
+    return found
+read_line()
+for count in range(300):
+    os.write(master, b"line %d\\n" % count)
+    echo = read_line()
+    answer = read_line() if echo.count(b"\\n") == 1 else b""
+    print((echo + answer).decode().split(), flush=True)
+    time.sleep(0.01)
+os.close(master)
+print("child", os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+def test_a_child_at_a_terminal_of_its_parent_goes_on_at_it(tmp_path: Path) -> None:
+    words = [sys.executable, "-c", TERMINAL_OF_A_CHILD]
+    program = start(words, tmp_path, isolate=True)
+    for round_number in range(LIVES):
+        with ended(program):
+            program.wait_for_output(3000 * (round_number + 1))
+            snapshot = captured_between_answers(program)
+        program = restored(snapshot, tmp_path)
+    with ended(program):
+        assert program.finish() == 0, program.complaints
+    lines = [f"['line', '{count}', 'LINE', '{count}', 'True', 'True', 'True']" for count in range(300)]
+    assert [line for line in program.output.splitlines() if line.startswith("[")] == lines
+    assert program.output.splitlines()[-1].startswith("child")
+
+
+def captured_between_answers(program: Program) -> Snapshot:
+    """A base, and the program killed; one in whose terminal something waits is asked again."""
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            return captured_and_killed(program)
+        except UnsupportedError as error:
+            if "that wait in it" not in str(error) or time.monotonic() > deadline:
+                raise
