@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import pty
+import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -140,3 +143,33 @@ def captured_between_answers(program: Program) -> Snapshot:
         except UnsupportedError as error:
             if "that wait in it" not in str(error) or time.monotonic() > deadline:
                 raise
+
+
+COUNTING = "i=0; while [ $i -lt 1000 ]; do echo line $i; echo $i >> counted; i=$((i + 1)); sleep 0.01; done; cat"
+
+
+def test_a_shell_in_tmux_goes_on_and_so_does_its_screen(tmp_path: Path) -> None:
+    if not (tmux := shutil.which("tmux")):
+        pytest.skip("needs tmux, which is not installed here")
+    at = [tmux, "-S", str(tmp_path / "socket")]
+    environment = {"PATH": os.environ["PATH"], "TERM": "xterm", "HOME": str(tmp_path), "LANG": "C.UTF-8", "SHELL": "/bin/sh"}
+    counted = tmp_path / "counted"
+    program = start([*at, "-D", "-f", "/dev/null"], tmp_path, env=environment, isolate=True)
+    seen = 0
+    program.wait_until((tmp_path / "socket").exists, "its socket")
+    subprocess.run([*at, "new-session", "-d", "-x", "80", "-y", "24", COUNTING], cwd=tmp_path, env=environment, check=True)
+    for _ in range(LIVES):
+        with ended(program):
+            program.wait_until(lambda: counted.exists() and counted.stat().st_size > seen + 100, "more lines")  # noqa: B023
+            snapshot = captured_between_answers(program)
+        seen = counted.stat().st_size
+        program = restored(snapshot, tmp_path)
+    with ended(program):
+        program.wait_until(lambda: counted.stat().st_size > seen + 100, "more lines")
+        shown = subprocess.run([*at, "capture-pane", "-p"], capture_output=True, text=True, check=True, env=environment).stdout
+    numbers = [int(line) for line in counted.read_text().split()]
+    back = [after for before, after in pairwise(numbers) if after != before + 1]
+    assert len(back) <= LIVES, "it went back where nobody restored it"  # what was not open is not cut back
+    assert shown.count("line") > 20
+    lines = [int(line.removeprefix("line ")) for line in shown.split("\n") if line]
+    assert lines == list(range(lines[0], lines[0] + len(lines))), shown
