@@ -162,7 +162,7 @@ def rebuild_all(
     for number in (*moved, *piped.values(), *connected.values(), *lines.values(), *rebuilding.objects.values(), *inherited):
         table.close(number)
     _settle(table, wanted, holders)
-    return tcp_connections.notes(state.resources)
+    return tcp_connections.notes([held for held in state.resources if _is_own(held, given, tcp_connections.KIND)])
 
 
 def deleted_directory(state: Snapshot) -> int | None:

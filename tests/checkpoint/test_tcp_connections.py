@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from checkpoint.errors import UnsupportedError
-from tests.checkpoint.round_trip import ENGINE, captured, captured_and_killed, ended, expect_ok, restored, start_tracee
+from tests.checkpoint.round_trip import ENGINE, captured, captured_and_killed, ended, expect_ok, restored, start, start_tracee
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
@@ -109,3 +110,40 @@ def test_the_report_tells_which_connections_end(peer: int, compiled: Compiled, t
         report = ENGINE.probe(tracee.pid)
         assert report.supported
         assert any(f"127.0.0.1 port {peer} is reset" in note for note in report.notes), report.notes
+
+
+BETWEEN_TWO = """
+import os, socket, time
+listener = socket.create_server(("127.0.0.1", 0))
+child = os.fork()
+if not child:
+    with socket.create_connection(listener.getsockname()) as asks:
+        listener.close()
+        while piece := asks.recv(1000):
+            asks.sendall(piece.upper())
+    os._exit(7)
+accepted, _ = listener.accept()
+with accepted:
+    for count in range(200):
+        accepted.sendall(b"line %d\\n" % count)
+        found = b""
+        while not found.endswith(b"\\n"):
+            found += accepted.recv(1000)
+        print(found.decode().strip(), flush=True)
+        time.sleep(0.01)
+print("child", os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+def test_a_connection_between_two_processes_of_a_component_comes_back(tmp_path: Path) -> None:
+    program = start([sys.executable, "-c", BETWEEN_TWO], tmp_path, isolate=True)
+    for round_number in range(ROUNDS):
+        with ended(program):
+            program.wait_for_output(350 * (round_number + 1))
+            report = ENGINE.probe(program.pid)
+            assert report.supported and not any("reset" in note for note in report.notes), report
+            snapshot = captured_and_killed(program)
+        program = restored(snapshot, tmp_path)
+    with ended(program):
+        assert program.finish() == 0, program.complaints
+    assert program.output.splitlines() == [*(f"LINE {count}" for count in range(200)), "child 7"]
