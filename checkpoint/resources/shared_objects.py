@@ -39,10 +39,10 @@ def refuse(pid: int, kin: Collection[int] = ()) -> Iterator[str]:
     Args:
         kin: all processes of its component.
     """
+    asker = min(kin, default=pid)
     for key, name in dict(_objects(pid)).items():
-        others = [
-            other for other in _mappers(time.monotonic_ns() // 1_000_000_000).get(key, ()) if other != pid and other not in kin
-        ]
+        mappers = _mappers(asker, time.monotonic_ns() // 1_000_000_000).get(key, ())
+        others = [other for other in mappers if other != pid and other not in kin]
         if others:
             yield (
                 f"the shared memory {os.fsdecode(name)} is mapped by pid {others[0]} too, which stays behind: protect the "
@@ -57,10 +57,11 @@ def _objects(pid: int) -> Iterator[tuple[bytes, bytes]]:
 
 
 @lru_cache(maxsize=1)
-def _mappers(second: int) -> dict[bytes, list[int]]:
+def _mappers(asker: int, second: int) -> dict[bytes, list[int]]:
     """Who has mapped which object: processes by device and inode number.
 
     Args:
+        asker: a process of the component about which it is asked: each looks for itself.
         second: of our clock; all that is asked within one second looks once.
     """
     found: dict[bytes, list[int]] = {}
