@@ -183,11 +183,19 @@ class CapturedProcess:
         return tuple(map(self.identities.as_known, resources))
 
     def unopened(self, look: Look) -> tuple[Resource, ...]:
-        """What no descriptor stands for: whether what it maps from now on is locked in memory, and System V shared memory."""
+        """What no descriptor stands for: locks on what it will map, System V shared memory, threads with rights of their own.
+
+        Raises:
+            CaptureError: one of its threads has just changed its rights.
+        """
         told = self._flags.flags
         ours = [codes for start, codes in told.items() if self.memory.borrowed.holds(start)]
         of_program = (told.get(line.start, ()) for line in look.taken.lines if line.name not in NOT_CARRIED)
-        return (*memory_locks.describe(of_program, ours), *system_v_memory.describe(look.taken.lines))
+        return (
+            *memory_locks.describe(of_program, ours),
+            *system_v_memory.describe(look.taken.lines),
+            *self.onlooker.rights.describe(),
+        )
 
     def _foreign_flags(self, line: MapsLine) -> tuple[str, ...]:
         """VmFlags without those that our own write protection sets."""

@@ -48,7 +48,7 @@ from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee
 from checkpoint.model import Credentials, Position, Snapshot, ThreadState, Vma
-from checkpoint.resources import files, laying, memory_locks, remembered, system_v_memory
+from checkpoint.resources import files, laying, memory_locks, remembered, system_v_memory, thread_rights
 from checkpoint.resources.rebuild import deleted_directory, rebuild_all, rebuild_last
 from checkpoint.resources.rebuilding import number_of
 
@@ -402,9 +402,10 @@ class ProcessRestore:
     def _thread_table(self, table: CallTable, thread: ThreadState, vessel: Vessel) -> CallTable:
         """What each thread must say for itself; its notes about rights are those of the first."""
         process = self._state.process
+        credentials = thread_rights.of_thread(self._state.resources, thread.tid, process.credentials)
         restore_process.thread_marks(table, thread)
         restore_process.scheduling(table, thread, vessel, f" for thread {thread.tid} ({thread.name})")
-        restore_process.rights(table, process, vessel)
+        restore_process.rights(table, replace(process, credentials=credentials), vessel)
         restore_process.pending_of_thread(table, process, thread, vessel.inner_pid, thread.tid)
         switches.set_again(table, [switch for switch in process.switches if switch[0] in switches.OF_THREADS])
         return table

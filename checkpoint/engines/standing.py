@@ -22,6 +22,7 @@ from checkpoint.linux.threads import Threads
 from checkpoint.linux.timers import parse_timers
 from checkpoint.model import Rseq
 from checkpoint.resources import Opened, OpenFile, gather, with_contents
+from checkpoint.resources.thread_rights import ThreadRights
 from checkpoint.stream_counts import Totals
 
 NOTHING_WRITTEN: Final[Totals] = (0, 0)
@@ -89,13 +90,18 @@ class Standing:
 
 
 class Onlooker:
-    """Asks one process, again and again; the questions stay the same while its signals and timers do."""
+    """Asks one process, again and again; the questions stay the same while its signals and timers do.
+
+    Attributes:
+        rights: of threads that may what the first may not, or the other way round.
+    """
 
     def __init__(self, threads: Threads, entered: Entered, devices: tuple[DeviceRule, ...]) -> None:
         self._devices = devices
         self._tracee = threads.leader
         self._threads = threads
         self._others = ThreadOnlooker(threads, entered)
+        self.rights = ThreadRights(threads.pid)
         self._borrowed = entered.pages
         self._interruptions = entered.interruptions
         self._inquiry: Inquiry | None = None
@@ -113,6 +119,7 @@ class Onlooker:
             with contextlib.suppress(CaptureError):  # it runs: one of its threads has just closed something
                 with_contents(gather(self._tracee.pid), None, self._devices)
         self._others.prepare()
+        self.rights.prepare()
 
     def place(self) -> Place:
         """Where it stands, before anything else is asked.

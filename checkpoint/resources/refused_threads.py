@@ -1,6 +1,6 @@
 """Threads that cannot be kept: those that do not share what the threads of a program share. Nothing here touches them.
 
-A thread comes back with the rights, the files and the namespaces of the first one, so it must have them now.
+A thread comes back with the files and the namespaces of the first one, so it must have them now.
 
 Source: pthreads(7), credentials(7), unshare(2), kcmp(2).
 """
@@ -34,10 +34,9 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.THREADS,
-        "a thread with other rights, a seccomp filter, namespaces, open files, directory or personality of its own (unshare)",
+        "a thread with a seccomp filter, namespaces, open files, directory or personality of its own (unshare)",
         "let all threads share these",
         "runs under a seccomp filter",
-        "has other rights (user, groups",
         "has its own {} (unshare)",
         "open files",
         "working directory and root",
@@ -63,8 +62,6 @@ THREAD_LIMIT: Final = 4096
 """Threads of one program: the state of each takes 3 to 12 KB, of 32 MiB."""
 
 CLOCK_THREAD_CPUTIME: Final = 3
-_RIGHTS: Final = ("Uid:", "Gid:", "Groups:", "Cap", "NoNewPrivs:", "Seccomp:")
-"""Beginnings of the lines that tell them."""
 _NAMESPACES: Final = ("net", "ipc", "uts", "cgroup", "mnt", "user", "pid_for_children", "time_for_children")
 _SHARED: Final = ((abi.KCMP_FILES, "open files"), (abi.KCMP_FS, "working directory and root"))
 
@@ -115,22 +112,20 @@ class _Shared:
     """What all threads of a program must have alike.
 
     Attributes:
-        rights: lines of /proc/PID/task/TID/status.
         tracer: 0 also where that is us, who may still hold some of them: those that did not stop in time for an earlier look.
     """
 
     tracer: int
-    rights: tuple[str, ...]
+    seccomp: int
     namespaces: tuple[str, ...]
     personality: bytes
 
     @classmethod
     def of(cls, pid: int, tid: int) -> _Shared:
-        status = procfs.read_text(pid, f"task/{tid}/status")
-        tracer = procfs.parse_status(status).tracer
+        status = procfs.parse_status(procfs.read_text(pid, f"task/{tid}/status"))
         return cls(
-            tracer=0 if tracer == os.getpid() else tracer,
-            rights=tuple(line for line in status.splitlines() if line.startswith(_RIGHTS)),
+            tracer=0 if status.tracer == os.getpid() else status.tracer,
+            seccomp=status.seccomp,
             namespaces=tuple(_namespace(pid, tid, kind) for kind in _NAMESPACES),
             personality=procfs.read_line(pid, f"task/{tid}/personality"),
         )
@@ -158,10 +153,8 @@ def _unlike(pid: int, tid: int, shared: _Shared, first: _Shared, own: list[str])
     named = f"its thread {tid} ({status.name})"
     if shared.tracer:
         yield f"{named} is traced by pid {shared.tracer}: end that debugger"
-    elif status.seccomp:
+    elif shared.seccomp:
         yield f"{named} runs under a seccomp filter, which forbids what a capture asks of it: run it without the filter"
-    elif shared.rights != first.rights:
-        yield f"{named} has other rights (user, groups or capabilities) than the first, which is not kept yet"
     for what in own:
         yield f"{named} has its own {what} (unshare), which is not kept yet"
     pairs = zip(_NAMESPACES, shared.namespaces, first.namespaces, strict=True)

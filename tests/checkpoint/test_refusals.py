@@ -26,7 +26,6 @@ REFUSED = {
     "thread_files": "own open files",
     "thread_directory": "own working directory",
     "thread_namespace": "namespace",
-    "thread_rights": "other rights",
     "thread_seccomp": "seccomp",
     "child_in_the_same_memory": "shares its memory",
     "shared_files_child": "shares its open files",

@@ -131,7 +131,7 @@ FILES = cases(
     "deleted_working_directory deleted_device deleted_place deleted_link mapped_memory",
 )
 
-THREADS = [*cases("threads"), *cases("threads", "many")]
+THREADS = [*cases("threads"), *cases("threads", "many"), *cases("thread_rights")]
 
 PRESERVED = [*MEMORY, *REGISTERS, *SIGNALS, *TIME, *PORTRAITS, *FILES, *THREADS]
 

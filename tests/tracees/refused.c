@@ -58,11 +58,9 @@ static void take_unlike_thread(int (*make)(void)) {
 static int unshare_files(void) { return unshare(CLONE_FILES); }
 static int unshare_directory(void) { return unshare(CLONE_FS); }
 static int unshare_names(void) { return unshare(CLONE_NEWUTS); }
-static int become_other(void) { return syscall(SYS_setresuid, -1, 65534, -1); }
 static void take_thread_files(void) { take_unlike_thread(unshare_files); }
 static void take_thread_directory(void) { take_unlike_thread(unshare_directory); }
 static void take_thread_namespace(void) { take_unlike_thread(unshare_names); }
-static void take_thread_rights(void) { take_unlike_thread(become_other); }
 
 static void *end_the_process(void *unused) {
     nap_along(unused);
@@ -332,7 +330,6 @@ static const struct kind {
              {"thread_files", take_thread_files},
              {"thread_directory", take_thread_directory},
              {"thread_namespace", take_thread_namespace},
-             {"thread_rights", take_thread_rights},
              {"thread_seccomp", take_thread_seccomp},
              {"dead_leader", take_dead_leader},
              {"child_in_the_same_memory", take_child_in_the_same_memory},
