@@ -32,14 +32,14 @@ class Deposit:
         store: Store,
         places: Places,
         tell: Callable[[Event], None],
-        kept: Callable[[str, Snapshot, int], None],
+        kept: Callable[[Offer, Snapshot], None],
         *,
         runs: bool = True,
         here: Callable[[str], ComponentConfig] = lambda _: ComponentConfig(),
     ) -> None:
         """
         Args:
-            kept: called with (component, the snapshot without its pages, its size) for the status.
+            kept: called with what was offered, and that snapshot without its pages, for the status.
             runs: this member runs components: what it keeps it may have to lay down.
             here: what this robot's operator wants for a component.
         """
@@ -107,7 +107,7 @@ class Deposit:
                 needs_base = isinstance(error, ChainError)
                 self._tell(StoreFailed(offer.component, offer.epoch, peer, str(error), needs_base))
                 return
-        self._kept(offer.component, snapshot, offer.size)
+        self._kept(offer, snapshot)
         keeps_state = snapshot.engine == COOPERATIVE
         self._tell(Stored(offer.component, offer.epoch, snapshot.position, peer, offer.spec, keeps_state))
 

@@ -10,6 +10,7 @@ from agent.component import Captured
 from checkpoint.device_rules import DeviceRule, rules_of
 from checkpoint.engine import PTRACE
 from checkpoint.model import Position, Snapshot
+from failover.core.types import ComponentSpec
 
 REASONS_TOLD: Final = 3
 """Of the reasons why it cannot be captured, in one sentence of the core; ``status --json`` has them all."""
@@ -79,8 +80,10 @@ class Figures:
     outage_ms: float | None = None
     reasons: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    lacking: tuple[str, ...] = ()
-    """Of a standby: instruction sets that the program may use and this processor has not."""
+    spec: ComponentSpec | None = None
+    """Of a standby: as its primary told it with the newest snapshot."""
+    lacks: tuple[str, ...] | None = None
+    """Of a standby: what this robot lacks of what the program needs, by `agent.lacks`; None: nobody has looked."""
     devices: tuple[DeviceRule, ...] = ()
     """Of those that it has open, as the newest snapshot from its primary tells."""
     hooks: dict[str, str] = field(default_factory=dict)
@@ -99,16 +102,10 @@ class Figures:
         self.newest = captured.position
         self.notes = captured.notes
 
-    def narrower(self) -> str:
-        """What this robot, a standby, would refuse in a takeover, while there is time to do something about it."""
-        return (
-            f"it could not go on here: this processor lacks {', '.join(self.lacking)}, by which it may have chosen its code; "
-            "start it with failover run --portable, see docs/configuration.md"
-        )
-
-    def stored(self, snapshot: Snapshot, size: int) -> None:
+    def stored(self, snapshot: Snapshot, size: int, spec: ComponentSpec) -> None:
         """Count one snapshot that came from the primary."""
         self.snapshots += 1
+        self.spec = spec
         self.devices = rules_of(snapshot.resources)
         self.newest, self.snapshot_size, self.engine = snapshot.position, size, snapshot.engine
 

@@ -8,13 +8,14 @@ again by their sockets. If the heart dies, this ends.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import sys
 from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any, Final
 
-from agent import births
+from agent import births, lacks
 from agent.belongings import Limits, Stock
 from agent.bringing import Bringing, Sources
 from agent.charge import Charge
@@ -36,12 +37,11 @@ from agent.switchboard import Switchboard, live, make_directory
 from agent.units import starter
 from agent.verbs import Verbs
 from agent.view import team_view
-from checkpoint import channel, format, portable
+from checkpoint import channel, format
 from checkpoint.channel import Channel, close_all
 from checkpoint.contents import FOLDER as CONTENTS_FOLDER
-from checkpoint.engine import COOPERATIVE, PTRACE
+from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CheckpointError, StoreError
-from checkpoint.linux import processor
 from checkpoint.model import Snapshot
 from checkpoint.needs import Need, names_of_contents, needs
 from checkpoint.store import Store, open_store
@@ -67,6 +67,9 @@ TIDY_S: Final = 900.0
 
 LOOK_S: Final = 3.0
 """Between two looks whether the files of running programs are still there."""
+
+LACKS_S: Final = 30.0
+"""Between two looks what this robot lacks of what its components need; each costs a keeper's start."""
 
 STORE_TRIES: Final = 50
 STORE_PAUSE_S: Final = 0.1
@@ -111,7 +114,10 @@ class Lanes(Switchboard):
         self._stock = Stock(store, self._limits(), self.settings.config.robot, self._deposit.hindrance)
         self._contents = Receiver(self._lane, self._store_path, self._stock)
         self._tasks: set[asyncio.Task[None]] = set()
+        self._new_here = asyncio.Event()
         self._task(self._tidy_contents())
+        if self.settings.me.role == "robot":
+            self._task(self._look_what_is_lacking())
         if self.settings.config.bring:
             self._task(self._keep_what_goes())
         found = await self._find_guards(records)
@@ -287,11 +293,30 @@ class Lanes(Switchboard):
         task.add_done_callback(self._tasks.discard)
         task.add_done_callback(end_lanes_on_mistake)
 
-    def _stored(self, component: str, snapshot: Snapshot, size: int) -> None:
-        figures = self.charge(component).figures
-        figures.stored(snapshot, size)
-        if snapshot.engine == PTRACE:
-            figures.lacking = portable.lacking(snapshot.machine.features, processor.features())
+    def _stored(self, offer: Offer, snapshot: Snapshot) -> None:
+        figures = self.charge(offer.component).figures
+        if figures.spec is None:
+            self._new_here.set()  # the first one of it: look at once whether it could go on here
+        figures.stored(snapshot, offer.size, offer.spec)
+
+    async def _look_what_is_lacking(self) -> None:
+        """Now and then, and when this robot becomes a standby: what it lacks of what it stands by for."""
+        while True:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._new_here.wait(), LACKS_S)
+            self._new_here.clear()
+            waiting = [charge for charge in self.charges.values() if charge.component is None and charge.figures.spec is not None]
+            found = await lacks.look(self._around, waiting)
+            for charge in waiting:
+                charge.figures.lacks = found.get(charge.name)
+
+    async def lacking(self, name: str) -> tuple[str, ...]:
+        """What this robot lacks, now, of what a component needs to go on here; nothing where it holds no checkpoint of it."""
+        charge = self.charge(name)
+        found = (await lacks.look(self._around, (charge,))).get(name)
+        if charge.figures.spec is not None:
+            charge.figures.lacks = found
+        return found or ()
 
     async def _silence_ns(self, component: str) -> int:
         """For how long the robot that last sent this component's snapshots has been silent; 0 if there is none."""

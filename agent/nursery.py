@@ -130,6 +130,14 @@ class Nursery:
                     return link
         return await self._keeper_born()
 
+    async def onlooker(self) -> KeeperLink:
+        """A keeper for a question, besides those that wait for a takeover; the asker's to end.
+
+        Raises:
+            KeeperLostError: it cannot be started.
+        """
+        return await self._keeper_born()
+
     async def close(self) -> None:
         """End the ones that wait; they guard nothing. Those in use live on."""
         self._closed = True

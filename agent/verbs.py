@@ -57,6 +57,7 @@ class Lanes(Lines, Protocol):
     charges: dict[str, Charge]
 
     def charge(self, name: str) -> Charge: ...
+    async def lacking(self, name: str) -> tuple[str, ...]: ...
 
 
 class Verbs(Questions):
@@ -81,7 +82,7 @@ class Verbs(Questions):
     def errands(self) -> dict[str, Order]:
         """What another robot may ask of this one: the orders, and how things stand here."""
         promoted = functools.partial(self._permitted, self._promoted)
-        return {**super().errands(), **self.orders(), "piece": self._outflow.piece, "promoted": promoted}
+        return {**super().errands(), **self.orders(), "piece": self._outflow.piece, "promoted": promoted, "lacks": self.lacks}
 
     def orders(self) -> dict[str, Order]:
         """Those that are carried out where the component runs, wherever they are given."""
@@ -187,12 +188,33 @@ class Verbs(Questions):
         """Move a component."""
         wanted = arguments_of(HandoverArguments, "handover", arguments)
         name = await self._known(wanted.name)
+        await self._check_fit(name, "hand over", wanted.to or (await self._view(name))["standby"])
         return await self._moved(name, lambda number: events.Handover(number, name, wanted.to))
 
     async def failback(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """Move a component back to the robot that is preferred, or where it was started."""
         name = await self._known(arguments_of(NameArguments, "failback", arguments).name)
+        view = await self._view(name)
+        await self._check_fit(name, "fail back", view["prefer"] or view["home"])
         return await self._moved(name, lambda number: events.Failback(number, name))
+
+    async def lacks(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
+        """What this robot lacks of what a component needs to go on here."""
+        name = arguments_of(NameArguments, "lacks", arguments).name
+        return {"lacks": list(await self._lanes.lacking(name) if name in await self._names() else ())}
+
+    async def _check_fit(self, name: str, verb: str, robot: str) -> None:
+        """Ask the robot that a component is to move to whether it could go on there; one that cannot be asked the core refuses.
+
+        Raises:
+            RefusedError: it lacks something, all of it by name.
+        """
+        if robot not in await self._reachable():
+            return
+        found = await self._lanes.errands.send(robot, "lacks", {"name": name})
+        if reasons := tuple(str(reason) for reason in found.get("lacks", ())):
+            sentence = f"cannot {verb} {name} to {robot}, where it could not go on: {'; '.join(reasons)}"
+            raise RefusedError(sentence, "MismatchError", reasons)
 
     async def _moved(self, name: str, make: Callable[[int], events.Command]) -> dict[str, Any]:
         began_ns, before = clock.now_ns(), await self._view(name)
@@ -228,6 +250,7 @@ class Verbs(Questions):
         """Say where a component should run."""
         wanted = arguments_of(PreferArguments, "prefer", arguments)
         name = await self._known(wanted.name)
+        await self._check_fit(name, "prefer", wanted.robot)
         await self._command(lambda number: events.Prefer(number, name, wanted.robot))
         return {"name": name, "robot": wanted.robot}
 

@@ -116,17 +116,22 @@ def _own_notes(view: ComponentView, figures: Figures | None) -> tuple[str, ...]:
     """What this robot's own work on it found out."""
     if figures is None:
         return ()
-    narrower = (figures.narrower(),) if figures.lacking and view.state is State.STANDBY else ()
-    return (*figures.notes, *_overdue(view, figures), *narrower, *figures.hooks.values(), *figures.bringing.values())
+    return (*figures.notes, *_overdue(view, figures), *figures.hooks.values(), *figures.bringing.values())
 
 
-def _missing_devices(view: ComponentView, figures: Figures | None, settings: Settings) -> tuple[str, ...]:
-    """Which devices a standby lacks that it would need, while there is time to attach them."""
+def _lacks(view: ComponentView, figures: Figures | None) -> tuple[str, ...] | None:
+    """What this robot, a standby, would refuse in a takeover, while there is time to do something about it; None: not known."""
+    return figures.lacks if figures is not None and view.state is State.STANDBY else None
+
+
+def _hung_up_devices(view: ComponentView, figures: Figures | None, settings: Settings) -> tuple[str, ...]:
+    """Which devices a standby lacks that the program would find hung up there."""
     if figures is None or view.state is not State.STANDBY:
         return ()
     wanted = {rule.path for rule in figures.devices}
     rules = merged(figures.devices, settings.component(view.name).device_rules())
-    return tuple(f"{settings.config.robot} {lack}" for lack in missing(rule for rule in rules if rule.path in wanted))
+    optional = (rule for rule in rules if rule.path in wanted and rule.optional)
+    return tuple(f"{settings.config.robot} {lack}" for lack in missing(optional))
 
 
 def _waiting_output(view: ComponentView, waiting: int) -> tuple[str, ...]:
@@ -178,6 +183,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, s
         "exit_status": view.status if view.state is State.FINISHED else None,
         "kept": _kept(store.kept(view.name) if store is not None else None),
         "unstored": view.unstored,
+        "lacks": _lacks(view, figures),
         "promise": view.promise,
         "promise_differs": view.differs,
         "home": view.home,
@@ -188,8 +194,9 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, s
         "reasons": list(figures.reasons) if figures else [],
         "notes": [
             *view.notes,
+            *(f"{settings.config.robot} could not go on with it: {lack}" for lack in _lacks(view, figures) or ()),
             *_own_notes(view, figures),
-            *_missing_devices(view, figures, settings),
+            *_hung_up_devices(view, figures, settings),
             *_waiting_output(view, waiting),
         ],
     }

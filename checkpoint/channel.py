@@ -259,6 +259,17 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
     terms: Terms = NO_TERMS
 
 
+class Compare(msgspec.Struct, frozen=True, tag=True):
+    """Look whether the program of a snapshot could go on here; with a descriptor: its newest snapshot. Answer: `Compared`.
+
+    Attributes:
+        contents, terms: see `checkpoint.engine.RestoreOptions`.
+    """
+
+    contents: str = ""
+    terms: Terms = NO_TERMS
+
+
 class OpenFile(msgspec.Struct, frozen=True, tag=True):
     """Open a file as the followed program has it: perhaps no name leads to it any more. Answer: `Opened` with the descriptor.
 
@@ -369,6 +380,12 @@ UNPROTECTED: Final = "it runs, unprotected"
 """Begins the note of a `Resumed` whose program could not be followed again: another keeper may."""
 
 
+class Compared(msgspec.Struct, frozen=True, tag=True):
+    """What is lacking here, one sentence each."""
+
+    lacks: tuple[str, ...] = ()
+
+
 class Resumed(msgspec.Struct, frozen=True, tag=True):
     """The program goes on; ``notes`` as of `Protected`, or `UNPROTECTED` and why."""
 
@@ -392,5 +409,7 @@ class Failed(msgspec.Struct, frozen=True, tag=True):
     reasons: tuple[str, ...] = ()
 
 
-Request = Probe | Tabulate | Protect | Capture | Acknowledge | Restore | OpenFile | Fill | Resume | Release
-Reply = Probed | Tabulated | Protected | Captured | Unchanged | Restored | Opened | Filled | Resumed | Released | Failed
+Request = Probe | Tabulate | Protect | Capture | Acknowledge | Restore | Compare | OpenFile | Fill | Resume | Release
+Reply = (
+    Probed | Tabulated | Protected | Captured | Unchanged | Restored | Compared | Opened | Filled | Resumed | Released | Failed
+)

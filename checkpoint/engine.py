@@ -273,6 +273,14 @@ class Engine(Protocol):
         """
         ...
 
+    def lacks(self, outline: Snapshot, options: RestoreOptions) -> tuple[str, ...]:
+        """What this machine lacks of what a program needs that runs elsewhere, one sentence each; without touching anything.
+
+        Args:
+            outline: of its newest snapshot (`checkpoint.format.read_outline`).
+        """
+        ...
+
     def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
         """Turn a waiting vessel into the program of a base.
 

@@ -56,6 +56,7 @@ class Keeper:
             channel.Acknowledge: self._acknowledge,
             channel.Restore: self._restore,
             channel.Fill: self._fill,
+            channel.Compare: self._compare,
             channel.OpenFile: self._open_file,
             channel.Resume: self._resume,
             channel.Release: self._release,
@@ -164,6 +165,14 @@ class Keeper:
         segment = fill_segment(state)
         laid = laying.lay_down_for(state, os.getpid(), own_eyes=request.own_eyes)
         return channel.Filled(state.position, laid.notes), (segment.descriptor,)
+
+    def _compare(self, request: channel.Compare, descriptors: Descriptors) -> Answer:
+        try:
+            outline = carried.relocated(format.read_outline(descriptors[-1]), dict(request.terms.carry.places))
+        finally:
+            channel.close_all(descriptors)
+        chosen = self._tracer if outline.engine == self._tracer.name else engine.engine_named(outline.engine)
+        return channel.Compared(chosen.lacks(outline, RestoreOptions(contents=request.contents, terms=request.terms))), ()
 
     def _open_file(self, request: channel.OpenFile, _: Descriptors) -> Answer:
         session = self._following("open a file of what is followed")

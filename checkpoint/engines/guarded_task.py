@@ -6,10 +6,12 @@ nothing, and each capture looks where its commits go now.
 
 from __future__ import annotations
 
+import os
 import time
 from typing import Final
 
 from checkpoint import program_files
+from checkpoint.contents import DIGEST_SIZE, path_in
 from checkpoint.engine import (
     COOPERATIVE,
     NOTED,
@@ -26,6 +28,7 @@ from checkpoint.engines.outputs import Outputs
 from checkpoint.errors import CaptureError, ProcessGoneError, RestoreError, UnsupportedError
 from checkpoint.linux import procfs
 from checkpoint.model import Position, Snapshot
+from checkpoint.needs import program_of
 from checkpoint.resources import carried_trees
 from checkpoint.resources.carried_trees import CarriedTrees
 
@@ -129,6 +132,10 @@ class GuardedTask:
         return self._trees
 
 
+def _is_brought(options: RestoreOptions, digest: bytes) -> bool:
+    return bool(options.contents) and len(digest) == DIGEST_SIZE and path_in(options.contents, digest).exists()
+
+
 class CooperativeEngine:
     """See `checkpoint.engine.Engine`. To restore is to start a program again with what `fill_segment` makes."""
 
@@ -144,6 +151,12 @@ class CooperativeEngine:
     def protect(self, pid: int, order: ProtectOrder) -> Session:
         """See `checkpoint.engine.Engine.protect`."""
         return GuardedTask(pid, order)
+
+    def lacks(self, outline: Snapshot, options: RestoreOptions) -> tuple[str, ...]:
+        """See `checkpoint.engine.Engine.lacks`: the files that it is started again from, here or as they were brought."""
+        files = program_of(outline)
+        gone = [file.path for file in files if not os.path.lexists(file.path) and not _is_brought(options, file.digest)]
+        return tuple(f"{path} is missing, from which it is started again: install it here" for path in gone)
 
     def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
         """Refused: see the class."""

@@ -6,6 +6,7 @@ Imported by the keeper alone, and at once: a keeper that waits in advance must n
 from __future__ import annotations
 
 from checkpoint.engine import PTRACE, ProtectOrder, Report, Restored, RestoreOptions, Session
+from checkpoint.engines import restore_checks
 from checkpoint.engines.probe import probe
 from checkpoint.engines.ptrace_capture import PtraceSession
 from checkpoint.engines.ptrace_restore import restore
@@ -24,6 +25,10 @@ class PtraceEngine:
     def protect(self, pid: int, order: ProtectOrder) -> Session:
         """See ``checkpoint.engine.Engine.protect``."""
         return PtraceSession.open(pid, order)
+
+    def lacks(self, outline: Snapshot, options: RestoreOptions) -> tuple[str, ...]:
+        """See ``checkpoint.engine.Engine.lacks``."""
+        return restore_checks.lacks(outline, options)
 
     def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
         """See ``checkpoint.engine.Engine.restore``."""

@@ -9,11 +9,11 @@ import mmap
 import os
 import stat
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from checkpoint import portable, tree
+from checkpoint import carried, portable, tree
 from checkpoint.arch import x86_64, x86_64_xstate
 from checkpoint.arch.x86_64_xstate import Layout
 from checkpoint.capability import Area, by_rule, refused
@@ -141,13 +141,43 @@ def _compare(state: Snapshot, options: RestoreOptions) -> tuple[tuple[str, ...],
     return (*_of_machine(state, options), *of_files), Brought(run, opened)
 
 
+def lacks(outline: Snapshot, options: RestoreOptions) -> tuple[str, ...]:
+    """What this machine lacks of what a program needs that still runs elsewhere, one sentence each.
+
+    What it writes to may change until it comes: of that only whether it is there is looked at. Not asked are who else writes to
+    it, and whether a vdso without its content can be led to ours (`require` does).
+
+    Args:
+        outline: of its newest snapshot, which may be a delta.
+    """
+    found: list[str] = []
+    for view in tree.views(carried.without(outline)):
+        expected = (*options.accept_changed, *carried.every_path(outline), *_in_flux(view))
+        found += _compare(view, replace(options, accept_changed=expected))[0]
+    return tuple(dict.fromkeys(found))
+
+
+def _in_flux(state: Snapshot) -> Iterator[str]:
+    """Files here that the program writes to, and that may yet be as it leaves them."""
+    here = state.machine.boot_id == this_machine().boot_id
+    for held in state.resources:
+        path = str(held.facts.get("path", ""))
+        if held.kind != "files" or not rebuild.is_written(held) or not os.path.exists(path):
+            continue
+        if here or os.path.getsize(path) >= number_of(held.facts["size"]):
+            yield path
+    for vma in state.vmas:
+        if vma.file is not None and vma.shared and vma.protection & abi.PROT_WRITE and os.path.exists(vma.file.path):
+            yield vma.file.path
+
+
 def _of_machine(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
     machine, here = state.machine, this_machine()
     if machine.page_size != abi.PAGE_SIZE:
         yield f"its pages are {machine.page_size} bytes, this kernel's {abi.PAGE_SIZE}: boot a kernel with the same"
     yield from _of_threads(state)
     ours = kernel_pages(procfs.parse_maps(procfs.read_text(os.getpid(), "maps")))
-    if not restore_vdso.fits(state, ours):
+    if state.contents and not restore_vdso.fits(state, ours):
         yield from restore_vdso.refuse(state)
     if listed := ", ".join(portable.lacking(machine.features, here.features)):
         cure = "use one that has them, or start it with failover run --portable"

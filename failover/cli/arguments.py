@@ -264,7 +264,7 @@ def check(room: argparse.ArgumentParser) -> None:
     either = room.add_mutually_exclusive_group()
     _pid(either, optional=True)
     either.add_argument("--table", action="store_true", help="show what comes back of any program, and what is refused")
-    _json(room)
+    _agent(room)
 
 
 def team(room: argparse.ArgumentParser) -> None:

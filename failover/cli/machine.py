@@ -17,7 +17,9 @@ from checkpoint.errors import CheckpointError
 from checkpoint.linux import vessel
 from checkpoint.linux.vessel import Birth
 from failover.cli import render
+from failover.cli.agent import connect
 from failover.cli.keeper import Keeper
+from failover.errors import FailoverError
 
 SUPPORTED = ("x86_64",)
 
@@ -45,6 +47,7 @@ def check_machine(arguments: argparse.Namespace) -> int:
         _memory_lock(),
         _watchdog(),
         _network(),
+        *_standing_by(arguments),
     ]
     able = all(offer.verdict != "missing" for offer in offers)
     if arguments.json:
@@ -53,6 +56,20 @@ def check_machine(arguments: argparse.Namespace) -> int:
         render.table(("", "what", "finding"), [(offer.verdict, offer.what, offer.text) for offer in offers])
         print("this machine can protect programs" if able else "this machine cannot protect programs: see what is missing above")
     return 0 if able else 1
+
+
+def _standing_by(arguments: argparse.Namespace) -> list[Offer]:
+    """What this robot lacks of what the components need that it stands by for; nothing where no agent answers."""
+    try:
+        with connect(arguments) as agent:
+            status = agent.ask("status")
+    except FailoverError:
+        return []
+    held = [one for one in status["components"] if one["role"] == "standby" and one["lacks"] is not None]
+    lacking = [(one["name"], lack) for one in held for lack in one["lacks"]]
+    if lacking:
+        return [Offer("lesser", name, f"could not go on here: {lack}") for name, lack in lacking]
+    return [Offer("good", "standing by", f"nothing is lacking of what {one['name']} needs") for one in held]
 
 
 def _architecture() -> Offer:

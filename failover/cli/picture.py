@@ -243,7 +243,7 @@ def is_healthy(status: Mapping[str, Any]) -> bool:
     living = [sight(component) for component in status["components"] if component.get("state") not in OVER_STATES]
     unwell = any(one.get("state") in BAD_STATES or not one.get("standby") or is_unprotected(one) for one in living)
     unwell |= any(
-        seen.get("cold") or seen.get("unstored")
+        seen.get("cold") or seen.get("unstored") or seen.get("lacks")
         for one in status["components"]
         for seen in (one, *(one.get("elsewhere") or {}).values())
     )

@@ -64,7 +64,7 @@ peers: [{name, role, state, last_heard_ms, hears_us, load, beats_lost, links, la
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
     freeze_us_max, snapshot_size, dirty_bytes, snapshots, restores, crashes, outage_ms, exit_status, promise,
-    promise_differs, kept, unstored, owner, reasons,
+    promise_differs, kept, unstored, lacks, owner, reasons,
     output, output_waiting, notes, elsewhere, warm, cold}]
     output: immediate | committed (--output); output_waiting: bytes that wait until another robot holds them
     warm: its program waits at its standby, started in advance; None where nothing could: it is restored from its memory
@@ -73,6 +73,8 @@ components: [{name, role, primary, home, prefer, state, protection, epoch, gener
     promise: what holds for it; promise_differs: from the team's, by what was chosen for it, or because a server stands by
     kept: {checkpoints, older, size, newest_age_s, oldest_age_s} of this robot's store: positions to which the team may go back,
         whole ones besides that are kept for people, bytes of all; None where it has nothing
+    lacks: what this robot, a standby, would need to go on with it and has not: a device, a file, a feature; by
+        sentence, None where nobody has looked
     unstored: why the last snapshot that came to this robot was not stored there; "" otherwise
     role: primary | standby | none; protection: none | protected | degraded | stopped
     state: starting | running | frozen | held | restoring | ended | degraded | failed | released

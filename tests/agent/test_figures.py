@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from agent.figures import Commits, Figures
+from agent.figures import Commits
 
 MS = 10**6
 SECOND = 10**9
@@ -37,7 +37,3 @@ def test_a_capture_that_finds_nothing_new_changes_nothing() -> None:
     before = commits.newest_ns
     commits.note(200, before)
     assert (commits.usual_ns, commits.newest_ns) == (10 * MS, before)
-
-
-def test_a_standby_says_what_its_processor_lacks() -> None:
-    assert "this processor lacks avx2, fma" in Figures(lacking=("avx2", "fma")).narrower()

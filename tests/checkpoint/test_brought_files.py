@@ -8,13 +8,14 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from checkpoint.contents import Contents, digest_of_file
 from checkpoint.disk import Disk
-from checkpoint.engine import CaptureOrder, ProtectOrder
+from checkpoint.engine import CaptureOrder, ProtectOrder, RestoreOptions
 from checkpoint.engines.identities import Identities
 from checkpoint.errors import MismatchError, UnsupportedError
 from checkpoint.linux import procfs
@@ -28,6 +29,7 @@ from tests.checkpoint.round_trip import (
     captured_and_killed,
     ended,
     expect_ok,
+    protected,
     restored,
     start,
     transported,
@@ -211,6 +213,26 @@ def test_what_was_not_brought_is_refused_by_name_as_before(stage: Stage) -> None
     with pytest.raises(MismatchError) as refusal:
         stage.back(snapshot).kill()
     assert any(str(stage.program) in reason for reason in refusal.value.reasons)
+
+
+def test_what_is_lacking_here_is_told_while_the_program_runs_elsewhere(stage: Stage) -> None:
+    """And what it goes on writing meanwhile is not."""
+    log = stage.work / "log"
+    with ended(
+        start(["/bin/sh", "-c", f"exec >> {log}; echo one; exec {stage.program} {stage.work / 'go'}"], stage.work)
+    ) as program:
+        program.wait_until(lambda: log.exists() and "ready" in log.read_text(), "its start")
+        with protected(program) as session:
+            snapshot = transported(session.capture(CaptureOrder()))
+            outline = replace(snapshot, contents=b"")
+            log.write_text("cut")
+            assert ENGINE.lacks(outline, RestoreOptions()) == ()
+            shutil.move(stage.place.parent, stage.work / "moved")
+            (lack, *_) = ENGINE.lacks(outline, RestoreOptions())
+            assert lack.startswith(f"{stage.program} cannot be used (No such file or directory)"), lack
+            shutil.move(stage.work / "moved", stage.place.parent)
+            log.unlink()
+            assert [str(log) in lack for lack in ENGINE.lacks(outline, RestoreOptions())] == [True]
 
 
 def test_a_file_that_is_only_read_goes_on_from_its_offset(stage: Stage) -> None:

@@ -73,10 +73,15 @@ def test_a_driver_goes_on_with_the_device_of_the_other_robot(tmp_path: Path) -> 
             start(first, PYTHON, "-S", "-c", DRIVER, here, "raw")
             robots.until_protected(first, "driver")
             assert told(first_line, b"one\n") == b"got one\n"
-            lack = f"robot2 lacks {there}: the program could not go on here"
-            robots.until(lambda: lack in notes(second), "robot2 to say what it lacks")
+            lack = f"the device {there}, open as fd 3, is missing here"
+            robots.until(lambda: any(lack in note for note in notes(second)), "robot2 to say what it lacks")
+            for order in (("handover", "driver"), ("prefer", "driver", "robot2")):
+                refused = robots.failover(first, *order)
+                assert refused.returncode == 1 and lack in refused.stderr, refused
+            assert "robot2 could not go on with it" in robots.failover(first, "status").stdout
+            assert f"could not go on here: {lack}" in robots.failover(second, "check").stdout
+            assert told(first_line, b"two\n") == b"got two\n", "it was never stopped"
             there.symlink_to(os.ttyname(second_end))
-            robots.until(lambda: lack not in notes(second), "robot2 to see that it is there now")
             robots.until_protected(first, "driver")
             robots.until(lambda: robots.failover(first, "handover", "driver").returncode == 0, "a handover")
             assert told(second_line, b"three\n") == b"got three\n"

@@ -1,0 +1,70 @@
+"""What this robot lacks of what a component needs to go on here: asked before it is moved here, and looked at while it stands by.
+
+Its newest checkpoint here tells what that is. A keeper compares, for it knows how a restore would; nothing is started.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Iterable, Mapping
+
+from agent.births import check_rights
+from agent.charge import Charge
+from agent.errors import TROUBLE
+from agent.nursery import KeeperLink
+from agent.rules import terms_here
+from agent.surroundings import Surroundings
+from checkpoint import channel, format
+from checkpoint.channel import Compared, Failed, close_all
+from checkpoint.engine import COOPERATIVE
+from checkpoint.errors import CheckpointError, MismatchError, StoreError
+
+log = logging.getLogger("failover.lacks")
+
+
+async def look(around: Surroundings, charges: Iterable[Charge]) -> Mapping[str, tuple[str, ...]]:
+    """What is lacking here for each of these, as sentences, by name; one that cannot be looked at, or is not stored, is left out.
+
+    One keeper is asked about all of them.
+    """
+    found: dict[str, tuple[str, ...]] = {}
+    keeper: KeeperLink | None = None
+    try:
+        for charge in charges:
+            keeper = keeper or await around.places.nursery.onlooker()
+            try:
+                found[charge.name] = await _compared(around, charge, keeper)
+            except StoreError:
+                continue  # there is no checkpoint of it here yet, or no more
+            except (CheckpointError, OSError) as trouble:
+                log.warning("%s: cannot look whether it could go on here: %s", charge.name, trouble)
+    except TROUBLE as trouble:
+        log.warning("cannot look which components could go on here: %s", trouble)
+    finally:
+        if keeper is not None:
+            keeper.end()
+    return found
+
+
+async def _compared(around: Surroundings, charge: Charge, keeper: KeeperLink) -> tuple[str, ...]:
+    name, spec = charge.name, charge.figures.spec
+    chain = await asyncio.to_thread(around.store.open_chain, name)
+    try:
+        outline = await asyncio.to_thread(format.read_outline, chain[-1])
+        if outline.engine == COOPERATIVE and around.here(name).command:
+            return ()  # it is started by that
+        terms = terms_here(spec.launch if spec is not None else None, around.here(name))
+        order = channel.Compare(around.places.contents, terms)
+        reply, _ = await keeper.dialogue.ask(order, (chain[-1],))
+    finally:
+        close_all(tuple(chain))
+    if isinstance(reply, Failed):
+        raise CheckpointError(reply.message)
+    assert isinstance(reply, Compared)
+    try:
+        if spec is not None:
+            check_rights(name, outline.process.credentials, spec.owner)
+    except MismatchError as mismatch:
+        return (*mismatch.reasons, *reply.lacks)
+    return reply.lacks
