@@ -1,0 +1,237 @@
+"""TCP connections that are kept silent: the kernel drops whatever comes for them and whatever they would send.
+
+While a connection moves, nobody may answer in its place: not a kernel that has no such socket any more (it would reset the
+peer's), nor one whose program was ended with the connection open. The peer hears nothing and sends again, as after a lost packet.
+
+Each connection has a table of its own in nf_tables, named by its two ends, so that whoever takes the connection up finds it,
+whichever process that is. It ceases to have an effect by itself after `SILENCE_S`.
+
+Source: linux/netfilter/nf_tables.h, linux/netfilter/nfnetlink.h; nf_tables_newrule() in net/netfilter/nf_tables_api.c.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import socket
+import struct
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from ipaddress import ip_address
+from typing import Final
+
+NS_PER_S: Final = 1_000_000_000
+SILENCE_S: Final = 924
+"""How long a peer that hears nothing goes on sending again before it gives up. Source: tcp_retries2 in tcp(7)."""
+ANSWER_S: Final = 10.0
+"""How long the kernel may take to obey."""
+
+NETLINK_NETFILTER: Final = 12
+_FAMILY_INET: Final = 1
+_SUBSYSTEM: Final = 10
+_BATCH_BEGIN: Final = 0x10
+_BATCH_END: Final = 0x11
+_NEW_TABLE: Final = _SUBSYSTEM << 8
+_DELETE_TABLE: Final = _SUBSYSTEM << 8 | 2
+_NEW_CHAIN: Final = _SUBSYSTEM << 8 | 3
+_NEW_RULE: Final = _SUBSYSTEM << 8 | 6
+_ERROR: Final = 2
+_REQUEST: Final = 1
+_ACKNOWLEDGE: Final = 4
+_CREATE: Final = 0x400
+_APPEND: Final = 0x800
+_NESTED: Final = 0x8000
+_HEADER: Final = struct.Struct("<IHHII")
+_GENERAL: Final = struct.Struct(">BBH")
+"""struct nlmsghdr and struct nfgenmsg."""
+
+_BEFORE_ALL: Final = -300
+"""NF_IP_PRI_RAW: before connections are tracked."""
+_INPUT: Final = 1
+_OUTPUT: Final = 3
+_ACCEPT: Final = 1
+_DROP: Final = 0
+_REGISTER: Final = 1
+_META_NFPROTO: Final = 15
+_META_L4PROTO: Final = 16
+_META_TIME_NS: Final = 30
+_NETWORK: Final = 1
+_TRANSPORT: Final = 2
+_EQUAL: Final = 0
+_LESS: Final = 2
+_TO_NETWORK_ORDER: Final = 1
+_LAYOUTS: Final = {4: (2, 12, 16), 6: (10, 8, 24)}
+"""By version of IP: NFPROTO_*, and where the source's and the destination's address stand in the header."""
+
+End = tuple[str, int]
+"""Address and port."""
+_Message = tuple[int, int, bytes]
+"""Kind, flags, and what follows the header."""
+
+
+@dataclass(frozen=True, slots=True)
+class Connection:
+    """The two ends of a TCP connection, as its packets name them: IPv4 where both are.
+
+    Attributes:
+        ours: the end whose packets are dropped on their way out.
+    """
+
+    ours: End
+    peer: End
+
+    @classmethod
+    def between(cls, ours: Sequence[object], peer: Sequence[object]) -> Connection:
+        """Of two addresses as getsockname(2) and getpeername(2) tell them."""
+        return cls(*((_plain(str(end[0])), int(str(end[1]))) for end in (ours, peer)))
+
+    @property
+    def table(self) -> str:
+        """How its table is called."""
+        return f"failover_{hashlib.blake2s(repr((self.ours, self.peer)).encode(), digest_size=12).hexdigest()}"
+
+
+def _plain(host: str) -> str:
+    return host.partition("%")[0].removeprefix("::ffff:")
+
+
+def impose(connections: Iterable[Connection]) -> None:
+    """Silence them, all at once; those that are silent already are for as long again.
+
+    Raises:
+        OSError: we may not (CAP_NET_ADMIN), or this kernel has no nf_tables.
+    """
+    until_ns = time.time_ns() + SILENCE_S * NS_PER_S
+    _transact([message for one in connections for message in (*_removal(one), *_rules(one, until_ns))])
+
+
+def lift(connections: Iterable[Connection]) -> None:
+    """Let them be heard again; those that are not silent stay as they are.
+
+    Raises:
+        OSError: we may not, or this kernel has no nf_tables.
+    """
+    _transact([message for one in connections for message in _removal(one)])
+
+
+def _removal(one: Connection) -> list[_Message]:
+    """Whether it is there or not: it is made, which changes one that is there in nothing, and then taken away."""
+    return [_message(_NEW_TABLE, _CREATE, _text(1, one.table)), _message(_DELETE_TABLE, 0, _text(1, one.table))]
+
+
+def _rules(one: Connection, until_ns: int) -> list[_Message]:
+    """The table of a connection: what comes is dropped, and what goes."""
+    table = one.table
+    messages = [_message(_NEW_TABLE, _CREATE, _text(1, table))]
+    for name, hook, source, target in (("input", _INPUT, one.peer, one.ours), ("output", _OUTPUT, one.ours, one.peer)):
+        place = _nested(4, _number(1, hook) + _number(2, _BEFORE_ALL & 0xFFFFFFFF))
+        chain = _text(1, table) + _text(3, name) + place + _number(5, _ACCEPT) + _text(7, "filter")
+        messages.append(_message(_NEW_CHAIN, _CREATE, chain))
+        rule = _text(1, table) + _text(2, name) + _nested(4, _dropping(source, target, until_ns))
+        messages.append(_message(_NEW_RULE, _CREATE | _APPEND, rule))
+    return messages
+
+
+def _dropping(source: End, target: End, until_ns: int) -> bytes:
+    """The expressions of a rule: a packet of TCP from here to there, until then, is dropped."""
+    addresses = [ip_address(end[0]) for end in (source, target)]
+    protocol, *places = _LAYOUTS[addresses[0].version]
+    matched = _meta(_META_NFPROTO) + _compared(_EQUAL, bytes([protocol]))
+    matched += _meta(_META_L4PROTO) + _compared(_EQUAL, bytes([socket.IPPROTO_TCP]))
+    for place, address in zip(places, addresses, strict=True):
+        matched += _loaded(_NETWORK, place, len(address.packed)) + _compared(_EQUAL, address.packed)
+    ports = struct.pack(">HH", source[1], target[1])
+    matched += _loaded(_TRANSPORT, 0, len(ports)) + _compared(_EQUAL, ports)
+    ordered = _number(1, _REGISTER) + _number(2, _REGISTER) + _number(3, _TO_NETWORK_ORDER) + _number(4, 8) + _number(5, 8)
+    matched += _meta(_META_TIME_NS) + _expression("byteorder", ordered) + _compared(_LESS, struct.pack(">Q", until_ns))
+    verdict = _nested(2, _nested(2, _number(1, _DROP)))
+    return matched + _expression("immediate", _number(1, 0) + verdict)
+
+
+def _meta(key: int) -> bytes:
+    return _expression("meta", _number(1, _REGISTER) + _number(2, key))
+
+
+def _loaded(base: int, offset: int, size: int) -> bytes:
+    return _expression("payload", _number(1, _REGISTER) + _number(2, base) + _number(3, offset) + _number(4, size))
+
+
+def _compared(operation: int, value: bytes) -> bytes:
+    return _expression("cmp", _number(1, _REGISTER) + _number(2, operation) + _nested(3, _attribute(1, value)))
+
+
+def _expression(name: str, content: bytes) -> bytes:
+    return _nested(1, _text(1, name) + _nested(2, content))
+
+
+def _attribute(kind: int, content: bytes) -> bytes:
+    return struct.pack("<HH", 4 + len(content), kind) + content + bytes(-len(content) % 4)
+
+
+def _nested(kind: int, content: bytes) -> bytes:
+    return _attribute(kind | _NESTED, content)
+
+
+def _text(kind: int, text: str) -> bytes:
+    return _attribute(kind, text.encode() + b"\0")
+
+
+def _number(kind: int, value: int) -> bytes:
+    return _attribute(kind, struct.pack(">I", value))
+
+
+def _message(kind: int, flags: int, attributes: bytes) -> _Message:
+    return kind, _REQUEST | _ACKNOWLEDGE | flags, _GENERAL.pack(_FAMILY_INET, 0, 0) + attributes
+
+
+def _transact(messages: Sequence[_Message]) -> None:
+    """Have the kernel obey all of them, or none.
+
+    Raises:
+        OSError: none.
+    """
+    if not messages:
+        return
+    mark = _GENERAL.pack(0, 0, _SUBSYSTEM)
+    batch = [(_BATCH_BEGIN, _REQUEST, mark), *messages, (_BATCH_END, _REQUEST, mark)]
+    packed = b"".join(
+        _HEADER.pack(_HEADER.size + len(content), kind, flags, number, 0) + content
+        for number, (kind, flags, content) in enumerate(batch)
+    )
+    with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC, NETLINK_NETFILTER) as asked:
+        asked.settimeout(ANSWER_S)
+        asked.send(packed)
+        missing = len(messages)
+        while missing:
+            missing -= _acknowledged(asked.recv(1 << 16))
+
+
+def _acknowledged(answer: bytes) -> int:
+    """How many messages were obeyed.
+
+    Raises:
+        OSError: one was not, so none will be.
+    """
+    count = place = 0
+    while place + _HEADER.size <= len(answer):
+        size, kind, *_ = _HEADER.unpack_from(answer, place)
+        if kind == _ERROR:
+            code = -int.from_bytes(answer[place + _HEADER.size : place + _HEADER.size + 4], "little", signed=True)
+            if code:
+                raise OSError(code, f"nf_tables: {os.strerror(code)}")
+            count += 1
+        place += max(-(-size // 4) * 4, _HEADER.size)
+    return count
+
+
+def hindrance() -> str:
+    """Why connections cannot be silenced here; "" where they can."""
+    try:
+        lift([Connection(("0.0.0.0", 0), ("0.0.0.0", 0))])
+    except OSError as error:
+        if error.errno == errno.EPERM:
+            return "CAP_NET_ADMIN is missing"
+        return f"this kernel has no nf_tables ({error.strerror})"
+    return ""
