@@ -12,6 +12,7 @@ from checkpoint.capability import Area, Capability, Verdict
 from checkpoint.engines import births, preserved, restore_checks, restore_kinds, restore_vdso
 from checkpoint.resources import (
     attached_devices,
+    carried_connections,
     carried_trees,
     devices,
     elsewhere,
@@ -70,6 +71,7 @@ CARRIERS: Final[tuple[ModuleType, ...]] = (
     timerfds,
     unix_sockets,
     tcp_connections,
+    carried_connections,
     internet_sockets,
     sockets,
     streams,

@@ -243,7 +243,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
 
     Attributes:
         streams: the last five descriptors are the streams, as with `Protect`.
-        own_eyes, epoch, contents: see `checkpoint.engine.RestoreOptions`.
+        own_eyes, epoch, contents, stood_still: see `checkpoint.engine.RestoreOptions`.
         terms: those under which it is restored, and followed from then on.
     """
 
@@ -257,6 +257,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
     epoch: int = 0
     contents: str = ""
     terms: Terms = NO_TERMS
+    stood_still: bool = False
 
 
 class Compare(msgspec.Struct, frozen=True, tag=True):

@@ -119,10 +119,12 @@ class Terms:
     Attributes:
         carry: its files that travel with it.
         devices: what becomes of devices that it has open.
+        connections: TCP connections with others go along where it goes on from the state in which it stood still for good.
     """
 
     carry: Carry = NOTHING_CARRIED
     devices: tuple[DeviceRule, ...] = ()
+    connections: bool = False
 
 
 NO_TERMS: Final = Terms()
@@ -183,6 +185,7 @@ class RestoreOptions:
         own_eyes: open its files with its own user's rights, not with ours: that user could have put other files in their place.
         contents: directory of files that were brought along (`checkpoint.contents`), for what this machine lacks or has in
             another version; "": there are none.
+        stood_still: nothing of it has run since the capture, so that TCP connections that were taken along can be taken up.
     """
 
     elapsed_ns: int = 0
@@ -191,6 +194,7 @@ class RestoreOptions:
     epoch: int = 0
     contents: str = ""
     terms: Terms = NO_TERMS
+    stood_still: bool = False
 
 
 class Session(Protocol):

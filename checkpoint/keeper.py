@@ -148,6 +148,7 @@ class Keeper:
             request.epoch,
             request.contents,
             terms=request.terms,
+            stood_still=request.stood_still,
         )
         self._restored = self._tracer.restore(request.pid, state, options)
         self._revived = request, ends

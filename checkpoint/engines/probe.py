@@ -171,7 +171,7 @@ def surroundings_of(pid: int, streams: Streams | None, terms: Terms = NO_TERMS) 
     """
     if not 0 < pid <= _largest_pid():
         raise ProbeError(f"cannot look at pid {pid}: that is not the number of a process")
-    return Surroundings(pipes_of(streams.outputs) if streams else {}, terms.devices)
+    return Surroundings(pipes_of(streams.outputs) if streams else {}, terms.devices, terms.connections)
 
 
 def _largest_pid() -> int:

@@ -38,7 +38,8 @@ from checkpoint.linux import abi, kinship, procfs
 from checkpoint.linux.kinship import Kinship
 from checkpoint.model import Position, Snapshot
 from checkpoint.pages import PageTable
-from checkpoint.resources import Surroundings, carried_trees, kinds, look
+from checkpoint.resources import OpenFile, Surroundings, carried_connections, carried_trees, glance, kinds, look
+from checkpoint.resources.carried_connections import Departing
 from checkpoint.resources.carried_trees import NO_PARCEL, CarriedTrees, Parcel, Seen
 from checkpoint.stream_counts import Totals
 
@@ -57,12 +58,14 @@ class Frozen:
         others: what was seen of the others; None where there are none.
         freeze_us: how long the program stood still.
         seen: its carried files.
+        departing: its connections, where it may stand still for good.
     """
 
     first: Look
     others: SeenOthers | None
     freeze_us: int
     seen: Seen = field(default_factory=Seen)
+    departing: Departing = carried_connections.NOBODY
 
 
 class PtraceSession:
@@ -93,6 +96,7 @@ class PtraceSession:
         self._tree = CapturedTree(first, kin)
         self._outputs: Outputs | None = None
         self._carried = trees
+        self._departing = carried_connections.NOBODY
         self._table = PageTable.empty(abi.PAGE_SIZE)
         self._totals_at: dict[Position, Totals] = {}
         self._refused = False
@@ -114,6 +118,8 @@ class PtraceSession:
             reasons = (*report.reasons, *(trees.refuse() if trees else ()))
             if reasons:
                 raise UnsupportedError(f"cannot protect pid {pid} ({report.command}): {'; '.join(reasons)}", reasons)
+            if surroundings.connections:
+                carried_connections.heard_again(glance(pid))
             kin = Kinship(pid, kinship.reaper_of(pid, is_guarded=order.streams is not None))
             first = CapturedProcess.entered(Met.of(pid), order)
             try:
@@ -236,6 +242,8 @@ class PtraceSession:
             if others:
                 self._tree.look(others, first, self._surroundings, base=base)
             seen = self._carried.look(self._shared_inodes(first, others)) if self._carried else Seen()
+            if hold and self._surroundings.connections:
+                self._departing = carried_connections.depart(self._opened(first, others))
         except BaseException:
             self._thaw()
             raise
@@ -243,7 +251,13 @@ class PtraceSession:
             self._hold()
         else:
             self._thaw()
-        return Frozen(first, others, (time.perf_counter_ns() - began) // NS_PER_US, seen)
+        return Frozen(first, others, (time.perf_counter_ns() - began) // NS_PER_US, seen, self._departing)
+
+    @staticmethod
+    def _opened(first: Look, others: SeenOthers | None) -> list[OpenFile]:
+        """What any of them has open."""
+        looks = [first, *(look for _, look in others.looks())] if others else [first]
+        return [held for look in looks for held in look.standing.opened]
 
     @staticmethod
     def _shared_inodes(first: Look, others: SeenOthers | None) -> set[int]:
@@ -272,6 +286,8 @@ class PtraceSession:
         self._tree.hold()
 
     def _thaw(self) -> None:
+        self._departing.stay(self.pid)
+        self._departing = carried_connections.NOBODY
         self._held = False
         self._first.threads.thaw()
         self._tree.thaw()
@@ -303,6 +319,7 @@ class PtraceSession:
             resources=(*self._first.known(held.resources), *self._first.unopened(first), *parcel.resources),
             output=self._outputs.pieces(self._output_since(parent), totals) if self._outputs else (),
         )
+        snapshot = frozen.departing.added_to(snapshot)
         snapshot = replace(snapshot, position=position_of(snapshot, order.generation, order.sequence))
         for process, _ in looks:
             process.settle(snapshot.position)

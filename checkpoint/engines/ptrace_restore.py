@@ -24,7 +24,7 @@ import resource
 import signal
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -48,7 +48,8 @@ from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee
 from checkpoint.model import Credentials, Position, Snapshot, ThreadState, Vma
-from checkpoint.resources import files, laying, memory_locks, remembered, system_v_memory, thread_rights
+from checkpoint.resources import carried_connections, files, laying, memory_locks, remembered, system_v_memory, thread_rights
+from checkpoint.resources.carried_connections import Arriving
 from checkpoint.resources.rebuild import deleted_directory, rebuild_all, rebuild_last
 from checkpoint.resources.rebuilding import number_of
 
@@ -72,12 +73,14 @@ class RestoredProgram:
     Attributes:
         threads: all of its first process; they stand still for us until `resume`.
         others: those of its other processes.
+        arriving: its connections, of which nobody hears until then.
     """
 
     threads: Threads
     position: Position
     notes: tuple[str, ...]
     others: tuple[Threads, ...] = ()
+    arriving: Arriving = field(default_factory=Arriving)
 
     @property
     def pid(self) -> int:
@@ -86,6 +89,7 @@ class RestoredProgram:
 
     def resume(self) -> None:
         """Let it go on, without us: all of its threads at once. Should we die halfway, it dies, too, or all of it goes on."""
+        self.arriving.let_go()
         everybody = (*self.others, self.threads)
         try:
             for threads in everybody:
@@ -106,12 +110,14 @@ def restore(vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restor
     brought = restore_checks.require(program, options, vessel_pid)
     laid = laying.lay_down_for(state, vessel_pid, own_eyes=options.own_eyes)
     program, _ = remembered.renewed(program, laid.identities)
+    arriving, program = carried_connections.arriving(program, wanted=options.stood_still)
     try:
         restored = (
-            _run_tree(vessel_pid, program, options, brought)
+            _run_tree(vessel_pid, program, options, brought, arriving)
             if state.is_tree
-            else _run_one(vessel_pid, program, options, brought[0])
+            else _run_one(vessel_pid, program, options, brought[0], arriving)
         )
+        restored.arriving = arriving
         restored.notes += laid.notes
         return restored
     except RestoreError:
@@ -120,24 +126,28 @@ def restore(vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restor
         raise RestoreError(f"cannot restore {state.component} into pid {vessel_pid}: {error}") from error
 
 
-def _run_one(vessel_pid: int, state: Snapshot, options: RestoreOptions, brought: Brought) -> RestoredProgram:
+def _run_one(vessel_pid: int, state: Snapshot, options: RestoreOptions, brought: Brought, arriving: Arriving) -> RestoredProgram:
     restoring = ProcessRestore(Tracee(vessel_pid), state, options, brought)
     try:
         restoring.prepare()
         restoring.build()
         restoring.become_program()
+        arriving.connect([vessel_pid])
     except BaseException:
         restoring.end()
         raise
     return RestoredProgram(restoring.held(), state.position, tuple(restoring.notes))
 
 
-def _run_tree(vessel_pid: int, state: Snapshot, options: RestoreOptions, brought: tuple[Brought, ...]) -> RestoredProgram:
+def _run_tree(
+    vessel_pid: int, state: Snapshot, options: RestoreOptions, brought: tuple[Brought, ...], arriving: Arriving
+) -> RestoredProgram:
     from checkpoint.engines.restore_tree import TreeRestore
 
     restoring = TreeRestore(vessel_pid, state, options, brought)
     try:
         restoring.run()
+        arriving.connect(restoring.pids())
     except BaseException:
         restoring.end()
         raise

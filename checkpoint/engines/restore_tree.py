@@ -81,6 +81,11 @@ class TreeRestore:
         """All of them, the first process first, standing still for us."""
         return tuple(restoring.held() for restoring in self._restoring)
 
+    def pids(self) -> list[int]:
+        """Theirs, as we see them, the first process first."""
+        processes = (self._state.process, *(member.process for member in self._state.members))
+        return [self._born[process.pid].pid for process in processes]
+
     def notes(self) -> tuple[str, ...]:
         """What differs, each once."""
         return tuple(dict.fromkeys(note for notes in (self._notes, *(one.notes for one in self._restoring)) for note in notes))

@@ -1,4 +1,5 @@
-"""What the kernel keeps of a TCP connection for a minute after its end (TIME_WAIT), which bars the same one from being made.
+"""What the kernel keeps of a TCP connection after its end, which bars the same one from being made: for a minute (TIME_WAIT), or
+while the peer does not answer, as one that is silent (`checkpoint.linux.silence`).
 
 Source: sock_diag(7), linux/inet_diag.h; tcp_diag_destroy() in net/ipv4/tcp_diag.c.
 """
@@ -22,6 +23,8 @@ _ENDS: Final = struct.Struct(">HH16s16s")
 _REST: Final = struct.Struct("<III")
 """Interface and cookie of struct inet_diag_sockid: any."""
 _STATE_AT: Final = _HEADER.size + 1
+_INODE_AT: Final = _HEADER.size + 68
+"""idiag_inode: 0 of a socket that nobody has open."""
 _ANY_STATE: Final = 0xFFFFFFFF
 _NO_COOKIE: Final = 0xFFFFFFFF
 
@@ -38,6 +41,18 @@ def remove(ends: Sequence[End]) -> None:
         with contextlib.suppress(OSError), socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM, NETLINK_SOCK_DIAG) as asked:
             if _answer(asked, SOCK_DIAG_BY_FAMILY, address, peer)[_STATE_AT : _STATE_AT + 1] == bytes([TIME_WAIT]):
                 _answer(asked, SOCK_DESTROY, address, peer)
+
+
+def remove_orphan(ends: Sequence[End]) -> None:
+    """Have the kernel forget our end of a connection that no process has open any more, in whatever state (CAP_NET_ADMIN).
+
+    The kernel may want to reset the peer's: the connection is silent.
+    """
+    address, peer = ends
+    with contextlib.suppress(OSError), socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM, NETLINK_SOCK_DIAG) as asked:
+        told = _answer(asked, SOCK_DIAG_BY_FAMILY, address, peer)
+        if told[_INODE_AT : _INODE_AT + 4] == bytes(4):
+            _answer(asked, SOCK_DESTROY, address, peer)
 
 
 def _answer(asked: socket.socket, order: int, address: End, peer: End) -> bytes:

@@ -95,11 +95,13 @@ class Surroundings:
     Attributes:
         pipes: "pipe:[123]" or a terminal's path → stream 0, 1 or 2: of a component under a guard, or what its first process has.
         devices: what the operator wants to become of devices.
+        connections: TCP connections with others go along where it is handed over.
         is_first: it is about the first process of a component.
     """
 
     pipes: Mapping[str, int] = field(default_factory=dict)
     devices: tuple[DeviceRule, ...] = ()
+    connections: bool = False
     is_first: bool = True
 
 

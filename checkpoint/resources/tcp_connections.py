@@ -9,6 +9,9 @@ A connection of which both ends are the program's is made again between the same
 waits at both ends. It is made as any other is, without TCP_REPAIR: no right is needed, and no capture may leave a
 socket in repair.
 
+What a program takes along when it moves, as its operator may have it, is in ``carried_connections``; facts of such connections
+are `TAKEN`, `LEFT` and `MAY_MOVE`.
+
 Facts besides those of ``internet_sockets``: ``local``: both addresses are one machine's; ``queue``: what waits to be read in a
 local one, one message; ``unread``: bytes that wait; ``sent`` and ``received``: bytes that went over it; ``unsent``: bytes still
 to be sent; ``ends``: what poll(2) says of its end, `READ_ENDED` and `FAILED`.
@@ -62,6 +65,7 @@ CAPABILITIES: Final = (
 )
 
 SYN_SENT: Final = 2
+ESTABLISHED: Final = 1
 FIN_WAIT_1: Final = 4
 FIN_WAIT_2: Final = 5
 CLOSE_WAIT: Final = 8
@@ -69,6 +73,13 @@ LAST_ACK: Final = 9
 CLOSING: Final = 11
 _WE_ENDED: Final = (CLOSED, FIN_WAIT_1, FIN_WAIT_2, LAST_ACK, CLOSING)
 _PEER_ENDED: Final = (CLOSE_WAIT, LAST_ACK, CLOSING)
+
+TAKEN: Final = "carried"
+"""Everything that must be known of a connection to take it up elsewhere."""
+MAY_MOVE: Final = "may_move"
+"""Present of one that is taken along where the program is handed over."""
+LEFT: Final = "left"
+"""Why one is not taken along that was to be."""
 
 READ_ENDED: Final = 1
 FAILED: Final = 2
@@ -150,11 +161,18 @@ def is_connection(facts: Mapping[str, Fact]) -> bool:
     return facts["state"] != CLOSED or bool(facts.get("ends"))
 
 
+def is_carriable(facts: Mapping[str, Fact]) -> bool:
+    """Whether it is a connection that lives, and may be taken along."""
+    return is_connection(facts) and facts["state"] in (ESTABLISHED, *_WE_ENDED, CLOSE_WAIT) and bool(facts["peer"])
+
+
 def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
     """The connection as it was observed."""
     if not is_connection(held.observed):
         return None
     facts: dict[str, Fact] = {"descriptors": held.numbers, "flags": held.first.flags & ~os.O_CLOEXEC, **held.observed}
+    if surroundings.connections and is_carriable(held.observed):
+        facts[MAY_MOVE] = True
     return Resource(KIND, held.name, facts)
 
 
@@ -179,8 +197,10 @@ def findings(held: Sequence[Resource], *, standing: bool) -> Iterator[Finding]:
         if other is not None:
             reasons = _refuse_end(one, other) if standing else ()
             yield from (Finding(KIND, one.name, REFUSED, reason) for reason in reasons)
-        elif text := note(one):
-            yield Finding(KIND, one.name, NOTED, f"{text} when the program comes back")
+        elif TAKEN not in one.facts and (text := note(one)):
+            may_move = MAY_MOVE in one.facts and LEFT not in one.facts
+            when = "should the program crash; a handover takes it along" if may_move else "when the program comes back"
+            yield Finding(KIND, one.name, NOTED, f"{text} {when}")
 
 
 def _refuse_end(one: Resource, other: Resource) -> Iterator[str]:
@@ -201,17 +221,18 @@ def note(held: Resource) -> str | None:
         return None
     peer = held.facts["peer"]
     where = f" with {in_words(peer)}" if isinstance(peer, list) and peer else ""
+    why = f" ({reason})" if isinstance(reason := held.facts.get(LEFT), str) else ""
     return (
-        f"the TCP connection {held.name}{where} is ended"
+        f"the TCP connection {held.name}{where} is ended{why}"
         if _reads_the_end(held)
-        else f"the TCP connection {held.name}{where} is reset"
+        else f"the TCP connection {held.name}{where} is reset{why}"
     )
 
 
 def notes(held: Sequence[Resource]) -> tuple[str, ...]:
     """What a restore loses, one sentence each."""
     others = pairs(held)
-    ending = (one for one in held if one.kind == KIND and _number(one, "socket") not in others)
+    ending = (one for one in held if one.kind == KIND and TAKEN not in one.facts and _number(one, "socket") not in others)
     return tuple(text for one in ending if (text := note(one)))
 
 
@@ -277,7 +298,7 @@ class _Work:
             other = self._others.get(_number(one, "socket"))
             if other is not None:
                 self._join(one, other)
-            elif one.facts["state"] == SYN_SENT:
+            elif one.facts["state"] == SYN_SENT or TAKEN in one.facts:
                 self._keep(one, sockets.make(self._table, one))
             else:
                 self._end(one)
@@ -383,6 +404,8 @@ def settle(table: CallTable, held: Sequence[Resource], made: Mapping[int, int]) 
     others = pairs(held)
     for one in held:
         number, other = made[_number(one, "socket")], others.get(_number(one, "socket"))
+        if TAKEN in one.facts:
+            continue
         if one.facts["state"] == SYN_SENT:
             _ask_again(table, one, number)
         elif other is not None:

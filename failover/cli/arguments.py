@@ -137,6 +137,10 @@ def _devices(room: argparse.ArgumentParser) -> None:
     )
 
 
+def _connections(room: argparse.ArgumentParser, what: str, default: str = "") -> None:
+    room.add_argument("--connections", choices=("reset", "carry"), default=default, help=f"{what} (see docs/connections.md)")
+
+
 def device(text: str) -> tuple[str, str]:
     """A path and its rule, which the agent reads."""
     path, is_there, rule = text.rpartition("=")
@@ -241,6 +245,7 @@ def capture(room: argparse.ArgumentParser) -> None:
     )
     room.add_argument("--force", action="store_true", help="replace FILE if it exists")
     _devices(room)
+    _connections(room, "carry: take its TCP connections with others along (default: reset)", "reset")
     _json(room)
 
 
@@ -249,6 +254,7 @@ def restore(room: argparse.ArgumentParser) -> None:
     room.add_argument("file", metavar="FILE", help="a snapshot made by failover capture")
     room.add_argument("--wait", action="store_true", help="stay until the program ends, and pass on its exit status")
     _devices(room)
+    _connections(room, "reset: do not take up TCP connections that the capture took along (default: carry)", "carry")
     _json(room)
 
 

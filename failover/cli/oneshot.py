@@ -22,6 +22,7 @@ from checkpoint.model import Snapshot
 from failover.cli import picture, render
 from failover.cli.components import exit_like
 from failover.cli.keeper import Keeper
+from failover.core.types import CARRY
 from failover.errors import FailoverError
 
 # --- capture ---------------------------------------------------------------------------------------------------------
@@ -33,7 +34,7 @@ def capture(arguments: argparse.Namespace) -> int:
     if target.exists() and not arguments.force:
         raise FailoverError(f"cannot write {target}: it exists; give another name, or --force to replace it")
     with Keeper.spawn() as keeper:
-        order = Protect(arguments.pid, f"/pid/{arguments.pid}", terms=Terms(devices=device_rules(arguments)))
+        order = Protect(arguments.pid, f"/pid/{arguments.pid}", terms=terms_of(arguments))
         protected, _ = keeper.ask(order, Protected)
         held = not arguments.leave_running
         captured, (content,) = keeper.ask(Capture(base=True, generation=1, sequence=1, hold=held), Captured)
@@ -92,6 +93,15 @@ def _write_whole(target: Path, content: int) -> None:
         aside.unlink(missing_ok=True)
 
 
+def terms_of(arguments: argparse.Namespace) -> Terms:
+    """What was ruled for this capture or restore.
+
+    Raises:
+        FailoverError: a rule is none.
+    """
+    return Terms(devices=device_rules(arguments), connections=arguments.connections == CARRY)
+
+
 def device_rules(arguments: argparse.Namespace) -> tuple[DeviceRule, ...]:
     """What becomes of devices.
 
@@ -114,9 +124,10 @@ def restore(arguments: argparse.Namespace) -> int:
     except OSError as error:
         raise FailoverError(f"cannot read {arguments.file}: {error.strerror}") from error
     outline = format.read_outline(file)
-    elapsed_ns, terms = vessel.elapsed_since(outline.clocks), Terms(devices=device_rules(arguments))
+    elapsed_ns, terms = vessel.elapsed_since(outline.clocks), terms_of(arguments)
     with Keeper.spawn() as keeper, _born(birth_of(outline, elapsed_ns, own_session=not arguments.wait)) as born:
-        restored, _ = keeper.ask(Restore(born.pid, outline.component, elapsed_ns, terms=terms), Restored, (file,))
+        order = Restore(born.pid, outline.component, elapsed_ns, terms=terms, stood_still=terms.connections)
+        restored, _ = keeper.ask(order, Restored, (file,))
         resumed, _ = keeper.ask(Resume(), Resumed)
         keeper.ask(Release(), Released)
     _tell_restore(arguments, restored.pid, born.notes + restored.notes + resumed.notes)

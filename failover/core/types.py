@@ -113,6 +113,13 @@ COMMITTED = "committed"
 """Output is shown once another robot holds a checkpoint that contains it."""
 
 
+RESET = "reset"
+"""TCP connections with others are reset wherever the program goes on."""
+
+CARRY = "carry"
+"""They are taken along where it goes on from the state in which it stood still for good: by a handover, a failback."""
+
+
 @dataclass(frozen=True, slots=True)
 class Launch:
     """How a program begins. The rules carry it and never look inside.

@@ -1,0 +1,178 @@
+"""TCP connections with somebody else that go along: the peer, in a network of its own, sees one unbroken stream of bytes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.failover.cli.test_verbs import COMMAND
+
+pytestmark = [pytest.mark.root]
+
+TALKERS = Path(__file__).with_name("talkers.py")
+PYTHON = getattr(sys, "_base_executable", sys.executable)
+PATIENCE_S = 60.0
+PORT = "7000"
+ADDRESSES = {4: ("10.77.0.9/24", "10.77.0.1/24"), 6: ("fd77::9/64", "fd77::1/64")}
+"""Of the program, which moves, and of its peer."""
+OWN = {4: ("10.77.0.2/24", "10.77.0.3/24"), 6: ("fd77::2/64", "fd77::3/64")}
+"""Of the two machines."""
+
+
+def run(*words: str) -> str:
+    """What a command said that must succeed."""
+    ran = subprocess.run(words, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
+    assert ran.returncode == 0, f"{' '.join(words)}: {ran.stdout}{ran.stderr}"
+    return ran.stdout
+
+
+def until(condition: Callable[[], object], what: str) -> None:
+    """Poll until something holds."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, f"waited in vain for {what}"
+        time.sleep(0.01)
+
+
+@dataclass(slots=True)
+class Machines:
+    """Two machines and a peer, each a network namespace, at one wire.
+
+    Attributes:
+        version: of IP.
+        homes: where the program's address is now.
+    """
+
+    directory: Path
+    version: int
+
+    def name(self, machine: str) -> str:
+        return f"failover-{os.getpid()}-{machine}"
+
+    def ip(self, machine: str, *words: str) -> None:
+        run("ip", "-n", self.name(machine), *words)
+
+    def inside(self, machine: str) -> list[str]:
+        """What to put before a command that is to run there, with the same files."""
+        return ["nsenter", f"--net=/run/netns/{self.name(machine)}"]
+
+    def give_address(self, machine: str) -> None:
+        """The program's address is that machine's from now on, and the wire knows."""
+        self.add_address(machine, "eth0", ADDRESSES[self.version][0])
+        self.ip("peer", "neigh", "flush", "all")
+
+    def add_address(self, machine: str, interface: str, address: str) -> None:
+        self.ip(machine, "addr", "add", address, "dev", interface, *(["nodad"] if self.version == 6 else []))
+
+    def take_address(self, machine: str) -> None:
+        self.ip(machine, "addr", "del", ADDRESSES[self.version][0], "dev", "eth0")
+
+    def start(self, machine: str, part: str) -> subprocess.Popen[bytes]:
+        """Start a talker there; what it says is in a file of its name."""
+        host = ADDRESSES[self.version][1].partition("/")[0]
+        with (self.directory / part).open("ab") as output:
+            return subprocess.Popen(
+                [*self.inside(machine), PYTHON, str(TALKERS), part, host, PORT, ADDRESSES[self.version][0].partition("/")[0]],
+                cwd=self.directory,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,
+            )
+
+    def said(self, part: str) -> list[str]:
+        return (self.directory / part).read_text().splitlines()
+
+    def failover(self, machine: str, *words: str) -> subprocess.CompletedProcess[str]:
+        command = [*self.inside(machine), *COMMAND, *words]
+        ran = subprocess.run(command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
+        assert "Traceback" not in ran.stderr + ran.stdout
+        return ran
+
+
+@pytest.fixture(params=[4, 6])
+def machines(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Machines]:
+    """Two machines and a peer; the first has the program's address."""
+    made = Machines(tmp_path, request.param)
+    yield from laid(made)
+
+
+def laid(made: Machines) -> Iterator[Machines]:
+    """The wires of three machines, for the body."""
+    try:
+        for machine in ("one", "two", "peer"):
+            run("ip", "netns", "add", made.name(machine))
+            made.ip(machine, "link", "set", "lo", "up")
+        made.ip("peer", "link", "add", "wire", "type", "bridge")
+        for machine in ("one", "two"):
+            made.ip("peer", "link", "add", machine, "type", "veth", "peer", "name", "eth0", "netns", made.name(machine))
+            made.ip("peer", "link", "set", machine, "master", "wire", "up")
+            made.ip(machine, "link", "set", "eth0", "up")
+        made.ip("peer", "link", "set", "wire", "up")
+        made.add_address("peer", "wire", ADDRESSES[made.version][1])
+        for machine, address in zip(("one", "two"), OWN[made.version], strict=True):
+            made.add_address(machine, "eth0", address)
+        made.give_address("one")
+        yield made
+    finally:
+        for machine in ("one", "two", "peer"):
+            subprocess.run(["ip", "netns", "del", made.name(machine)], capture_output=True, check=False)
+
+
+def conversation(machines: Machines) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
+    """A program and its peer, which have filled their connection in both directions."""
+    called = machines.start("peer", "called")
+    until(lambda: machines.said("called") == ["listens"], "the peer to listen")
+    caller = machines.start("one", "caller")
+    until(lambda: machines.said("caller") == ["ready"] and machines.said("called")[-1:] == ["ready"], "both ends to be full")
+    return caller, called
+
+
+def captured(machines: Machines, caller: subprocess.Popen[bytes], *words: str) -> Path:
+    """The program's snapshot, after which it has ended."""
+    file = machines.directory / "snapshot"
+    ran = machines.failover("one", "capture", str(caller.pid), "-o", str(file), "--force", *words)
+    assert ran.returncode == 0, ran.stderr
+    return file
+
+
+def restored(machines: Machines, machine: str, file: Path, *words: str) -> tuple[int, str]:
+    """The program's PID where it goes on, and what was said of that."""
+    ran = machines.failover(machine, "restore", str(file), *words)
+    assert ran.returncode == 0, ran.stderr
+    return int(ran.stdout), ran.stderr
+
+
+def finish(machines: Machines, pid: int, called: subprocess.Popen[bytes]) -> None:
+    """Have both read what they were told, and wait for their end."""
+    (machines.directory / "go").touch()
+    try:
+        until(lambda: len(machines.said("caller")) > 1, "the program's verdict")
+        until(lambda: called.poll() is not None, "the peer's verdict")
+    finally:
+        called.kill()
+        called.wait()
+        try:
+            os.kill(pid, signal.SIGKILL)
+        except ProcessLookupError:
+            pass
+
+
+def test_a_connection_goes_along_with_all_that_waits_in_it(machines: Machines) -> None:
+    caller, called = conversation(machines)
+    file = captured(machines, caller, "--connections", "carry")
+    caller.wait()
+    machines.take_address("one")
+    pid, notes = restored(machines, "two", file)
+    assert "is reset (" not in notes, notes
+    machines.give_address("two")
+    finish(machines, pid, called)
+    assert (machines.said("caller")[-1], machines.said("called")[-1]) == ("ok", "ok")
