@@ -103,13 +103,10 @@ def _reason(number: int) -> str:
 
 
 def end(leader: Tracee, others: Iterable[Tracee]) -> None:
-    """Kill a vessel that will be no program: its threads end for their tracer, or its parent could not reap it."""
-    others = tuple(others)
-    if not others:
-        return
+    """Kill a vessel that will be no program: all of it ends for its tracer first, or its parent would wait for it in vain."""
     with contextlib.suppress(ProcessLookupError):
         os.kill(leader.pid, signal.SIGKILL)
-    for thread in others:
+    for thread in (*others, leader):
         with contextlib.suppress(ProcessGoneError, CheckpointError):
             while True:
                 thread.wait(call_table.RUN_TIMEOUT_S)

@@ -74,7 +74,7 @@ class TreeRestore:
         for restoring in self._restoring[:1]:
             restoring.end()
         for tracee in self._born.values():
-            if tracee is not self._first:
+            if tracee is not self._first or not self._restoring:  # while it is traced its parent waits for it in vain
                 _await_end(tracee)
 
     def held(self) -> tuple[Threads, ...]:

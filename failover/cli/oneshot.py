@@ -5,17 +5,20 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import select
 import signal
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Final, TypeVar
 
 from checkpoint import channel, format
 from checkpoint.channel import Capture, Captured, Protect, Protected, Release, Released, Restore, Restored, Resume, Resumed
 from checkpoint.device_rules import DeviceRule, rule_from
 from checkpoint.engine import Terms
-from checkpoint.errors import CheckpointError
+from checkpoint.errors import CaptureError, CheckpointError, NothingCommittedError, ProcessGoneError
 from checkpoint.linux import kinship, vessel
 from checkpoint.linux.vessel import Birth, Born
 from checkpoint.model import Snapshot
@@ -24,6 +27,14 @@ from failover.cli.components import exit_like
 from failover.cli.keeper import Keeper
 from failover.core.types import CARRY
 from failover.errors import FailoverError
+
+CAPTURE_TRIES: Final = 12
+CAPTURE_PAUSE_S: Final = 0.25
+"""How often, and how soon, a capture is made again that was begun in a bad moment: a machine without a processor to spare."""
+END_TIMEOUT_S: Final = 10.0
+"""How long a killed program may take to be dead; the kernel gives a large memory back first."""
+
+A = TypeVar("A")
 
 # --- capture ---------------------------------------------------------------------------------------------------------
 
@@ -35,9 +46,10 @@ def capture(arguments: argparse.Namespace) -> int:
         raise FailoverError(f"cannot write {target}: it exists; give another name, or --force to replace it")
     with Keeper.spawn() as keeper:
         order = Protect(arguments.pid, f"/pid/{arguments.pid}", terms=terms_of(arguments))
-        protected, _ = keeper.ask(order, Protected)
+        protected, _ = _at_last(lambda: keeper.ask(order, Protected))
         held = not arguments.leave_running
-        captured, (content,) = keeper.ask(Capture(base=True, generation=1, sequence=1, hold=held), Captured)
+        whole = Capture(base=True, generation=1, sequence=1, hold=held)
+        captured, (content,) = _at_last(lambda: keeper.ask(whole, Captured))
         try:
             _write_whole(target, content)
         finally:
@@ -49,11 +61,46 @@ def capture(arguments: argparse.Namespace) -> int:
     return _tell_capture(arguments, captured, tuple(dict.fromkeys(protected.notes + captured.notes)))
 
 
+def _at_last(ask: Callable[[], A]) -> A:
+    """The answer to what is asked again where the moment was bad: nobody else is there to do so, unlike with an agent.
+
+    Raises:
+        CheckpointError: what the last try said, or the first one that no other moment would have helped.
+    """
+    for left in reversed(range(CAPTURE_TRIES)):
+        try:
+            return ask()
+        except (ProcessGoneError, NothingCommittedError):
+            raise
+        except CaptureError:
+            if not left:
+                raise
+            time.sleep(CAPTURE_PAUSE_S)
+    raise AssertionError("the last try answers or raises")
+
+
 def _end(pid: int) -> None:
-    """Kill a program that stands still, its children first, so that none of them runs on without it."""
-    for one in (*reversed(kinship.descendants(pid)), pid):
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(one, signal.SIGKILL)
+    """Kill a program that stands still, its children first, so that none runs on without it; wait until all are dead."""
+    with contextlib.ExitStack() as held:
+        dying = select.poll()
+        count = 0
+        for one in (*reversed(kinship.descendants(pid)), pid):
+            with contextlib.suppress(ProcessLookupError):
+                end = os.pidfd_open(one)
+                held.callback(os.close, end)
+                signal.pidfd_send_signal(end, signal.SIGKILL)
+                dying.register(end, select.POLLIN)
+                count += 1
+        _wait_for_ends(dying, count)
+
+
+def _wait_for_ends(dying: select.poll, count: int) -> None:
+    """Wait, for a while, until all pidfds of a poll have told of an end: who restores at once finds files and PIDs free."""
+    deadline = time.monotonic() + END_TIMEOUT_S
+    while count and (left := deadline - time.monotonic()) > 0:
+        for descriptor, _ in dying.poll(left * 1000):
+            dying.unregister(descriptor)
+            count -= 1
 
 
 def _tell_capture(arguments: argparse.Namespace, captured: Captured, notes: tuple[str, ...]) -> int:

@@ -17,6 +17,8 @@ from pathlib import Path
 import pytest
 
 from checkpoint import capabilities
+from checkpoint.linux import kinship
+from checkpoint.linux.threads import thread_ids
 from tests.failover.cli.test_verbs import failover
 
 PYTHON = getattr(sys, "_base_executable", sys.executable)
@@ -130,6 +132,39 @@ def test_waiting_passes_on_the_exit_status_of_the_restored_program(tmp_path: Pat
     ran = failover("restore", "--wait", str(tmp_path / "snapshot"))
     assert ran.returncode == 7, ran.stderr
     assert lines(tmp_path / "output") == LINES
+
+
+BY_ITS_PID = {
+    "a program of two processes": "import subprocess; subprocess.run(['sleep', '600'])",
+    "a program of two threads": "import threading, time; threading.Thread(target=time.sleep, args=[600]).start()",
+}
+
+
+@pytest.mark.parametrize("text", BY_ITS_PID.values(), ids=list(BY_ITS_PID))
+def test_a_restore_that_comes_to_nothing_in_the_middle_says_so_and_leaves_nothing(text: str, tmp_path: Path) -> None:
+    with subprocess.Popen([PYTHON, "-c", text], stdout=subprocess.DEVNULL, start_new_session=True) as process:
+        try:
+            wait_for("its other half", lambda: len(kinship.descendants(process.pid)) + len(thread_ids(process.pid)) == 2)
+            snapshot = str(tmp_path / "snapshot")
+            captured = failover("capture", "--leave-running", str(process.pid), "-o", snapshot)
+            assert captured.returncode == 0, captured.stderr
+            restored = failover("restore", snapshot)
+        finally:
+            os.killpg(process.pid, signal.SIGKILL)
+    assert restored.returncode == 1
+    assert f"pid {process.pid}, by which they know it, cannot be had" in restored.stderr
+    assert not kinship.descendants(os.getpid())
+
+
+def test_who_was_captured_is_dead_when_the_command_returns(tmp_path: Path) -> None:
+    argv = [PYTHON, "-c", "import os, time; x = os.urandom(64 << 20); print('ready', flush=True); time.sleep(600)"]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        captured = failover("capture", str(process.pid), "-o", str(tmp_path / "snapshot"))
+        assert captured.returncode == 0, captured.stderr
+        assert os.waitpid(process.pid, os.WNOHANG) == (process.pid, signal.SIGKILL)
+        process.returncode = -signal.SIGKILL
 
 
 def test_a_program_left_running_writes_what_an_undisturbed_one_writes(tmp_path: Path) -> None:
