@@ -296,22 +296,27 @@ class Charge:
         if waiting is not None:
             try:
                 component = await comeback.brought_back(self.around, act, chain, outage_ns, laps, waiting)
-                return await self._let_it_run(component, act.epoch, outage_ns, laps)
+                return await self._let_it_run(component, act, outage_ns, laps)
             except TROUBLE as trouble:
                 log.warning("%s: what waited here cannot go on with it, it is started anew: %s", self.name, trouble)
         component = await comeback.brought_back(self.around, act, chain, outage_ns, laps)
-        return await self._let_it_run(component, act.epoch, outage_ns, laps)
+        return await self._let_it_run(component, act, outage_ns, laps)
 
-    async def _let_it_run(self, component: Component, epoch: int, outage_ns: int, laps: clock.Laps) -> tuple[Component, int]:
+    async def _let_it_run(
+        self, component: Component, act: acts.Restore, outage_ns: int, laps: clock.Laps
+    ) -> tuple[Component, int]:
         """Give it the newest lease, and those that come while it is resumed; then it runs, or nothing of it is left."""
         prepared = component.prepared
-        self.around.records.note(self.name, epoch, component.keeper.terms)
+        self.around.records.note(self.name, act.epoch, component.keeper.terms)
         self._coming = component
         try:
             if self._lease_until_ns:
                 await component.lease(self._lease_until_ns)
-            await component.resume()
+            told = self._occasions.told_by(act)
+            untold = await component.resume(told)
             laps.lap("letting it go")
+            if told:
+                self._occasions.told(told[0], untold)
         except GuardError:
             await component.undo()
             raise

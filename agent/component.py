@@ -162,17 +162,25 @@ class Component:
         bounds = [self.logs.bounds(stream) for stream in STREAMS]
         return sum(stream.size - stream.committed for stream in bounds)
 
-    async def resume(self) -> None:
+    async def resume(self, told: tuple[int, int] | None = None) -> str:
         """After `births.restore`: commit to it and let it go on.
+
+        Args:
+            told: a signal, and its value, that it gets before its next instruction.
+
+        Returns:
+            Why it was not told; "" if it was, or nobody wanted that.
 
         Raises:
             RestoreError, GuardError, KeeperLostError: it did not get that far; nothing of it is left.
         """
         if self.prepared is not None:
             await self._begin_again(self.prepared)
-            return
+            return "a program that is started again from its state is called back by on_resume" if told else ""
+        untold = ""
         try:
             await self.ask_guard(guard_messages.Commit())
+            untold = await self._tell(*told) if told else ""
             resumed, _ = await self.keeper.ask(channel.Resume())
         except (CheckpointError, GuardError, KeeperLostError):
             await self.undo()
@@ -182,6 +190,17 @@ class Component:
             self._drop_keeper()  # the next capture tries with a new one
         else:
             self.keeper.followed = PTRACE, self.pid
+        return untold
+
+    async def _tell(self, number: int, value: int) -> str:
+        """Have a signal wait for it; why not, "" if it does."""
+        try:
+            await self.ask_guard(guard_messages.Tell(number, value))
+        except GuardLostError:
+            raise
+        except GuardError as error:
+            return str(error)
+        return ""
 
     async def _begin_again(self, prepared: Prepared) -> None:
         """Have the program go on with the state that waits for it. One that waits has its lease before it can take a step."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from agent.errors import ConfigError
-from agent.hooks import KINDS
+from agent.hooks import KINDS, check_told
 from checkpoint.device_rules import RULES_MAX, DeviceRule, checked, rule_from
 from checkpoint.engine import is_carriable
 from failover.client import strict_toml
@@ -348,6 +348,10 @@ def _check_command(where: str, component: ComponentConfig) -> None:
         hook = component.hooks.command(key)
         if hook and (not hook[0] or any("\0" in word for word in hook)):
             raise ConfigError(f"{where}: {key} begins with an empty word, or holds a zero byte; the first word names the program")
+    try:
+        check_told({kind: component.hooks.command(kind) for kind in KINDS})
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}") from error
     if not 1 <= component.hooks.limit_s <= HOOK_S_MAX:
         raise ConfigError(f"{where}: limit_s of its hooks is {component.hooks.limit_s}; at least 1 and at most {HOOK_S_MAX}")
     if any("\0" in word for word in (*component.command, component.directory, *component.environment.values())):

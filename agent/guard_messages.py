@@ -146,6 +146,13 @@ class Kill(Message, frozen=True):
     signal: int
 
 
+class Tell(Message, frozen=True):
+    """Send the program a signal with a value; refused where that would end it, for it has no handler."""
+
+    signal: int
+    value: int
+
+
 class Describe(Message, frozen=True):
     """How does the component stand?"""
 
@@ -266,6 +273,7 @@ Request = (
     | CommitSafe
     | LimitOutput
     | Kill
+    | Tell
     | Describe
     | LetGo
     | Forget

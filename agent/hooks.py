@@ -15,6 +15,9 @@ the program looks for them. They are told in their environment which robot this 
 
 Standard output and error go to the agent's log, under systemd to the journal, and the last line to ``failover why``: the
 component's own output is the program's alone. No shell reads the command.
+
+An after_resume of the one word ``signal:SIGUSR2`` runs nothing: the program itself gets that signal before its next instruction,
+with the generation as its value (``epoch × 64 + the robot's place in the order of names``), and its handler is the hook.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ import logging
 import os
 import secrets
 import signal
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -52,6 +55,35 @@ SYSTEMD_S: Final = 2.0
 PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
 log = logging.getLogger("failover.component")
+
+
+SIGNAL: Final = "signal:"
+"""Begins the word that stands in place of a command, see `signal_in`."""
+
+
+def signal_in(command: Sequence[str]) -> int:
+    """The signal by which the program itself is told; 0 where a command is run.
+
+    Raises:
+        ValueError: it names none that a program can handle.
+    """
+    if not command or not command[0].startswith(SIGNAL):
+        return 0
+    number = getattr(signal.Signals, command[0].removeprefix(SIGNAL), None)
+    if len(command) > 1 or number is None or number in (signal.SIGKILL, signal.SIGSTOP):
+        raise ValueError(f"{' '.join(command)!r} names no signal that a program can handle: say {SIGNAL}SIGUSR2, for one")
+    return int(number)
+
+
+def check_told(commands: Mapping[Any, Sequence[str]]) -> None:
+    """Let a signal be a hook where a program can hear it.
+
+    Raises:
+        ValueError: it is none, or meant for another occasion.
+    """
+    for kind, command in commands.items():
+        if signal_in(command) and kind != "after_resume":
+            raise ValueError(f"{kind} = {command[0]!r}: nobody could wait for what its handler does; only after_resume takes one")
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """The few system calls that a guard needs and that Python does not offer.
 
-Sources: prctl(2), mlockall(2), fallocate(2), timerfd_create(2).
+Sources: prctl(2), mlockall(2), fallocate(2), sigqueue(3), timerfd_create(2).
 """
 
 from __future__ import annotations
@@ -49,6 +49,15 @@ def punch_hole(descriptor: int, offset: int, size: int) -> None:
         OSError: EOPNOTSUPP where the filesystem cannot.
     """
     _check(_libc.fallocate(descriptor, FALLOC_FL_PUNCH_HOLE | FALLOC_FL_KEEP_SIZE, offset, size), "fallocate(PUNCH_HOLE)")
+
+
+def queue_signal(pid: int, number: int, value: int) -> None:
+    """Send a process a signal with a value, which a handler with SA_SIGINFO finds as ``si_value.sival_ptr``.
+
+    Raises:
+        OSError: ESRCH, EPERM; EAGAIN where too many wait already.
+    """
+    _check(_libc.sigqueue(pid, number, ctypes.c_void_p(value)), "sigqueue")
 
 
 class Alarm:

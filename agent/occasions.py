@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import signal
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -72,8 +73,24 @@ class Occasions:
         await self._prepare("before_resume", act.spec, occasion)
         return occasion
 
+    def told_by(self, act: acts.Restore) -> tuple[int, int] | None:
+        """The signal by which the program itself is told that it goes on here, and its value; None where a command is run."""
+        number = _signal_in(self._hook("after_resume", act.spec).command)
+        return (number, act.generation) if number else None
+
+    def told(self, number: int, failure: str) -> None:
+        """How it went to tell the program by a signal, which has gone on."""
+        self.figures.hooks.pop("after_resume", None)
+        name = signal.Signals(number).name
+        if failure:
+            self.figures.hooks["after_resume"] = f"after_resume (signal:{name}) failed on {self.around.places.robot}: {failure}"
+        said = self.figures.hooks.get("after_resume") or f"after_resume: it was told by {name}, before its next instruction"
+        self.around.tell(events.Noticed(self.name, said))
+
     async def after_resume(self, spec: ComponentSpec | None, occasion: Occasion, pid: int) -> None:
         """Run what is to be run once it has gone on here."""
+        if _signal_in(self._hook("after_resume", spec).command):
+            return
         await self._run("after_resume", spec, replace(occasion, pid=pid))
 
     def runs_here(self, spec: ComponentSpec | None) -> None:
@@ -116,3 +133,11 @@ class Occasions:
         told = outcome.failure or f"{kind} ({' '.join(hook.command)}) ended well after {took_ms:.0f} ms"
         self.around.tell(events.Noticed(self.name, told + said))
         return outcome.failure
+
+
+def _signal_in(command: tuple[str, ...]) -> int:
+    """Of a command that may have come from another robot: what is no signal is found out when it is run."""
+    try:
+        return hooks.signal_in(command)
+    except ValueError:
+        return 0

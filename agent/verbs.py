@@ -27,6 +27,7 @@ from agent.charge import Charge
 from agent.control import Conversation, Verb
 from agent.errands import Order
 from agent.errors import RefusedError
+from agent.hooks import check_told
 from agent.outflow import Outflow
 from agent.places import Places
 from agent.questions import Lines, Questions
@@ -117,6 +118,10 @@ class Verbs(Questions):
         wanted = arguments_of(RunArguments, "run", arguments)
         if not wanted.argv:
             raise RefusedError("run needs a command: failover run -- COMMAND …")
+        try:
+            check_told(dict(wanted.hooks))
+        except ValueError as error:
+            raise RefusedError(f"run: {error}") from error
         inheritance = inheritance_for(say.caller, wanted.user)
         name = await self._fresh_name(wanted.name, wanted.argv[0], say.caller.uid)
         launch = Launch(

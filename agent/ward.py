@@ -27,10 +27,13 @@ from agent import freezer as freezing
 from agent.clock import now_ns
 from agent.freezer import Freezer
 from agent.guard_messages import BeginTask, Described, Exited, MakeVessel, Start, Watch
+from agent.kernel import queue_signal
 from agent.pump import Pump
 from agent.streams import STREAMS, OutputLogs
 from agent.task_end import TaskEnd, name_told_to
 from checkpoint.engine import PTRACE
+from checkpoint.errors import ProbeError
+from checkpoint.linux import procfs
 from checkpoint.linux.brought import BroughtFile
 from checkpoint.linux.vessel import Birth, Born, spawn_program, spawn_vessel
 from checkpoint.task_channel import VARIABLE
@@ -294,6 +297,20 @@ class Ward:
                 os.kill(self.born.pid, number)
         except ProcessLookupError:
             pass
+
+    def tell(self, number: int, value: int) -> None:
+        """Send a signal with a value.
+
+        Raises:
+            WardError: it would end by it, has ended, or cannot be told.
+        """
+        try:
+            fields = procfs.parse_fields(procfs.read_text(self.born.pid, "status"))
+            if not (int(fields["SigCgt"], 16) | int(fields["SigBlk"], 16)) >> (number - 1) & 1:
+                raise WardError(f"it neither handles nor blocks {signal.Signals(number).name}, which may end it: not told")
+            queue_signal(self.born.pid, number, value)
+        except (OSError, ProbeError) as error:
+            raise WardError(f"it cannot be told by {signal.Signals(number).name}: {error}") from error
 
     def abandon(self) -> None:
         """Agent or keeper are gone before it was the component: nothing of it stays."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import pwd
+import signal
+import subprocess
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -51,9 +53,9 @@ def told(directory: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def move(robot: RobotMachine, order: str) -> None:
+def move(robot: RobotMachine, order: str, name: str = "count") -> None:
     """Have the component moved; on a busy machine its last snapshot may be called off, and is tried again."""
-    robots.until(lambda: robots.failover(robot, order, "count").returncode == 0, f"a {order}")
+    robots.until(lambda: robots.failover(robot, order, name).returncode == 0, f"a {order}")
 
 
 def around(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -176,3 +178,52 @@ def test_a_hook_that_comes_with_the_program_runs_as_its_user(tmp_path: Path, ope
         assert essence(line) == ("after_resume", "robot2", "handed over", "robot1")
         assert line["uid"] == str(nobody.pw_uid)
         assert robots.component(second, "count")["role"] == "primary"
+
+
+HEARS = r"""
+#include <signal.h>
+#include <stdio.h>
+#include <time.h>
+static volatile sig_atomic_t told;
+static volatile unsigned long turns, turns_then;
+static void *volatile value;
+static void hear(int number, siginfo_t *about, void *context) {
+    told = number + 0 * (context != 0);
+    value = about->si_value.sival_ptr;
+    turns_then = turns;
+}
+int main(void) {
+    struct sigaction action = {.sa_sigaction = hear, .sa_flags = SA_SIGINFO | SA_RESTART};
+    sigaction(SIGUSR2, &action, NULL);
+    for (puts("ready"), fflush(stdout);; turns++) {
+        nanosleep(&(struct timespec){.tv_nsec = 1000000}, NULL);
+        if (told) {
+            printf("%d %lu %d\n", told, (unsigned long)value, turns - turns_then <= 1);
+            fflush(stdout);
+            told = 0;
+        }
+    }
+}
+"""
+
+
+@pytest.mark.compiler
+def test_a_program_is_told_by_a_signal_where_it_is_now(tmp_path: Path) -> None:
+    (tmp_path / "hears.c").write_text(HEARS)
+    subprocess.run(["cc", "-o", str(tmp_path / "hears"), str(tmp_path / "hears.c")], check=True)
+    by_signal = {"after_resume": ["signal:SIGUSR2"]}
+    with robots.two_robots(tmp_path) as (first, second):
+        for name, argv in (("hears", [str(tmp_path / "hears")]), ("deaf", ["/bin/sleep", "1000"])):
+            with first.control() as link:
+                link.ask("run", argv=argv, name=name, env={}, cwd="/", wait=False, hooks=by_signal)
+            robots.until_protected(first, name)
+            move(first, "handover", name)
+            robots.until_protected(second, name)
+        here = robots.component(second, "hears")
+        expected = ["ready", f"{int(signal.SIGUSR2)} {here['generation']} 1"]
+        robots.until(lambda: robots.output(second, "hears").decode().splitlines() == expected, "what the program was told")
+        assert here["generation"] // 64 == here["epoch"]
+        notes = robots.component(second, "deaf")["notes"]
+        assert any("neither handles nor blocks SIGUSR2" in note for note in notes), notes
+        refused = robots.failover(first, "run", "--before-capture", "signal:SIGUSR2", "--", "/bin/true")
+        assert refused.returncode == 1 and "only after_resume takes one" in refused.stderr, refused
