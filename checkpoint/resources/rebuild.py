@@ -216,6 +216,7 @@ def rebuild_last(table: CallTable, state: Snapshot, inner_pid: int) -> None:
             continue  # nothing that is open
         first = number_of(numbers[0][0])
         locks.settle(table, held, first, inner_pid)
+        signalling.settle(table, first, held)
         if held.kind == watches.KIND:
             watches.settle(table, held, first)
 

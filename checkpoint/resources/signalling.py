@@ -1,8 +1,9 @@
 """Who gets which signal when a descriptor becomes ready: F_SETOWN and F_SETSIG of fcntl(2), kept of every kind of open file.
 
 Facts, added to a resource's own: ``signal`` (0 for SIGIO) and ``owner``: 1 if it is the process itself, 2 if its first thread
-alone (F_OWNER_TID), 0 if nobody. Directory notifications (F_NOTIFY) cannot be asked for; but nothing else gives a directory an
-owner, so one that has an owner is refused.
+alone (F_OWNER_TID), 0 if nobody; in a component of several processes ``owner_pid``, which of them. Whether signals are sent at
+all is one of its ``flags`` (O_ASYNC). Directory notifications (F_NOTIFY) cannot be asked for; but nothing else gives a directory
+an owner, so one that has an owner is refused.
 
 Source: fcntl_dirnotify() in fs/notify/dnotify/dnotify.c.
 """
@@ -11,18 +12,25 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import os
 import stat
 import struct
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
+from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.descriptors import copy_of
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile
+from checkpoint.resources.rebuilding import number_of
 
 CAPABILITIES: Final = (
-    preserved(Area.PIPES, "signals of a descriptor (F_SETOWN, F_SETSIG) to the program itself or its first thread", "set again"),
+    preserved(
+        Area.PIPES,
+        "signals of a descriptor (F_SETOWN, F_SETSIG, O_ASYNC) to a process of the program, or its first thread",
+        "set again",
+    ),
     refused(
         Area.PIPES,
         "signals of a descriptor to another process, a group or another thread",
@@ -50,7 +58,15 @@ def describe(held: OpenFile) -> dict[str, Fact]:
     if asked is None:
         return {}
     signal, kind, owner = asked
-    return {"signal": signal, "owner": _OWNERS.get(kind, 0) if owner == held.pid else 0}
+    if not _is_of_ours(held, owner):
+        return {"signal": signal, "owner": 0}
+    facts: dict[str, Fact] = {"signal": signal, "owner": _OWNERS.get(kind, 0)}
+    return facts | ({"owner_pid": procfs.status(owner).pids[-1]} if held.kin.pids else {})
+
+
+def _is_of_ours(held: OpenFile, owner: int) -> bool:
+    """Whether the owner is the process itself, or another one of its component."""
+    return owner == held.pid or owner in held.kin.pids
 
 
 def refuse(held: OpenFile) -> str | None:
@@ -61,20 +77,33 @@ def refuse(held: OpenFile) -> str | None:
     if stat.S_ISDIR(held.first.mode):
         return f"{held.name} is a directory whose changes are told by a signal (F_NOTIFY), which is not kept: use inotify"
     _, kind, owner = asked
-    if owner == held.pid and kind in _OWNERS:
+    if _is_of_ours(held, owner) and kind in _OWNERS:
         return None
     whom = {F_OWNER_TID: f"thread {owner} alone", F_OWNER_PGRP: f"process group {owner}"}.get(kind, str(owner))
     return f"{held.name} sends its signals to {whom}, not to the process itself, which is not kept: let it own them itself"
 
 
 def rebuild(table: CallTable, descriptor: int, held: Resource, inner_pid: int) -> None:
-    """Set them again."""
-    if held.facts.get("owner"):
-        kind = F_OWNER_TID if held.facts["owner"] == ITS_FIRST_THREAD else F_OWNER_PID
-        owner = table.place(_OWNER.pack(kind, inner_pid))
-        table.call(f"own the signals of {held.name}", "fcntl", descriptor, F_SETOWN_EX, owner)
+    """Set them again, as far as they are the process's own: of others, `settle` does, who may not be born yet."""
+    if held.facts.get("owner") and held.facts.get("owner_pid", inner_pid) == inner_pid:
+        _own(table, descriptor, held, inner_pid)
     if held.facts.get("signal"):
         table.call(f"choose the signal of {held.name}", "fcntl", descriptor, fcntl.F_SETSIG, int(str(held.facts["signal"])))
+
+
+def settle(table: CallTable, descriptor: int, held: Resource) -> None:
+    """Give them to whichever process of the component had them: all are there now; and begin to send them."""
+    if held.facts.get("owner") and "owner_pid" in held.facts:
+        _own(table, descriptor, held, number_of(held.facts["owner_pid"]))
+    flags = number_of(held.facts.get("flags", 0))
+    if flags & os.O_ASYNC and not flags & O_PATH:
+        table.call(f"have {held.name} send signals", "fcntl", descriptor, fcntl.F_SETFL, flags)
+
+
+def _own(table: CallTable, descriptor: int, held: Resource, pid: int) -> None:
+    kind = F_OWNER_TID if held.facts["owner"] == ITS_FIRST_THREAD else F_OWNER_PID
+    place = table.place(_OWNER.pack(kind, pid))
+    table.call(f"own the signals of {held.name}", "fcntl", descriptor, F_SETOWN_EX, place)
 
 
 def disown(table: CallTable, descriptor: int) -> None:

@@ -119,6 +119,16 @@ def test_a_family_of_processes_finds_itself_as_it_was(tmp_path: Path) -> None:
 
 
 @pytest.mark.compiler
+def test_what_a_process_has_of_another_by_descriptor_is_as_it_was_after_three_lives(
+    compiled: Callable[..., Path], tmp_path: Path
+) -> None:
+    tracee, _ = three_lives(start_tracee(compiled("kin_descriptors", "-O2"), tmp_path, isolate=True), lambda _: True)
+    with ended(tracee):
+        tracee.tell()
+        expect_ok(tracee)
+
+
+@pytest.mark.compiler
 @pytest.mark.parametrize("kind", ["child", "child_of_thread", "zombie_child"])
 def test_a_child_is_still_there_after_three_lives(kind: str, compiled: Callable[..., Path], tmp_path: Path) -> None:
     tracee = start_tracee(compiled("refused", "-O2"), tmp_path, kind, isolate=True)
