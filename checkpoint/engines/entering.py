@@ -80,7 +80,8 @@ def _enter_once(threads: Threads, interruptions: Interruptions, *, last: bool) -
     decoded = where_it_stands(tracee, interruptions, tracee.rseq())
     lines = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
     left = entry.leftovers(tracee.memory, lines)
-    places = [decoded[arch.INSTRUCTION_POINTER], *map(_instruction_pointer, threads.others)]
+    others = [(other, arch.decode_registers(other.registers())) for other in threads.others]
+    places = [decoded[arch.INSTRUCTION_POINTER], *(found[arch.INSTRUCTION_POINTER] for _, found in others)]
     stands_inside = any(
         entry.is_in_stub(place, tracee.memory, lines) or any(borrowed.holds(place) for borrowed in left) for place in places
     )
@@ -88,7 +89,8 @@ def _enter_once(threads: Threads, interruptions: Interruptions, *, last: bool) -
         if last:
             raise CaptureError(f"pid {tracee.pid} does not leave the code of an earlier tracer; protect it again")
         return None
-    interruptions.of(tracee).settled(decoded)  # remembers the call that it stands in
+    for one, found in ((tracee, decoded), *others):
+        interruptions.of(one).settled(found)  # remembers the call that it stands in
     registers = arch.encode_registers(decoded)
     for borrowed in left:
         if borrowed.state() == remote.ARMED:
@@ -109,10 +111,6 @@ def _enter_once(threads: Threads, interruptions: Interruptions, *, last: bool) -
             os.close(entered.faults)
         raise
     return entered
-
-
-def _instruction_pointer(tracee: Tracee) -> int:
-    return arch.decode_registers(tracee.registers())[arch.INSTRUCTION_POINTER]
 
 
 def _put_back(pid: int, borrowed: BorrowedPages) -> None:

@@ -50,6 +50,8 @@ ITS_FIRST_THREAD: Final = 2
 _OWNERS: Final = {F_OWNER_PID: THE_PROCESS, F_OWNER_TID: ITS_FIRST_THREAD}
 _OWNER: Final = struct.Struct("<ii")
 O_PATH: Final = 0o10000000
+SETTABLE: Final = os.O_APPEND | os.O_ASYNC | os.O_DIRECT | os.O_NOATIME | os.O_NONBLOCK
+"""What F_SETFL changes; it ignores the rest."""
 
 
 def describe(held: OpenFile) -> dict[str, Fact]:
@@ -89,6 +91,11 @@ def rebuild(table: CallTable, descriptor: int, held: Resource, inner_pid: int) -
         _own(table, descriptor, held, inner_pid)
     if held.facts.get("signal"):
         table.call(f"choose the signal of {held.name}", "fcntl", descriptor, fcntl.F_SETSIG, int(str(held.facts["signal"])))
+    flags = int(str(held.facts.get("flags", 0)))
+    if flags & os.O_ASYNC:
+        # open(2) takes the flag without asking for signals, and the kernel acts only where it changes (open(2), BUGS)
+        for wanted in (flags & SETTABLE & ~os.O_ASYNC, flags & SETTABLE):
+            table.call(f"ask for the signals of {held.name}", "fcntl", descriptor, fcntl.F_SETFL, wanted)
 
 
 def settle(table: CallTable, descriptor: int, held: Resource) -> None:

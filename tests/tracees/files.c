@@ -331,6 +331,20 @@ static void owner_thread(const char *go) {
     EXPECT_EQUAL("owner", owner.pid, gettid());
 }
 
+static void asynchronous(const char *go) {
+    int channel[2];
+    struct sigaction action = {.sa_handler = hear};
+    sigaction(SIGUSR2, &action, NULL);
+    if (pipe(channel)) cannot("make a pipe");
+    fcntl(channel[0], F_SETOWN, getpid());
+    fcntl(channel[0], F_SETSIG, SIGUSR2);
+    fcntl(channel[0], F_SETFL, O_ASYNC | O_NONBLOCK);
+    ready(), wait_for_go(go);
+    EXPECT_EQUAL("flags", fcntl(channel[0], F_GETFL), O_ASYNC | O_NONBLOCK);
+    EXPECT_EQUAL("written", write(channel[1], "x", 1), 1);
+    EXPECT(told, "no signal came with what was written");
+}
+
 int main(int count, char **arguments) {
     static const struct {
         const char *name;
@@ -344,7 +358,7 @@ int main(int count, char **arguments) {
                  {"deleted_link", deleted_link}, {"mapped_memory", mapped_memory},
                  {"directory", directory},     {"path_only", path_only}, {"beyond_end", beyond_end},
                  {"memory_file", memory_file}, {"odd_name", odd_name}, {"owner_signal", owner_signal},
-                 {"owner_thread", owner_thread}};
+                 {"owner_thread", owner_thread}, {"asynchronous", asynchronous}};
     for (size_t index = 0; index < sizeof kinds / sizeof *kinds; index++)
         if (count > 2 && !strcmp(arguments[2], kinds[index].name)) {
             kinds[index].act(arguments[1]);
