@@ -7,12 +7,17 @@ from __future__ import annotations
 
 import socket
 import struct
-from collections.abc import Iterator
 from typing import Final
 
-from checkpoint.linux.unix_sockets import NETLINK_SOCK_DIAG, NLM_F_REQUEST, SOCK_DIAG_BY_FAMILY, attributes
+from checkpoint.linux.unix_sockets import (
+    NETLINK_SOCK_DIAG,
+    NLM_F_DUMP,
+    NLM_F_REQUEST,
+    SOCK_DIAG_BY_FAMILY,
+    answers,
+    attributes,
+)
 
-_NLM_F_DUMP: Final = 0x300
 _HEADER: Final = struct.Struct("<IHHII")
 _REQUEST: Final = struct.Struct("<BBBxI48x")
 """Family, protocol, extensions, states; any socket."""
@@ -20,7 +25,6 @@ _ANSWER_SIZE: Final = 72
 _INODE_AT: Final = 68
 _ANY_STATE: Final = 0xFFFFFFFF
 _SHUTDOWN: Final = 8
-_ROOM: Final = 1 << 18
 
 
 def shut_down(family: int, protocol: int) -> dict[int, int]:
@@ -33,22 +37,10 @@ def shut_down(family: int, protocol: int) -> dict[int, int]:
         with socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM, NETLINK_SOCK_DIAG) as asked:
             request = _REQUEST.pack(family, protocol, 0, _ANY_STATE)
             size = _HEADER.size + len(request)
-            asked.send(_HEADER.pack(size, SOCK_DIAG_BY_FAMILY, NLM_F_REQUEST | _NLM_F_DUMP, 1, 0) + request)
-            for answer in _answers(asked):
+            asked.send(_HEADER.pack(size, SOCK_DIAG_BY_FAMILY, NLM_F_REQUEST | NLM_F_DUMP, 1, 0) + request)
+            for answer in answers(asked):
                 if how := int.from_bytes(dict(attributes(answer[_ANSWER_SIZE:])).get(_SHUTDOWN, b""), "little"):
                     found[int.from_bytes(answer[_INODE_AT : _INODE_AT + 4], "little")] = how
     except OSError:
         return {}
     return found
-
-
-def _answers(asked: socket.socket) -> Iterator[bytes]:
-    """Every message of a list, without its header."""
-    while True:
-        packed = asked.recv(_ROOM)
-        while packed:
-            size, kind, *_ = _HEADER.unpack_from(packed)
-            if kind != SOCK_DIAG_BY_FAMILY:  # the list's end, or an error
-                return
-            yield packed[_HEADER.size : size]
-            packed = packed[-(-size // 4) * 4 :]

@@ -6,6 +6,7 @@ Source: sock_diag(7), linux/unix_diag.h.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import socket
 import struct
 from collections.abc import Iterator
@@ -15,6 +16,10 @@ from typing import Final
 NETLINK_SOCK_DIAG: Final = 4
 SOCK_DIAG_BY_FAMILY: Final = 20
 NLM_F_REQUEST: Final = 1
+NLM_F_DUMP: Final = 0x300
+ROOM: Final = 1 << 18
+"""Bytes of one part of a list; the kernel fills 32 KiB at most."""
+SIOCUNIXFILE: Final = 0x89E0
 _HEADER: Final = struct.Struct("<IHHII")
 _REQUEST: Final = struct.Struct("<BBHIIIII")
 _ANSWER: Final = struct.Struct("<BBBxIII")
@@ -39,7 +44,8 @@ class UnixSocket:
         name: a path, or a zero byte and an abstract name; b"" when it has none.
         peer: inode number of the socket that it is connected to; 0 when there is none (any more).
         backlog: of one that listens.
-        waiting: how many connections wait to be accepted.
+        clients: whose connections wait to be accepted, in their order: inode numbers of sockets, 0 for one that has gone. The
+            kernel tells nothing else of such a connection.
         shutdown: 1 what it reads, 2 what it sends.
     """
 
@@ -48,7 +54,7 @@ class UnixSocket:
     name: bytes
     peer: int
     backlog: int
-    waiting: int
+    clients: tuple[int, ...]
     shutdown: int
 
 
@@ -59,6 +65,18 @@ def unix_socket(inode: int) -> UnixSocket | None:
         asked.send(_HEADER.pack(_HEADER.size + len(request), SOCK_DIAG_BY_FAMILY, NLM_F_REQUEST, 1, 0) + request)
         return _parsed(asked.recv(1 << 16))
     return None
+
+
+def answers(asked: socket.socket) -> Iterator[bytes]:
+    """Every message of a list that was asked for, without its header."""
+    while True:
+        packed = asked.recv(ROOM)
+        while packed:
+            size, kind, *_ = _HEADER.unpack_from(packed)
+            if kind != SOCK_DIAG_BY_FAMILY:  # the list's end, or an error
+                return
+            yield packed[_HEADER.size : size]
+            packed = packed[-(-size // 4) * 4 :]
 
 
 def _parsed(answer: bytes) -> UnixSocket | None:
@@ -74,7 +92,7 @@ def _parsed(answer: bytes) -> UnixSocket | None:
         name=found.get(_NAME, b""),
         peer=int.from_bytes(found.get(_PEER, b""), "little"),
         backlog=lengths[1] if state == LISTENING else 0,
-        waiting=len(found.get(_WAITING, b"")) // 4,
+        clients=tuple(number for (number,) in struct.iter_unpack("<I", found.get(_WAITING, b""))),
         shutdown=int.from_bytes(found.get(_SHUTDOWN, b""), "little"),
     )
 
@@ -88,3 +106,16 @@ def attributes(packed: bytes) -> Iterator[tuple[int, bytes]]:
             return
         yield kind, packed[place + _ATTRIBUTE.size : place + size]
         place += -(-size // 4) * 4
+
+
+def bound_file(looked: socket.socket) -> int | None:
+    """An O_PATH descriptor for the file that a socket is bound to, whatever name that has by now.
+
+    Source: unix_open_file() in net/unix/af_unix.c (Linux 4.13); it takes CAP_NET_ADMIN.
+
+    Returns:
+        None where it has none, or we may not.
+    """
+    with contextlib.suppress(OSError):
+        return fcntl.ioctl(looked.fileno(), SIOCUNIXFILE)
+    return None

@@ -135,7 +135,11 @@ def findings_of_all(resources: Sequence[Resource], *, standing: bool) -> tuple[F
     Args:
         standing: they all stood still.
     """
-    return (*tcp_connections.findings(resources, standing=standing), *internet_sockets.findings(resources))
+    return (
+        *tcp_connections.findings(resources, standing=standing),
+        *internet_sockets.findings(resources),
+        *unix_sockets.findings(resources),
+    )
 
 
 def reasons_of_all(resources: Sequence[Resource]) -> tuple[str, ...]:

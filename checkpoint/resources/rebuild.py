@@ -50,10 +50,13 @@ from checkpoint.resources import (
     terminals,
     thread_rights,
     timerfds,
+    unix_names,
     unix_sockets,
     watches,
 )
 from checkpoint.resources.rebuilding import Rebuilding, number_of
+from checkpoint.resources.unix_makers import Disguise
+from checkpoint.resources.unix_rebuild import Work
 
 NS_PER_S: Final = 1_000_000_000
 UTIME_OMIT: Final = (1 << 30) - 2
@@ -82,7 +85,7 @@ MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
 NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
     fifos.KIND: fifos.mismatches,
     watches.KIND: watches.mismatches,
-    unix_sockets.KIND: unix_sockets.mismatches,
+    unix_sockets.KIND: unix_names.mismatches,
     kernel_files.KIND: kernel_files.mismatches,
     internet_sockets.KIND: internet_sockets.mismatches,
     system_v_memory.KIND: system_v_memory.mismatches,
@@ -137,7 +140,8 @@ def rebuild_all(
         return ()
     moved = _move_streams_away(table, max(wanted[-1].number, *table.descriptors, 0) + 1)
     piped = pipes.rebuild(table, [held for held in state.resources if _is_own(held, given, pipes.KIND)], moved[-1] + 1)
-    unix, connected = _prepare_sockets(table, state, moved[-1] + 1 + len(piped), given)
+    disguise = Disguise(procfs.status(vessel_pid), state.process, options.own_eyes, inner_pid)
+    unix, connected = _prepare_sockets(table, state, moved[-1] + 1 + len(piped), given, disguise)
     last = max((moved[-1] + len(piped), unix.end, *connected.values()))
     lines = terminals.prepare(
         table, [held for held in state.resources if _is_own(held, given, terminals.KIND)], last + 1, vessel_pid
@@ -163,7 +167,8 @@ def rebuild_all(
     for number in (*moved, *piped.values(), *connected.values(), *lines.values(), *rebuilding.objects.values(), *inherited):
         table.close(number)
     _settle(table, wanted, holders)
-    return tcp_connections.notes([held for held in state.resources if _is_own(held, given, tcp_connections.KIND)])
+    of_tcp = tcp_connections.notes([held for held in state.resources if _is_own(held, given, tcp_connections.KIND)])
+    return (*of_tcp, *unix.notes())
 
 
 def deleted_directory(state: Snapshot) -> int | None:
@@ -181,8 +186,8 @@ def _is_own(held: Resource, given: Mapping[int, int], kind: str) -> bool:
 
 
 def _prepare_sockets(
-    table: CallTable, state: Snapshot, first: int, given: Mapping[int, int]
-) -> tuple[unix_sockets.Work, dict[int, int]]:
+    table: CallTable, state: Snapshot, first: int, given: Mapping[int, int], disguise: Disguise
+) -> tuple[Work, dict[int, int]]:
     """Make all sockets at numbers from ``first`` on, in the working directory: names may be relative to it."""
     of_unix = [held for held in state.resources if _is_own(held, given, unix_sockets.KIND)]
     of_internet = [held for held in state.resources if _is_own(held, given, internet_sockets.KIND)]
@@ -190,7 +195,7 @@ def _prepare_sockets(
     if of_unix and not procfs.is_gone(state.process.working_directory):
         directory = state.process.working_directory
         table.call(f"enter the working directory {directory}", "chdir", table.place_path(directory))
-    unix = unix_sockets.Work(table, of_unix, first)
+    unix = Work(table, of_unix, first, disguise=disguise, working_directory=state.process.working_directory)
     made = dict(unix.run())
     connected = tcp_connections.prepare(table, of_tcp, unix.end)
     made |= connected

@@ -371,38 +371,56 @@ def _set_buffer(table: CallTable, made: int, number: int, size: int) -> None:
         table.attempt("", "setsockopt", made, socket.SOL_SOCKET, option, table.place(value), len(value))
 
 
-def fill(table: CallTable, held: Resource, sender: int, sending: Resource | None) -> None:
-    """Send what waited, through a socket whose messages arrive there.
+@dataclass(frozen=True, slots=True)
+class Way:
+    """How a message gets to where it waited.
+
+    Attributes:
+        number: the descriptor through which it is sent.
+        address: where to; b"" to where that is connected.
+        sender: whose descriptor that is, if it is the program's.
+    """
+
+    number: int
+    address: bytes = b""
+    sender: Resource | None = None
+
+
+def fill(table: CallTable, held: Resource, ways: Sequence[Way]) -> None:
+    """Send what waited in a socket.
 
     A full buffer may be fuller than one that is filled again in other pieces: it is made large meanwhile.
 
     Args:
-        sending: the sender, if it is the program's.
+        ways: one for each message.
     """
     messages, passed = held.facts["queue"], held.facts.get("passed", [])
     assert isinstance(messages, list) and isinstance(passed, list)
     is_much = sum(len(message) for message in messages if isinstance(message, bytes)) > MUCH
-    if is_much:
-        _set_buffer(table, sender, socket.SO_SNDBUF, 4 * QUEUE_LIMIT)
-    for index, message in enumerate(messages):
+    enlarged = {way.number: way.sender for way in ways if is_much}
+    for number in enlarged:
+        _set_buffer(table, number, socket.SO_SNDBUF, 4 * QUEUE_LIMIT)
+    for index, (message, way) in enumerate(zip(messages, ways, strict=True)):
         rights = passed[index] if passed else []
         assert isinstance(message, bytes) and isinstance(rights, list)
-        _send(table, f"fill {held.name} with what waited in it", sender, message, [number_of(one) for one in rights])
-    if is_much and sending is not None:
-        _set_send_buffer_back(table, sending, sender)
+        _send(table, f"fill {held.name} with what waited in it", way, message, [number_of(one) for one in rights])
+    for number, sending in enlarged.items():
+        if sending is not None:
+            _set_send_buffer_back(table, sending, number)
 
 
-def _send(table: CallTable, what: str, sender: int, message: bytes, passed: Sequence[int]) -> None:
+def _send(table: CallTable, what: str, way: Way, message: bytes, passed: Sequence[int]) -> None:
     """Send one message, with descriptors if there are any. Source: sendmsg(2), cmsg(3)."""
     size, flags = len(message), socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
+    address = (table.place(way.address) if way.address else 0, len(way.address))
     if not passed:
-        table.call(what, "sendto", sender, table.place(message), size, flags, 0, 0, least=size, most=size)
+        table.call(what, "sendto", way.number, table.place(message), size, flags, *address, least=size, most=size)
         return
     rights = struct.pack(f"<{len(passed)}i", *passed)
     control = _CONTROL_HEAD.pack(_CONTROL_HEAD.size + len(rights), socket.SOL_SOCKET, socket.SCM_RIGHTS) + rights
     piece = table.place(struct.pack("<QQ", table.place(message), size))
-    head = _MESSAGE_HEAD.pack(0, 0, piece, 1, table.place(control), len(control), 0)
-    table.call(what, "sendmsg", sender, table.place(head), flags, least=size, most=size)
+    head = _MESSAGE_HEAD.pack(*address, piece, 1, table.place(control), len(control), 0)
+    table.call(what, "sendmsg", way.number, table.place(head), flags, least=size, most=size)
 
 
 def _set_send_buffer_back(table: CallTable, held: Resource, made: int) -> None:

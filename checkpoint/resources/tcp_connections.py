@@ -413,7 +413,7 @@ def settle(table: CallTable, held: Sequence[Resource], made: Mapping[int, int]) 
             _set(table, number, sockets.SO_BUF_LOCK, 0)
             sockets.set_options(table, one, number, is_bound=True)
             if _queue(one):
-                sockets.fill(table, one, made[_number(other, "socket")], other)
+                sockets.fill(table, one, [sockets.Way(made[_number(other, "socket")], sender=other)])
     for one in held:
         number = made[_number(one, "socket")]
         if _number(one, "socket") in others and one.facts["state"] in _WE_ENDED:

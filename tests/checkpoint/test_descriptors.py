@@ -51,6 +51,9 @@ CASES = {
         "listener_abstract unix_with_itself unix_datagrams unix_fresh tcp_listener_4 tcp_listener_6 tcp_fresh udp_queue "
         "udp_options udp_group filtered tcp_shared_port"
     ),
+    "unix_sockets": (
+        "ghost_left ghost_directory name_taken_again waiting_stream waiting_packets named_senders named_pair makers"
+    ),
     "internet_sockets": "udp_shut_down foreign_address closed_connection_4 closed_connection_6",
 }
 

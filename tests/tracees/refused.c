@@ -140,26 +140,29 @@ static void take_unix_rights(void) {
     keep(ends[1], "a socket");
 }
 
-static void take_unix_waiting(void) {
+static int ask_for_connection(void) {
     struct sockaddr_un address = {.sun_family = AF_UNIX, .sun_path = "waiting.sock"};
+    int client = socket(AF_UNIX, SOCK_STREAM, 0);
     keep(socket(AF_UNIX, SOCK_STREAM, 0), "a socket");
     if (bind(opened, (struct sockaddr *)&address, sizeof address) || listen(opened, 1)) cannot("listen");
-    if (connect(socket(AF_UNIX, SOCK_STREAM, 0), (struct sockaddr *)&address, sizeof address)) cannot("connect");
+    if (connect(client, (struct sockaddr *)&address, sizeof address)) cannot("connect");
+    return client;
 }
 
-static void bind_at(const char *path) {
+static void take_unix_waiting_data(void) {
+    if (write(ask_for_connection(), "x", 1) != 1) cannot("write");
+}
+
+static void take_unix_waiting_gone(void) { close(ask_for_connection()); }
+
+static void take_unix_other_name(void) {
     struct sockaddr_un address = {.sun_family = AF_UNIX};
-    strcpy(address.sun_path, path);
+    if (!getcwd(address.sun_path, 80)) cannot("see where I am");
+    strcat(address.sun_path, "/name");
     keep(socket(AF_UNIX, SOCK_STREAM, 0), "a socket");
-    if (bind(opened, (struct sockaddr *)&address, sizeof address) || listen(opened, 1) || unlink(path)) cannot("listen");
+    if (bind(opened, (struct sockaddr *)&address, sizeof address) || listen(opened, 1) || unlink("name")) cannot("listen");
+    close(open("name", O_CREAT | O_WRONLY, 0600));
 }
-
-static void take_unix_no_directory(void) {
-    mkdir("short-lived", 0700), bind_at("short-lived/socket");
-    if (rmdir("short-lived")) cannot("remove a directory");
-}
-
-static void take_unix_other_name(void) { bind_at("name"), close(open("name", O_CREAT | O_WRONLY, 0600)); }
 
 static void take_netlink_socket(void) { keep(socket(AF_NETLINK, SOCK_RAW, 0), "a socket"); }
 
@@ -340,8 +343,8 @@ static const struct kind {
              {"traced_child", take_traced_child},
              {"pipe", take_pipe},
              {"unix_rights", take_unix_rights},
-             {"unix_waiting", take_unix_waiting},
-             {"unix_no_directory", take_unix_no_directory},
+             {"unix_waiting_data", take_unix_waiting_data},
+             {"unix_waiting_gone", take_unix_waiting_gone},
              {"unix_other_name", take_unix_other_name},
              {"netlink_socket", take_netlink_socket},
              {"fanotify", take_fanotify},

@@ -1,0 +1,277 @@
+"""Names of unix sockets that are files: where they lie, and how a socket gets such a name again.
+
+A name is what bind(2) was told, and stays so when the directory has changed or the file has another name or none. The file that
+its predecessor has left is replaced, one that somebody listens to is not. A socket whose file is gone (a *ghost*) is bound, and
+its file removed again; where it was bound by a relative name, in a directory that is made for it.
+
+Facts of unix sockets that are told here: ``path`` of its name, "" if that is no file's; ``mode`` and ``file_owner`` of that file,
+mode -1 if it is gone; ``directory`` in which it was bound by a relative name, "" if it was not, or if that is the program's own.
+
+Source: unix(7), bind(2).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import socket
+import stat
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from checkpoint.capability import Area, refused
+from checkpoint.linux import procfs
+from checkpoint.linux.call_table import AT_FDCWD, CallTable
+from checkpoint.linux.unix_sockets import ESTABLISHED, bound_file
+from checkpoint.model import Fact, Resource
+from checkpoint.resources import OpenFile
+from checkpoint.resources.rebuilding import number_of
+
+CAPABILITIES: Final = (
+    refused(
+        Area.SOCKETS,
+        "a unix socket whose name is something else by now, or was given from a directory that was left (../name)",
+        "let the program bind a name that stays",
+        "is a unix socket whose name is something else",
+        "from a directory that it has left",
+    ),
+    refused(
+        Area.THERE,
+        "something else has the name of a unix socket, or there is no place for it",
+        "end or remove what is there; make the directory",
+        "the directory of the unix socket",
+        "is something else here",
+        "is another process's here",
+    ),
+)
+
+DELETED: Final = " (deleted)"
+GONE: Final = -1
+FREED_S: Final = 1.0
+"""How long the kernel may take to find sockets that nobody can reach any more."""
+REMOVE_DIRECTORY: Final = 0x200
+"""AT_REMOVEDIR of unlinkat(2)."""
+
+
+def observe(held: OpenFile, looked: socket.socket, name: bytes) -> dict[str, Fact]:
+    """Where the file of a name lies.
+
+    Args:
+        name: as the kernel tells it, in full.
+    """
+    if not name or name[:1] == b"\0":
+        return {"path": "", "mode": GONE, "file_owner": [], "directory": ""}
+    told = os.fsdecode(name.rstrip(b"\0"))
+    working = procfs.read_link(held.pid, "cwd")
+    opened = bound_file(looked)
+    if opened is None:  # we may not ask the socket: then the name counts, as the program would look for it now
+        path = os.path.join(working, told)
+        about = _socket_at(f"/proc/{held.pid}/root{path}")
+    else:
+        try:
+            path, about = os.readlink(f"/proc/self/fd/{opened}"), os.fstat(opened)
+        finally:
+            os.close(opened)
+        path = path.removesuffix(DELETED) if not about.st_nlink else path
+    mode, owner = (GONE, []) if about is None or not about.st_nlink else (about.st_mode, [about.st_uid, about.st_gid])
+    directory = "" if os.path.isabs(told) else os.path.normpath(path).removesuffix(f"/{os.path.normpath(told)}") or "/"
+    return {"path": path, "mode": mode, "file_owner": list(owner), "directory": "" if directory == working else directory}
+
+
+def _socket_at(path: str) -> os.stat_result | None:
+    with contextlib.suppress(OSError):
+        about = os.stat(path)
+        return about if stat.S_ISSOCK(about.st_mode) else None
+    return None
+
+
+def refuse(held: OpenFile) -> str | None:
+    """Why a socket cannot be given its name again."""
+    seen = held.observed
+    path, told = str(seen["path"]), _told(seen["name"])
+    if not path:
+        return None
+    if seen["directory"] and ".." in told.split("/"):
+        return f"{held.name} is a unix socket with a name ({told}) from a directory that it has left: let it bind a whole path"
+    if seen["mode"] == GONE and os.path.isabs(told) and _is_something_else(f"/proc/{held.pid}/root{path}"):
+        return f"{held.name} is a unix socket whose name is something else by now ({path}): let the program bind another one"
+    return None
+
+
+def _told(name: Fact) -> str:
+    """A name for people, and for open(2) where it is a path."""
+    assert isinstance(name, bytes)
+    return "@" + os.fsdecode(name[1:]) if name[:1] == b"\0" else os.fsdecode(name.rstrip(b"\0"))
+
+
+def _is_something_else(path: str) -> bool:
+    return os.path.lexists(path) and not stat.S_ISSOCK(os.lstat(path).st_mode)
+
+
+def mismatches(held: Resource) -> Iterator[str]:
+    """Why it could not have its name here."""
+    path, name = str(held.facts["path"]), held.facts["name"]
+    assert isinstance(name, bytes)
+    has_own = held.facts["type"] == socket.SOCK_DGRAM or held.facts["state"] != ESTABLISHED  # no accepted end has
+    if name[:1] == b"\0" and has_own and not _is_free(name, number_of(held.facts["type"])):
+        yield f"the abstract name {_told(name)!r} of the unix socket {held.name} is another process's here: end that first"
+    if not path or _is_hidden(held):
+        return
+    if is_ghost(held) and not os.path.isdir(os.path.dirname(path)):
+        return  # which is made for the while that it takes
+    if not os.path.isdir(os.path.dirname(path)):
+        yield f"the directory of the unix socket {path}, {held.name}, is missing here: make it"
+    elif _is_something_else(path):
+        yield f"{path}, the name of the unix socket {held.name}, is something else here: remove it"
+    elif os.path.lexists(path) and is_answered(path):
+        yield f"{path}, the name of the unix socket {held.name}, is another process's here: end that first"
+
+
+def _is_free(name: bytes, kind: int) -> bool:
+    """Whether an abstract name can be had.
+
+    Sockets that were on their way to themselves keep theirs after the end of their program, until the kernel looks for such: each
+    time that a socket is closed. Source: unix_gc() in net/unix/garbage.c.
+    """
+    deadline = time.monotonic() + FREED_S
+    while True:
+        with socket.socket(socket.AF_UNIX, kind) as tried:
+            try:
+                tried.bind(name)
+            except OSError:
+                if time.monotonic() > deadline:
+                    return False
+            else:
+                return True
+        time.sleep(FREED_S / 100)
+
+
+def is_answered(path: str) -> bool:
+    """Whether a process has the socket file open: connecting to one that nobody has any more is refused by the kernel."""
+    for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM, socket.SOCK_SEQPACKET):
+        with socket.socket(socket.AF_UNIX, kind) as asked:
+            asked.setblocking(False)
+            refused = asked.connect_ex(path)
+            if refused in (0, errno.EAGAIN):
+                return True
+    return False
+
+
+def is_ghost(held: Resource) -> bool:
+    """Whether its name is a file's that is gone."""
+    return bool(held.facts["path"]) and number_of(held.facts["mode"]) == GONE
+
+
+def _is_hidden(held: Resource) -> bool:
+    """Whether it is bound where nobody looks: a ghost by a relative name."""
+    return is_ghost(held) and not os.path.isabs(_told(held.facts["name"]))
+
+
+# --- Restore -----------------------------------------------------------------------------------------------------------
+
+
+class Naming:
+    """One restore of names, and how a socket is reached that has one.
+
+    Attributes:
+        closing: descriptors for the files of names that are gone, or lie elsewhere: to be closed when all is connected.
+    """
+
+    def __init__(self, table: CallTable, working_directory: str, away: Callable[[int], int]) -> None:
+        """
+        Args:
+            away: moves a descriptor above all that are wanted, and tells where it is then.
+        """
+        self._table = table
+        self._working = working_directory
+        self._away = away
+        self._files: dict[int, int] = {}
+
+    @property
+    def closing(self) -> tuple[int, ...]:
+        return tuple(self._files.values())
+
+    def bind(self, one: Resource, made: int) -> None:
+        """Give a socket its name."""
+        if not one.facts["path"]:
+            self._bind(one, made)
+        elif is_ghost(one):
+            self._bind_ghost(one, made)
+        else:
+            self._bind_file(one, made)
+
+    def address_of(self, one: Resource) -> bytes:
+        """What connect(2) takes to reach a socket that has a name."""
+        name, opened = one.facts["name"], self._files.get(number_of(one.facts["socket"]))
+        assert isinstance(name, bytes)
+        return packed(name if opened is None else b"/proc/self/fd/%d\0" % opened)
+
+    def _keep(self, one: Resource, path: str) -> None:
+        """Keep hold of a socket's file."""
+        self._files[number_of(one.facts["socket"])] = self._away(self._table.open(path, os.O_PATH | os.O_CLOEXEC))
+
+    def _bind(self, one: Resource, made: int) -> None:
+        table, name = self._table, one.facts["name"]
+        assert isinstance(name, bytes)
+        address = packed(name)
+        table.call(f"bind {one.name} to {_told(name)!r}", "bind", made, table.place(address), len(address))
+
+    def _bind_file(self, one: Resource, made: int) -> None:
+        table, path, directory = self._table, str(one.facts["path"]), str(one.facts.get("directory", ""))
+        place = table.place_path(path)
+        table.attempt("", "unlinkat", AT_FDCWD, place, 0)
+        with self._inside(directory):
+            self._bind(one, made)
+        owner = one.facts.get("file_owner")
+        if isinstance(owner, list) and owner:
+            lost = f"the name of the unix socket {path} belongs to whom the program runs as"
+            table.attempt(lost, "fchownat", AT_FDCWD, place, number_of(owner[0]), number_of(owner[1]), 0)
+        table.call(f"set the mode of {path}", "fchmodat", AT_FDCWD, place, number_of(one.facts["mode"]) & 0o7777)
+        if directory:
+            self._keep(one, path)
+
+    def _bind_ghost(self, one: Resource, made: int) -> None:
+        """Bind it, keep hold of its file, and remove that; directories that are made for it go again."""
+        table, told = self._table, _told(one.facts["name"])
+        root = "" if os.path.isabs(told) else tempfile.mkdtemp(prefix="failover-socket-")
+        if root:
+            os.rmdir(root)  # its name is ours: the vessel makes it, with its program's rights
+        directories = _missing([root] if root else [], os.path.dirname(os.path.join(root, told)))
+        for directory in directories:
+            table.call(f"make the directory {directory}", "mkdirat", AT_FDCWD, table.place_path(directory), 0o700)
+        path = os.path.join(root, told)
+        if not root:
+            table.attempt("", "unlinkat", AT_FDCWD, table.place_path(path), 0)
+        with self._inside(root):
+            self._bind(one, made)
+        self._keep(one, path)
+        table.call(f"unlink {path}", "unlinkat", AT_FDCWD, table.place_path(path), 0)
+        for directory in reversed(directories):
+            table.attempt("", "unlinkat", AT_FDCWD, table.place_path(directory), REMOVE_DIRECTORY)
+
+    @contextlib.contextmanager
+    def _inside(self, directory: str) -> Iterator[None]:
+        """Have the vessel in another directory for the body; "" for its own."""
+        table = self._table
+        if directory:
+            table.call(f"enter {directory}", "chdir", table.place_path(directory))
+        yield
+        if directory:
+            table.call(f"enter {self._working}", "chdir", table.place_path(self._working))
+
+
+def packed(name: bytes) -> bytes:
+    """A name as bind(2) and connect(2) take it."""
+    return socket.AF_UNIX.to_bytes(2, "little") + name
+
+
+def _missing(made: list[str], directory: str) -> list[str]:
+    """Directories that lead to one and are not there, the outermost first; those in ``made`` are on their way."""
+    missing: list[str] = []
+    while directory and directory not in made and not os.path.isdir(directory):
+        missing.append(directory)
+        directory = os.path.dirname(directory)
+    return made + missing[::-1]
