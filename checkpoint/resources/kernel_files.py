@@ -3,7 +3,8 @@
 What is read from them is what the kernel says then. Whatever acts on the machine when it is written to is refused, and so are
 files of other processes.
 
-Facts: ``descriptors``; ``path``, with ``{pid}`` in place of the program's own number; ``flags`` of open(2); ``offset``.
+Facts: ``descriptors``; ``path``, with ``{pid}`` in place of the process's own number, and numbers of others as the program knows
+them; ``flags`` of open(2); ``offset``.
 
 Source: proc(5), sysfs(5).
 """
@@ -40,7 +41,7 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.FILES,
-        "files of /proc of single threads and of other processes",
+        "files of /proc of single threads and of other programs",
         "let the program close them after reading",
         "of one of its threads: let the program close it",
         "a view of another process",
@@ -64,6 +65,9 @@ UNREADABLE: Final = ("/proc/kmsg", "/sys/kernel/debug", "/sys/kernel/tracing", "
 """What is used up by being read, or is no view at all."""
 OWN: Final = "/proc/{pid}"
 O_PATH: Final = 0o10000000
+
+INIT: Final = 1
+"""Every machine has one, and every PID namespace."""
 
 _OF_A_PROCESS: Final = re.compile(r"/proc/(\d+)(/.*)?")
 _OF_A_THREAD: Final = re.compile(r"/task/\d+")
@@ -91,6 +95,11 @@ def _path_of(held: OpenFile) -> str:
     return OWN + (match[2] or "").replace(f"/task/{match[1]}", "/task/{pid}")
 
 
+def _known_numbers(held: OpenFile) -> Iterator[int]:
+    """Of the other processes of its component, as it knows them; what several have open is made before these are born."""
+    return (procfs.status(pid).pids[-1] for pid in held.kin.pids if not held.description)
+
+
 def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     """Why it cannot be opened again."""
     if not is_kernels(held.first):
@@ -100,7 +109,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return f"{what}, a part of this machine's kernel that cannot be opened again as it was: let the program close it"
     if path.startswith(OWN):
         return f"{what}, of one of its threads: let the program close it" if _OF_A_THREAD.search(path) else None
-    if _OF_A_PROCESS.fullmatch(path):
+    if (match := _OF_A_PROCESS.fullmatch(path)) and int(match[1]) not in (INIT, *_known_numbers(held)):
         return f"{what}, a view of another process: let the program close it after reading"
     if held.first.flags & os.O_ACCMODE != os.O_RDONLY and not held.first.flags & O_PATH:
         return f"{what}, open for writing, by which it acts on this machine's kernel: let the program open it only to write"
@@ -110,7 +119,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
 def mismatches(held: Resource) -> Iterator[str]:
     """Why it is not here."""
     path = str(held.facts["path"])
-    if not path.startswith(OWN) and not os.path.exists(path):
+    if not (path.startswith(OWN) or _OF_A_PROCESS.fullmatch(path) or os.path.exists(path)):
         yield f"{path}, open as {held.name}, is not offered by this kernel: boot the same one, or attach what it shows"
 
 

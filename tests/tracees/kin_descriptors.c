@@ -2,6 +2,7 @@
 #include "tracee.h"
 
 #include <poll.h>
+#include <sys/prctl.h>
 #include <sys/wait.h>
 
 static volatile int heard;
@@ -17,6 +18,7 @@ static int live(int self_pipe, int other_end) {
     struct f_owner_ex owner = {F_OWNER_PID, parent};
     if (fcntl(self_pipe, F_SETOWN_EX, &owner) || fcntl(self_pipe, F_SETSIG, SIGUSR2) || fcntl(file, F_SETOWN, getpid())) return 11;
     if (fcntl(self_pipe, F_SETFL, fcntl(self_pipe, F_GETFL) | O_ASYNC)) return 12;
+    prctl(PR_SET_NAME, "otherwise");
     sigemptyset(&user), sigaddset(&user, SIGUSR1);
     kill(parent, SIGUSR1);
     if (sigwait(&user, &number)) return 13;
@@ -39,11 +41,16 @@ int main(int count, char **arguments) {
     close(ends[0]), close(ends[1]);
     int of_child = syscall(SYS_pidfd_open, child, 0), of_self = syscall(SYS_pidfd_open, getpid(), 0);
     if (of_child < 0 || of_self < 0 || sigwait(&user, &number)) cannot("know the child");
+    char path[40], told[16] = "";
+    snprintf(path, sizeof path, "/proc/%d/comm", child);
+    int name = open(path, O_RDONLY);
+    if (name < 0) cannot("open a file of /proc");
     ready();
     wait_for_go(arguments[1]);
     struct pollfd ended = {of_child, POLLIN, 0};
     siginfo_t about = {0};
     EXPECT_EQUAL("it has ended", poll(&ended, 1, 0), 0);
+    EXPECT(read(name, told, 15) == 10 && !strcmp(told, "otherwise\n"), "the child's name is %s", told);
     EXPECT(syscall(SYS_pidfd_send_signal, of_self, 0, NULL, 0) == 0, "the pidfd of itself: %s", strerror(errno));
     EXPECT(syscall(SYS_pidfd_send_signal, of_child, SIGUSR1, NULL, 0) == 0, "the pidfd of the child: %s", strerror(errno));
     EXPECT(poll(&ended, 1, 20000) == 1 || errno == EINTR, "it does not end");

@@ -265,7 +265,7 @@ static void take_perf_event(void) {
 
 static void take_pidfd_other(void) { keep(pidfd_open(1, 0), "a pidfd"); }
 static void take_namespace(void) { keep(open("/proc/self/ns/net", O_RDONLY), "a namespace"); }
-static void take_proc_file(void) { keep(open("/proc/1/status", O_RDONLY), "a file of /proc"); }
+static void take_proc_file(void) { keep(open("/proc/2/status", O_RDONLY), "a file of /proc"); }
 static void take_kernel_switch(void) { keep(open("/proc/sys/kernel/hostname", O_RDWR), "a switch of the kernel"); }
 
 static void take_secret_memory(void) {
