@@ -246,7 +246,7 @@ def _of_files(state: Snapshot, options: RestoreOptions, brought: dict[str, str])
     for identity in {identity.path: identity for identity in (state.process.executable, *mapped)}.values():
         if identity.path in options.accept_changed or _is_made(state, identity.path):
             continue
-        reasons = tuple(_of_file(identity))
+        reasons = tuple(_of_file(identity, is_written=identity.path in written))
         content, damage = _content(options, identity.digest if reasons and identity.path not in written else b"")
         if content:
             brought[identity.path] = content
@@ -272,14 +272,21 @@ def _is_made(state: Snapshot, path: str) -> bool:
     return not os.path.lexists(path) and makes_shared_memory(state.vmas, path)
 
 
-def _of_file(identity: FileIdentity) -> Iterator[str]:
+def _of_file(identity: FileIdentity, *, is_written: bool) -> Iterator[str]:
+    """Why a file is not the one that was mapped.
+
+    Args:
+        is_written: through a shared mapping, by the program itself: the very same file holds other bytes by now, and
+            gets those of the snapshot.
+    """
     path = identity.path
     try:
         about = os.stat(path)
     except OSError as error:
         yield f"{path} cannot be used ({error.strerror}): {_FAR}"
         return
-    if (about.st_dev, about.st_ino, about.st_mtime_ns) == (identity.device, identity.inode, identity.mtime_ns):
+    is_same = (about.st_dev, about.st_ino) == (identity.device, identity.inode)
+    if is_same and (about.st_mtime_ns == identity.mtime_ns or (is_written and about.st_size == identity.size)):
         return
     if identity.size and about.st_size != identity.size:
         yield f"{path} is another file: {about.st_size} bytes here, {identity.size} there; {_FAR}"

@@ -56,7 +56,7 @@ def _explained(pid: int, name: str) -> Iterator[None]:
     try:
         yield
     except (FileNotFoundError, ProcessLookupError) as error:
-        if os.path.exists(os.path.dirname(path)):
+        if isinstance(error, FileNotFoundError) and os.path.exists(os.path.dirname(path)):
             raise ProbeError(f"cannot read {path}: this kernel does not offer it") from error
         raise ProcessGoneError(f"cannot read {path}: there is no such process or thread") from error
     except PermissionError as error:

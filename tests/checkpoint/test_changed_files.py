@@ -46,6 +46,13 @@ def test_a_log_that_grew_after_the_capture_is_cut_back(compiled: Compiled, tmp_p
     _expect_ok(snapshot, tmp_path)
 
 
+def test_a_file_that_the_program_wrote_by_its_memory_alone_is_as_it_was(compiled: Compiled, tmp_path: Path) -> None:
+    snapshot = _snapshot(compiled, tmp_path, "mapped_and_closed")
+    with (tmp_path / "counters").open("r+b") as counters:
+        counters.write(b"counts of a life that never was")
+    _expect_ok(snapshot, tmp_path)
+
+
 def test_a_log_that_shrank_is_refused(compiled: Compiled, tmp_path: Path) -> None:
     snapshot = _snapshot(compiled, tmp_path, "append")
     os.truncate(tmp_path / "log", 5)

@@ -331,6 +331,17 @@ static void owner_thread(const char *go) {
     EXPECT_EQUAL("owner", owner.pid, gettid());
 }
 
+static void mapped_and_closed(const char *go) {
+    int file = make("counters", O_RDWR);
+    if (ftruncate(file, 2 * PAGE)) cannot("size a file");
+    unsigned char *counters = mmap(NULL, 2 * PAGE, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
+    if (counters == MAP_FAILED) cannot("map a file");
+    close(file);
+    fill(counters, 2 * PAGE, 7);
+    ready(), wait_for_go(go);
+    expect_filled("what is mapped", counters, 2 * PAGE, 7);
+}
+
 static void asynchronous(const char *go) {
     int channel[2];
     struct sigaction action = {.sa_handler = hear};
@@ -358,7 +369,8 @@ int main(int count, char **arguments) {
                  {"deleted_link", deleted_link}, {"mapped_memory", mapped_memory},
                  {"directory", directory},     {"path_only", path_only}, {"beyond_end", beyond_end},
                  {"memory_file", memory_file}, {"odd_name", odd_name}, {"owner_signal", owner_signal},
-                 {"owner_thread", owner_thread}, {"asynchronous", asynchronous}};
+                 {"owner_thread", owner_thread}, {"asynchronous", asynchronous},
+                 {"mapped_and_closed", mapped_and_closed}};
     for (size_t index = 0; index < sizeof kinds / sizeof *kinds; index++)
         if (count > 2 && !strcmp(arguments[2], kinds[index].name)) {
             kinds[index].act(arguments[1]);
