@@ -29,6 +29,9 @@ Age = Annotated[int, msgspec.Meta(ge=0, le=1 << 50)]
 HookName = Literal["before_capture", "before_resume", "after_resume"]
 """Occasions for a command that comes with a program, see `agent.hooks`."""
 
+Connections = Literal["", "reset", "carry"]
+"""What becomes of TCP connections; "" for what this robot's operator says."""
+
 T = TypeVar("T")
 
 
@@ -61,6 +64,7 @@ class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
     hooks: dict[HookName, list[Text]] = {}
     carry: list[Text] = []
     devices: dict[Text, Text] = {}
+    connections: Connections = ""
 
 
 class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):
@@ -70,6 +74,7 @@ class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):
     name: str
     carry: list[Text] = []
     devices: dict[Text, Text] = {}
+    connections: Connections = ""
 
 
 class StopArguments(msgspec.Struct, forbid_unknown_fields=True):

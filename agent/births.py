@@ -122,6 +122,7 @@ async def restore(
     task: guard_messages.Task | None = None,
     epoch: int = 0,
     terms: Terms = NO_TERMS,
+    stood_still: bool = False,
 ) -> Component:
     """Rebuild a component from a chain (descriptors of encoded snapshots, oldest first), stopped, committed to nothing.
 
@@ -133,6 +134,7 @@ async def restore(
         task: for a program that may still say that it keeps its state.
         owner: uid; None: whoever it ran as. What is not root's opens its files with its owner's rights, and gets no others.
         terms: this robot's.
+        stood_still: nothing of it has run since the newest snapshot.
 
     Raises:
         checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
@@ -176,6 +178,7 @@ async def restore(
             epoch=epoch,
             contents=places.contents,
             terms=component.keeper.terms,
+            stood_still=stood_still,
         )
         restored, _ = await component.keeper.ask(order, (*chain, *component.streams))
         laps.lap("restore")

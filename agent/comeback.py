@@ -20,7 +20,7 @@ from checkpoint.engine import AUTO, COOPERATIVE
 from checkpoint.errors import RestoreError
 from checkpoint.model import Snapshot
 from failover.core import acts
-from failover.core.types import ComponentSpec
+from failover.core.types import ComponentSpec, Resumption
 
 LINE_LIMIT: Final = 300
 """Characters of what a program said last that are told."""
@@ -62,6 +62,7 @@ async def brought_back(
             task=task,
             epoch=act.epoch,
             terms=terms,
+            stood_still=act.why is Resumption.HANDED_OVER,
         )
     if spec is None:
         raise RestoreError(f"cannot start {name} again: this robot was never told its command; start it by failover run")

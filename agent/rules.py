@@ -11,7 +11,7 @@ from checkpoint.engine import Carry, Terms
 from checkpoint.history import Retention
 from failover.client.quantities import size_bytes, span_ms
 from failover.core import types
-from failover.core.types import Launch, OnCrash, OnLoss, OnUnsupported, Rule, Rules, WhenAlone
+from failover.core.types import CARRY, Launch, OnCrash, OnLoss, OnUnsupported, Rule, Rules, WhenAlone
 
 
 def node_config(settings: Settings) -> types.Config:
@@ -80,7 +80,9 @@ def terms_here(launch: Launch | None, component: ComponentConfig) -> Terms:
     Which files it carries its snapshots say.
     """
     carry = Carry(size_max=size_bytes(component.carry_limit), places=tuple(component.carry_at.items()))
-    return Terms(carry, merged(arrived(launch.devices if launch is not None else ()), component.device_rules()))
+    if launch is None:
+        return Terms(carry, component.device_rules())
+    return Terms(carry, merged(arrived(launch.devices), component.device_rules()), launch.connections == CARRY)
 
 
 def begun_on(launch: Launch, component: ComponentConfig) -> Terms:

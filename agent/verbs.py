@@ -136,6 +136,7 @@ class Verbs(Questions):
             hooks=tuple((occasion, tuple(command)) for occasion, command in wanted.hooks.items() if command),
             carry=self._carried(name, wanted.carry),
             devices=self._device_rules(name, wanted.devices),
+            connections=self._connections(name, wanted.connections),
         )
         charge = await self._begin(name, launch, inheritance.uid)
         started: dict[str, Any] = {"name": name, "notes": list(charge.figures.notes), "reasons": list(charge.figures.reasons)}
@@ -168,7 +169,8 @@ class Verbs(Questions):
                 raise RefusedError(f"pid {wanted.pid} is protected already, as {known.name}; failover release lets it go")
         name = await self._fresh_name(wanted.name, "", say.caller.uid)
         carried, devices = self._carried(name, wanted.carry), self._device_rules(name, wanted.devices)
-        launch = Launch(pid=wanted.pid, carry=carried, devices=devices)
+        connections = self._connections(name, wanted.connections)
+        launch = Launch(pid=wanted.pid, carry=carried, devices=devices, connections=connections)
         charge = await self._begin(name, launch, owner)
         return {"name": name, "pid": wanted.pid, "notes": list(charge.figures.notes)}
 
@@ -314,6 +316,10 @@ class Verbs(Questions):
             if not is_carriable(path):
                 raise RefusedError(f"cannot carry {path!r}: name the file or folder by its whole path, without . and ..")
         return paths
+
+    def _connections(self, name: str, wanted: str) -> str:
+        """What becomes of a component's TCP connections: what was asked for, else what this robot's operator wants."""
+        return wanted or self._lanes.settings.component(name).connections
 
     def _device_rules(self, name: str, wanted: dict[str, str]) -> tuple[tuple[str, str], ...]:
         """What becomes of a component's devices on every robot: what was asked for, and what this robot's operator wants here.

@@ -108,6 +108,7 @@ def run(room: argparse.ArgumentParser) -> None:
         room.add_argument(option, metavar="CMD", type=shlex.split, default=[], help=f"run this, as you, {when}")
     _carry(room)
     _devices(room)
+    _connections(room, "carry: take its TCP connections with others along by a handover (default: as agent.toml says: reset)")
     room.add_argument("--user", metavar="USER", help="run it as this user, by name or number (only root may; default: as you)")
     room.add_argument("command", metavar="CMD", nargs="+", help="the program and its arguments, after --")
     _agent(room)
@@ -155,6 +156,7 @@ def protect(room: argparse.ArgumentParser) -> None:
     room.add_argument("--name", metavar="NAME", help="its name (default: /TEAM/ROBOT/pid-PID)")
     _carry(room)
     _devices(room)
+    _connections(room, "carry: take its TCP connections with others along by a handover (default: as agent.toml says: reset)")
     _agent(room)
 
 

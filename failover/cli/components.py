@@ -35,6 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     wanted |= {"output": arguments.output, "hooks": {kind: getattr(arguments, kind) for kind in HOOKS}}
     wanted["portable"] = arguments.portable
     wanted |= {"carry": [os.path.realpath(path) for path in arguments.carry], "devices": dict(arguments.devices)}
+    wanted["connections"] = arguments.connections
     if arguments.name:
         wanted["name"] = arguments.name
     if arguments.user:
@@ -181,7 +182,8 @@ def protect(arguments: argparse.Namespace) -> int:
     name = arguments.name or f"pid-{arguments.pid}"
     with connect(arguments) as agent:
         carry = [os.path.realpath(path) for path in arguments.carry]
-        answer = agent.ask("protect", pid=arguments.pid, name=name, carry=carry, devices=dict(arguments.devices))
+        rules = {"devices": dict(arguments.devices), "connections": arguments.connections}
+        answer = agent.ask("protect", pid=arguments.pid, name=name, carry=carry, **rules)
     return _tell(arguments, answer, f"pid {answer['pid']} is protected as {answer['name']}")
 
 

@@ -134,6 +134,7 @@ class Launch:
         inheritance: whose rights, limits and priorities it gets, packed (`checkpoint.linux.inheritance`); b"": the agent's own.
         carry: files and folders that travel with it, as absolute paths.
         devices: (path, rule) of devices that it has open, where a robot has no rule of its own; see `checkpoint.device_rules`.
+        connections: `RESET` or `CARRY`: what becomes of its TCP connections with others.
     """
 
     argv: tuple[str, ...] = ()
@@ -149,6 +150,7 @@ class Launch:
     hooks: tuple[tuple[str, tuple[str, ...]], ...] = ()
     carry: tuple[str, ...] = ()
     devices: tuple[tuple[str, str], ...] = ()
+    connections: str = RESET
 
 
 @dataclass(frozen=True, slots=True)
