@@ -35,6 +35,7 @@ from checkpoint.resources import (
     signalfds,
     signalling,
     sockets,
+    stops,
     streams,
     system_v_memory,
     tcp_connections,
@@ -51,6 +52,7 @@ from checkpoint.resources import (
 CARRIERS: Final[tuple[ModuleType, ...]] = (
     preserved,
     births,
+    stops,
     shared,
     sharing,
     thread_rights,

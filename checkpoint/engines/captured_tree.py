@@ -33,7 +33,7 @@ from checkpoint.linux.kinship import Kinship
 from checkpoint.linux.procfs import Stat, Status
 from checkpoint.linux.threads import Threads
 from checkpoint.model import Member, Position, ProcessState, Resource, ThreadState, Vma, Zombie
-from checkpoint.resources import Held, Surroundings, elsewhere, gather, refused_threads, sharing, streams, unsupported
+from checkpoint.resources import Held, Surroundings, elsewhere, gather, refused_threads, sharing, stops, streams, unsupported
 from checkpoint.resources import look as sorted_into_kinds
 
 ENDING_S: Final = 0.2
@@ -332,13 +332,14 @@ class CapturedTree:
         outside = streams.of_first(first.standing.opened, surroundings)
         around = replace(surroundings, pipes={**outside, **surroundings.pipes}, is_first=False)
         told = NOBODY | self._first.memory.shared_places()
+        stands = bool(self._first.threads.leader.stopped_by)
         for pid, threads in self._standing.items():
             process = self._known.get(pid)
             try:
                 with _gone_if_ended(pid):
                     look, process = self._look_at(process, threads, seen, told, base=base)
                     told |= process.memory.shared_places()
-                    seen.processes.append(_told_of(process, look, seen, around))
+                    seen.processes.append(_told_of(process, look, seen, around, stands=stands))
             except ProcessGoneError as error:
                 raise MovedError(f"process {pid} ended in the middle of a capture; capture it again") from error
 
@@ -429,11 +430,16 @@ def _end_of(pid: int) -> tuple[Status, Stat] | None:
         time.sleep(0.0005)
 
 
-def _told_of(process: CapturedProcess, look: Look, seen: SeenOthers, around: Surroundings) -> SeenProcess:
-    """All that is said of a process, while it stands."""
+def _told_of(process: CapturedProcess, look: Look, seen: SeenOthers, around: Surroundings, *, stands: bool) -> SeenProcess:
+    """All that is said of a process, while it stands for us.
+
+    Args:
+        stands: its component was stopped as a whole before.
+    """
     held = sorted_into_kinds(look.standing.opened, around)
     named = f"its process {process.pid} ({look.standing.status.name})"
     reasons = [*held.reasons, *process.reasons(look, seen.pids), *_of_namespaces(process.pid, seen)]
+    stopped_by = 0 if stands else process.threads.leader.stopped_by
     return SeenProcess(
         captured=process,
         look=look,
@@ -441,7 +447,7 @@ def _told_of(process: CapturedProcess, look: Look, seen: SeenOthers, around: Sur
         threads=process.thread_states(look),
         vmas=process.mappings(look, is_kin=True),
         held=held,
-        unopened=process.unopened(look),
+        unopened=(*process.unopened(look), *stops.describe(stopped_by, look.standing.stat.exit_code)),
         reasons=tuple(f"{named}: {reason}" for reason in reasons),
     )
 

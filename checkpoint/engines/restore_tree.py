@@ -4,7 +4,7 @@
 
     estate       the first vessel makes what several of them share: open files, files without a name, shared memory
     births       processes, sessions, groups, in the order of `births`; they inherit the estate, and are vessels themselves
-    ends         zombies end as they had ended, stand-ins without a trace
+    ends         zombies end as they had ended, stand-ins without a trace; who was stopped is stopped
     each         as `ptrace_restore.ProcessRestore` does it, up to the registers
     registers    of all; nobody runs before everybody is what it was
 
@@ -29,7 +29,7 @@ from typing import Final
 from checkpoint import tree
 from checkpoint.arch import x86_64, x86_64_stub
 from checkpoint.engine import RestoreOptions
-from checkpoint.engines import births, restore_memory, restore_process, restore_threads
+from checkpoint.engines import births, restore_memory, restore_process, restore_stops, restore_threads
 from checkpoint.engines.births import Birth, End, Join, NewSession, Step
 from checkpoint.engines.ptrace_restore import OPTIONS, REFUGE_SIZE, Estate, ProcessRestore, look_at_vessel
 from checkpoint.engines.restore_checks import Brought
@@ -39,8 +39,8 @@ from checkpoint.linux import abi, call_table, procfs
 from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Tracee
-from checkpoint.model import Resource, Snapshot, Vma, Zombie
-from checkpoint.resources import files, rebuild, shared, streams, terminals
+from checkpoint.model import ProcessState, Resource, Snapshot, Vma, Zombie
+from checkpoint.resources import files, rebuild, shared, stops, streams, terminals
 from checkpoint.resources.rebuilding import number_of
 
 PTRACE_O_TRACEFORK: Final = 2
@@ -107,6 +107,9 @@ class TreeRestore:
         self._set_foreground(estate.base)
         for zombie in self._state.zombies:
             self._end_as(zombie, estate.base)
+        for member in self._state.members:
+            if stop := stops.stop_of(member.resources):
+                self._stop(member.process, *stop)
         self._restoring = [
             ProcessRestore(self._born[view.process.pid], view, self._options, brought, estate)
             for view, brought in zip(tree.views(self._state), self._brought, strict=True)
@@ -249,6 +252,16 @@ class TreeRestore:
         tracee.set_registers(x86_64_stub.at_call(self._registers, self._instruction, number, (status,)))
         tracee.cont()
         _await_end(tracee)
+
+    def _stop(self, process: ProcessState, number: int, untold: int) -> None:
+        """Stop a process as it was, and have its parent hear what it had been told."""
+        tracee, parent = self._born[process.pid], process.ppid
+        restore_stops.stop(tracee, number or signal.SIGSTOP)
+        if untold != stops.CLD_STOPPED and parent:
+            flags = os.WUNTRACED | os.WNOHANG | WALL
+            self._call(parent, f"take note of the stop of {process.pid}", "wait4", process.pid, 0, flags, 0)
+        if not number:
+            restore_stops.go_on(tracee)
 
     def _end_as(self, zombie: Zombie, base: int) -> None:
         """End a process as it had ended; its parent does not ask for it before it is what it was."""

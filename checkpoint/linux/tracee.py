@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import signal
 import time
 from dataclasses import dataclass
 from typing import Final
@@ -23,6 +24,7 @@ from checkpoint.linux import abi, procfs
 from checkpoint.linux.memory import Memory
 from checkpoint.model import Rseq
 
+PTRACE_EVENT_STOP: Final = 128
 REGISTERS_SIZE: Final = 4096
 """Bytes offered for the general registers: more than any processor has."""
 XSTATE_SIZE: Final = 16384
@@ -68,6 +70,7 @@ class Tracee:
 
     Attributes:
         is_as_found: nobody has set its registers since it was seized.
+        stopped_by: the signal that had stopped its process when it stopped for us last (SIGSTOP, job control); 0: it ran.
 
     Args:
         pid: the thread's id; for the first thread of a process that of the process.
@@ -78,6 +81,7 @@ class Tracee:
         self.pid = pid
         self.memory = memory or Memory(pid)
         self.is_as_found = True
+        self.stopped_by = 0
         self._registers = ctypes.create_string_buffer(REGISTERS_SIZE)
         self._xstate = ctypes.create_string_buffer(XSTATE_SIZE)
         self._iov = abi.IoVec()
@@ -204,15 +208,18 @@ class Tracee:
     def _stop_of(self, status: int) -> Stop:
         if not os.WIFSTOPPED(status):
             raise ProcessGoneError(f"pid {self.pid} ended while it was being looked at")
-        return Stop(event=status >> 16, signal=os.WSTOPSIG(status))
+        stop = Stop(event=status >> 16, signal=os.WSTOPSIG(status))
+        if stop.event == PTRACE_EVENT_STOP:
+            self.stopped_by = stop.signal if stop.signal != signal.SIGTRAP else 0
+        return stop
 
-    def cont(self, signal: int = 0) -> None:
-        """Let it run, still traced; ``signal`` is delivered first unless 0."""
-        self.request("continue", abi.PTRACE_CONT, 0, signal)
+    def cont(self, number: int = 0) -> None:
+        """Let it run, still traced; signal ``number`` is delivered first unless 0."""
+        self.request("continue", abi.PTRACE_CONT, 0, number)
 
-    def detach(self, signal: int = 0) -> None:
+    def detach(self, number: int = 0) -> None:
         """Let it go for good; it must be stopped."""
-        self.request("detach from", abi.PTRACE_DETACH, 0, signal)
+        self.request("detach from", abi.PTRACE_DETACH, 0, number)
 
     # Registers
 

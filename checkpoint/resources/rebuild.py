@@ -44,6 +44,7 @@ from checkpoint.resources import (
     shared,
     signalfds,
     signalling,
+    stops,
     streams,
     system_v_memory,
     tcp_connections,
@@ -92,7 +93,7 @@ NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
 }
 """Kinds that need something of this machine: why it does not have that, one sentence each."""
 SOCKETS: Final = (unix_sockets.KIND, tcp_connections.KIND, internet_sockets.KIND)
-NOT_OPEN: Final = (memory_locks.KIND, system_v_memory.KIND, thread_rights.KIND)
+NOT_OPEN: Final = (memory_locks.KIND, system_v_memory.KIND, thread_rights.KIND, stops.KIND)
 """Kinds of what no descriptor stands for."""
 KINDS: Final = (files.KIND, streams.KIND, shared.KIND, pipes.KIND, terminals.KIND, *NOT_OPEN, *MADE, *SOCKETS)
 
