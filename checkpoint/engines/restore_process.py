@@ -65,6 +65,8 @@ PR_CAPBSET_DROP: Final = 24
 PR_CAP_AMBIENT: Final = 47
 PR_CAP_AMBIENT_RAISE: Final = 2
 PR_CAP_AMBIENT_CLEAR_ALL: Final = 4
+SECBIT_KEEP_CAPS: Final = 1 << 4
+NO_ID: Final = 0xFFFFFFFF
 _CAPABILITY_VERSION_3: Final = 0x20080522
 
 
@@ -398,7 +400,7 @@ def rights(table: CallTable, process: ProcessState, vessel: Vessel) -> tuple[str
     same_user = (theirs.uids, theirs.gids, set(theirs.groups)) == (ours.uids, ours.gids, set(ours.groups))
     if not same_user and vessel.may(CAP_SETUID) and vessel.may(CAP_SETGID):
         _bounding_set(table, theirs, vessel)
-        _become_user(table, theirs)
+        _become_user(table, theirs, ours)
     elif not same_user:
         notes.append(f"runs as uid {ours.uids[1]} gid {ours.gids[1]}; it was uid {theirs.uids[1]} gid {theirs.gids[1]}")
     else:
@@ -406,9 +408,7 @@ def rights(table: CallTable, process: ProcessState, vessel: Vessel) -> tuple[str
     notes += _capabilities(table, theirs, ours)
     if theirs.no_new_privs:
         table.call("forbid new privileges", "prctl", abi.PR_SET_NO_NEW_PRIVS, 1)
-    if theirs.securebits:
-        table.attempt("securebits are not kept", "prctl", abi.PR_SET_SECUREBITS, theirs.securebits)
-    elif not same_user:
+    if not theirs.securebits & ~SECBIT_KEEP_CAPS:
         table.attempt("", "prctl", abi.PR_SET_KEEPCAPS, int(process.keep_caps))
     return tuple(notes)
 
@@ -422,31 +422,51 @@ def _bounding_set(table: CallTable, theirs: Credentials, vessel: Vessel) -> None
             table.attempt("", "prctl", PR_CAPBSET_DROP, capability)
 
 
-def _become_user(table: CallTable, theirs: Credentials) -> None:
+def _become_user(table: CallTable, theirs: Credentials, ours: Credentials) -> None:
     table.call("keep capabilities over the change of user", "prctl", abi.PR_SET_KEEPCAPS, 1)
     groups = table.place(struct.pack(f"<{len(theirs.groups)}I", *theirs.groups))
     table.call("set the groups", "setgroups", len(theirs.groups), groups)
     table.call(f"become gid {theirs.gids[1]}", "setresgid", *theirs.gids[:3])
+    _set_file_id(table, "setfsgid", theirs.gids)  # before the user, whose change takes the right to
     table.call(f"become uid {theirs.uids[1]}", "setresuid", *theirs.uids[:3])
-    if theirs.gids[3] != theirs.gids[1]:
-        table.call("set the filesystem's gid", "setfsgid", theirs.gids[3])
-    if theirs.uids[3] != theirs.uids[1]:
-        table.call("set the filesystem's uid", "setfsuid", theirs.uids[3])
+    if theirs.uids[3] not in theirs.uids[:3]:
+        _set_capabilities(table, ours.capabilities[1], ours.capabilities[1], ours.capabilities[0])  # the change took them
+    _set_file_id(table, "setfsuid", theirs.uids)
+
+
+def _set_file_id(table: CallTable, name: str, ids: tuple[int, int, int, int]) -> None:
+    """Set the id by which files are opened, where it is not the effective one: the call does not tell whether it did.
+
+    Source: setfsuid(2), "Bugs": asked for what cannot be, it answers with the id in force.
+    """
+    if ids[3] != ids[1]:
+        table.call("", name, ids[3])
+        table.call(f"have files opened by id {ids[3]} ({name})", name, NO_ID, least=ids[3], most=ids[3])
+
+
+def _set_capabilities(table: CallTable, effective: int, permitted: int, inheritable: int) -> None:
+    sets = (effective, permitted, inheritable)
+    low, high = [word & 0xFFFFFFFF for word in sets], [word >> 32 for word in sets]
+    header = table.place(struct.pack("<Ii", _CAPABILITY_VERSION_3, 0))
+    table.call("set the capabilities", "capset", header, table.place(struct.pack("<6I", *low, *high)))
 
 
 def _capabilities(table: CallTable, theirs: Credentials, ours: Credentials) -> list[str]:
+    """Capabilities, and what securebits forbid afterwards; raised to all that there are in between, where something needs it."""
     inheritable, permitted, effective, _, ambient = theirs.capabilities
     have = ours.capabilities[1]
-    if theirs.capabilities == ours.capabilities and theirs.uids == ours.uids:
-        return []
-    table.attempt("", "prctl", PR_CAP_AMBIENT, PR_CAP_AMBIENT_CLEAR_ALL)
-    header = table.place(struct.pack("<Ii", _CAPABILITY_VERSION_3, 0))
-    sets = (effective & have, permitted & have, inheritable & (have | ours.capabilities[0]))
-    low, high = [word & 0xFFFFFFFF for word in sets], [word >> 32 for word in sets]
-    table.call("set the capabilities", "capset", header, table.place(struct.pack("<6I", *low, *high)))
-    for capability in range(64):
-        if ambient >> capability & 1:
-            table.attempt("an ambient capability is not kept", "prctl", PR_CAP_AMBIENT, PR_CAP_AMBIENT_RAISE, capability)
+    is_same = theirs.capabilities == ours.capabilities and theirs.uids == ours.uids
+    if not is_same:
+        table.attempt("", "prctl", PR_CAP_AMBIENT, PR_CAP_AMBIENT_CLEAR_ALL)
+        kept = inheritable & (have | ours.capabilities[0])
+        _set_capabilities(table, have, have, kept)
+        for capability in range(64):
+            if ambient >> capability & 1:
+                table.attempt("an ambient capability is not kept", "prctl", PR_CAP_AMBIENT, PR_CAP_AMBIENT_RAISE, capability)
+    if theirs.securebits & ~SECBIT_KEEP_CAPS:
+        table.attempt("securebits are not kept", "prctl", abi.PR_SET_SECUREBITS, theirs.securebits)
+    if not is_same:
+        _set_capabilities(table, effective & have, permitted & have, kept)
     if permitted & ~have:
         return [f"capabilities {permitted & ~have:#x} of the program are not kept: we do not have them"]
     return []
