@@ -16,6 +16,7 @@ Source: ptrace(2) (PTRACE_O_TRACEFORK), clone(2), wait(2), setsid(2), setpgid(2)
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import resource
 import signal
@@ -29,7 +30,7 @@ from typing import Final
 from checkpoint import tree
 from checkpoint.arch import x86_64, x86_64_stub
 from checkpoint.engine import RestoreOptions
-from checkpoint.engines import births, restore_memory, restore_process, restore_stops, restore_threads
+from checkpoint.engines import births, common_files, restore_memory, restore_process, restore_stops, restore_threads
 from checkpoint.engines.births import Birth, End, Join, NewSession, Step
 from checkpoint.engines.ptrace_restore import OPTIONS, REFUGE_SIZE, Estate, ProcessRestore, look_at_vessel
 from checkpoint.engines.restore_checks import Brought
@@ -56,6 +57,7 @@ class TreeRestore:
 
     def __init__(self, vessel_pid: int, state: Snapshot, options: RestoreOptions, brought: tuple[Brought, ...]) -> None:
         self._state = state
+        self._views, self._nameless = common_files.made_once(tree.views(state))
         self._brought = brought
         self._options = options
         self._first = Tracee(vessel_pid)
@@ -112,7 +114,7 @@ class TreeRestore:
                 self._stop(member.process, *stop)
         self._restoring = [
             ProcessRestore(self._born[view.process.pid], view, self._options, brought, estate)
-            for view, brought in zip(tree.views(self._state), self._brought, strict=True)
+            for view, brought in zip(self._views, self._brought, strict=True)
         ]
         for restoring in self._restoring:
             restoring.build()
@@ -142,8 +144,7 @@ class TreeRestore:
     # What they share
 
     def _make_estate(self, vessel: Vessel) -> Estate:
-        mappings = procfs.parse_maps(procfs.read_text(self._first.pid, "maps"))
-        views = tree.views(self._state)
+        mappings, views = procfs.parse_maps(procfs.read_text(self._first.pid, "maps")), self._views
         vmas = [vma for view in views for vma in view.vmas]
         sizes = {
             key: max(vma.offset + vma.size for vma in group) for key, group in _grouped(vmas, restore_memory.is_anonymous_object)
@@ -153,12 +154,12 @@ class TreeRestore:
         base = call_table.find_hole(taken, size)
         resources = _first_told(views)
         objects = dict(_grouped(vmas, restore_memory.is_object_mapping))
-        first_number = max((one.number for view in views for one in rebuild.descriptors_of(view)), default=2) + 1
+        numbers = itertools.count(max((one.number for view in views for one in rebuild.descriptors_of(view)), default=2) + 1)
         estate = Estate(
             base=base,
             size=size,
-            objects={key: first_number + index for index, key in enumerate(objects)},
-            descriptions={number: first_number + len(objects) + index for index, number in enumerate(resources)},
+            objects=dict(zip((*objects, *self._nameless), numbers, strict=False)),
+            descriptions=dict(zip(resources, numbers, strict=False)),
             anonymous=dict(zip(sizes, _places(base + AREA_SIZE + REFUGE_SIZE, sizes.values()), strict=True)),
         )
         self._terminals = terminals.controlling({estate.descriptions[number]: held for number, held in resources.items()})
@@ -191,6 +192,7 @@ class TreeRestore:
             arguments = (place, size, abi.PROT_READ | abi.PROT_WRITE, flags, -1, 0)
             table.call(what, "mmap", *arguments, least=place, most=place)
         made = opened | {key: restore_memory.make_object(table, vmas) for key, vmas in objects.items()}
+        made |= {key: common_files.make(table, held) for key, held in self._nameless.items()}
         for key, number in estate.objects.items():
             table.duplicate(made[key], number, os.O_CLOEXEC)
         kept = [Resource(streams.KIND, f"fd {n}", {"descriptors": [[n, 0]], "stream": n, "flags": 0}) for n in streams.STANDARD]
@@ -276,7 +278,8 @@ class TreeRestore:
         tracee.set_signal_mask(0)
         tracee.set_registers(self._registers)
         os.kill(tracee.pid, number)
-        tracee.cont(number if number != signal.SIGKILL else 0)
+        if number != signal.SIGKILL:  # which does not wait for us
+            tracee.cont()
         _await_end(tracee)
 
 

@@ -143,6 +143,22 @@ def make(table: CallTable, name: str, mode: int, size: int) -> int:
     return made
 
 
+def make_whole(table: CallTable, held: Resource) -> int:
+    """Make one that nobody has mapped, filled and sealed."""
+    facts = held.facts
+    made = make(table, str(facts["name"]), number_of(facts["mode"]), number_of(facts["size"]))
+    _fill(table, held, made)
+    if seals := number_of(facts["seals"]):
+        table.call("seal a memory file", "fcntl", made, F_ADD_SEALS, seals)
+    return made
+
+
+def _fill(table: CallTable, held: Resource, made: int) -> None:
+    for offset, piece in _pieces(held.facts["content"]):
+        size, what = len(piece), f"fill the memory file of {held.name}"
+        table.call(what, "pwrite64", made, table.place(piece), size, offset, least=size, most=size)
+
+
 def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     """Open it as it was; made and filled if this is the first open file of it, and no mapping has made it."""
     facts = held.facts
@@ -151,9 +167,7 @@ def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     if is_new:
         made = make(table, str(facts["name"]), number_of(facts["mode"]), number_of(facts["size"]))
         rebuilding.keep(table, key, made)
-    for offset, piece in _pieces(facts["content"]):
-        size, what = len(piece), f"fill the memory file of {held.name}"
-        table.call(what, "pwrite64", rebuilding.objects[key], table.place(piece), size, offset, least=size, most=size)
+    _fill(table, held, rebuilding.objects[key])
     opened = _opened(table, rebuilding.objects[key], number_of(facts["flags"]), is_new)
     offset = number_of(facts["offset"])
     table.call(f"set the offset of {held.name}", "lseek", opened, offset, os.SEEK_SET, least=offset, most=offset)

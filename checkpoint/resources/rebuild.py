@@ -305,17 +305,41 @@ def _open(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
 def _open_deleted(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     """Make a file that no name leads to, with the content that it had, opened as it was; it may be mapped already."""
     facts, mode = held.facts, number_of(held.facts.get("mode", 0o600))
-    path, key = str(facts["path"]), (number_of(facts["device"]), number_of(facts["inode"]))
+    key = number_of(facts["device"]), number_of(facts["inode"])
     if key not in rebuilding.objects:
-        if stat.S_ISLNK(mode):
-            rebuilding.keep(table, key, nameless.make_link(table, path, str(facts["link"])))
-        else:
-            make = nameless.make_directory if stat.S_ISDIR(mode) else nameless.make_file
-            rebuilding.keep(table, key, make(table, path, stat.S_IMODE(mode)))
+        rebuilding.keep(table, key, _empty(table, held, mode))
     made = rebuilding.objects[key]
+    _finish(table, made, held, mode)
+    again, flags = f"/proc/self/fd/{made}", number_of(facts["flags"])
+    if flags & O_PATH:
+        return table.open(again, O_PATH | (flags & os.O_DIRECTORY))
+    is_temporary = stat.S_ISREG(mode)  # O_DIRECTORY is a part of O_TMPFILE, by which it may have been made
+    opened = table.open(again, flags & REOPENED_FLAGS & ~(os.O_DIRECTORY if is_temporary else 0))
+    _seek(table, opened, held)
+    return opened
+
+
+def make_deleted(table: CallTable, held: Resource) -> int:
+    """Make what no name leads to, with all that it had: a descriptor of it."""
+    mode = number_of(held.facts.get("mode", 0o600))
+    made = _empty(table, held, mode)
+    _finish(table, made, held, mode)
+    return made
+
+
+def _empty(table: CallTable, held: Resource, mode: int) -> int:
+    path = str(held.facts["path"])
+    if stat.S_ISLNK(mode):
+        return nameless.make_link(table, path, str(held.facts["link"]))
+    make = nameless.make_directory if stat.S_ISDIR(mode) else nameless.make_file
+    return make(table, path, stat.S_IMODE(mode))
+
+
+def _finish(table: CallTable, made: int, held: Resource, mode: int) -> None:
+    """Content, owner and times."""
+    facts, path, again = held.facts, str(held.facts["path"]), f"/proc/self/fd/{made}"
     if stat.S_ISREG(mode):
         _fill(table, made, held)
-    again, flags = f"/proc/self/fd/{made}", number_of(facts["flags"])
     if "uid" in facts:
         owner = number_of(facts["uid"]), number_of(facts["gid"])
         lost = f"the deleted file {path} belongs to whom the program runs as"
@@ -325,12 +349,6 @@ def _open_deleted(table: CallTable, held: Resource, rebuilding: Rebuilding) -> i
         changed = struct.pack("<qq", *divmod(number_of(facts["mtime_ns"]), NS_PER_S))
         times = table.place(struct.pack("<qq", 0, UTIME_OMIT) + changed)
         table.attempt("", "utimensat", -1, table.place_path(again), times, 0)
-    if flags & O_PATH:
-        return table.open(again, O_PATH | (flags & os.O_DIRECTORY))
-    is_temporary = stat.S_ISREG(mode)  # O_DIRECTORY is a part of O_TMPFILE, by which it may have been made
-    opened = table.open(again, flags & REOPENED_FLAGS & ~(os.O_DIRECTORY if is_temporary else 0))
-    _seek(table, opened, held)
-    return opened
 
 
 def _fill(table: CallTable, made: int, held: Resource) -> None:

@@ -81,3 +81,150 @@ print("ok", flush=True)
 
 def test_stopped_children_stay_so_and_their_parent_is_told_once(tmp_path: Path) -> None:
     goes_through_three_lives(STOPPED, tmp_path)
+
+
+NAMELESS = """
+import fcntl
+deleted = os.open("deleted", os.O_RDWR | os.O_CREAT)
+sealed = os.memfd_create("sealed", os.MFD_ALLOW_SEALING)
+plain = os.memfd_create("plain")
+os.write(deleted, b"a" * 5000)
+os.write(sealed, b"sealed")
+os.write(plain, b"plain")
+parent = os.getpid()
+read_end, write_end = os.pipe()
+
+def work():
+    mine = [os.open(f"/proc/{parent}/fd/{one}", os.O_RDWR) for one in (deleted, sealed, plain)]
+    for one in (deleted, sealed, plain):
+        os.close(one)
+    os.write(write_end, b".")
+    wait_for_go()
+    os.pwrite(mine[0], b"child", 5000)
+    os.pwrite(mine[2], b"child", 100)
+    expect("what the child reads of a sealed file", os.pread(mine[1], 10, 0), b"sealed")
+    expect("its offset", os.lseek(mine[0], 0, os.SEEK_CUR), 0)
+
+child = born(work)
+os.read(read_end, 1)
+os.unlink("deleted")
+fcntl.fcntl(sealed, fcntl.F_ADD_SEALS, fcntl.F_SEAL_WRITE | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
+is_ready()
+expect_child(child)
+expect("what the child has written", os.pread(deleted, 5100, 0), b"a" * 5000 + b"child")
+expect("what it has written to memory", os.pread(plain, 200, 0), b"plain" + bytes(95) + b"child")
+expect("seals", fcntl.fcntl(sealed, fcntl.F_GET_SEALS), fcntl.F_SEAL_WRITE | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
+expect("the offset", os.lseek(deleted, 0, os.SEEK_CUR), 5000)
+print("ok", flush=True)
+"""
+
+
+def test_a_file_without_a_name_that_two_processes_have_opened_is_one_file(tmp_path: Path) -> None:
+    goes_through_three_lives(NAMELESS, tmp_path)
+
+
+OWNERS = """
+import fcntl
+heard = []
+signal.signal(signal.SIGUSR1, lambda *_: heard.append(1))
+read_end, write_end = os.pipe()
+
+def work():
+    wait_for_go()
+    os.write(write_end, b"x")
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGUSR1])
+    while not Path("told").exists():
+        time.sleep(0.01)
+    expect("a signal to the child", signal.sigwait([signal.SIGUSR1]), signal.SIGUSR1)
+
+signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGUSR1])
+child = born(work)
+other_read, other_write = os.pipe()
+for descriptor, owner in ((read_end, os.getpid()), (other_read, child)):
+    fcntl.fcntl(descriptor, fcntl.F_SETOWN, owner)
+    fcntl.fcntl(descriptor, fcntl.F_SETSIG, signal.SIGUSR1)
+    fcntl.fcntl(descriptor, fcntl.F_SETFL, os.O_ASYNC | os.O_NONBLOCK)
+is_ready()
+expect("the signal", signal.sigwait([signal.SIGUSR1]), signal.SIGUSR1)
+expect("the flags", fcntl.fcntl(read_end, fcntl.F_GETFL) & (os.O_ASYNC | os.O_NONBLOCK), os.O_ASYNC | os.O_NONBLOCK)
+os.write(other_write, b"x")
+Path("told").touch()
+expect_child(child)
+print("ok", flush=True)
+"""
+
+
+def test_signals_of_what_processes_share_go_to_whom_they_went(tmp_path: Path) -> None:
+    goes_through_three_lives(OWNERS, tmp_path)
+
+
+RIGHTS = """
+import ctypes
+libc = ctypes.CDLL(None, use_errno=True)
+SECBITS, NO_NEW_PRIVS, CAPBSET_DROP = 28, 38, 24
+LINES = ("Uid:", "Gid:", "Groups:", "NoNewPrivs:", "CapInh:", "CapPrm:", "CapEff:", "CapBnd:", "CapAmb:")
+
+def rights():
+    return [line.split() for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(LINES)] + [
+        libc.prctl(27, 0, 0, 0, 0)
+    ]
+
+def one(act):
+    def work():
+        act()
+        before = rights()
+        os.write(write_end, b".")
+        while not os.path.exists("go"):
+            time.sleep(0.01)
+        expect("who it runs as", rights(), before)
+    return work
+
+def with_file_ids():
+    os.setgroups([5, 7])
+    os.setresgid(10, 11, 12)
+    libc.setfsgid(13)
+    os.setresuid(20, 21, 22)
+
+def with_a_file_user():
+    libc.setfsuid(1000)
+
+def with_securebits():
+    libc.prctl(CAPBSET_DROP, 22, 0, 0, 0)
+    libc.prctl(NO_NEW_PRIVS, 1, 0, 0, 0)
+    expect("securebits", libc.prctl(SECBITS, 0xF, 0, 0, 0), 0)
+    os.setresuid(30, 30, 30)
+
+def with_few():
+    libc.prctl(8, 1, 0, 0, 0)
+    os.setresuid(40, 41, 40)
+
+os.chmod(".", 0o755)
+read_end, write_end = os.pipe()
+children = [born(one(act)) for act in (with_file_ids, with_a_file_user, with_securebits, with_few)]
+for _ in children:
+    os.read(read_end, 1)
+is_ready()
+for child in children:
+    expect_child(child)
+print("ok", flush=True)
+"""
+
+
+def test_every_child_runs_as_whom_it_ran(tmp_path: Path) -> None:
+    goes_through_three_lives(RIGHTS, tmp_path)
+
+
+KILLED = """
+children = [born(signal.pause) for _ in range(4)]
+for child, number in zip(children, (signal.SIGKILL, signal.SIGTERM, signal.SIGUSR1, signal.SIGKILL)):
+    os.kill(child, number)
+    os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)
+is_ready()
+for child, number in zip(children, (signal.SIGKILL, signal.SIGTERM, signal.SIGUSR1, signal.SIGKILL)):
+    expect("its end", os.waitpid(child, 0), (child, number))
+print("ok", flush=True)
+"""
+
+
+def test_who_was_killed_and_not_asked_for_is_still_to_be_asked_for(tmp_path: Path) -> None:
+    goes_through_three_lives(KILLED, tmp_path)
