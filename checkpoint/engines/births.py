@@ -140,11 +140,21 @@ def refuse(first: Status, members: Sequence[Member], zombies: Sequence[Zombie]) 
     Args:
         first: of the first process.
     """
-    person = Person(first.pids[-1], 0, first.pgids[-1], first.sids[-1])
+    yield from refuse_persons(first, _persons(members, zombies))
+
+
+def refuse_persons(first: Status, others: Sequence[Person]) -> Iterator[str]:
+    """The same of those of whom no more is known."""
     try:
-        steps(person, _persons(members, zombies), set())
+        steps(Person(first.pids[-1], 0, first.pgids[-1], first.sids[-1]), others, set())
     except NoWayError as error:
         yield str(error)
+
+
+def persons(statuses: Sequence[Status]) -> list[Person]:
+    """All of these processes, but for what they are known by outside of their namespace."""
+    inner = {status.pids[0]: status.pids[-1] for status in statuses}
+    return [Person(one.pids[-1], inner.get(one.ppid, 0), one.pgids[-1], one.sids[-1]) for one in statuses]
 
 
 def steps(first: Person, others: Sequence[Person], numbers: set[int]) -> list[Step]:

@@ -11,6 +11,7 @@ from typing import Final
 
 from checkpoint import portable
 from checkpoint.engine import KEPT, NO_TERMS, NOTED, REFUSED, Finding, Report, Streams, Terms
+from checkpoint.engines import births
 from checkpoint.errors import CheckpointError, ProbeError, ProcessGoneError
 from checkpoint.linux import dirty, kinship, processor, procfs, vm_flags
 from checkpoint.linux.procfs import Status
@@ -157,10 +158,28 @@ def _others_findings(opened: sharing.OpenedByAll, first: int, looked: Mapping[in
         except (CheckpointError, FileNotFoundError, ProcessLookupError):
             continue
         reasons += [why for line in lines if (why := unsupported.refuse_mapping(line, flags.get(line.start, ())))]
+        reasons += unsupported.refuse_memory(lines)
         for reason in reasons:
             yield Finding("process", f"pid {pid}", REFUSED, f"its process {pid} ({status.name}): {reason}")
-    for reason in sharing.refuse(opened):
+    for reason in (*sharing.refuse(opened), *_births_refused(first)):
         yield Finding("process", "shared", REFUSED, reason)
+
+
+def _births_refused(first: int) -> tuple[str, ...]:
+    """Why its processes could not be born again: what is said twice, for they come and go."""
+    reasons = _births_refused_now(first)
+    if not reasons:
+        return ()
+    time.sleep(LOOK_PAUSE_S)
+    again = _births_refused_now(first)
+    return tuple(reason for reason in reasons if reason in again)
+
+
+def _births_refused_now(first: int) -> tuple[str, ...]:
+    with contextlib.suppress(CheckpointError):
+        everybody = list(map(procfs.status, (first, *kinship.component(first))))
+        return tuple(births.refuse_persons(everybody[0], births.persons(everybody)[1:]))
+    return ()
 
 
 def surroundings_of(pid: int, streams: Streams | None, terms: Terms = NO_TERMS) -> Surroundings:
@@ -215,6 +234,8 @@ def _memory_findings(pid: int) -> Iterator[Finding]:
         reason = unsupported.refuse_mapping(line, flags.get(line.start, ()))
         if reason is not None:
             yield Finding("memory", f"VMA {line.start:x}-{line.end:x}", REFUSED, reason)
+    for reason in unsupported.refuse_memory(lines):
+        yield Finding("memory", "vdso", REFUSED, reason)
     for reason in system_v_memory.refuse(lines):
         yield Finding("memory", "System V shared memory", REFUSED, reason)
     for path, note in unsupported.note_mappings(line for line in lines if not system_v_memory.is_segment(line)):

@@ -1,5 +1,9 @@
 """The processes of a component: the first one, its children, theirs, and those whose parent has ended.
 
+Who has lost its parent is given to the nearest ancestor that asks for such (a *reaper*). That of a component in PIDs of its own,
+or under a guard, has no other children. Elsewhere a *stray* is told from the children of others by its session or process group,
+where one of the component leads it or is in it, and no ancestor is.
+
 Source: proc_pid_task(5) (children), credentials(7), pid_namespaces(7); PR_SET_CHILD_SUBREAPER of prctl(2).
 """
 
@@ -7,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Final
 
 from checkpoint.errors import CheckpointError
@@ -60,6 +64,8 @@ class Kinship:
         self._reaper = reaper
         self._of_first = Children(pid)
         self._of_reaper = Children(reaper)
+        self._of_ancestors = () if reaper else tuple(map(Children, ancestors(pid)))
+        self._has_strays = False
 
     def has_others(self, tids: list[int]) -> bool:
         """Whether there is anybody besides the first process.
@@ -67,17 +73,34 @@ class Kinship:
         Args:
             tids: its threads.
         """
-        return bool(self._of_first.read(tids)) or bool(self._reaper and self._orphans())
+        return self._has_strays or bool(self._of_first.read(tids)) or bool(self._reaper and self._orphans())
 
     def _orphans(self) -> list[int]:
         return [pid for pid in self._of_reaper.read([self._reaper]) if pid != self._pid]
 
     def others(self) -> list[int]:
         """Everybody besides the first process, parents before children, zombies included."""
-        return list(self._walk([*children(self._pid), *(self._orphans() if self._reaper else ())]))
+        found = list(self._walk([*children(self._pid), *(self._orphans() if self._reaper else ())], ()))
+        self._has_strays = False
+        while strays := self._strays(found):
+            self._has_strays = True
+            found += self._walk(strays, found)
+        return found
 
-    def _walk(self, waiting: list[int]) -> Iterator[int]:
-        seen: set[int] = set()
+    def _strays(self, found: list[int]) -> list[int]:
+        """Who has lost its parent, and is not among those that were found."""
+        if not self._of_ancestors:
+            return []
+        elders = {self._pid, *(one.pid for one in self._of_ancestors)}
+        ours = _circles([self._pid, *found]) | {self._pid, *found}
+        ours -= _circles(one.pid for one in self._of_ancestors)
+        known = elders | set(found)
+        fresh = [pid for one in self._of_ancestors for pid in one.read([one.pid]) if pid not in known]
+        return [pid for pid in fresh if _circles([pid]) & ours]
+
+    @staticmethod
+    def _walk(waiting: list[int], known: Iterable[int]) -> Iterator[int]:
+        seen = set(known)
         while waiting:
             pid = waiting.pop(0)
             if pid not in seen:
@@ -87,8 +110,8 @@ class Kinship:
 
     def close(self) -> None:
         """Give descriptors back."""
-        self._of_first.close()
-        self._of_reaper.close()
+        for one in (self._of_first, self._of_reaper, *self._of_ancestors):
+            one.close()
 
 
 def children(pid: int) -> list[int]:
@@ -99,6 +122,24 @@ def children(pid: int) -> list[int]:
             with contextlib.suppress(CheckpointError):  # it has ended; its children are those of another one now
                 found += map(int, procfs.read_line(pid, f"task/{tid}/children").split())
     return found
+
+
+def ancestors(pid: int) -> list[int]:
+    """Its parent, whose parent, and so on, as far as we see them."""
+    found: list[int] = []
+    with contextlib.suppress(CheckpointError):
+        while pid := procfs.stat(pid).ppid:
+            found.append(pid)
+    return found
+
+
+def _circles(pids: Iterable[int]) -> set[int]:
+    """The sessions and process groups of processes; of one that has ended nothing."""
+    found: set[int] = set()
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            found |= {os.getsid(pid), os.getpgid(pid)}
+    return found - {0}
 
 
 def reaper_of(pid: int, *, is_guarded: bool) -> int:
@@ -133,6 +174,11 @@ def others(pid: int, reaper: int) -> list[int]:
         kin.close()
 
 
+def component(pid: int) -> list[int]:
+    """Everybody of the component of a process that nobody guards, but for itself, parents before children."""
+    return others(pid, reaper_of(pid, is_guarded=False))
+
+
 def descendants(pid: int) -> list[int]:
     """Everybody whom a process has given birth to, and they, parents before children."""
-    return others(pid, 0)
+    return list(Kinship._walk(children(pid), ()))

@@ -84,7 +84,7 @@ def _end(pid: int) -> None:
     with contextlib.ExitStack() as held:
         dying = select.poll()
         count = 0
-        for one in (*reversed(kinship.descendants(pid)), pid):
+        for one in (*reversed(kinship.component(pid)), pid):
             with contextlib.suppress(ProcessLookupError):
                 end = os.pidfd_open(one)
                 held.callback(os.close, end)

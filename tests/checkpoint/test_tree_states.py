@@ -2,16 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import signal
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.checkpoint.round_trip import Program, ended, expect_ok, start
+from checkpoint.engine import CaptureOrder
+from checkpoint.linux import kinship
+from checkpoint.linux.namespaces import prctl
+from tests.checkpoint.round_trip import (
+    Program,
+    captured_at_last,
+    ended,
+    expect_ok,
+    protected,
+    restored,
+    start,
+    transported,
+)
 from tests.checkpoint.test_trees import three_lives
 
 pytestmark = pytest.mark.root
 
+PR_SET_CHILD_SUBREAPER = 36
 PREAMBLE = """
 import os, signal, struct, sys, time
 from pathlib import Path
@@ -228,3 +244,61 @@ print("ok", flush=True)
 
 def test_who_was_killed_and_not_asked_for_is_still_to_be_asked_for(tmp_path: Path) -> None:
     goes_through_three_lives(KILLED, tmp_path)
+
+
+STRAYS = """
+if os.getsid(0) != os.getpid():
+    os.setsid()
+
+def lead():
+    os.setsid()
+    os.waitpid(born(leave_behind), 0)
+    wait_for_go()
+
+def leave_behind():
+    born(live_alone)
+
+def live_alone():
+    mine = os.getpgid(0), os.getsid(0)
+    Path(f"alone{os.getpid()}").touch()
+    wait_for_go()
+    expect("group and session of an orphan", (os.getpgid(0), os.getsid(0)), mine)
+    Path(f"alone{os.getpid()}").unlink()
+
+os.waitpid(born(leave_behind), 0)
+leader = born(lead)
+while len(list(Path(".").glob("alone*"))) < 2:
+    time.sleep(0.01)
+is_ready()
+expect_child(leader)
+while list(Path(".").glob("alone*")):
+    time.sleep(0.01)
+print("ok", flush=True)
+"""
+
+
+def test_processes_that_have_lost_their_parent_are_told_by_their_session(tmp_path: Path) -> None:
+    prctl(PR_SET_CHILD_SUBREAPER, 1)  # so that we can reap whom it leaves behind
+    try:
+        program = start([sys.executable, "-c", PREAMBLE + STRAYS], tmp_path)
+        with ended(program):
+            program.wait_for_line("ready")
+            strays = set(kinship.component(program.pid)) - set(kinship.descendants(program.pid))
+            with protected(program) as session:
+                snapshot = transported(captured_at_last(session, CaptureOrder(hold=True)))
+                everybody = [member.process.pid for member in snapshot.members]
+                assert (len(everybody), len(strays)) == (3, 2)
+                for pid in everybody:
+                    os.kill(pid, signal.SIGKILL)
+                program.kill()
+            for pid in strays | set(everybody):
+                with contextlib.suppress(ChildProcessError):
+                    os.waitpid(pid, 0)
+        again = restored(snapshot, tmp_path)
+        with ended(again):
+            again.tell()
+            expect_ok(again)
+        for pid in strays:
+            os.waitpid(pid, 0)
+    finally:
+        prctl(PR_SET_CHILD_SUBREAPER, 0)

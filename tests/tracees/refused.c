@@ -323,7 +323,7 @@ static void take_directory_notice(void) {
 static void take_owner_group(void) {
     keep(open("owned", O_RDONLY | O_CREAT, 0600), "a file");
     if (getpgrp() != getpid() && setpgid(0, 0)) cannot("lead a process group");
-    if (fcntl(opened, F_SETOWN, -getpgrp())) cannot("own signals as a group");
+    if (fcntl(opened, F_SETOWN, -getpgid(getppid()))) cannot("have another program's group own signals");
 }
 
 static const struct kind {
