@@ -11,7 +11,7 @@ Pure: no process is touched here. Sources: fork(2), setsid(2), setpgid(2), crede
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -54,6 +54,8 @@ CAPABILITIES: Final = (
 )
 
 SIGCHLD: Final = 17
+PIDS_EVERYWHERE: Final = 1 << 15
+"""Pids below this can be had on every machine (/proc/sys/kernel/pid_max)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,13 +112,16 @@ class NoWayError(RestoreError):
     """Processes that cannot be born into what they were in."""
 
 
-def steps_of(state: Snapshot) -> list[Step]:
+def steps_of(state: Snapshot, is_taken: Callable[[int], bool]) -> list[Step]:
     """Every step, beginning with the first process alone.
+
+    Args:
+        is_taken: whether somebody else has a pid, so that no stand-in can have it.
 
     Raises:
         NoWayError: there is none.
     """
-    return steps(_person(state.process), _persons(state.members, state.zombies), _numbers(state))
+    return steps(_person(state.process), _persons(state.members, state.zombies), _numbers(state), is_taken)
 
 
 def _persons(members: Sequence[Member], zombies: Sequence[Zombie]) -> list[Person]:
@@ -157,13 +162,15 @@ def persons(statuses: Sequence[Status]) -> list[Person]:
     return [Person(one.pids[-1], inner.get(one.ppid, 0), one.pgids[-1], one.sids[-1]) for one in statuses]
 
 
-def steps(first: Person, others: Sequence[Person], numbers: set[int]) -> list[Step]:
+def steps(
+    first: Person, others: Sequence[Person], numbers: set[int], is_taken: Callable[[int], bool] = lambda _: False
+) -> list[Step]:
     """As `steps_of`.
 
     Args:
         numbers: ids that no stand-in may take, besides those of the processes.
     """
-    return _Plan(first, others, numbers).made()
+    return _Plan(first, others, numbers, is_taken).made()
 
 
 @dataclass(slots=True)
@@ -178,6 +185,7 @@ class _Plan:
     first: Person
     others: Sequence[Person]
     numbers: set[int]
+    is_taken: Callable[[int], bool]
     steps: list[Step] = field(default_factory=list)
     session: dict[int, int] = field(default_factory=dict)
     standins: dict[int, int] = field(default_factory=dict)
@@ -185,7 +193,7 @@ class _Plan:
     def made(self) -> list[Step]:
         everybody = {person.pid: person for person in (self.first, *self.others)}
         self._everybody = everybody
-        self._spare = itertools.count(max((*everybody, *self.numbers, *(one.sid for one in self.others))) + 1)
+        self._spare = self._free(max((*everybody, *self.numbers, *(one.sid for one in self.others))))
         self.session[self.first.pid] = self.first.sid
         self._grow(self.first)
         for orphan in [one for one in self.others if one.ppid not in everybody]:
@@ -199,6 +207,12 @@ class _Plan:
 
     _everybody: dict[int, Person] = field(default_factory=dict)
     _spare: Iterator[int] = field(default_factory=itertools.count)
+
+    def _free(self, last: int) -> Iterator[int]:
+        """Numbers for stand-ins: above all that are wanted, else between them."""
+        wanted = {*self._everybody, *self.numbers, *(number for one in self.others for number in (one.sid, one.pgid))}
+        numbers = itertools.chain(range(last + 1, PIDS_EVERYWHERE), range(2, last), itertools.count(last + 1))
+        return (number for number in numbers if number not in wanted and not self.is_taken(number))
 
     # Sessions
 

@@ -158,7 +158,6 @@ def _others_findings(opened: sharing.OpenedByAll, first: int, looked: Mapping[in
         except (CheckpointError, FileNotFoundError, ProcessLookupError):
             continue
         reasons += [why for line in lines if (why := unsupported.refuse_mapping(line, flags.get(line.start, ())))]
-        reasons += unsupported.refuse_memory(lines)
         for reason in reasons:
             yield Finding("process", f"pid {pid}", REFUSED, f"its process {pid} ({status.name}): {reason}")
     for reason in (*sharing.refuse(opened), *_births_refused(first)):
@@ -234,8 +233,6 @@ def _memory_findings(pid: int) -> Iterator[Finding]:
         reason = unsupported.refuse_mapping(line, flags.get(line.start, ()))
         if reason is not None:
             yield Finding("memory", f"VMA {line.start:x}-{line.end:x}", REFUSED, reason)
-    for reason in unsupported.refuse_memory(lines):
-        yield Finding("memory", "vdso", REFUSED, reason)
     for reason in system_v_memory.refuse(lines):
         yield Finding("memory", "System V shared memory", REFUSED, reason)
     for path, note in unsupported.note_mappings(line for line in lines if not system_v_memory.is_segment(line)):

@@ -104,7 +104,12 @@ class TreeRestore:
         estate = self._make_estate(vessel)
         self._instruction = estate.base + x86_64_stub.CALL_LOOP.index(x86_64.SYSCALL)
         self._take_terminal(self._state.process.pid)
-        for step in births.steps_of(self._state):
+        is_apart = vessel.inner_pid != vessel.pid  # where nobody else has pids
+
+        def is_taken(pid: int) -> bool:
+            return not is_apart and os.path.exists(f"/proc/{pid}")
+
+        for step in births.steps_of(self._state, is_taken):
             self._take(step, estate.base)
         self._set_foreground(estate.base)
         for zombie in self._state.zombies:

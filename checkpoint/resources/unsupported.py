@@ -82,12 +82,6 @@ CAPABILITIES: Final = (
         "run it without: a capture asks system calls of it that the filter forbids",
         "it runs under a seccomp filter",
     ),
-    refused(
-        Area.PROCESS,
-        "a process without a vdso",
-        "let it keep that mapping, or start the kernel without vdso=0",
-        "it has no vdso",
-    ),
     refused(Area.PROCESS, "programs of 32 bits", "use a 64-bit build", "it is a program of 32 bits"),
     refused(Area.PROCESS, "a program without the kernel’s vdso", "do not unmap it", "it has no vdso"),
     refused(
@@ -247,12 +241,6 @@ def refuse_mapping(line: MapsLine, flags: tuple[str, ...]) -> str | None:
         if is_orphan(line) and line.size > ORPHAN_LIMIT:
             return f"{replaced}, and larger than {ORPHAN_LIMIT >> 20} MiB: restart the program, then protect it"
     return None
-
-
-def refuse_memory(lines: Iterable[MapsLine]) -> Iterator[str]:
-    """Why none of its memory can be captured."""
-    if not any(line.name == "[vdso]" for line in lines):
-        yield "it has no vdso, by which it is entered: let it keep that mapping (or the kernel was started with vdso=0)"
 
 
 def note_mappings(lines: Iterable[MapsLine]) -> Iterator[tuple[str, str]]:
