@@ -111,6 +111,7 @@ class CapturedProcess:
     def close(self) -> None:
         """Let go; the process is not changed."""
         self.memory.close()
+        self.threads.close()
 
     def settle(self, position: Position) -> None:
         """The last look has become part of the snapshot with this position."""

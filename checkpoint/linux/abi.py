@@ -44,6 +44,9 @@ PTRACE_PEEKSIGINFO_SHARED: Final = 1
 WALL: Final = 0x40000000
 """__WALL of waitpid(2): also children that are not ours."""
 
+ENDS: Final = (os.CLD_EXITED, os.CLD_KILLED, os.CLD_DUMPED)
+"""What waitid(2) says of whom has ended."""
+
 # linux/elf.h: names of register sets
 NT_PRSTATUS: Final = 1
 NT_X86_XSTATE: Final = 0x202
@@ -290,6 +293,28 @@ def kcmp(pid1: int, pid2: int, kind: int, index1: int = 0, index2: int = 0) -> i
     if result < 0 and ctypes.get_errno() in (errno.ENOSYS, errno.EPERM):
         return None
     return result
+
+
+_held_libc: Final = ctypes.PyDLL(None, use_errno=True)
+
+
+def timerfd() -> int:
+    """A descriptor (close-on-exec) that can be read whenever a timer of CLOCK_MONOTONIC has gone off; it is not set yet.
+
+    Raises:
+        OSError: there are too many descriptors.
+
+    Source: timerfd_create(2).
+    """
+    number = int(_libc.timerfd_create(1, O_CLOEXEC))
+    return number if number >= 0 else int(raise_errno("timerfd_create"))
+
+
+def set_timerfd(timer: int, period_ns: int) -> None:
+    """Have it go off after so long, again and again; 0: never."""
+    setting = (ctypes.c_int64 * 4)(0, period_ns, 0, period_ns)
+    if _held_libc.timerfd_settime(timer, 0, setting, None) < 0:
+        raise_errno("timerfd_settime")
 
 
 NR_GET_ROBUST_LIST: Final[dict[str, int]] = {"x86_64": 274, "aarch64": 100}

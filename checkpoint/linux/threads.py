@@ -11,6 +11,10 @@ How none is missed, and none left behind (each step is a race):
    soon as it stops, which SIGCHLD tells us.
 5. The process is killed while it stands: each thread ends for its tracer first, as in 3.
 6. We die: the kernel lets everybody go.
+7. A thread executes another program while we seize: it waits for our taking note of the others' ends, and we wait for it
+   (`checkpoint.linux.burial`).
+8. A thread that we have seized executes another program: we trace it still, under its process's id, and its own is gone. It runs
+   on unless it has been asked to stop, or is asked once more; what was asked of the first thread, which had that id, is void.
 
 Source: ptrace(2), "Attaching and detaching", "Death under ptrace"; proc_pid_task(5).
 """
@@ -25,14 +29,17 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
-from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
-from checkpoint.linux import abi, procfs
-from checkpoint.linux.tracee import STOP_TIMEOUT_S, Tracee
+from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError
+from checkpoint.linux import procfs
+from checkpoint.linux.burial import Burial, bury
+from checkpoint.linux.tracee import STOP_TIMEOUT_S, Tracee, no_stop, rest
 
 GLANCE_S: Final = 0.02
 """How long a thread may take before we look whether it waits inside the kernel."""
 PATIENCE_S: Final = 1.0
 """How long we wait for threads that do not stop where no signal can tell us (in a thread of ours that is not the first)."""
+SEIZINGS: Final = 30
+"""How often a thread is seized before it is believed that we may not; the kernel has one word for that and for one that ends."""
 FIRST_LINKS: Final = 2
 """Links of an empty /proc/PID/task: its own, and its parent's. Each thread is one more."""
 
@@ -49,11 +56,26 @@ def thread_count(pid: int) -> int:
 
 
 def thread_ids(pid: int) -> list[int]:
-    """The ids of its threads, oldest first."""
+    """The ids of its threads, the first one first."""
     try:
-        return sorted(int(name) for name in os.listdir(f"/proc/{pid}/task"))
+        return sorted(map(int, os.listdir(f"/proc/{pid}/task")), key=lambda tid: (tid != pid, tid))
     except (FileNotFoundError, ProcessLookupError) as error:
         raise ProcessGoneError(f"there is no process {pid} any more") from error
+
+
+def _seized_at_last(tracee: Tracee) -> None:
+    """Seize a thread; whoever has this id may just be leaving it to the one that executes another program (8).
+
+    Raises:
+        ProbeError: we may not, or somebody else traces it.
+    """
+    for _ in range(SEIZINGS):
+        with contextlib.suppress(ProbeError):
+            return tracee.seize()
+        if procfs.status(tracee.pid).tracer:
+            break
+        time.sleep(0.0001)
+    return tracee.seize()
 
 
 class Ear:
@@ -107,6 +129,9 @@ class Threads:
         self._moving: set[int] = set()
         self._loose: dict[int, Tracee] = {}
         self.is_one_of_many = False
+        self._burial: Burial | None = None
+        self._seized: set[int] = set()
+        self._have_ended = False
 
     @property
     def pid(self) -> int:
@@ -141,6 +166,7 @@ class Threads:
         deadline = time.perf_counter() + STOP_TIMEOUT_S
         ended: set[int] = set()
         self._moving.clear()
+        self._have_ended = False
         fresh = [self.pid] if thread_count(self.pid) == 1 else thread_ids(self.pid)
         while fresh:
             ended |= self._stop(fresh, deadline)
@@ -156,20 +182,30 @@ class Threads:
     def _stop(self, tids: list[int], deadline: float) -> set[int]:
         """Stop these; those that have ended instead."""
         ended: set[int] = set()
-        asked = [tid for tid in tids if self._unless_ended(self._seize, tid, ended)]
+        with self._watched(tids):
+            asked = [tid for tid in tids if self._unless_ended(self._seize, tid, ended)]
         for tid in asked:
             self._unless_ended(self._ask, tid, ended)
-        for tid in asked:
-            if tid in self._moving:
-                self._unless_ended(lambda tid: self._await(self._held[tid], deadline), tid, ended)
+        self._await_all(deadline, ended)
         return ended
+
+    def _watched(self, tids: list[int]) -> contextlib.AbstractContextManager[None]:
+        """See that seizing them does not wait for ever (7): that takes two."""
+        if len(tids) + len(self._held) <= 1:
+            return contextlib.nullcontext()
+        if self._burial is None:
+            self._burial = Burial()
+        self._seized = set(self._held) - {self.pid}
+        return self._burial.watching(self._seized)
 
     def _seize(self, tid: int) -> None:
         tracee = self._known.get(tid)
         if tracee is None:
             tracee = self._known[tid] = Tracee(tid, self.leader.memory)
-        tracee.seize()
+        _seized_at_last(tracee)
         self._held[tid] = tracee
+        if tid != self.pid:
+            self._seized.add(tid)
 
     def _ask(self, tid: int) -> None:
         if self._held[tid].ask_to_stop() is None:
@@ -182,23 +218,67 @@ class Threads:
         except ProcessGoneError:
             if tid == self.pid:
                 raise
-            self._held.pop(tid, None)
-            self._moving.discard(tid)
+            bury(tid)
             ended.add(tid)
+            self._forget(tid)
             return False
         return True
 
-    def _await(self, tracee: Tracee, deadline: float) -> None:
-        left_s = max(deadline - time.perf_counter(), 0.0)
-        try:
-            tracee.await_stop(min(GLANCE_S, left_s))
-        except ProcessGoneError:
-            raise
-        except CaptureError:
-            is_alone = thread_count(self.pid) == 1 and not self.is_one_of_many
-            if not is_alone and procfs.thread_stat(self.pid, tracee.pid).state == "D":
-                raise
-            tracee.await_stop(left_s)
+    def _forget(self, tid: int) -> None:
+        """A thread has ended."""
+        self._held.pop(tid, None)
+        self._moving.discard(tid)
+        self._have_ended = True
+
+    def _await_all(self, deadline: float, ended: set[int]) -> None:
+        """Wait for the stops of those that move: for all at once, for the end of one may wait for our taking note of another's.
+
+        Raises:
+            CaptureError: one does not stop.
+        """
+        began = now = time.perf_counter()
+        glance = began + GLANCE_S
+        while self._moving:
+            count = len(self._moving)
+            for tid in tuple(self._moving):
+                self._unless_ended(self._look_whether_it_stands, tid, ended)
+            if len(self._moving) == count:
+                rest(now - began)
+            now = time.perf_counter()
+            if now > deadline:
+                raise no_stop(min(self._moving), now - began)
+            if now > glance:
+                glance = now + GLANCE_S
+                self._glance(now - began, ended)
+
+    def _look_whether_it_stands(self, tid: int) -> None:
+        if self._held[tid].has_stopped():
+            self._moving.discard(tid)
+
+    def _glance(self, waited_s: float, ended: set[int]) -> None:
+        """See who keeps us waiting.
+
+        Raises:
+            ProcessGoneError: another thread has become the first one, which is not traced.
+            CaptureError: one waits inside the kernel; but where nobody else stands still, that may take its time.
+        """
+        for tid in [tid for tid in self._held if tid not in self._moving and tid != self.pid and bury(tid)]:
+            ended.add(tid)
+            self._forget(tid)
+        is_alone = thread_count(self.pid) == 1 and not self.is_one_of_many
+        for tid in () if is_alone else sorted(self._moving):
+            with contextlib.suppress(ProcessGoneError):
+                if procfs.thread_stat(self.pid, tid).state == "D":
+                    raise no_stop(tid, waited_s)
+        if self.pid in self._moving:
+            self._glance_at_first()
+
+    def _glance_at_first(self) -> None:
+        """The first thread may be another one than we have seized, or than we have asked (8)."""
+        if procfs.status(self.pid).tracer != threading.get_native_id():
+            raise ProcessGoneError(f"pid {self.pid} has become another program (exec)")
+        if self._have_ended:
+            self.leader.interrupt()  # the same one could stop twice: not without need
 
     # Letting go
 
@@ -213,6 +293,12 @@ class Threads:
             except CheckpointError:
                 self._loose[tid] = tracee
         self._settle()
+
+    def close(self) -> None:
+        """Nothing more will be asked of it; nobody may be held."""
+        if self._burial is not None:
+            self._burial.close()
+            self._burial = None
 
     def adopt(self, others: tuple[Tracee, ...]) -> None:
         """Take over threads that are ours already and stand still, the leader among them."""
@@ -250,14 +336,22 @@ class Threads:
         try:
             stop = tracee.reported()
         except ProcessGoneError:
+            self._look_for_heir(tracee)
             return True
         if stop is None:
-            return False
+            return not tracee.interrupt_if_ours()  # (8): nobody may have asked it yet under this id
         try:
             tracee.detach(stop.signal if stop.is_delivery else 0)
         except ProcessGoneError:
             return False  # killed just now: its end is still to come
         return True
+
+    def _look_for_heir(self, gone: Tracee) -> None:
+        """A thread whose id is gone may have its process's by now (8), and have stopped before anybody looked for it there."""
+        if gone is not self.leader and self.pid not in self._held and self.leader.interrupt_if_ours():
+            self._loose[self.pid] = self.leader
+            if self._is_let_go(self.leader):
+                self._loose.pop(self.pid, None)
 
     def _is_our_child(self, tracee: Tracee) -> bool:
         if tracee is not self.leader:
@@ -293,8 +387,7 @@ class Threads:
         """One of somebody's has stopped or ended."""
         for tracee in self._held.values():
             if not self._is_our_child(tracee):
-                with contextlib.suppress(ChildProcessError):
-                    os.waitid(os.P_PID, tracee.pid, os.WEXITED | os.WNOHANG | abi.WALL)
+                bury(tracee.pid)
         if self._loose:
             self._tend()
             if not (self._loose or self._held):

@@ -65,6 +65,22 @@ def _is_dead(pid: int) -> bool:
         return True
 
 
+def no_stop(tid: int, waited_s: float) -> CaptureError:
+    """What is said of a thread that does not stop."""
+    return CaptureError(
+        f"pid {tid} did not stop within {waited_s:.2g} s: it waits inside the kernel for a device or "
+        "a file system; capture it again when that answers"
+    )
+
+
+def rest(waited_s: float) -> None:
+    """Leave the processor to others before a thread is looked at again that we have waited for so long already."""
+    if waited_s < SPIN_S:
+        os.sched_yield()
+    else:
+        time.sleep(0.0001)
+
+
 class Tracee:
     """One thread of another process, from `seize` to `detach`.
 
@@ -136,6 +152,17 @@ class Tracee:
         """Ask it to stop; `wait` tells when it has."""
         self.request("interrupt", abi.PTRACE_INTERRUPT)
 
+    def interrupt_if_ours(self) -> bool:
+        """As `interrupt`, of whoever has this id now; False when that is nobody whom we trace.
+
+        A thread that executes another program has its process's id from then on, and is traced under that by whoever traced it.
+        """
+        try:
+            _ptrace(abi.PTRACE_INTERRUPT, self.pid, 0, 0)
+        except PtraceError as error:
+            return bool(error.errno != errno.ESRCH)
+        return True
+
     def freeze(self, timeout_s: float = STOP_TIMEOUT_S) -> Stop:
         """Stop it and return once it stands; a signal on its way is delivered first.
 
@@ -149,7 +176,7 @@ class Tracee:
 
     def ask_to_stop(self) -> Stop | None:
         """The first half of `freeze`: where it stands already; None when `await_stop` must follow."""
-        stood = self.reported()
+        stood = self._standing()
         if stood is not None and not stood.is_delivery:
             return stood
         self.interrupt()
@@ -180,14 +207,26 @@ class Tracee:
                 return self._stop_of(status)
             waited = time.perf_counter() - began
             if waited > timeout_s:
-                raise CaptureError(
-                    f"pid {self.pid} did not stop within {timeout_s:g} s: it waits inside the kernel for a device or "
-                    "a file system; capture it again when that answers"
-                )
-            if waited < SPIN_S:
-                os.sched_yield()
-            else:
-                time.sleep(0.0001)
+                raise no_stop(self.pid, timeout_s)
+            rest(waited)
+
+    def has_stopped(self) -> bool:
+        """Whether it stands now, as `await_stop` would find it. Raises as `_standing`."""
+        stop = self._standing()
+        if stop is not None and stop.is_delivery:
+            self.cont(stop.signal)
+        return stop is not None and not stop.is_delivery
+
+    def _standing(self) -> Stop | None:
+        """As `reported`, but of its end no note is taken: it may be our child, which somebody of us waits for."""
+        options = os.WEXITED | os.WSTOPPED | os.WNOHANG | os.WNOWAIT | abi.WALL
+        try:
+            found = os.waitid(os.P_PID, self.pid, options)
+        except ChildProcessError as error:
+            raise ProcessGoneError(f"pid {self.pid} ended while it was being looked at") from error
+        if found is not None and found.si_code in abi.ENDS:
+            raise ProcessGoneError(f"pid {self.pid} ended while it was being looked at")
+        return self.reported() if found is not None else None
 
     def is_dead(self) -> bool:
         """Whether it has ended, reaped or not."""

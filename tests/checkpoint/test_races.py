@@ -99,10 +99,6 @@ def test_captures_that_race_with_it_lose_nothing(kind: str, compiled: Compiled, 
         expect_ok(tracee)
 
 
-@pytest.mark.skipif(
-    "FAILOVER_TEST_RACES" not in os.environ,
-    reason="once in some thousand captures both wait for each other (README); set FAILOVER_TEST_RACES to run it",
-)
 def test_captures_that_race_with_the_execution_of_another_program_harm_nobody(compiled: Compiled, tmp_path: Path) -> None:
     with ended(start_tracee(compiled("races", "-O2", "-pthread"), tmp_path, "execs")) as tracee:
         ours, its = open_descriptors(), len(os.listdir(f"/proc/{tracee.pid}/fd"))

@@ -1,0 +1,119 @@
+"""A thread that executes another program while its process is being stopped: nobody waits for ever, nobody is left stopped."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
+from checkpoint.linux import procfs
+from checkpoint.linux.threads import Threads, thread_ids
+from checkpoint.linux.tracee import Stop, Tracee, no_stop
+from tests.checkpoint.round_trip import PATIENCE_S, Program, ended, expect_ok, start_tracee
+from tests.checkpoint.test_threads import open_descriptors, states, tracers
+
+pytestmark = [pytest.mark.compiler, pytest.mark.root]
+
+Compiled = Callable[..., Path]
+
+
+def have_it_execute(tracee: Program) -> None:
+    """Until it has executed its program, or waits inside the kernel for us to take note of the others' ends, or stands still."""
+    executes = max(thread_ids(tracee.pid))
+    tracee.tell()
+    deadline = time.monotonic() + PATIENCE_S
+    while "executed" not in tracee.output and "D" not in states(tracee.pid) and state(tracee.pid, executes) != "t":
+        assert time.monotonic() < deadline, f"it executes nothing: {states(tracee.pid)}"
+
+
+def state(pid: int, tid: int) -> str:
+    """Of one thread; "" when it has gone."""
+    try:
+        return procfs.thread_stat(pid, tid).state
+    except ProcessGoneError:
+        return ""
+
+
+def freeze_until_it_stands(threads: Threads) -> None:
+    """Whatever becomes of it meanwhile."""
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            return threads.freeze()
+        except CaptureError:
+            if time.monotonic() > deadline:
+                raise
+
+
+@pytest.mark.parametrize("step", ["seize", "ask_to_stop", "has_stopped", "detach"])
+@pytest.mark.parametrize("turn", [1, 2, 4, 5])
+def test_an_execution_at_any_step_of_a_freeze_ends_it(
+    step: str, turn: int, compiled: Compiled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    turns = 0
+    original = getattr(Tracee, step)
+
+    def then_execute(self: Tracee, *arguments: object) -> object:
+        nonlocal turns
+        answer = original(self, *arguments)
+        turns += 1
+        if turns == turn:
+            have_it_execute(tracee)
+        return answer
+
+    with ended(start_tracee(compiled("executes", "-O2", "-pthread"), tmp_path)) as tracee:
+        ours = open_descriptors()
+        threads = Threads(Tracee(tracee.pid))
+        monkeypatch.setattr(Tracee, step, then_execute)
+        try:
+            threads.freeze()
+        except CheckpointError:
+            assert step != "detach"
+        else:
+            threads.thaw()
+        monkeypatch.undo()
+        expect_unharmed(tracee, threads)
+        assert open_descriptors() == ours
+
+
+def test_a_thread_that_did_not_stop_and_executes_a_program_instead_is_let_go(
+    compiled: Compiled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ask, detach = Tracee.ask_to_stop, Tracee.detach
+
+    with ended(start_tracee(compiled("executes", "-O2", "-pthread"), tmp_path)) as tracee:
+        executes = max(thread_ids(tracee.pid))
+
+        def ask_all_but_one(self: Tracee) -> Stop | None:
+            if self.pid == executes:
+                raise no_stop(executes, 0.0)
+            return ask(self)
+
+        def detach_then_execute(self: Tracee, signal: int = 0) -> None:
+            detach(self, signal)
+            if self.pid == tracee.pid:
+                have_it_execute(tracee)
+
+        threads = Threads(Tracee(tracee.pid))
+        monkeypatch.setattr(Tracee, "ask_to_stop", ask_all_but_one)
+        monkeypatch.setattr(Tracee, "detach", detach_then_execute)
+        with pytest.raises(CaptureError, match="did not stop"):
+            threads.freeze()
+        monkeypatch.undo()
+        expect_unharmed(tracee, threads)
+
+
+def expect_unharmed(tracee: Program, threads: Threads) -> None:
+    """It has executed its program, nobody traces that, and it can be stopped like any other."""
+    tracee.wait_for_line("executed")
+    tracee.wait_until(lambda: tracers(tracee.pid) == {"0"}, "nobody to trace it")
+    freeze_until_it_stands(threads)
+    assert states(tracee.pid) == "t"
+    threads.thaw()
+    assert tracers(tracee.pid) == {"0"}
+    threads.close()
+    (tracee.directory / "may-end").touch()
+    expect_ok(tracee)
