@@ -17,6 +17,7 @@ IPC_EXCL: Final = 0o2000
 IPC_RMID: Final = 0
 IPC_SET: Final = 1
 IPC_STAT: Final = 2
+MADV_REMOVE: Final = 9
 SHM_DEST: Final = 0o1000
 """Bit of the permissions: it goes with the last that has it attached."""
 PERMISSIONS: Final = 0o777
@@ -36,6 +37,7 @@ class Segment:
         permissions: of a file, and `SHM_DEST`.
         attached: mappings of it, in all processes.
         creator: uid of who made it, and may use it whoever owns it; -1 where that is not known.
+        changed: when it was made, or its owner set, in seconds of the wall clock; 0 where that is not known.
     """
 
     key: int
@@ -46,6 +48,7 @@ class Segment:
     uid: int
     gid: int
     creator: int = -1
+    changed: int = 0
 
 
 class _Permissions(ctypes.Structure):
@@ -68,7 +71,7 @@ def segments() -> dict[int, Segment]:
         for line in _TABLE.read_text().splitlines()[1:]:
             words = line.split()
             key, identifier, permissions, size = int(words[0]), int(words[1]), int(words[2], 8), int(words[3])
-            found[identifier] = Segment(key, identifier, permissions, size, *map(int, words[6:10]))
+            found[identifier] = Segment(key, identifier, permissions, size, *map(int, (*words[6:10], words[13])))
     return found
 
 
@@ -101,6 +104,25 @@ def _own(identifier: int, wanted: Segment) -> None:
     about.uid, about.gid = wanted.uid, wanted.gid
     if _libc.shmctl(identifier, IPC_SET, ctypes.byref(about)) < 0:
         raise _failure()
+
+
+def wipe(segment: Segment) -> None:
+    """Have a segment hold nothing but zeros, and no memory.
+
+    Raises:
+        OSError: it cannot be attached for writing.
+
+    Source: madvise(2), MADV_REMOVE.
+    """
+    _libc.shmat.restype = ctypes.c_void_p
+    place = _libc.shmat(segment.identifier, None, 0)
+    if place == ctypes.c_void_p(-1).value:
+        raise _failure()
+    try:
+        if _libc.madvise(ctypes.c_void_p(place), ctypes.c_size_t(segment.size), MADV_REMOVE) < 0:
+            ctypes.memset(place, 0, segment.size)
+    finally:
+        _libc.shmdt(ctypes.c_void_p(place))
 
 
 def remove(identifier: int) -> None:

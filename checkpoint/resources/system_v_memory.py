@@ -4,7 +4,7 @@ Its pages are those of the mappings; what is told here is how to make it. A segm
 nothing attached cannot be seen, and stays behind.
 
 Facts: ``descriptors`` (none); ``id``; ``key``; ``size`` in bytes; ``permissions``, with SHM_DEST where it goes with the last that
-has it attached; ``uid`` and ``gid`` of its owner.
+has it attached; ``uid`` and ``gid`` of its owner; ``changed`` in seconds of the wall clock: 0 or missing where it is not known.
 
 Source: shmget(2), shmop(2); ipc/shm.c: the inode number of a mapping is the id.
 """
@@ -74,6 +74,7 @@ def _described(segment: Segment) -> Resource:
             "permissions": segment.permissions,
             "uid": segment.uid,
             "gid": segment.gid,
+            "changed": segment.changed,
         },
     )
 
@@ -109,16 +110,23 @@ def _is_whole(pieces: Sequence[MapsLine], size: int) -> bool:
 
 def _wanted(held: Resource) -> Segment:
     facts = {name: number_of(held.facts[name]) for name in ("key", "id", "permissions", "size", "uid", "gid")}
-    return Segment(facts["key"], facts["id"], facts["permissions"], facts["size"], 0, facts["uid"], facts["gid"])
+    changed = number_of(held.facts.get("changed", 0))
+    return Segment(facts["key"], facts["id"], facts["permissions"], facts["size"], 0, facts["uid"], facts["gid"], changed=changed)
 
 
 def _left_behind(wanted: Segment, here: Iterable[Segment]) -> Segment | None:
     """The very segment, that nobody has attached any more: the program left it here when it died.
 
-    Whoever else may use one like it would share the program's memory.
+    Whoever else may use one like it would share the program's memory. One without a key is known by when it was made: of
+    this machine's there is no other with the same id at the same time.
     """
-    same = (one for one in here if replace(one, attached=0, creator=wanted.creator) == wanted)
-    return next((one for one in same if wanted.key and not one.attached and one.creator in (wanted.uid, os.geteuid())), None)
+
+    def is_it(one: Segment) -> bool:
+        is_known = wanted.key or (wanted.changed and one.changed == wanted.changed)
+        alike = replace(one, attached=0, creator=wanted.creator, changed=wanted.changed) == wanted
+        return bool(is_known) and alike and not one.attached and one.creator in (wanted.uid, os.geteuid())
+
+    return next(filter(is_it, here), None)
 
 
 def mismatches(held: Resource) -> Iterator[str]:
@@ -151,9 +159,18 @@ class Segments:
         """
         for wanted in (_wanted(held) for held in resources if held.kind == KIND):
             left = _left_behind(wanted, system_v.segments().values())
-            self.ids[wanted.identifier] = left.identifier if left else self._new(wanted)
+            self.ids[wanted.identifier] = self._emptied(left) if left else self._new(wanted)
             if wanted.permissions & SHM_DEST:
                 self._passing.append(self.ids[wanted.identifier])
+
+    def _emptied(self, left: Segment) -> int:
+        """What the program wrote after the snapshot goes: pages that were zero then are not in it."""
+        try:
+            system_v.wipe(left)
+        except OSError as error:
+            what = f"the System V shared memory {left.identifier} that the program left"
+            raise RestoreError(f"cannot empty {what}: {error.strerror}; remove it (ipcrm)") from error
+        return left.identifier
 
     def _new(self, wanted: Segment) -> int:
         try:

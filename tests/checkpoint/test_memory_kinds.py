@@ -6,6 +6,7 @@ import contextlib
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from checkpoint.linux import procfs, system_v
 from checkpoint.resources import system_v_memory, unsupported
 from tests.checkpoint.round_trip import (
     NOBODY,
+    captured,
     captured_and_killed,
     captured_at_last,
     ended,
@@ -183,11 +185,51 @@ def test_shared_memory_of_system_v_comes_back(is_left: bool, compiled: Compiled,
                 expect_ok(tracee)
 
 
+PYTHON = getattr(sys, "_base_executable", sys.executable)
+SEGMENT_ALONE = """\
+import ctypes, os, time
+libc = ctypes.CDLL(None, use_errno=True)
+libc.shmat.restype = ctypes.c_void_p
+identifier = libc.shmget(0, 16384, 0o1600)
+place = ctypes.c_void_p(libc.shmat(identifier, None, 0))
+words = (ctypes.c_uint64 * 2048).from_address(place.value)
+words[0] = 1
+print(identifier, flush=True)
+while not os.path.exists("on"):
+    time.sleep(0.01)
+seen = words[0], words[1024]
+words[0] = words[1024] = 9
+print("after", *seen, flush=True)
+while not os.path.exists("end"):
+    time.sleep(0.01)
+assert libc.shmctl(identifier, 0, None) == 0
+"""
+"""Writes its segment, without a key, once more after the capture."""
+
+
+def test_a_segment_without_a_key_is_the_one_it_was_with_what_it_held(tmp_path: Path) -> None:
+    with ended(start([PYTHON, "-c", SEGMENT_ALONE], tmp_path)) as program:
+        program.wait_for_output(0)
+        identifier = int(program.output)
+        with segment_removed(identifier):
+            snapshot = captured(program)
+            (tmp_path / "on").touch()
+            program.wait_for_line("after 1 0")
+            program.kill()
+            with ended(restored(snapshot, tmp_path)) as program:
+                program.wait_for_line("after 1 0")
+                (tmp_path / "end").touch()
+                assert program.finish() == 0
+            assert identifier not in system_v.segments()
+
+
 def test_a_segment_that_another_user_has_made_is_not_taken_for_the_one_that_was_left() -> None:
     """He could write to what the program has in it, also when he has given it away."""
-    left = system_v.Segment(0x5EED, 7, 0o600, 4096, 0, 0, 0, creator=0)
+    left = system_v.Segment(0x5EED, 7, 0o600, 4096, 0, 0, 0, creator=0, changed=1000)
     wanted = replace(left, creator=-1)
     assert system_v_memory._left_behind(wanted, [left]) is left
+    assert system_v_memory._left_behind(replace(wanted, key=0), [replace(left, key=0)]) is not None
+    assert system_v_memory._left_behind(replace(wanted, key=0), [replace(left, key=0, changed=1001)]) is None
     for other in (
         replace(left, creator=NOBODY),
         replace(left, uid=NOBODY),
