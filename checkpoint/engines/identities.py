@@ -6,7 +6,7 @@ import contextlib
 import os
 import stat
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -24,6 +24,7 @@ KEPT_FLAGS: Final = _ADVICE | {vm_flags.HUGE, vm_flags.GIGANTIC, vm_flags.SEALED
 """Codes that a restore gives back."""
 ROOT: Final = 0
 VSYSCALL: Final = "[vsyscall]"
+SHARED_ANONYMOUS: Final = "/dev/zero (deleted)"
 KINDS: Final = {
     "[heap]": VmaKind.HEAP,
     "[stack]": VmaKind.STACK,
@@ -49,6 +50,7 @@ class Identities:
         self._pid = pid
         self._names = names
         self.is_kin = False
+        self._mapped_twice: frozenset[int] = frozenset()
         self._known: dict[tuple[int, int, str], FileIdentity] = {}
 
     def vmas(self, lines: Sequence[MapsLine], flags: Mapping[int, tuple[str, ...]], guards: Words) -> tuple[Vma, ...]:
@@ -60,6 +62,7 @@ class Identities:
         """
         mapped = {_key(line) for line in lines}
         self._known = {key: identity for key, identity in self._known.items() if key in mapped}
+        self._mapped_twice = _mapped_twice(lines)
         found = (self._vma(line, flags.get(line.start, ())) for line in lines if line.name != VSYSCALL)
         if not len(guards):
             return tuple(found)
@@ -75,9 +78,13 @@ class Identities:
             kind=VmaKind.FILE if is_file else KINDS.get(line.name, VmaKind.ANONYMOUS),
             offset=line.offset,
             name=self._names.get(line.name, line.name),
-            file=self.of_mapping(line) if is_file else _of_shared(line) if self.is_kin and line.shared else None,
+            file=self.of_mapping(line) if is_file else _of_shared(line) if self._is_told(line) else None,
             flags=tuple(flag for flag in flags if flag in KEPT_FLAGS or (flag == vm_flags.MAY_WRITE and is_file and line.shared)),
         )
+
+    def _is_told(self, line: MapsLine) -> bool:
+        """Whether it must be told which shared memory without a file this is: it is mapped elsewhere, too."""
+        return line.shared and (self.is_kin or line.inode in self._mapped_twice)
 
     def of_mapping(self, line: MapsLine) -> FileIdentity:
         """The file behind a mapping."""
@@ -152,6 +159,18 @@ class Identities:
             digest=b"" if is_memory else files.digest_at(through, (about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns)),
             deleted=deleted,
         )
+
+
+def _mapped_twice(lines: Iterable[MapsLine]) -> frozenset[int]:
+    """Inode numbers of shared memory without a file that lies at several places (mremap(2)); pieces side by side are one."""
+    ends: dict[int, tuple[int, int]] = {}
+    found = set()
+    for line in lines:
+        if line.shared and line.name == SHARED_ANONYMOUS:
+            if ends.get(line.inode, (line.start, line.offset)) != (line.start, line.offset):
+                found.add(line.inode)
+            ends[line.inode] = line.end, line.offset + line.size
+    return frozenset(found)
 
 
 def _of_shared(line: MapsLine) -> FileIdentity:

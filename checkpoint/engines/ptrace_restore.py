@@ -274,7 +274,8 @@ class ProcessRestore:
         state, tracee = self._state, self._tracee
         taken = [(line.start, line.end) for line in mappings] + [(vma.start, vma.end) for vma in state.vmas]
         self._segments.make(state.resources)
-        base = self._estate.base if self._estate else call_table.find_hole(taken, AREA_SIZE + REFUGE_SIZE)
+        shared_size = sum(restore_memory.anonymous_sizes(state.vmas).values())
+        base = self._estate.base if self._estate else call_table.find_hole(taken, AREA_SIZE + REFUGE_SIZE + shared_size)
         kernel_pages = restore_memory.kernel_pages(mappings)
         first = self._mappings_table(CallTable(base, descriptors=self._inherited()), vessel, mappings, base + AREA_SIZE)
         second = self._state_table(CallTable(base, descriptors=set(first.descriptors)), vessel)
@@ -348,9 +349,13 @@ class ProcessRestore:
         restore_kinds.allocate_keys(table, restore_kinds.keys_of(self._state))
         attached = [vma for vma in vmas if system_v_memory.is_segment(vma)]
         system_v_memory.attach(table, attached, self._segments.ids, system_v_memory.sizes_of(self._state.resources))
-        inherited = (self._estate.objects, self._estate.anonymous) if self._estate else ({}, {})
+        sizes = {} if self._estate else restore_memory.anonymous_sizes(vmas)
+        ours_alone = restore_memory.map_anonymous(table, sizes, refuge + REFUGE_SIZE)
+        inherited = (self._estate.objects, self._estate.anonymous) if self._estate else ({}, ours_alone)
         self._objects |= restore_memory.map_program(table, vmas, runs, brought, *inherited)
         self._objects |= inherited[0]
+        for key, place in ours_alone.items():
+            table.call("unmap shared memory, which is mapped elsewhere now", "munmap", place, sizes[key])
         self._executable = brought.pop(self._state.process.executable.path, None)
         for descriptor in brought.values():
             table.close(descriptor)

@@ -144,8 +144,28 @@ def map_program(
     return made
 
 
+def anonymous_sizes(vmas: Iterable[Vma]) -> dict[Object, int]:
+    """How long each piece of shared memory without a file is, of which it is told which, as far as it is mapped."""
+    sizes: dict[Object, int] = {}
+    for vma in filter(is_anonymous_object, vmas):
+        sizes[object_of(vma)] = max(sizes.get(object_of(vma), 0), vma.offset + vma.size)
+    return sizes
+
+
+def map_anonymous(table: CallTable, sizes: Mapping[Object, int], place: int) -> dict[Object, int]:
+    """Map each whole, one after the other from an address on: where each lies."""
+    places: dict[Object, int] = {}
+    for key, size in sizes.items():
+        flags = abi.MAP_SHARED | abi.MAP_ANONYMOUS | abi.MAP_FIXED_NOREPLACE
+        arguments = (place, size, abi.PROT_READ | abi.PROT_WRITE, flags, -1, 0)
+        table.call(f"map {size >> 10} KiB of shared memory", "mmap", *arguments, least=place, most=place)
+        places[key] = place
+        place += size
+    return places
+
+
 def is_anonymous_object(vma: Vma) -> bool:
-    """Whether it is shared memory without a file, of which it is told which: other processes may have it, too."""
+    """Whether it is shared memory without a file, of which it is told which: it is mapped elsewhere, too."""
     return vma.kind is VmaKind.ANONYMOUS and vma.shared and vma.file is not None
 
 
