@@ -247,9 +247,9 @@ def check(arguments: argparse.Namespace) -> int:
     print(f"pid {report.pid}: {report.command}")
     print(f"{picture.size(report.resident_size)} in memory; written pages are found by {report.tracking}")
     render.table(("verdict", "what", "which", "why"), [(f.verdict, f.kind, f.name, f.text) for f in report.findings])
-    print(
-        "it can be captured" if report.supported else f"it cannot be captured: {len(report.reasons)} reasons, see refused above"
-    )
+    count = len(report.reasons)
+    cannot = f"it cannot be captured: {count} reason{'s' if count > 1 else ''}, see refused above"
+    print("it can be captured" if report.supported else cannot)
     return 0 if report.supported else 1
 
 
