@@ -102,6 +102,7 @@ CAPABILITIES: Final = (
         "network, IPC, UTS, cgroup, mount and user namespaces of its own (containers)",
         "run it, and failover, in the same one",
         "namespace of its own, which is not kept yet: run it",
+        "its children are to live in a {} namespace of their own",
     ),
     refused(
         Area.PROCESS,
@@ -353,3 +354,16 @@ def _refuse_namespaces(pid: int) -> Iterator[str]:
     for kind in ("net", "ipc", "uts", "cgroup", "mnt", "user", "time"):
         if kind not in allowed and differs(kind):
             yield f"it lives in a {kind} namespace of its own, which is not kept yet: run it, and failover, in the same one"
+    for kind in ("pid", "time"):
+        if _has_other_for_children(pid, kind):
+            yield f"its children are to live in a {kind} namespace of their own (unshare), which is not kept yet: run it without"
+
+
+def _has_other_for_children(pid: int, kind: str) -> bool:
+    """Whether those whom it gives birth to live in another namespace than it; the link leads nowhere before the first one."""
+    try:
+        return os.readlink(f"/proc/{pid}/ns/{kind}_for_children") != os.readlink(f"/proc/{pid}/ns/{kind}")
+    except FileNotFoundError:
+        return os.path.lexists(f"/proc/{pid}/ns/{kind}_for_children")
+    except OSError:  # gone, or not ours to look at: others say so
+        return False

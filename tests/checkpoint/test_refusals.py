@@ -59,6 +59,7 @@ REFUSED = {
     "secret_memory": "secret",
     "root": "root",
     "own_namespace": "namespace",
+    "namespace_of_children": "its children are to live in a pid namespace",
     "owner_group": "process group",
     "directory_notice": "f_notify",
     "no_vdso": "no vdso",

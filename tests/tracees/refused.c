@@ -309,6 +309,10 @@ static void take_traced_child(void) {
     waitpid(child, NULL, 0);
 }
 
+static void take_namespace_of_children(void) {
+    if (unshare(CLONE_NEWPID)) cannot("make a namespace");
+}
+
 static void take_own_namespace(void) {
     if (unshare(CLONE_NEWUTS)) cannot("make a namespace");
 }
@@ -333,6 +337,7 @@ static const struct kind {
              {"thread_files", take_thread_files},
              {"thread_directory", take_thread_directory},
              {"thread_namespace", take_thread_namespace},
+             {"namespace_of_children", take_namespace_of_children},
              {"thread_seccomp", take_thread_seccomp},
              {"dead_leader", take_dead_leader},
              {"child_in_the_same_memory", take_child_in_the_same_memory},
