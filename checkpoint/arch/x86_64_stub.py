@@ -143,6 +143,7 @@ SYSTEM_CALLS: Final = {
     "setresuid": 117,
     "setsid": 112,
     "setsockopt": 54,
+    "setxattr": 188,
     "shmat": 30,
     "shutdown": 48,
     "sigaltstack": 131,

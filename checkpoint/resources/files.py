@@ -3,13 +3,15 @@
 Facts: ``descriptors``; ``path``; ``flags`` of open(2); ``offset`` and ``size`` in bytes, ``mode``, ``device``, ``inode`` and
 ``mtime_ns`` at the capture; ``digest``: blake3 of the content of a file that is open for reading only, b"" where it is longer
 than `DIGEST_LIMIT` or cannot be read. Of what no name leads to any more ``deleted`` true, ``uid`` and ``gid``; ``link``: where a
-symbolic link leads; ``content``: [offset, bytes] of each part that is no hole, with one of its open files, [] with the others.
+symbolic link leads; ``attributes``: the extended ones, by name; ``content``: [offset, bytes] of each part that is no hole, with
+one of its open files, [] with the others.
 
 A file that is open for writing and only grew since the capture is cut back to ``size``.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
 from collections.abc import Iterator, Mapping, Sequence
@@ -103,6 +105,8 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
         facts |= {"deleted": True, "content": held.observed.get("content", []), "uid": first.uid, "gid": first.gid}
         if stat.S_ISLNK(first.mode):
             facts["link"] = _link_of(held)
+        if attributes := held.observed.get("attributes"):
+            facts["attributes"] = attributes
     elif is_only_read(first):
         facts["digest"] = digest_of(held)
     return Resource(KIND, held.name, facts)
@@ -235,7 +239,17 @@ def observe_deleted(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, 
     first = next(one for one in opened if (one.first.device, one.first.inode) == (held.first.device, held.first.inode))
     if locks.has_lease(held):
         return {}  # to read it would break that
-    return {"content": _content_of(held) if first is held else []}
+    return {"content": _content_of(held) if first is held else [], "attributes": _attributes_of(held)}
+
+
+def _attributes_of(held: OpenFile) -> dict[str, Fact]:
+    """The extended attributes, as far as we may read them."""
+    path, found = f"/proc/{held.pid}/fd/{held.first.number}", {}
+    with contextlib.suppress(OSError):  # a file system without
+        for name in os.listxattr(path):
+            with contextlib.suppress(OSError):
+                found[name] = os.getxattr(path, name)
+    return dict(found)
 
 
 def _link_of(held: OpenFile) -> str:

@@ -21,8 +21,15 @@ NAME_MAX: Final = 50
 """Characters of its own name that another one begins with: a file system takes 255 bytes."""
 
 
-def make_file(table: CallTable, path: str, mode: int) -> int:
-    """Make an empty regular file: a descriptor that reads and writes."""
+def make_file(table: CallTable, path: str, mode: int, *, was_born_so: bool = False) -> int:
+    """Make an empty regular file: a descriptor that reads and writes.
+
+    Args:
+        was_born_so: it never had a name (O_TMPFILE), and may be given one.
+    """
+    directory = os.path.dirname(path)
+    if was_born_so and os.access(directory, os.W_OK):
+        return table.open(directory, os.O_TMPFILE | os.O_RDWR, mode)
     name = _name_for(path)
     made = table.open(name, os.O_CREAT | os.O_EXCL | os.O_RDWR, mode)
     table.call(f"unlink {name}", "unlinkat", AT_FDCWD, table.place_path(name), 0)

@@ -313,6 +313,11 @@ def _open_deleted(table: CallTable, held: Resource, rebuilding: Rebuilding) -> i
     again, flags = f"/proc/self/fd/{made}", number_of(facts["flags"])
     if flags & O_PATH:
         return table.open(again, O_PATH | (flags & os.O_DIRECTORY))
+    if _was_born_so(flags):
+        opened = table.obtain(f"open {facts['path']!s}", "fcntl", made, fcntl.F_DUPFD, 0)
+        table.call(f"set the flags of {held.name}", "fcntl", opened, fcntl.F_SETFL, flags & (os.O_APPEND | os.O_NONBLOCK))
+        _seek(table, opened, held)
+        return opened
     is_temporary = stat.S_ISREG(mode)  # O_DIRECTORY is a part of O_TMPFILE, by which it may have been made
     opened = table.open(again, flags & REOPENED_FLAGS & ~(os.O_DIRECTORY if is_temporary else 0))
     _seek(table, opened, held)
@@ -331,8 +336,14 @@ def _empty(table: CallTable, held: Resource, mode: int) -> int:
     path = str(held.facts["path"])
     if stat.S_ISLNK(mode):
         return nameless.make_link(table, path, str(held.facts["link"]))
-    make = nameless.make_directory if stat.S_ISDIR(mode) else nameless.make_file
-    return make(table, path, stat.S_IMODE(mode))
+    if stat.S_ISDIR(mode):
+        return nameless.make_directory(table, path, stat.S_IMODE(mode))
+    return nameless.make_file(table, path, stat.S_IMODE(mode), was_born_so=_was_born_so(number_of(held.facts["flags"])))
+
+
+def _was_born_so(flags: int) -> bool:
+    """Whether an open file is the one by which a file without a name was made (O_TMPFILE), to read and to write it."""
+    return flags & os.O_TMPFILE == os.O_TMPFILE and flags & os.O_ACCMODE == os.O_RDWR
 
 
 def _finish(table: CallTable, made: int, held: Resource, mode: int) -> None:
@@ -345,6 +356,12 @@ def _finish(table: CallTable, made: int, held: Resource, mode: int) -> None:
         lost = f"the deleted file {path} belongs to whom the program runs as"
         table.attempt(lost, "fchownat", made, table.place_path(""), *owner, AT_EMPTY_PATH)
         table.attempt("", "fchmodat", -1, table.place_path(again), stat.S_IMODE(mode))  # a change of owner takes set-user-ID away
+    attributes = facts.get("attributes", {})
+    assert isinstance(attributes, dict)
+    for name, value in attributes.items():
+        assert isinstance(value, bytes)
+        lost = f"the deleted file {path} is without its attribute {name}"
+        table.attempt(lost, "setxattr", table.place_path(again), table.place_path(name), table.place(value), len(value), 0)
     if "mtime_ns" in facts:
         changed = struct.pack("<qq", *divmod(number_of(facts["mtime_ns"]), NS_PER_S))
         times = table.place(struct.pack("<qq", 0, UTIME_OMIT) + changed)

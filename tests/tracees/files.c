@@ -2,6 +2,7 @@
 #include "tracee.h"
 
 #include <dirent.h>
+#include <sys/xattr.h>
 
 #define TEXT "0123456789abcdefghijklmnopqrstuvwxyz\n"
 
@@ -90,10 +91,18 @@ static void deleted(const char *go) {
     unlink("doomed"), unlink("hollow");
     if (fchown(file, 1234, 5678) && geteuid() == 0) cannot("give a file away");
     if (fchmod(file, 04751) || pwrite(hollow, "in the middle", 13, 64 * PAGE) != 13 || ftruncate(hollow, 128 * PAGE)) cannot("write");
+    int nameless = open(".", O_TMPFILE | O_RDWR, 0640);
+    if (nameless < 0 || write(nameless, "born so", 7) != 7) cannot("make a file without a name");
+    int has_attributes = !fsetxattr(file, "user.colour", "red", 3, 0);
     lseek(file, 10, SEEK_SET);
     fstat(file, &before);
     ready(), wait_for_go(go);
     fstat(file, &changed);
+    char path[40], colour[8] = "";
+    EXPECT(!has_attributes || (fgetxattr(file, "user.colour", colour, 7) == 3 && !strcmp(colour, "red")), "its attribute is '%s'", colour);
+    snprintf(path, sizeof path, "/proc/self/fd/%d", nameless), unlink("named");
+    EXPECT(!linkat(AT_FDCWD, path, AT_FDCWD, "named", AT_SYMLINK_FOLLOW), "it can be given no name: %s", strerror(errno));
+    expect_read(open("named", O_RDONLY), "born so"), unlink("named");
     expect_read(file, "abc"), expect_read(twin, "def");
     if (pwrite(file, "ZZ", 2, 0) != 2) differs("cannot write: %s", strerror(errno));
     lseek(file, 0, SEEK_SET);
