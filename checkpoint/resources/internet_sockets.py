@@ -7,7 +7,8 @@ reset. Connections of TCP are in ``tcp_connections``.
 Facts besides those of every socket: ``state`` of tcp(7), `CLOSED` for UDP; ``address`` and ``peer``: [host, port] or [host, port,
 flow, scope], empty if there is none; ``backlog``; ``waiting``: connections not accepted yet; ``sources``: addresses from which
 what is in the queue came; ``groups``: a list of [interface, group, filter as MCAST_MSFILTER takes it]; ``shutdown`` of a socket
-for datagrams: 1 what it reads, 2 what it sends; ``foreign``: the machine does not have its address (any more).
+for datagrams: 1 what it reads, 2 what it sends; ``lost``: something waits in one that is raw or of ICMP; ``foreign``: the
+machine does not have its address (any more).
 
 Source: tcp(7), udp(7), ip(7); linux/in.h for group_filter.
 """
@@ -31,6 +32,7 @@ from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import Group, Opened, OpenFile, Surroundings, elsewhere, sockets
 from checkpoint.resources.rebuilding import number_of
+from checkpoint.resources.unix_makers import Disguise
 
 KIND: Final = "internet_sockets"
 
@@ -40,8 +42,13 @@ CAPABILITIES: Final = (
     ),
     preserved(
         Area.SOCKETS,
-        "UDP sockets",
+        "UDP and UDP-Lite sockets",
         "with their groups and options; datagrams from other machines that wait are lost, as the network may lose them",
+    ),
+    preserved(
+        Area.SOCKETS,
+        "raw sockets, and those for ICMP echoes",
+        "with address, groups, filters and options; what waits in them is lost, as the network may lose it",
     ),
     refused(
         Area.THERE,
@@ -53,7 +60,9 @@ CAPABILITIES: Final = (
 )
 
 FAMILIES: Final = (socket.AF_INET, socket.AF_INET6)
-PROTOCOLS: Final = (socket.IPPROTO_TCP, socket.IPPROTO_UDP)
+UDPLITE: Final = 136
+DATAGRAMS: Final = (socket.IPPROTO_UDP, UDPLITE)
+PINGS: Final = (socket.IPPROTO_ICMP, socket.IPPROTO_ICMPV6)
 
 CLOSED: Final = 7
 LISTENING: Final = 10
@@ -73,6 +82,15 @@ ADDRESS_SIZE: Final = 128
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
+def is_kept(family: int, kind: int, protocol: int) -> bool:
+    """Whether a socket of this form is of this kind: TCP, datagrams, echoes of ICMP, or raw."""
+    if family not in FAMILIES:
+        return False
+    if kind == socket.SOCK_DGRAM:
+        return protocol in (*DATAGRAMS, *PINGS)
+    return kind == socket.SOCK_RAW or protocol == socket.IPPROTO_TCP
+
+
 def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: sockets.Noted | None) -> dict[str, Fact]:
     """Its state, its addresses and what waits in it.
 
@@ -86,18 +104,20 @@ def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: socket
     state, waiting, backlog = CLOSED, 0, 0
     if looked.proto == socket.IPPROTO_TCP:
         state, *_, waiting, backlog = _TCP_INFO.unpack(looked.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size))
-    is_datagram = looked.proto == socket.IPPROTO_UDP
-    queue = sockets.queue_of(looked, held.first.number, noted) if is_datagram else sockets.NOTHING
+    is_datagram = looked.type != socket.SOCK_STREAM
+    may_queue = looked.type == socket.SOCK_DGRAM and looked.proto in DATAGRAMS
+    queue = sockets.queue_of(looked, held.first.number, noted) if may_queue else sockets.NOTHING
     return facts | {
         "state": state,
         "address": _bound(looked.getsockname()),
-        "peer": _peer(looked),
+        "peer": _peer(held, looked),
         "backlog": backlog if state == LISTENING else 0,
         "waiting": waiting if state == LISTENING else 0,
         "queue": list(queue.messages),
         "sources": [list(source) for source in queue.sources if isinstance(source, tuple)],
         "groups": list(_groups(looked, _machine_groups(held.pid, opened, looked.family))) if is_datagram else [],
         "shutdown": _shutdown(held, looked, opened) if is_datagram else 0,
+        "lost": is_datagram and not may_queue and bool(sockets.readiness(looked)),
     }
 
 
@@ -105,7 +125,7 @@ def _shutdown(held: OpenFile, looked: socket.socket, opened: Opened) -> int:
     """What of a socket for datagrams was shut down; only poll(2) tells of one that is bound to no port, and not that it sends."""
     key = int(looked.family), looked.proto
     if key not in opened.shut_down:
-        opened.shut_down[key] = inet_diag.shut_down(*key)
+        opened.shut_down[key] = inet_diag.shut_down(*key) if looked.proto in DATAGRAMS else {}
     poll = select.poll()
     poll.register(looked, select.POLLRDHUP)
     seen = dict(poll.poll(0)).get(looked.fileno(), 0)
@@ -122,7 +142,7 @@ def in_words(address: Sequence[Fact]) -> str:
     return f"{address[0]!s} port {address[1]!s}"
 
 
-def _peer(looked: socket.socket) -> list[Fact]:
+def _peer(held: OpenFile, looked: socket.socket) -> list[Fact]:
     """Whom it is, or was, connected with."""
     with contextlib.suppress(OSError):
         return list(looked.getpeername())
@@ -130,6 +150,20 @@ def _peer(looked: socket.socket) -> list[Fact]:
         with contextlib.suppress(OSError):  # a connection that has ended tells it this way alone
             size = 28 if looked.family == socket.AF_INET6 else 16
             return _unpacked(looked.getsockopt(socket.SOL_SOCKET, SO_PEERNAME, size))
+    elif looked.type == socket.SOCK_RAW or looked.proto in PINGS:  # no port, and so no peer for getpeername(2)
+        return listed_peer(held, looked.family, "raw" if looked.type == socket.SOCK_RAW else "icmp")
+    return []
+
+
+def listed_peer(held: OpenFile, family: int, table: str) -> list[Fact]:
+    """Whom a socket is connected with, as /proc lists it; empty for none. Source: proc_pid_net(5)."""
+    for line in procfs.read_text(held.pid, f"net/{table}{'6' if family == socket.AF_INET6 else ''}").splitlines()[1:]:
+        words = line.split()
+        if int(words[9]) == held.first.inode:
+            host, _, port = words[2].partition(":")
+            packed = b"".join(bytes.fromhex(host[place : place + 8])[::-1] for place in range(0, len(host), 8))
+            if any(packed):
+                return [socket.inet_ntop(family, packed), int(port, 16), *([0, 0] if family == socket.AF_INET6 else [])]
     return []
 
 
@@ -203,7 +237,8 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
 
 def _is_mine(held: OpenFile) -> bool:
     seen = held.observed
-    return seen.get("family") in FAMILIES and seen.get("protocol") in PROTOCOLS
+    form = [seen.get(name) for name in ("family", "type", "protocol")]
+    return all(isinstance(part, int) for part in form) and is_kept(*map(number_of, form))
 
 
 def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
@@ -211,13 +246,18 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     if not _is_mine(held):
         return None
     seen = held.observed
-    name = {socket.IPPROTO_TCP: "a TCP socket", socket.IPPROTO_UDP: "a UDP socket"}[number_of(seen["protocol"])]
+    kinds = {int(socket.SOCK_STREAM): "a TCP socket", int(socket.SOCK_DGRAM): "a UDP socket"}
+    name = kinds.get(number_of(seen["type"]), "a raw socket")
     return sockets.refuse_filter(held) or elsewhere.refuse(held, name)
 
 
 def findings(held: Iterable[Resource]) -> Iterator[Finding]:
-    """Connections that are lost."""
+    """Connections and datagrams that are lost."""
     for one in held:
+        if one.kind == KIND and one.facts.get("lost"):
+            yield Finding(
+                KIND, one.name, NOTED, f"what waits in {one.name}, a raw or ICMP socket, is lost when the program comes back"
+            )
         if one.kind == KIND and number_of(one.facts["waiting"]):
             count = number_of(one.facts["waiting"])
             text = f"{count} connections that {one.name} has not accepted yet are reset when the program comes back"
@@ -267,11 +307,15 @@ def _joined(held: Resource) -> Iterator[tuple[str, str, bytes]]:
 # --- Restore -----------------------------------------------------------------------------------------------------------
 
 
-def prepare(table: CallTable, held: Sequence[Resource], first: int) -> dict[int, int]:
+def prepare(table: CallTable, held: Sequence[Resource], first: int, disguise: Disguise) -> dict[int, int]:
     """Make all of them at numbers from ``first`` on: the descriptor of each, by the socket's number in the snapshot."""
     made: dict[int, int] = {}
     for one in held:
-        opened = sockets.make(table, one)
+        if one.facts["type"] == socket.SOCK_DGRAM and one.facts["protocol"] in PINGS:  # the right to that is a group's
+            with disguise.as_program(table):
+                opened = sockets.make(table, one)
+        else:
+            opened = sockets.make(table, one)
         place = first + len(made)
         made[number_of(one.facts["socket"])] = place
         table.duplicate(opened, place, os.O_CLOEXEC)
@@ -359,7 +403,7 @@ def _send_again(table: CallTable, one: Resource, held: Sequence[Resource], made:
     for message, source in zip(messages, sources, strict=True):
         assert isinstance(message, bytes) and isinstance(source, list)
         sender = ours.get(tuple(source))
-        if sender is None and not _is_free(source):
+        if sender is None and not _is_free(source, number_of(one.facts["protocol"])):
             continue
         lent = sender if sender is not None else _sender(table, one, source)
         arguments = (
@@ -381,9 +425,9 @@ def _reachable(address: list[Fact]) -> list[Fact]:
     return [host, *address[1:]]
 
 
-def _is_free(source: Sequence[Fact]) -> bool:
+def _is_free(source: Sequence[Fact], protocol: int) -> bool:
     family = socket.AF_INET6 if ":" in str(source[0]) else socket.AF_INET
-    with socket.socket(family, socket.SOCK_DGRAM) as tried:
+    with socket.socket(family, socket.SOCK_DGRAM, protocol) as tried:
         try:
             tried.bind(tuple(source))
         except (OSError, OverflowError):
@@ -393,6 +437,7 @@ def _is_free(source: Sequence[Fact]) -> bool:
 
 def _sender(table: CallTable, one: Resource, source: list[Fact]) -> int:
     family = socket.AF_INET6 if ":" in str(source[0]) else socket.AF_INET
-    made = table.obtain(f"make a sender for {one.name}", "socket", family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC, 0)
+    form = (family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC, number_of(one.facts["protocol"]))
+    made = table.obtain(f"make a sender for {one.name}", "socket", *form)
     table.call(f"bind a sender for {one.name}", "bind", made, table.place(sockaddr(source)), size_of(source))
     return made

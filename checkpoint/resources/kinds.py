@@ -24,6 +24,8 @@ from checkpoint.resources import (
     internet_sockets,
     kernel_files,
     memory_files,
+    netlink_sockets,
+    packet_sockets,
     pidfds,
     pipes,
     refused_devices,
@@ -75,6 +77,8 @@ ASKED: Final[tuple[Kind, ...]] = (
     unix_sockets,
     tcp_connections,
     internet_sockets,
+    netlink_sockets,
+    packet_sockets,
     refused_devices,
     unsupported,
 )
@@ -113,7 +117,11 @@ def _observe_socket(held: OpenFile, opened: Opened, *, noted: sockets.Noted | No
         with sockets.looked_into(held.pid, held.first.number) as looked:
             if looked.family == socket.AF_UNIX:
                 return unix_sockets.observe(held, looked, opened, noted)
-            if looked.family in internet_sockets.FAMILIES and looked.proto in internet_sockets.PROTOCOLS:
+            if looked.family == socket.AF_NETLINK:
+                return netlink_sockets.observe(held, looked)
+            if packet_sockets.is_mine(looked):
+                return packet_sockets.observe(held, looked)
+            if internet_sockets.is_kept(looked.family, looked.type, looked.proto):
                 return _observe_internet_socket(held, looked, opened, noted)
     except OSError as error:
         raise CaptureError(f"cannot look into the socket {held.name} of pid {held.pid}: {error.strerror}; try again") from error
@@ -139,6 +147,8 @@ def findings_of_all(resources: Sequence[Resource], *, standing: bool) -> tuple[F
         *tcp_connections.findings(resources, standing=standing),
         *internet_sockets.findings(resources),
         *unix_sockets.findings(resources),
+        *netlink_sockets.findings(resources),
+        *packet_sockets.findings(resources),
     )
 
 

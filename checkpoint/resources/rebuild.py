@@ -39,6 +39,8 @@ from checkpoint.resources import (
     memory_files,
     memory_locks,
     nameless,
+    netlink_sockets,
+    packet_sockets,
     pidfds,
     pipes,
     shared,
@@ -89,10 +91,13 @@ NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
     unix_sockets.KIND: unix_names.mismatches,
     kernel_files.KIND: kernel_files.mismatches,
     internet_sockets.KIND: internet_sockets.mismatches,
+    packet_sockets.KIND: packet_sockets.mismatches,
     system_v_memory.KIND: system_v_memory.mismatches,
 }
 """Kinds that need something of this machine: why it does not have that, one sentence each."""
-SOCKETS: Final = (unix_sockets.KIND, tcp_connections.KIND, internet_sockets.KIND)
+OF_KERNEL: Final = {netlink_sockets.KIND: netlink_sockets.prepare, packet_sockets.KIND: packet_sockets.prepare}
+"""Sockets that lead to the kernel or an interface alone."""
+SOCKETS: Final = (unix_sockets.KIND, tcp_connections.KIND, internet_sockets.KIND, *OF_KERNEL)
 NOT_OPEN: Final = (memory_locks.KIND, system_v_memory.KIND, thread_rights.KIND, stops.KIND)
 """Kinds of what no descriptor stands for."""
 KINDS: Final = (files.KIND, streams.KIND, shared.KIND, pipes.KIND, terminals.KIND, *NOT_OPEN, *MADE, *SOCKETS)
@@ -200,8 +205,11 @@ def _prepare_sockets(
     made = dict(unix.run())
     connected = tcp_connections.prepare(table, of_tcp, unix.end)
     made |= connected
-    made |= internet_sockets.prepare(table, of_internet, unix.end + len(connected))
+    made |= internet_sockets.prepare(table, of_internet, unix.end + len(connected), disguise)
     tcp_connections.settle(table, of_tcp, connected)
+    for kind, prepare in OF_KERNEL.items():
+        of_kernel = [held for held in state.resources if _is_own(held, given, kind)]
+        made |= prepare(table, of_kernel, max((unix.end - 1, *made.values())) + 1)
     return unix, made
 
 

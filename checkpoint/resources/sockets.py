@@ -87,6 +87,14 @@ _TCP: Final = (1, 3, 4, 5, 6, 7, 8, 9, 10, 13, 18, 23, 25, 37)
 FASTOPEN, NOTSENT_LOWAT, TX_DELAY."""
 _UDP: Final = (1, 101, 102, 103, 104)
 """UDP_CORK, NO_CHECK6_TX, NO_CHECK6_RX, SEGMENT, GRO."""
+_UDPLITE: Final = 136
+_SOL_RAW: Final = 255
+_NETLINK: Final = (3, 4, 5, 8, 10, 11, 12)
+"""NETLINK_PKTINFO, BROADCAST_ERROR, NO_ENOBUFS, LISTEN_ALL_NSID, CAP_ACK, EXT_ACK, GET_STRICT_CHK."""
+_PACKET: Final = (8, 9, 10, 12, 14, 15, 17, 19, 20, 23)
+"""PACKET_AUXDATA, ORIGDEV, VERSION, RESERVE, LOSS, VNET_HDR, TIMESTAMP, TX_HAS_OFF, QDISC_BYPASS, IGNORE_OUTGOING."""
+_OF_FAMILY: Final = {socket.AF_NETLINK: (270, _NETLINK), socket.AF_PACKET: (263, _PACKET)}
+"""SOL_NETLINK and SOL_PACKET."""
 
 _getsockopt = ctypes.CDLL(None, use_errno=True).getsockopt
 
@@ -207,19 +215,34 @@ def _options(looked: socket.socket, form: Form) -> Iterator[list[Fact]]:
 def _fresh_options(form: Form) -> Mapping[tuple[int, int], bytes]:
     """Options of a socket that was just made, as far as it has them."""
     levels = [(socket.SOL_SOCKET, (*_GENERAL, *_BUFFERS))]
+    if form.family in _OF_FAMILY:
+        levels.append(_OF_FAMILY[socket.AddressFamily(form.family)])
     if form.family in (socket.AF_INET, socket.AF_INET6):
         levels.append((socket.IPPROTO_IP, _IP))
-        levels.append((form.protocol, {socket.IPPROTO_TCP: _TCP, socket.IPPROTO_UDP: _UDP}.get(form.protocol, ())))
+        levels += _of_protocol(form)
     if form.family == socket.AF_INET6:
         levels.append((socket.IPPROTO_IPV6, _IPV6))
+    is_ping = form.type == socket.SOCK_DGRAM and form.protocol in (socket.IPPROTO_ICMP, socket.IPPROTO_ICMPV6)
     try:
-        fresh = socket.socket(form.family, form.type, form.protocol)
+        fresh = socket.socket(form.family, form.type, 0 if is_ping else form.protocol)  # which group of users may, we may not
     except OSError:
         return {}
     with fresh:
         found = {(level, number): _option(fresh, level, number) for level, numbers in levels for number in numbers}
     left_out = _OF_DATAGRAMS if form.type == socket.SOCK_STREAM else ()
     return {place: value for place, value in found.items() if value is not None and place not in left_out}
+
+
+def _of_protocol(form: Form) -> list[tuple[int, tuple[int, ...]]]:
+    """Levels and options besides those of the family."""
+    if form.type == socket.SOCK_RAW:
+        own = {
+            socket.IPPROTO_ICMP: (_SOL_RAW, (1,)),
+            socket.IPPROTO_ICMPV6: (socket.IPPROTO_ICMPV6, (1,)),
+        }  # which types it hears
+        return [(socket.IPPROTO_IP, (3,)), *([own[form.protocol]] if form.protocol in own else [])]  # IP_HDRINCL
+    own_numbers = {socket.IPPROTO_TCP: _TCP, socket.IPPROTO_UDP: _UDP, _UDPLITE: (*_UDP, 10, 11)}  # which part has a checksum
+    return [(form.protocol, own_numbers.get(form.protocol, ()))]
 
 
 def _option(looked: socket.socket, level: int, number: int) -> bytes | None:
@@ -242,7 +265,7 @@ def queue_of(looked: socket.socket, number: int, noted: Noted | None, identify: 
     Raises:
         OSError: this socket cannot be looked into, or an error waits in it, which our look would take away.
     """
-    ready = _readiness(looked)
+    ready = readiness(looked)
     if looked.type != socket.SOCK_STREAM and ready & select.POLLERR:
         if looked.family == socket.AF_UNIX:
             raise OSError(errno.EBUSY, "an error waits in it, which the program has not been told yet")
@@ -269,7 +292,8 @@ def set_peek_offset(looked: socket.socket, offset: int) -> None:
     looked.setsockopt(socket.SOL_SOCKET, SO_PEEK_OFF, offset)
 
 
-def _readiness(looked: socket.socket) -> int:
+def readiness(looked: socket.socket) -> int:
+    """What poll(2) says of reading it."""
     poll = select.poll()
     poll.register(looked, select.POLLIN)
     return next((events for _, events in poll.poll(0)), 0)

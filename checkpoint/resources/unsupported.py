@@ -40,9 +40,12 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.SOCKETS,
-        "sockets of other families (netlink, packet, CAN, vsock …) and protocols (ICMP, SCTP …)",
+        "sockets of other families (CAN, vsock, Bluetooth …) and protocols (SCTP, MPTCP …)",
         "open it for a moment and close it again; captures are taken in between",
         "a socket ({}, {})",
+    ),
+    refused(
+        Area.SOCKETS, "the rings of a packet socket that are mapped", "read its frames by recv(2)", "the rings of a packet socket"
     ),
     refused(Area.DEVICES, "memory of a device", "the driver process maps it", "memory of a device"),
     refused(Area.MEMORY, "secret memory that is mapped", "run it without", "secret memory"),
@@ -133,6 +136,7 @@ ANONYMOUS_INODES: Final[Mapping[str, str]] = {
 _MAPPINGS: Final = (
     (re.compile(r"anon_inode:\[io_uring\]"), "the rings of an io_uring"),
     (re.compile(r"anon_inode:\[perf_event\]"), "the buffer of a perf event"),
+    (re.compile(r"socket:"), "the rings of a packet socket"),
     (re.compile(r"/\[aio\]"), "a ring of asynchronous I/O (aio)"),
     (re.compile(r"/secretmem"), "secret memory"),
     (re.compile(r"/dev/(?!zero|shm/|hugepages/)"), "memory of a device"),

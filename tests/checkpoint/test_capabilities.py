@@ -126,7 +126,7 @@ def test_a_refusal_without_a_row_is_seen() -> None:
 
 def test_the_row_of_a_refusal_is_found_by_its_words() -> None:
     row = capabilities.row_of(
-        "fd 3 is a socket (netlink, socket:[123]), which is not kept yet: protect the program while it has none"
+        "fd 3 is a socket (vsock, socket:[123]), which is not kept yet: protect the program while it has none"
     )
     assert row is not None and row.area == Area.SOCKETS and row.verdict == Verdict.REFUSED
 

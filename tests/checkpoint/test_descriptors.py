@@ -54,6 +54,7 @@ CASES = {
     "unix_sockets": (
         "ghost_left ghost_directory name_taken_again waiting_stream waiting_packets named_senders named_pair makers"
     ),
+    "kernel_sockets": "netlink raw light_datagrams packets",
     "internet_sockets": "udp_shut_down foreign_address closed_connection_4 closed_connection_6",
 }
 

@@ -164,7 +164,15 @@ static void take_unix_other_name(void) {
     close(open("name", O_CREAT | O_WRONLY, 0600));
 }
 
-static void take_netlink_socket(void) { keep(socket(AF_NETLINK, SOCK_RAW, 0), "a socket"); }
+static void take_netlink_socket(void) { keep(socket(AF_NETLINK, SOCK_RAW, 12 /* NETLINK_NETFILTER */), "a socket"); }
+
+static void take_netlink_answer(void) {
+    int request[] = {17, 18 | 0x301 << 16, 1, 0, 0}; /* RTM_GETLINK, of all */
+    keep(socket(AF_NETLINK, SOCK_RAW, 0), "a socket");
+    if (send(opened, request, 17, 0) != 17) cannot("ask");
+}
+
+static void take_vsock(void) { keep(socket(AF_VSOCK, SOCK_STREAM, 0), "a socket"); }
 
 static void take_fanotify(void) { keep(fanotify_init(FAN_CLASS_NOTIF, O_RDONLY), "fanotify"); }
 
@@ -352,6 +360,8 @@ static const struct kind {
              {"unix_waiting_gone", take_unix_waiting_gone},
              {"unix_other_name", take_unix_other_name},
              {"netlink_socket", take_netlink_socket},
+             {"netlink_answer", take_netlink_answer},
+             {"vsock", take_vsock},
              {"fanotify", take_fanotify},
              {"io_uring", take_io_uring},
              {"io_uring_mapped", take_io_uring_mapped},

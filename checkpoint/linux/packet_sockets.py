@@ -1,0 +1,81 @@
+"""What the kernel tells of packet sockets when it is asked by netlink: memberships and rings, which nothing else tells.
+
+Source: sock_diag(7), linux/packet_diag.h.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from checkpoint.linux.unix_sockets import (
+    NETLINK_SOCK_DIAG,
+    NLM_F_DUMP,
+    NLM_F_REQUEST,
+    SOCK_DIAG_BY_FAMILY,
+    answers,
+    attributes,
+)
+
+_HEADER: Final = struct.Struct("<IHHII")
+_REQUEST: Final = struct.Struct("<BBHIIII")
+_ANSWER: Final = struct.Struct("<BBHI8x")
+_MEMBERSHIP: Final = struct.Struct("<IIHH32s")
+_SHOW: Final = 1 | 2 | 4
+"""Interface, memberships, rings."""
+_MEMBERSHIPS: Final = 1
+_RINGS: Final = {2: 5, 3: 13}
+"""PACKET_DIAG_RX_RING and TX_RING, and the options that make them: PACKET_RX_RING and PACKET_TX_RING."""
+
+
+@dataclass(frozen=True, slots=True)
+class Membership:
+    """What a packet socket receives besides what is for this machine.
+
+    Attributes:
+        count: how often it was asked for.
+        type: PACKET_MR_MULTICAST, PROMISC, ALLMULTI or UNICAST.
+    """
+
+    interface: int
+    count: int
+    type: int
+    address: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class PacketSocket:
+    """One packet socket.
+
+    Attributes:
+        rings: by the option that makes one, what that was told: struct tpacket_req3.
+    """
+
+    memberships: tuple[Membership, ...]
+    rings: Mapping[int, bytes]
+
+
+def packet_sockets() -> Mapping[int, PacketSocket]:
+    """All of our network namespace, by inode number.
+
+    Raises:
+        OSError: the kernel does not tell (CONFIG_PACKET_DIAG).
+    """
+    found = {}
+    with socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM, NETLINK_SOCK_DIAG) as asked:
+        request = _REQUEST.pack(socket.AF_PACKET, 0, 0, 0, _SHOW, 0xFFFFFFFF, 0xFFFFFFFF)
+        asked.send(_HEADER.pack(_HEADER.size + len(request), SOCK_DIAG_BY_FAMILY, NLM_F_REQUEST | NLM_F_DUMP, 1, 0) + request)
+        for answer in answers(asked):
+            told = dict(attributes(answer[_ANSWER.size :]))
+            packed = told.get(_MEMBERSHIPS, b"")
+            memberships = tuple(
+                Membership(interface, count, kind, address[:size])
+                for interface, count, kind, size, address in _MEMBERSHIP.iter_unpack(packed)
+            )
+            found[_ANSWER.unpack_from(answer)[3]] = PacketSocket(
+                memberships, {option: told[ring] for ring, option in _RINGS.items() if ring in told}
+            )
+    return found
