@@ -4,7 +4,7 @@ Called in a child between its birth and its execve. The one thing that others se
 rights of the program's user, over which the files are mounted. Everything but the mount itself is done with those rights: a
 user who puts a link in the way finds nothing written that he could not have written himself.
 
-Source: mount(2), tmpfs(5), seteuid(2).
+Source: mount(2), tmpfs(5), seteuid(2), setgroups(2).
 """
 
 from __future__ import annotations
@@ -17,9 +17,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from checkpoint.linux import namespaces
+from checkpoint.linux.abi import PAGE_SIZE
 
 PART_SIZE = 1 << 20
 """Bytes copied at a time."""
+ROOM = 64 << 20
+"""Bytes that the program may add in memory to what was brought; without a limit it were half of the machine's."""
+
+
+@dataclass(frozen=True, slots=True)
+class User:
+    """Whose program it is; ``groups``: the supplementary ones."""
+
+    uid: int
+    gid: int
+    groups: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,11 +49,10 @@ class BroughtFile:
     mode: int
 
 
-def show(files: Sequence[BroughtFile], user: tuple[int, int], *, own_mounts: bool) -> None:
+def show(files: Sequence[BroughtFile], user: User, *, own_mounts: bool) -> None:
     """Have the files there, unless the first one, which is started, is there already: that was installed, and is used.
 
     Args:
-        user: uid and gid of the program.
         own_mounts: the caller has a mount namespace of its own.
 
     Raises:
@@ -55,7 +66,8 @@ def show(files: Sequence[BroughtFile], user: tuple[int, int], *, own_mounts: boo
     contents = [os.open(file.content, os.O_RDONLY | os.O_CLOEXEC) for file in files]
     with _as_user(user):
         place = _place_for(files, user)
-    namespaces.mount_memory(place, *user)
+    size = sum(os.fstat(content).st_size for content in contents) + len(files) * PAGE_SIZE
+    namespaces.mount_memory(place, user.uid, user.gid, size + ROOM)
     os.close(place)
     with _as_user(user):
         for file, content in zip(files, contents, strict=True):
@@ -65,19 +77,24 @@ def show(files: Sequence[BroughtFile], user: tuple[int, int], *, own_mounts: boo
 
 
 @contextlib.contextmanager
-def _as_user(user: tuple[int, int]) -> Iterator[None]:
-    """Touch files with the rights of the program's user."""
-    uid, gid = os.geteuid(), os.getegid()
-    os.setegid(user[1])
-    os.seteuid(user[0])
+def _as_user(user: User) -> Iterator[None]:
+    """Touch files with the rights of the program's user, and with none that our own groups have."""
+    uid, gid, groups = os.geteuid(), os.getegid(), os.getgroups()
+    others = user.uid != uid
+    if others:
+        os.setgroups(user.groups)
+    os.setegid(user.gid)
+    os.seteuid(user.uid)
     try:
         yield
     finally:
         os.seteuid(uid)
         os.setegid(gid)
+        if others:
+            os.setgroups(groups)
 
 
-def _place_for(files: Sequence[BroughtFile], user: tuple[int, int]) -> int:
+def _place_for(files: Sequence[BroughtFile], user: User) -> int:
     """A descriptor of an empty directory of the user's that all files are below; it is made if need be.
 
     Raises:
@@ -89,7 +106,7 @@ def _place_for(files: Sequence[BroughtFile], user: tuple[int, int]) -> int:
         folder = missing[-1]
         folder.mkdir(mode=0o755)
     place = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
-    if os.fstat(place).st_uid != user[0] or os.listdir(place):
+    if os.fstat(place).st_uid != user.uid or os.listdir(place):
         os.close(place)
         raise OSError(errno.EEXIST, "holds other files, or is somebody else's: install the program there", str(folder))
     return place

@@ -157,17 +157,18 @@ def set_clocks(clocks: Clocks, elapsed_ns: int) -> None:
         raise PermissionError(error.errno, reason) from error
 
 
-def mount_memory(place: int, uid: int, gid: int) -> None:
+def mount_memory(place: int, uid: int, gid: int, size: int) -> None:
     """Mount an empty file system in memory over a directory, for the caller's mount namespace alone.
 
     Args:
         place: descriptor of the directory: a name could be made to lead elsewhere meanwhile.
         uid, gid: whose it is.
+        size: bytes that it may hold.
 
     Raises:
         OSError: EPERM without the right to mount.
     """
-    options = f"mode=755,uid={uid},gid={gid}".encode()
+    options = f"mode=755,uid={uid},gid={gid},size={size}".encode()
     target = f"/proc/self/fd/{place}".encode()
     _checked(_libc.mount(b"failover", target, b"tmpfs", ctypes.c_ulong(_MS_NOSUID_NODEV), options), "mount(tmpfs)")
 

@@ -37,7 +37,7 @@ from typing import Final, NoReturn
 from checkpoint.arch import x86_64_stub as stub
 from checkpoint.errors import RestoreError
 from checkpoint.linux import namespaces
-from checkpoint.linux.brought import BroughtFile, show
+from checkpoint.linux.brought import BroughtFile, User, show
 from checkpoint.linux.inheritance import Inheritance, take_on
 from checkpoint.model import Clocks
 
@@ -291,7 +291,8 @@ def _grow_up(
 ) -> None:
     """The child's own part, up to the execve that ends it."""
     kept = birth.inheritance
-    show(birth.brought, (kept.uid, kept.gid) if kept else (os.geteuid(), os.getegid()), own_mounts=own_mounts)
+    user = User(kept.uid, kept.gid, kept.groups) if kept else User(os.geteuid(), os.getegid())
+    show(birth.brought, user, own_mounts=own_mounts)
     with contextlib.suppress(OSError):  # only kernels with Yama know this; the others let our keeper in anyway
         namespaces.prctl(namespaces.PR_SET_PTRACER, -1)
     if keep_right:

@@ -54,6 +54,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+OUR_GROUP = 61_234
 PACKAGE = ["package/__init__.py", "package/deep/__init__.py", "package/deep/module.py", "package/table.csv"]
 
 
@@ -129,14 +130,14 @@ def content(tmp_path: Path) -> Path:
     return kept / "content"
 
 
-def born(path: Path, content: Path, *, uid: int = 0, isolate: bool = True) -> str:
+def born(path: Path, content: Path, *, uid: int = 0, isolate: bool = True, groups: tuple[int, ...] = ()) -> str:
     """Start the program from what was brought; what it says, or why it cannot be."""
     read_end, write_end = os.pipe()
     null = os.open("/dev/null", os.O_RDWR)
     birth = Birth(
         isolate=isolate,
         stdio=(null, write_end, write_end),
-        inheritance=Inheritance(uid, uid),
+        inheritance=Inheritance(uid, uid, groups),
         brought=(BroughtFile(str(path), str(content), 0o755),),
     )
     try:
@@ -187,6 +188,23 @@ def test_a_user_gets_nothing_mounted_where_he_could_not_write(reached: Path, con
     assert "somebody else's" in born(empty / "run", content, uid=NOBODY)
     assert born(mine / "link" / "run", content, uid=NOBODY).startswith(("Not a directory", "Too many levels"))
     assert "Permission denied" in born(reached / "new" / "run", content, uid=NOBODY)
+
+
+@pytest.mark.root
+def test_our_own_groups_open_no_directory_to_a_user(reached: Path, content: Path) -> None:
+    """Nor do his that he has not; those that he has do."""
+    shared, ours = reached / "shared", os.getgroups()
+    shared.mkdir()
+    os.chown(shared, 0, OUR_GROUP)
+    shared.chmod(0o775)
+    os.setgroups([OUR_GROUP])
+    try:
+        assert "Permission denied" in born(shared / "app" / "run", content, uid=NOBODY)
+        assert list(shared.iterdir()) == []
+        assert born(shared / "app" / "run", content, uid=NOBODY, groups=(OUR_GROUP,)) == f"ready\n{NOBODY}\n"
+        assert os.getgroups() == [OUR_GROUP]
+    finally:
+        os.setgroups(ours)
 
 
 def test_a_resource_that_says_anything_else_names_no_file() -> None:
