@@ -28,7 +28,7 @@ from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.tracking import NONE, NOT_CARRIED
 from checkpoint.linux.vm_flags import FlagsReader
 from checkpoint.model import Position, ProcessState, Resource, ThreadState, Vma
-from checkpoint.resources import Opened, memory_locks, system_v_memory, unsupported
+from checkpoint.resources import Opened, deadlines, memory_locks, system_v_memory, unsupported
 
 NOBODY: SharedPlaces = frozenset()
 
@@ -196,6 +196,7 @@ class CapturedProcess:
             *memory_locks.describe(of_program, ours),
             *system_v_memory.describe(look.taken.lines),
             *self.onlooker.rights.describe(),
+            *deadlines.describe(self.pid),
         )
 
     def _foreign_flags(self, line: MapsLine) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from typing import Final
 
 from checkpoint.arch import x86_64 as arch
 from checkpoint.engines.restart import Interruptions, outside_critical_section
-from checkpoint.errors import CaptureError
+from checkpoint.errors import CaptureError, UnsupportedError
 from checkpoint.linux import dirty, entry, procfs, remote
 from checkpoint.linux.digests import DigestTracker
 from checkpoint.linux.dirty import SoftDirtyTracker
@@ -76,6 +76,9 @@ def _try_to_enter(threads: Threads, interruptions: Interruptions, *, last: bool)
 
 def _enter_once(threads: Threads, interruptions: Interruptions, *, last: bool) -> entry.Entered | None:
     tracee = threads.leader
+    if dispatching := [one.pid for one in (tracee, *threads.others) if one.dispatches_calls()]:
+        reason = f"its thread {dispatching[0]} handles its system calls itself (PR_SET_SYSCALL_USER_DISPATCH): run it without"
+        raise UnsupportedError(f"cannot enter pid {tracee.pid}: {reason}", (reason,))
     mask = tracee.signal_mask()
     decoded = where_it_stands(tracee, interruptions, tracee.rseq())
     lines = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))

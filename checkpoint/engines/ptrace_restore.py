@@ -48,7 +48,16 @@ from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee
 from checkpoint.model import Credentials, Position, Snapshot, ThreadState, Vma
-from checkpoint.resources import carried_connections, files, laying, memory_locks, remembered, system_v_memory, thread_rights
+from checkpoint.resources import (
+    carried_connections,
+    deadlines,
+    files,
+    laying,
+    memory_locks,
+    remembered,
+    system_v_memory,
+    thread_rights,
+)
 from checkpoint.resources.carried_connections import Arriving
 from checkpoint.resources.rebuild import deleted_directory, rebuild_all, rebuild_last
 from checkpoint.resources.rebuilding import number_of
@@ -403,6 +412,7 @@ class ProcessRestore:
         process = state.process
         memory_locks.rebuild(table, state.resources)  # which takes a right, or a limit
         restore_process.scheduling(table, thread, vessel)
+        deadlines.rebuild(table, state.resources, thread.tid, bool(thread.policy & os.SCHED_RESET_ON_FORK))
         self.notes += restore_process.limits(table, process, vessel)
         self.notes += restore_process.rights(table, process, vessel)
         restore_process.pending_signals(table, process, vessel.inner_pid)
@@ -420,6 +430,7 @@ class ProcessRestore:
         credentials = thread_rights.of_thread(self._state.resources, thread.tid, process.credentials)
         restore_process.thread_marks(table, thread)
         restore_process.scheduling(table, thread, vessel, f" for thread {thread.tid} ({thread.name})")
+        deadlines.rebuild(table, self._state.resources, thread.tid, bool(thread.policy & os.SCHED_RESET_ON_FORK))
         restore_process.rights(table, replace(process, credentials=credentials), vessel)
         restore_process.pending_of_thread(table, process, thread, vessel.inner_pid, thread.tid)
         switches.set_again(table, [switch for switch in process.switches if switch[0] in switches.OF_THREADS])

@@ -21,7 +21,7 @@ from checkpoint.errors import RestoreError
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.call_table import AT_FDCWD, CallTable
 from checkpoint.model import Credentials, IntervalTimer, PosixTimer, ProcessState, SignalAction, ThreadState
-from checkpoint.resources import nameless
+from checkpoint.resources import deadlines, nameless
 
 _NO_FILE: Final = 0xFFFFFFFF
 _MM_MAP: Final = struct.Struct("<12Q2I")
@@ -216,7 +216,7 @@ def scheduling(table: CallTable, thread: ThreadState, vessel: Vessel, whose: str
         whose: added to the notes.
     """
     table.attempt(f"nice {thread.nice} is not kept{whose}", "setpriority", 0, 0, thread.nice)
-    if thread.policy:
+    if thread.policy & ~os.SCHED_RESET_ON_FORK != deadlines.SCHED_DEADLINE and thread.policy:
         priority = table.place(struct.pack("<i", thread.priority))
         table.attempt(f"scheduling policy {thread.policy} is not kept{whose}", "sched_setscheduler", 0, thread.policy, priority)
     allowed = vessel.affinity & set(thread.affinity)

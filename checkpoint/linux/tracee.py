@@ -8,6 +8,7 @@ Source: ptrace(2).
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import os
@@ -325,6 +326,14 @@ class Tracee:
             if count < PEEK_COUNT:
                 return tuple(found)
         raise CaptureError(f"pid {self.pid} has more than {PENDING_LIMIT} signals queued; capture it when it has taken them")
+
+    def dispatches_calls(self) -> bool:
+        """Whether its system calls may end in a signal handler of its own (PR_SET_SYSCALL_USER_DISPATCH)."""
+        told = (ctypes.c_uint64 * 4)()  # mode, offset, length, selector
+        request = abi.PTRACE_GET_SYSCALL_USER_DISPATCH_CONFIG
+        with contextlib.suppress(PtraceError):  # Linux 6.4 tells
+            _ptrace(request, self.pid, ctypes.sizeof(told), ctypes.addressof(told))
+        return bool(told[0])
 
     def rseq(self) -> Rseq | None:
         """Read its restartable-sequences registration; None without one, or where the kernel cannot tell."""

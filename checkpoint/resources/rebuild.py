@@ -28,6 +28,7 @@ from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource, Snapshot
 from checkpoint.resources import (
     attached_devices,
+    deadlines,
     devices,
     epolls,
     eventfds,
@@ -98,7 +99,7 @@ NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
 OF_KERNEL: Final = {netlink_sockets.KIND: netlink_sockets.prepare, packet_sockets.KIND: packet_sockets.prepare}
 """Sockets that lead to the kernel or an interface alone."""
 SOCKETS: Final = (unix_sockets.KIND, tcp_connections.KIND, internet_sockets.KIND, *OF_KERNEL)
-NOT_OPEN: Final = (memory_locks.KIND, system_v_memory.KIND, thread_rights.KIND, stops.KIND)
+NOT_OPEN: Final = (memory_locks.KIND, system_v_memory.KIND, thread_rights.KIND, deadlines.KIND, stops.KIND)
 """Kinds of what no descriptor stands for."""
 KINDS: Final = (files.KIND, streams.KIND, shared.KIND, pipes.KIND, terminals.KIND, *NOT_OPEN, *MADE, *SOCKETS)
 

@@ -43,6 +43,12 @@ CAPABILITIES: Final = (
         "lives in a namespace of its own ({})",
         "has an execution domain of its own",
     ),
+    refused(
+        Area.THREADS,
+        "a thread that handles its system calls itself (PR_SET_SYSCALL_USER_DISPATCH)",
+        "run it without: a capture asks system calls of it",
+        "handles its system calls itself",
+    ),
     refused(Area.THREADS, "a thread that a debugger traces", "end that debugger", "is traced by pid"),
     refused(
         Area.TIME,

@@ -108,6 +108,20 @@ def test_a_program_whose_first_thread_has_ended_is_refused_by_name(compiled: Com
         expect_ok(tracee)
 
 
+def test_a_program_that_handles_its_system_calls_itself_is_refused_and_hears_nothing_of_it(
+    compiled: Compiled, tmp_path: Path
+) -> None:
+    """It can only be asked when it stands still, so `probe` does not know."""
+    with ended(start_tracee(compiled("refused", "-O2"), tmp_path, "user_dispatch")) as tracee:
+        before = _facts(tracee.pid)
+        with pytest.raises(UnsupportedError, match="handles its system calls itself") as refusal:
+            ENGINE.protect(tracee.pid, ProtectOrder("/test/tracee")).close()
+        assert _facts(tracee.pid) == before
+        assert all(map(_is_in_the_table, refusal.value.reasons))
+        tracee.tell()
+        expect_ok(tracee)
+
+
 def test_a_program_that_holds_nothing_special_is_not_refused(compiled: Compiled, tmp_path: Path) -> None:
     with ended(start_tracee(compiled("refused", "-O2"), tmp_path, "nothing")) as tracee:
         report = ENGINE.probe(tracee.pid)

@@ -131,7 +131,13 @@ FILES = cases(
     "deleted_working_directory deleted_device deleted_place deleted_link mapped_memory",
 )
 
-THREADS = [*cases("threads"), *cases("threads", "many"), *cases("blocked"), *cases("thread_rights")]
+THREADS = [
+    *cases("threads"),
+    *cases("threads", "many"),
+    *cases("blocked"),
+    *cases("thread_rights"),
+    *cases("deadlines", "deadline slice"),
+]
 
 PRESERVED = [*MEMORY, *REGISTERS, *SIGNALS, *TIME, *PORTRAITS, *FILES, *THREADS]
 

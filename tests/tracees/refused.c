@@ -291,6 +291,18 @@ static void take_memory_file(void) {
         cannot("map a memory file");
 }
 
+static char dispatches;
+static void take_call(int number) {
+    (void)number;
+    dispatches = 0;
+    differs("a system call that it did not make");
+}
+
+static void take_user_dispatch(void) {
+    signal(SIGSYS, take_call);
+    if (prctl(PR_SET_SYSCALL_USER_DISPATCH, PR_SYS_DISPATCH_ON, 1, 1, &dispatches)) cannot("dispatch system calls");
+}
+
 static void take_no_vdso(void) {
     unsigned long start = 0, end = 0;
     char line[600];
@@ -386,6 +398,7 @@ static const struct kind {
              {"secret_memory", take_secret_memory},
              {"memory_file", take_memory_file},
               {"no_vdso", take_no_vdso},
+             {"user_dispatch", take_user_dispatch},
              {"root", take_root},
              {"own_namespace", take_own_namespace},
              {"owner_group", take_owner_group},
