@@ -30,7 +30,7 @@ from typing import Final
 from checkpoint import tree
 from checkpoint.arch import x86_64, x86_64_stub
 from checkpoint.engine import RestoreOptions
-from checkpoint.engines import births, common_files, restore_memory, restore_process, restore_stops, restore_threads
+from checkpoint.engines import births, files_of_several, restore_memory, restore_process, restore_stops, restore_threads
 from checkpoint.engines.births import Birth, End, Join, NewSession, Step
 from checkpoint.engines.ptrace_restore import OPTIONS, REFUGE_SIZE, Estate, ProcessRestore, look_at_vessel
 from checkpoint.engines.restore_checks import Brought
@@ -57,7 +57,7 @@ class TreeRestore:
 
     def __init__(self, vessel_pid: int, state: Snapshot, options: RestoreOptions, brought: tuple[Brought, ...]) -> None:
         self._state = state
-        self._views, self._nameless = common_files.made_once(tree.views(state))
+        self._views, self._nameless = files_of_several.made_once(tree.views(state))
         self._brought = brought
         self._options = options
         self._first = Tracee(vessel_pid)
@@ -197,7 +197,7 @@ class TreeRestore:
             arguments = (place, size, abi.PROT_READ | abi.PROT_WRITE, flags, -1, 0)
             table.call(what, "mmap", *arguments, least=place, most=place)
         made = opened | {key: restore_memory.make_object(table, vmas) for key, vmas in objects.items()}
-        made |= {key: common_files.make(table, held) for key, held in self._nameless.items()}
+        made |= {key: files_of_several.make(table, held) for key, held in self._nameless.items()}
         for key, number in estate.objects.items():
             table.duplicate(made[key], number, os.O_CLOEXEC)
         kept = [Resource(streams.KIND, f"fd {n}", {"descriptors": [[n, 0]], "stream": n, "flags": 0}) for n in streams.STANDARD]
