@@ -11,6 +11,7 @@ import contextlib
 import errno
 import fcntl
 import os
+import select
 import socket
 import struct
 import termios
@@ -46,8 +47,9 @@ FIN_WAIT_2: Final = 5
 CLOSE_WAIT: Final = 8
 LAST_ACK: Final = 9
 CLOSING: Final = 11
-WE_ENDED: Final = (FIN_WAIT_1, LAST_ACK, CLOSING)
-"""Our end of the stream was sent, and takes a number; it is not acknowledged."""
+WE_ENDED: Final = (FIN_WAIT_1, FIN_WAIT_2, LAST_ACK, CLOSING)
+"""Our end of the stream was sent, and takes a number."""
+LIVING: Final = (ESTABLISHED, CLOSE_WAIT, *WE_ENDED)
 
 QUEUE_MAX: Final = 16 << 20
 """Bytes in one direction that are taken along: more than the kernel lets wait unless it is told to (tcp_rmem, tcp_wmem)."""
@@ -91,6 +93,7 @@ class Kept:
         mss: as the peer announced it.
         timestamp: of our clock for the peer, 0 where the ends use none.
         window: struct tcp_repair_window.
+        reads_end: nothing more comes, for the peer has ended its side, or the program does not want it.
         buffers: bytes of the send and the receive buffer; which of them the program has chosen (SO_BUF_LOCK).
     """
 
@@ -106,6 +109,7 @@ class Kept:
     timestamp: int
     window: bytes
     buffers: tuple[int, int, int]
+    reads_end: bool = False
 
 
 @contextlib.contextmanager
@@ -127,11 +131,11 @@ def read(looked: socket.socket) -> Kept:
         OSError: we may not (CAP_NET_ADMIN).
     """
     _require_plain(looked)
-    buffers = _buffers(looked)
+    buffers, reads_end = _buffers(looked), _reads_end(looked)
     with _in_repair(looked):
         state, options, scales = struct.unpack("<B4xBB", looked.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 7))
-        if state not in (ESTABLISHED, FIN_WAIT_1):
-            raise CannotCarryError("it has ended at one side, or both")
+        if state not in LIVING:
+            raise CannotCarryError("it has just ended")
         _set(looked, TCP_REPAIR_QUEUE, _SENT)
         ended = int(state in WE_ENDED)
         sent_end = looked.getsockopt(socket.IPPROTO_TCP, TCP_QUEUE_SEQ) & (_SEQUENCES - 1)
@@ -153,6 +157,7 @@ def read(looked: socket.socket) -> Kept:
             timestamp=looked.getsockopt(socket.IPPROTO_TCP, TCP_TIMESTAMP) & (_SEQUENCES - 1) if options & 1 else 0,
             window=looked.getsockopt(socket.IPPROTO_TCP, TCP_REPAIR_WINDOW, _WINDOW.size),
             buffers=buffers,
+            reads_end=reads_end,
         )
 
 
@@ -179,6 +184,12 @@ def _peeked(looked: socket.socket, size: int) -> bytes:
     if len(found) != size:
         raise CannotCarryError("urgent bytes wait in it")
     return found
+
+
+def _reads_end(looked: socket.socket) -> bool:
+    poll = select.poll()
+    poll.register(looked, select.POLLRDHUP)
+    return any(events & select.POLLRDHUP for _, events in poll.poll(0))
 
 
 def _buffers(looked: socket.socket) -> tuple[int, int, int]:
@@ -210,7 +221,7 @@ def connect(made: socket.socket, kept: Kept, ours: Address, peer: Address) -> No
     _set(made, TCP_REPAIR_QUEUE, _SENT)
     _set(made, TCP_QUEUE_SEQ, _signed(kept.sent_end - ended - len(kept.sent)))
     _set(made, TCP_REPAIR_QUEUE, _RECEIVED)
-    _set(made, TCP_QUEUE_SEQ, _signed(kept.received_end - len(kept.received)))
+    _set(made, TCP_QUEUE_SEQ, _signed(kept.received_end - len(kept.received)))  # the peer's end counts as acknowledged
     with _anywhere(made):
         try:
             made.bind(ours)
@@ -254,6 +265,8 @@ def fill(made: socket.socket, kept: Kept) -> None:
     _lay(made, _RECEIVED, kept.received)
     _lay(made, _SENT, kept.sent[: len(kept.sent) - kept.unsent])
     made.setsockopt(socket.IPPROTO_TCP, TCP_REPAIR_WINDOW, kept.window)
+    if kept.reads_end:  # no packet can bring it a second time: as far as the program sees it is the same
+        made.shutdown(socket.SHUT_RD)
 
 
 def _agreed(kept: Kept) -> Iterator[bytes]:
@@ -289,8 +302,6 @@ def set_free(made: socket.socket, kept: Kept, reuse: int) -> None:
     unsent = memoryview(kept.sent)[len(kept.sent) - kept.unsent :]
     while unsent:
         unsent = unsent[made.send(unsent, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL) :]
-    if kept.state in WE_ENDED:
-        made.shutdown(socket.SHUT_WR)
     sending, receiving, locks = kept.buffers
     made.setsockopt(socket.SOL_SOCKET, SO_SNDBUFFORCE, sending // 2)
     made.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, receiving // 2)
@@ -298,7 +309,7 @@ def set_free(made: socket.socket, kept: Kept, reuse: int) -> None:
         made.setsockopt(socket.SOL_SOCKET, SO_BUF_LOCK, locks)
 
 
-def ask_peer(made: socket.socket, reuse: int) -> None:
+def ask_peer(made: socket.socket, kept: Kept, reuse: int) -> None:
     """Have the kernel ask the peer where it stands, now that it is heard; what waits is sent upon the answer.
 
     Raises:
@@ -306,6 +317,9 @@ def ask_peer(made: socket.socket, reuse: int) -> None:
     """
     _set(made, TCP_REPAIR, _ON)
     _leave_repair(made, _OFF, reuse)
+    if kept.state in WE_ENDED:
+        with contextlib.suppress(OSError):  # the peer has answered, and does not know it any more: the program will hear
+            made.shutdown(socket.SHUT_WR)
 
 
 def _leave_repair(made: socket.socket, how: int, reuse: int) -> None:

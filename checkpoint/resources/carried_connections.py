@@ -213,8 +213,8 @@ class Arriving:
             for made, one, reuse in self._made:
                 tcp_repair.set_free(made, one.kept, reuse)
             silence.lift([one.connection for one in self._arrivals])
-            for made, _, reuse in self._made:
-                tcp_repair.ask_peer(made, reuse)
+            for made, one, reuse in self._made:
+                tcp_repair.ask_peer(made, one.kept, reuse)
                 made.close()
         except OSError as error:
             raise RestoreError(f"cannot let TCP connections go on: {error.strerror}") from error

@@ -33,7 +33,7 @@ from typing import Final
 
 from checkpoint.capability import Area, by_rule, preserved, refused
 from checkpoint.engine import NOTED, REFUSED, Finding
-from checkpoint.linux import connection_remains, procfs
+from checkpoint.linux import connection_remains, procfs, tcp_repair
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile, Surroundings, elsewhere, internet_sockets, sockets
@@ -65,7 +65,6 @@ CAPABILITIES: Final = (
 )
 
 SYN_SENT: Final = 2
-ESTABLISHED: Final = 1
 FIN_WAIT_1: Final = 4
 FIN_WAIT_2: Final = 5
 CLOSE_WAIT: Final = 8
@@ -163,7 +162,7 @@ def is_connection(facts: Mapping[str, Fact]) -> bool:
 
 def is_carriable(facts: Mapping[str, Fact]) -> bool:
     """Whether it is a connection that lives, and may be taken along."""
-    return is_connection(facts) and facts["state"] in (ESTABLISHED, *_WE_ENDED, CLOSE_WAIT) and bool(facts["peer"])
+    return is_connection(facts) and facts["state"] in tcp_repair.LIVING and bool(facts["peer"])
 
 
 def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:

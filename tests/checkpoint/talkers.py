@@ -1,14 +1,16 @@
 """Two ends of a TCP connection, each a process of its own, which say to each other what a test can check byte for byte.
 
-    python3 talkers.py caller HOST PORT OWN     connects from an address of its own; the program that is captured
-    python3 talkers.py called HOST PORT OWN     listens; its peer, which knows of nothing
+    python3 talkers.py caller HOST PORT OWN [ends]     connects from an address of its own; the program that is captured
+    python3 talkers.py called HOST PORT OWN [ends]     listens; its peer, which knows of nothing
 
 Both send until nothing more is taken, while neither reads, and say "ready". Once the file ``go`` is there each reads all that the
-other has said, says something more, and ends its side. Each then says "ok", or what was wrong.
+other has said, says something more, and ends its side. Each then says "ok", or what was wrong. One that is told ``ends`` says
+little, and ends its side before it is ready.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import sys
@@ -16,6 +18,7 @@ import threading
 import time
 
 PATTERN = b"".join(b"%07d\n" % number for number in range(1 << 17))
+LITTLE = 1000
 LAST = b"the last words"
 
 
@@ -47,18 +50,21 @@ def heard(end: socket.socket) -> bytes:
     return b"".join(pieces)
 
 
-def talk(end: socket.socket) -> str:
+def talk(end: socket.socket, *, ends: bool) -> str:
     """What was wrong; "ok" if nothing."""
-    total = fill(end)
+    total = LITTLE if ends else fill(end)
+
+    def say() -> None:
+        with contextlib.suppress(OSError):  # whoever reads says so
+            end.sendall((said(total) if ends else b"") + LAST + b" %d" % total)
+            end.shutdown(socket.SHUT_WR)
+
+    if ends:
+        say()
     print("ready", flush=True)
     while not os.path.exists("go"):
         time.sleep(0.01)
-
-    def say() -> None:
-        end.sendall(LAST + b" %d" % total)
-        end.shutdown(socket.SHUT_WR)
-
-    saying = threading.Thread(target=say)
+    saying = threading.Thread(target=(lambda: None) if ends else say)
     saying.start()
     try:
         found = heard(end)
@@ -71,7 +77,7 @@ def talk(end: socket.socket) -> str:
     return "ok" if body == said(len(body)) else "other bytes than were said"
 
 
-def main(part: str, host: str, port: str, own: str) -> None:
+def main(part: str, host: str, port: str, own: str, *how: str) -> None:
     """Be one of the two."""
     if part == "called":
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -80,7 +86,7 @@ def main(part: str, host: str, port: str, own: str) -> None:
         end, _ = listener.accept()
     else:
         end = socket.create_connection((host, int(port)), source_address=(own, 0))
-    print(talk(end), flush=True)
+    print(talk(end, ends="ends" in how), flush=True)
 
 
 if __name__ == "__main__":

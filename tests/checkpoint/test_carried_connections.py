@@ -13,6 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from checkpoint import format
+from checkpoint.model import Snapshot
+from checkpoint.resources.tcp_connections import TAKEN
 from tests.failover.cli.test_verbs import COMMAND
 
 pytestmark = [pytest.mark.root]
@@ -21,6 +24,15 @@ TALKERS = Path(__file__).with_name("talkers.py")
 PYTHON = getattr(sys, "_base_executable", sys.executable)
 PATIENCE_S = 60.0
 PORT = "7000"
+ROOT = Path(__file__).resolve().parents[2]
+HOLD = """
+import os, signal
+from checkpoint.engine import CaptureOrder, ProtectOrder, Terms, engine_named
+session = engine_named("ptrace").protect({pid}, ProtectOrder("/test/talks", terms=Terms(connections=True)))
+session.capture(CaptureOrder(hold=True))
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+"""A keeper that dies while a program stands still for it."""
 ADDRESSES = {4: ("10.77.0.9/24", "10.77.0.1/24"), 6: ("fd77::9/64", "fd77::1/64")}
 """Of the program, which moves, and of its peer."""
 OWN = {4: ("10.77.0.2/24", "10.77.0.3/24"), 6: ("fd77::2/64", "fd77::3/64")}
@@ -75,12 +87,12 @@ class Machines:
     def take_address(self, machine: str) -> None:
         self.ip(machine, "addr", "del", ADDRESSES[self.version][0], "dev", "eth0")
 
-    def start(self, machine: str, part: str) -> subprocess.Popen[bytes]:
+    def start(self, machine: str, part: str, *how: str) -> subprocess.Popen[bytes]:
         """Start a talker there; what it says is in a file of its name."""
-        host = ADDRESSES[self.version][1].partition("/")[0]
+        own, host = (address.partition("/")[0] for address in ADDRESSES[self.version])
         with (self.directory / part).open("ab") as output:
             return subprocess.Popen(
-                [*self.inside(machine), PYTHON, str(TALKERS), part, host, PORT, ADDRESSES[self.version][0].partition("/")[0]],
+                [*self.inside(machine), PYTHON, str(TALKERS), part, host, PORT, own, *how],
                 cwd=self.directory,
                 stdin=subprocess.DEVNULL,
                 stdout=output,
@@ -101,8 +113,13 @@ class Machines:
 @pytest.fixture(params=[4, 6])
 def machines(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Machines]:
     """Two machines and a peer; the first has the program's address."""
-    made = Machines(tmp_path, request.param)
-    yield from laid(made)
+    yield from laid(Machines(tmp_path, request.param))
+
+
+@pytest.fixture
+def machines_4(tmp_path: Path) -> Iterator[Machines]:
+    """The same with IPv4 alone, for what does not depend on that."""
+    yield from laid(Machines(tmp_path, 4))
 
 
 def laid(made: Machines) -> Iterator[Machines]:
@@ -127,19 +144,19 @@ def laid(made: Machines) -> Iterator[Machines]:
             subprocess.run(["ip", "netns", "del", made.name(machine)], capture_output=True, check=False)
 
 
-def conversation(machines: Machines) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
-    """A program and its peer, which have filled their connection in both directions."""
-    called = machines.start("peer", "called")
+def conversation(machines: Machines, ending: str = "") -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
+    """A program and its peer, which have filled their connection in both directions, but for the one that ends."""
+    called = machines.start("peer", "called", *(["ends"] if ending == "called" else []))
     until(lambda: machines.said("called") == ["listens"], "the peer to listen")
-    caller = machines.start("one", "caller")
+    caller = machines.start("one", "caller", *(["ends"] if ending == "caller" else []))
     until(lambda: machines.said("caller") == ["ready"] and machines.said("called")[-1:] == ["ready"], "both ends to be full")
     return caller, called
 
 
-def captured(machines: Machines, caller: subprocess.Popen[bytes], *words: str) -> Path:
+def captured(machines: Machines, pid: int, *words: str) -> Path:
     """The program's snapshot, after which it has ended."""
     file = machines.directory / "snapshot"
-    ran = machines.failover("one", "capture", str(caller.pid), "-o", str(file), "--force", *words)
+    ran = machines.failover("one", "capture", str(pid), "-o", str(file), "--force", *words)
     assert ran.returncode == 0, ran.stderr
     return file
 
@@ -149,6 +166,12 @@ def restored(machines: Machines, machine: str, file: Path, *words: str) -> tuple
     ran = machines.failover(machine, "restore", str(file), *words)
     assert ran.returncode == 0, ran.stderr
     return int(ran.stdout), ran.stderr
+
+
+def decoded(file: Path) -> Snapshot:
+    """What a snapshot's file says."""
+    with file.open("rb") as opened:
+        return format.decode(opened.fileno())
 
 
 def finish(machines: Machines, pid: int, called: subprocess.Popen[bytes]) -> None:
@@ -166,13 +189,97 @@ def finish(machines: Machines, pid: int, called: subprocess.Popen[bytes]) -> Non
             pass
 
 
+def expect_unbroken(machines: Machines, pid: int, called: subprocess.Popen[bytes]) -> None:
+    """Both have read all that the other has said, in one piece."""
+    finish(machines, pid, called)
+    assert (machines.said("caller")[-1], machines.said("called")[-1]) == ("ok", "ok")
+
+
 def test_a_connection_goes_along_with_all_that_waits_in_it(machines: Machines) -> None:
     caller, called = conversation(machines)
-    file = captured(machines, caller, "--connections", "carry")
+    file = captured(machines, caller.pid, "--connections", "carry")
     caller.wait()
     machines.take_address("one")
     pid, notes = restored(machines, "two", file)
     assert "is reset (" not in notes, notes
     machines.give_address("two")
-    finish(machines, pid, called)
-    assert (machines.said("caller")[-1], machines.said("called")[-1]) == ("ok", "ok")
+    expect_unbroken(machines, pid, called)
+
+
+def test_so_does_one_whose_ends_use_no_timestamps(machines_4: Machines) -> None:
+    run(*machines_4.inside("one"), "sh", "-c", "echo 0 >/proc/sys/net/ipv4/tcp_timestamps")
+    test_a_connection_goes_along_with_all_that_waits_in_it(machines_4)
+
+
+@pytest.mark.parametrize("ending", ["caller", "called"])
+def test_so_does_one_that_has_ended_at_one_side(machines_4: Machines, ending: str) -> None:
+    caller, called = conversation(machines_4, ending)
+    file = captured(machines_4, caller.pid, "--connections", "carry")
+    caller.wait()
+    machines_4.take_address("one")
+    pid, notes = restored(machines_4, "two", file)
+    assert "is reset (" not in notes, notes
+    machines_4.give_address("two")
+    expect_unbroken(machines_4, pid, called)
+
+
+def test_it_may_come_back_to_the_same_machine_again_and_again(machines_4: Machines) -> None:
+    caller, called = conversation(machines_4)
+    pid = caller.pid
+    for _ in range(3):
+        file = captured(machines_4, pid, "--connections", "carry")
+        pid, notes = restored(machines_4, "one", file)
+        assert "is reset (" not in notes, notes
+    caller.wait()
+    expect_unbroken(machines_4, pid, called)
+
+
+def test_a_program_that_runs_on_keeps_its_connection_and_its_snapshot_has_none(machines_4: Machines) -> None:
+    caller, called = conversation(machines_4)
+    file = captured(machines_4, caller.pid, "--connections", "carry", "--leave-running")
+    assert not any(TAKEN in held.facts for held in decoded(file).resources)
+    expect_unbroken(machines_4, caller.pid, called)
+    caller.wait()
+
+
+def test_a_program_that_was_to_be_ended_and_was_not_goes_on_talking(machines_4: Machines) -> None:
+    caller, called = conversation(machines_4)
+    nowhere = machines_4.directory / "nowhere" / "snapshot"
+    ran = machines_4.failover("one", "capture", str(caller.pid), "-o", str(nowhere), "--connections", "carry")
+    assert ran.returncode == 1
+    assert "the program was not ended" in ran.stderr
+    expect_unbroken(machines_4, caller.pid, called)
+    caller.wait()
+
+
+def test_one_that_fell_silent_with_its_keeper_is_heard_again_by_the_next(machines_4: Machines) -> None:
+    caller, called = conversation(machines_4)
+    script = HOLD.format(pid=caller.pid)
+    keeper = subprocess.run([*machines_4.inside("one"), sys.executable, "-c", script], check=False, cwd=ROOT)
+    assert keeper.returncode == -signal.SIGKILL
+    captured(machines_4, caller.pid, "--connections", "carry", "--leave-running")
+    expect_unbroken(machines_4, caller.pid, called)
+    caller.wait()
+
+
+def test_where_no_way_leads_to_the_peer_it_is_reset_and_that_is_said(machines_4: Machines) -> None:
+    caller, called = conversation(machines_4)
+    file = captured(machines_4, caller.pid, "--connections", "carry")
+    caller.wait()
+    machines_4.ip("two", "link", "set", "eth0", "down")
+    pid, notes = restored(machines_4, "two", file)
+    assert "with 10.77.0.1 port 7000 is reset (no way leads to 10.77.0.1 from here: Network is unreachable)" in notes
+    called.kill()
+    finish(machines_4, pid, called)
+    assert machines_4.said("caller")[-1] == "Connection reset by peer (104)"
+
+
+def test_it_is_reset_where_who_restores_wants_it_so(machines_4: Machines) -> None:
+    caller, called = conversation(machines_4)
+    file = captured(machines_4, caller.pid, "--connections", "carry")
+    caller.wait()
+    pid, notes = restored(machines_4, "one", file, "--connections", "reset")
+    assert "is reset (it goes on from an older state)" in notes
+    called.kill()
+    finish(machines_4, pid, called)
+    assert machines_4.said("caller")[-1] == "Connection reset by peer (104)"
