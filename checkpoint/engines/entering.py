@@ -21,7 +21,7 @@ from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.tracking import Tracker
 from checkpoint.linux.write_protection import PagemapTracker
 from checkpoint.model import Rseq
-from checkpoint.resources import sockets
+from checkpoint.resources import refused_threads, sockets
 
 LEAVE_TIMEOUT_S: Final = 0.5
 """How long a program may take to leave the code of a tracer that died in the middle: that waits 100 ms at most."""
@@ -77,7 +77,7 @@ def _try_to_enter(threads: Threads, interruptions: Interruptions, *, last: bool)
 def _enter_once(threads: Threads, interruptions: Interruptions, *, last: bool) -> entry.Entered | None:
     tracee = threads.leader
     if dispatching := [one.pid for one in (tracee, *threads.others) if one.dispatches_calls()]:
-        reason = f"its thread {dispatching[0]} handles its system calls itself (PR_SET_SYSCALL_USER_DISPATCH): run it without"
+        reason = refused_threads.of_dispatching(dispatching[0])
         raise UnsupportedError(f"cannot enter pid {tracee.pid}: {reason}", (reason,))
     mask = tracee.signal_mask()
     decoded = where_it_stands(tracee, interruptions, tracee.rseq())

@@ -113,6 +113,11 @@ def _refuse_shared(pid: int, parent: int, kinds: Iterable[tuple[int, str]]) -> I
             yield f"it shares its {what} with its parent {parent}, a process of its own (vfork, clone), which is not kept yet"
 
 
+def of_dispatching(tid: int) -> str:
+    """Why a thread whose calls end in a handler of its own cannot be entered; only a tracer is told."""
+    return f"its thread {tid} handles its system calls itself (PR_SET_SYSCALL_USER_DISPATCH): run it without"
+
+
 @dataclass(frozen=True, slots=True)
 class _Shared:
     """What all threads of a program must have alike.
