@@ -28,6 +28,7 @@ PR_CAP_AMBIENT: Final = 47
 PR_CAP_AMBIENT_RAISE: Final = 2
 PR_SET_PTRACER: Final = 0x59616D61
 
+CAP_SYS_ADMIN: Final = 21
 CAP_CHECKPOINT_RESTORE: Final = 40
 
 _SYS_CLONE3: Final = 435
@@ -206,6 +207,13 @@ def keep_restore_right() -> None:
     sets[5] |= 1 << (CAP_CHECKPOINT_RESTORE - 32)
     _checked(_libc.capset(header, sets), "capset")
     prctl(PR_CAP_AMBIENT, PR_CAP_AMBIENT_RAISE, CAP_CHECKPOINT_RESTORE)
+
+
+def may_choose_pids() -> bool:
+    """Whether we have a right by which a new process gets the PID that we want. Source: clone3(2), set_tid."""
+    status = Path("/proc/self/status").read_text()
+    effective = int(status.partition("CapEff:")[2].split()[0], 16)
+    return bool(effective & (1 << CAP_CHECKPOINT_RESTORE | 1 << CAP_SYS_ADMIN))
 
 
 def prctl(option: int, *arguments: int) -> int:

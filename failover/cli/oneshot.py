@@ -19,9 +19,9 @@ from checkpoint.channel import Capture, Captured, Protect, Protected, Release, R
 from checkpoint.device_rules import DeviceRule, rule_from
 from checkpoint.engine import Terms
 from checkpoint.errors import CaptureError, CheckpointError, NothingCommittedError, ProcessGoneError
-from checkpoint.linux import kinship, vessel
+from checkpoint.linux import kinship, namespaces, vessel
 from checkpoint.linux.vessel import Birth, Born
-from checkpoint.model import Snapshot
+from checkpoint.model import Member, Snapshot
 from failover.cli import picture, render
 from failover.cli.components import exit_like
 from failover.cli.keeper import Keeper
@@ -33,6 +33,8 @@ CAPTURE_PAUSE_S: Final = 0.25
 """How often, and how soon, a capture is made again that was begun in a bad moment: a machine without a processor to spare."""
 END_TIMEOUT_S: Final = 10.0
 """How long a killed program may take to be dead; the kernel gives a large memory back first."""
+
+OWN_PIDS: Final = "it goes on in PIDs of its own, in which it has its old ones: here they are taken, or not ours to choose"
 
 A = TypeVar("A")
 
@@ -172,12 +174,14 @@ def restore(arguments: argparse.Namespace) -> int:
         raise FailoverError(f"cannot read {arguments.file}: {error.strerror}") from error
     outline = format.read_outline(file)
     elapsed_ns, terms = vessel.elapsed_since(outline.clocks), terms_of(arguments)
-    with Keeper.spawn() as keeper, _born(birth_of(outline, elapsed_ns, own_session=not arguments.wait)) as born:
+    birth = birth_of(outline, elapsed_ns, own_session=not arguments.wait)
+    with Keeper.spawn() as keeper, _born(birth) as born:
         order = Restore(born.pid, outline.component, elapsed_ns, terms=terms, stood_still=terms.connections)
         restored, _ = keeper.ask(order, Restored, (file,))
         resumed, _ = keeper.ask(Resume(), Resumed)
         keeper.ask(Release(), Released)
-    _tell_restore(arguments, restored.pid, born.notes + restored.notes + resumed.notes)
+    moved = (OWN_PIDS,) if born.isolated and not outline.process.isolated else ()
+    _tell_restore(arguments, restored.pid, born.notes + moved + restored.notes + resumed.notes)
     return _wait_for(born) if arguments.wait else 0
 
 
@@ -185,11 +189,19 @@ def birth_of(outline: Snapshot, elapsed_ns: int, own_session: bool) -> Birth:
     """How the vessel for a snapshot must be born.
 
     On the boot that it was captured on, a program that lived in the machine's own PIDs and clocks finds them as they were.
+    One that knows itself by several PIDs, which cannot be had here, gets PIDs of its own.
     """
     isolated = outline.process.isolated
     here = Path("/proc/sys/kernel/random/boot_id").read_text().strip() == outline.machine.boot_id
     clocks = None if here and not isolated else outline.clocks
-    return Birth(outline.process.pid, isolated, clocks, elapsed_ns, own_session=own_session)
+    return Birth(outline.process.pid, isolated or _lacks_its_ids(outline), clocks, elapsed_ns, own_session=own_session)
+
+
+def _lacks_its_ids(outline: Snapshot) -> bool:
+    """Whether a program of several processes or threads finds one of its ids taken, or may not choose them at all."""
+    processes: tuple[Snapshot | Member, ...] = (outline, *outline.members)
+    ids = {thread.tid for one in processes for thread in one.threads} | {zombie.pid for zombie in outline.zombies}
+    return len(ids) > 1 and (not namespaces.may_choose_pids() or any(Path(f"/proc/{number}").exists() for number in ids))
 
 
 @contextmanager

@@ -11,14 +11,18 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from checkpoint import capabilities
-from checkpoint.linux import kinship
+from checkpoint.channel import Restore, Restored
+from checkpoint.errors import CheckpointError
+from checkpoint.linux import kinship, procfs
 from checkpoint.linux.threads import thread_ids
+from checkpoint.linux.vessel import Birth, spawn_vessel
+from failover.cli.keeper import Keeper
 from tests.failover.cli.test_verbs import failover
 
 PYTHON = getattr(sys, "_base_executable", sys.executable)
@@ -140,20 +144,45 @@ BY_ITS_PID = {
 }
 
 
-@pytest.mark.parametrize("text", BY_ITS_PID.values(), ids=list(BY_ITS_PID))
-def test_a_restore_that_comes_to_nothing_in_the_middle_says_so_and_leaves_nothing(text: str, tmp_path: Path) -> None:
-    with subprocess.Popen([PYTHON, "-c", text], stdout=subprocess.DEVNULL, start_new_session=True) as process:
+@pytest.fixture(params=BY_ITS_PID.values(), ids=list(BY_ITS_PID))
+def taken(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[int, Path]]:
+    """A program that knows itself by several PIDs and runs on: its PID, and its snapshot."""
+    with subprocess.Popen([PYTHON, "-c", request.param], stdout=subprocess.DEVNULL, start_new_session=True) as process:
         try:
             wait_for("its other half", lambda: len(kinship.descendants(process.pid)) + len(thread_ids(process.pid)) == 2)
-            snapshot = str(tmp_path / "snapshot")
-            captured = failover("capture", "--leave-running", str(process.pid), "-o", snapshot)
+            captured = failover("capture", "--leave-running", str(process.pid), "-o", str(tmp_path / "snapshot"))
             assert captured.returncode == 0, captured.stderr
-            restored = failover("restore", snapshot)
+            yield process.pid, tmp_path / "snapshot"
         finally:
             os.killpg(process.pid, signal.SIGKILL)
-    assert restored.returncode == 1
-    assert f"pid {process.pid}, by which they know it, cannot be had" in restored.stderr
-    assert not kinship.descendants(os.getpid())
+
+
+def test_a_restore_that_comes_to_nothing_in_the_middle_leaves_a_vessel_that_can_be_ended(taken: tuple[int, Path]) -> None:
+    pid, snapshot = taken
+    file = os.open(snapshot, os.O_RDONLY | os.O_CLOEXEC)
+    born = spawn_vessel(Birth())
+    with Keeper.spawn() as keeper:
+        with pytest.raises(CheckpointError, match=f"pid {pid}, by which they know it, cannot be had"):
+            keeper.ask(Restore(born.pid, "/test/taken", 0), Restored, (file,))
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(born.pid, signal.SIGKILL)
+        wait_for("the end of the vessel, while its tracer lives", lambda: os.waitpid(born.pid, os.WNOHANG)[0] == born.pid)
+    os.close(file)
+
+
+@pytest.mark.root
+def test_a_program_whose_pids_are_taken_goes_on_in_pids_of_its_own(taken: tuple[int, Path]) -> None:
+    pid, snapshot = taken
+    restored = failover("restore", str(snapshot))
+    assert restored.returncode == 0, restored.stderr
+    back = int(restored.stdout)
+    try:
+        assert back != pid
+        assert "it goes on in PIDs of its own" in restored.stderr
+        assert procfs.status(back).pids[-1] == pid
+    finally:
+        os.kill(back, signal.SIGKILL)
+        wait_for("its end", lambda: has_ended(back))
 
 
 def test_who_was_captured_is_dead_when_the_command_returns(tmp_path: Path) -> None:
