@@ -31,6 +31,11 @@ CAPABILITIES: Final = (
         "shared memory of the processes of one program",
         "one object again, carried once",
     ),
+    preserved(
+        Area.MEMORY,
+        "private memory that processes have in common since a fork (copy-on-write)",
+        "there once until one of them writes to it, and carried once",
+    ),
     refused(
         Area.PROCESS,
         "a session that is older than its leader's children, a namespace that only a child lives in",

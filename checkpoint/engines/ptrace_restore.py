@@ -40,6 +40,7 @@ from checkpoint.engines import (
     restore_vdso,
     switches,
 )
+from checkpoint.engines.forked_memory import Legacy
 from checkpoint.engines.restore_checks import Brought
 from checkpoint.engines.restore_process import Vessel, pending_traps
 from checkpoint.errors import CheckpointError, MismatchError, RestoreError
@@ -188,12 +189,20 @@ class ProcessRestore:
     Args:
         state: of this process alone.
         estate: None for a component of one process.
+        legacy: what it has in common with others.
     """
 
     def __init__(
-        self, tracee: Tracee, state: Snapshot, options: RestoreOptions, brought: Brought, estate: Estate | None = None
+        self,
+        tracee: Tracee,
+        state: Snapshot,
+        options: RestoreOptions,
+        brought: Brought,
+        estate: Estate | None = None,
+        legacy: Legacy = restore_memory.NOTHING,
     ) -> None:
         self._state = state
+        self._legacy = legacy
         self._brought = brought
         self._executable: int | None = None
         self._options = options
@@ -302,7 +311,7 @@ class ProcessRestore:
         self.notes += stub.run(first)
         self._segments.attached()
         self.notes += self._segments.notes
-        restore_memory.fill(tracee.memory, state)
+        restore_memory.fill(tracee.memory, state, self._legacy)
         if self._own_functions:
             self._leave_old_vdso()
             tracee.memory.write_each(restore_vdso.jumps(state, self._vdso, self._own_functions))
@@ -351,7 +360,7 @@ class ProcessRestore:
         restore_process.make_directories(table, restore_checks.missing_directories(self._state))
         if self._estate is not None:
             restore_process.begin_member(table)
-        restore_memory.clear(table, mappings)
+        restore_memory.clear(table, mappings, self._legacy)
         ours, theirs = restore_memory.kernel_pages(mappings), restore_memory.kernel_pages_of(vmas)
         self._vdso = restore_memory.move_kernel_pages(table, ours, theirs, refuge)
         self._vdso_size = ours[-1].size
@@ -361,7 +370,7 @@ class ProcessRestore:
         sizes = {} if self._estate else restore_memory.anonymous_sizes(vmas)
         ours_alone = restore_memory.map_anonymous(table, sizes, refuge + REFUGE_SIZE)
         inherited = (self._estate.objects, self._estate.anonymous) if self._estate else ({}, ours_alone)
-        self._objects |= restore_memory.map_program(table, vmas, runs, brought, *inherited)
+        self._objects |= restore_memory.map_program(table, vmas, runs, brought, *inherited, self._legacy)
         self._objects |= inherited[0]
         for key, place in ours_alone.items():
             table.call("unmap shared memory, which is mapped elsewhere now", "munmap", place, sizes[key])

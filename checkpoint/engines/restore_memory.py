@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import groupby
 from types import MappingProxyType
 from typing import Final
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from checkpoint import pages
 from checkpoint.engines import restore_kinds
+from checkpoint.engines.forked_memory import Legacy
 from checkpoint.linux import abi, vm_flags
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.memory import Memory
@@ -38,6 +40,7 @@ KERNEL_KINDS: Final = frozenset({VmaKind.VDSO, VmaKind.VVAR, VmaKind.VSYSCALL})
 KERNEL_NAMES: Final = ("[vdso]", "[vvar", "[vsyscall]")
 VSYSCALL: Final = "[vsyscall]"
 LAST_ADDRESS: Final = (1 << 64) - 1
+NOTHING: Final = Legacy()
 
 ADVICE: Final = {"sr": 2, "rr": 1, "dc": 10, "mg": 12, "hg": 14, "nh": 15, "dd": 16, "wf": 18}
 """madvise(2) by the letters of VmFlags: sequential, random, don't fork, mergeable, huge, not huge, don't dump, wipe on fork."""
@@ -46,11 +49,12 @@ NAMED_ANONYMOUS: Final = "[anon:"
 PR_SET_VMA: Final = 0x53564D41
 
 
-def clear(table: CallTable, vessel: Iterable[MapsLine]) -> None:
-    """Unmap everything that the vessel came with, but the kernel's own pages."""
-    for line in vessel:
-        if not line.name.startswith(KERNEL_NAMES):
-            table.call(f"unmap {line.start:#x} of the vessel", "munmap", line.start, line.size)
+def clear(table: CallTable, vessel: Iterable[MapsLine], legacy: Legacy = NOTHING) -> None:
+    """Unmap everything that the vessel came with, but the kernel's own pages, and what it keeps."""
+    theirs = [PageRun(line.start, line.end) for line in vessel if not line.name.startswith(KERNEL_NAMES)]
+    for start, end in pages.difference(pages.extents(theirs), legacy.kept).tolist():
+        table.call(f"unmap {start:#x} of the vessel", "munmap", start, end - start)
+    legacy.empty_stale(table)
 
 
 def kernel_pages(vessel: Iterable[MapsLine]) -> list[MapsLine]:
@@ -99,6 +103,7 @@ def map_program(
     brought: Mapping[str, int],
     inherited: Mapping[Object, int] = MappingProxyType({}),
     anonymous: Mapping[Object, int] = MappingProxyType({}),
+    legacy: Legacy = NOTHING,
 ) -> dict[Object, int]:
     """Map everything that the program had, but for attached segments; what will be filled is writable for now.
 
@@ -108,6 +113,7 @@ def map_program(
         brought: descriptors of what is mapped in place of this machine's files, by path; they stay open.
         inherited: those that are there already: a descriptor of each, which is left as it is.
         anonymous: shared memory that is there already: where it is mapped whole.
+        legacy: private memory that is there already.
     """
     carried = Carried(runs)
     vmas = tuple(vmas)
@@ -140,7 +146,8 @@ def map_program(
             _map_again(table, vma, anonymous[object_of(vma)])
     others = (vma for vma in mapped if not is_file_mapping(vma) and not is_object_mapping(vma))
     for piece in joined_shared(vma for vma in others if not (is_anonymous_object(vma) and object_of(vma) in anonymous)):
-        _map(table, piece, _first_protection(piece, carried), -1)
+        for start, end in legacy.without_kept(piece):
+            _map(table, replace(piece, start=start, end=end), _first_protection(piece, carried), -1)
     return made
 
 
@@ -281,10 +288,11 @@ class Carried:
         return index < len(self._starts) and int(self._starts[index]) < vma.end
 
 
-def fill(memory: Memory, snapshot: Snapshot) -> None:
-    """Write every page that the snapshot carries, but for those of the kernel's own mappings, which have come with the vessel."""
+def fill(memory: Memory, snapshot: Snapshot, legacy: Legacy = NOTHING) -> None:
+    """Write every page that the snapshot carries, but for those of the kernel's own mappings, and those that are there."""
     contents, position = np.frombuffer(snapshot.contents, np.uint8), 0
     mapped = pages.extents(vma for vma in snapshot.vmas if vma.kind not in KERNEL_KINDS)
+    mapped = pages.difference(mapped, legacy.there)
     for is_wanted, piece in _cut(snapshot.runs, mapped):
         ranges = piece.copy()
         ranges[:, 1] -= ranges[:, 0]

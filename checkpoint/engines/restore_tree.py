@@ -2,7 +2,8 @@
 
 ::
 
-    estate       the first vessel makes what several of them share: open files, files without a name, shared memory
+    estate       the first vessel makes what several of them share: open files, files without a name, shared memory, and
+                 what of their private memory is equal since a fork (`forked_memory`)
     births       processes, sessions, groups, in the order of `births`; they inherit the estate, and are vessels themselves
     ends         zombies end as they had ended, stand-ins without a trace; who was stopped is stopped
     each         as `ptrace_restore.ProcessRestore` does it, up to the registers
@@ -27,11 +28,20 @@ from dataclasses import replace
 from itertools import groupby
 from typing import Final
 
-from checkpoint import tree
+from checkpoint import pages, tree
 from checkpoint.arch import x86_64, x86_64_stub
 from checkpoint.engine import RestoreOptions
-from checkpoint.engines import births, files_of_several, restore_memory, restore_process, restore_stops, restore_threads
+from checkpoint.engines import (
+    births,
+    files_of_several,
+    forked_memory,
+    restore_memory,
+    restore_process,
+    restore_stops,
+    restore_threads,
+)
 from checkpoint.engines.births import Birth, End, Join, NewSession, Step
+from checkpoint.engines.forked_memory import Legacy
 from checkpoint.engines.ptrace_restore import OPTIONS, REFUGE_SIZE, Estate, ProcessRestore, look_at_vessel
 from checkpoint.engines.restore_checks import Brought
 from checkpoint.engines.restore_process import Vessel
@@ -40,7 +50,7 @@ from checkpoint.linux import abi, call_table, procfs
 from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Tracee
-from checkpoint.model import ProcessState, Resource, Snapshot, Vma, Zombie
+from checkpoint.model import PageRun, ProcessState, Resource, Snapshot, Vma, Zombie
 from checkpoint.resources import files, rebuild, shared, stops, streams, terminals
 from checkpoint.resources.rebuilding import number_of
 
@@ -64,6 +74,7 @@ class TreeRestore:
         self._born: dict[int, Tracee] = {state.process.pid: self._first}
         self._restoring: list[ProcessRestore] = []
         self._notes: list[str] = []
+        self._legacies: tuple[Legacy, ...] = ()
         self._terminals: dict[int, terminals.Controlling] = {}
 
     def end(self) -> None:
@@ -118,8 +129,8 @@ class TreeRestore:
             if stop := stops.stop_of(member.resources):
                 self._stop(member.process, *stop)
         self._restoring = [
-            ProcessRestore(self._born[view.process.pid], view, self._options, brought, estate)
-            for view, brought in zip(self._views, self._brought, strict=True)
+            ProcessRestore(self._born[view.process.pid], view, self._options, brought, estate, legacy)
+            for view, brought, legacy in zip(self._views, self._brought, self._legacies, strict=True)
         ]
         for restoring in self._restoring:
             restoring.build()
@@ -171,22 +182,28 @@ class TreeRestore:
         stub = Stub(self._first, base)
         image = restore_memory.kernel_pages(mappings)[-1]
         stub.install(image.start + self._first.memory.read(image.start, image.size).find(x86_64.SYSCALL), AREA_SIZE)
-        table = self._estate_table(vessel, estate, sizes, objects, resources)
+        taken_by_vessel = pages.extents(PageRun(line.start, line.end) for line in mappings)
+        inheritance = forked_memory.of(views, taken_by_vessel)
+        self._legacies = inheritance.legacies
+        table = CallTable(estate.base)
+        inheritance.leave(table)
+        self._make_common(table, vessel, estate, sizes, objects, resources)
         if table.end - base > AREA_SIZE:
             raise RestoreError(f"cannot restore: what its processes share takes more than {AREA_SIZE >> 20} MiB")
         self._notes += stub.run(table)
+        inheritance.put_in(self._first.memory)
         return estate
 
-    def _estate_table(
+    def _make_common(
         self,
+        table: CallTable,
         vessel: Vessel,
         estate: Estate,
         sizes: dict[restore_memory.Object, int],
         objects: dict[restore_memory.Object, list[Vma]],
         resources: dict[int, Resource],
-    ) -> CallTable:
-        """The calls that make all that is shared, at the numbers and addresses that the estate says."""
-        table = CallTable(estate.base)
+    ) -> None:
+        """Add the calls that make all that is shared, at the numbers and addresses that the estate says."""
         restore_process.raise_limits(table, vessel)
         opened = self._open_brought(table, resources)  # with our rights, from a place of ours
         if self._options.own_eyes:
@@ -204,7 +221,6 @@ class TreeRestore:
         told = [_at(held, estate.descriptions[number]) for number, held in resources.items()]
         bag = replace(self._state, resources=(*kept, *told))
         self._notes += rebuild.rebuild_all(table, bag, self._options, vessel.inner_pid, made, vessel.pid)
-        return table
 
     def _open_brought(self, table: CallTable, resources: dict[int, Resource]) -> dict[restore_memory.Object, int]:
         """Open what was brought along of files that several processes have open for reading."""

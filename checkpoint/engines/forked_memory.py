@@ -1,0 +1,184 @@
+"""Private memory that processes of a component have had in common since a fork, so that it is there once, and not once for each.
+
+What is equal at the same address in several processes is put into the vessel of the first one before the others are born: they
+are born with it, and the kernel keeps one copy until somebody writes (copy-on-write). Each keeps of it what lies in mappings of
+its own, and is given the rest as ever.
+
+Only plain memory counts: private, anonymous, to be read and written. Pure but for `Inheritance.leave` and `Inheritance.put_in`.
+
+Source: fork(2); mmap(2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from checkpoint import pages
+from checkpoint.linux import abi
+from checkpoint.linux.call_table import CallTable
+from checkpoint.linux.memory import Memory
+from checkpoint.model import Snapshot, Vma, VmaKind
+from checkpoint.pages import Words
+
+PLAIN_KINDS: Final = (VmaKind.ANONYMOUS, VmaKind.HEAP)
+PLAIN_FLAGS: Final = frozenset(("dc", "dd", "hg", "mg", "nh", "rr", "sr", "wf", "mw"))
+"""Codes that say nothing of how the mapping is made: advice, given later."""
+COMPARED_AT_ONCE: Final = 1024
+"""Pages."""
+MADV_DONTNEED: Final = 4
+NO_PAGES: Final[Words] = np.empty((0, 2), np.uint64)
+
+
+@dataclass(frozen=True, slots=True)
+class Legacy:
+    """What one process is born with.
+
+    Attributes:
+        kept: where it stays mapped.
+        there: pages that hold what they must.
+        stale: pages that hold what others have, and must be empty.
+    """
+
+    kept: Words = field(default_factory=lambda: NO_PAGES)
+    there: Words = field(default_factory=lambda: NO_PAGES)
+    stale: Words = field(default_factory=lambda: NO_PAGES)
+
+    def without_kept(self, vma: Vma) -> tuple[tuple[int, int], ...]:
+        """Start and end of the parts of a mapping that must be mapped."""
+        if not _is_plain(vma):
+            return ((vma.start, vma.end),)
+        return tuple((start, end) for start, end in pages.difference(pages.extents([vma]), self.kept).tolist())
+
+    def empty_stale(self, table: CallTable) -> None:
+        """Add the calls that give back what others have."""
+        for start, end in self.stale.tolist():
+            table.call(f"empty {(end - start) >> 10} KiB at {start:#x}", "madvise", start, end - start, MADV_DONTNEED)
+
+
+@dataclass(frozen=True, slots=True)
+class Inheritance:
+    """What all of them are born with.
+
+    Attributes:
+        regions: where the vessel has it mapped.
+        sources: of whom the pages are: their places in his contents, and in memory.
+        legacies: of each process.
+    """
+
+    regions: Words
+    sources: tuple[tuple[Snapshot, NDArray[np.intp], Words], ...]
+    legacies: tuple[Legacy, ...]
+
+    def leave(self, table: CallTable) -> None:
+        """Add the calls that map it in the vessel."""
+        flags = abi.MAP_PRIVATE | abi.MAP_ANONYMOUS | abi.MAP_FIXED_NOREPLACE
+        for start, end in self.regions.tolist():
+            arguments = (start, end - start, abi.PROT_READ | abi.PROT_WRITE, flags, -1, 0)
+            table.call(f"map {(end - start) >> 10} KiB for several processes", "mmap", *arguments, least=start, most=start)
+
+    def put_in(self, memory: Memory) -> None:
+        """Write the pages to the vessel."""
+        for view, rows, addresses in self.sources:
+            contents = _rows(view)
+            for first in range(0, len(rows), COMPARED_AT_ONCE):
+                some = slice(first, first + COMPARED_AT_ONCE)
+                ranges = pages.extents_of_addresses(addresses[some], abi.PAGE_SIZE)
+                ranges[:, 1] -= ranges[:, 0]
+                memory.write_from(ranges, np.ascontiguousarray(contents[rows[some]]).reshape(-1))
+
+
+@dataclass(slots=True)
+class _Known:
+    """The first page that any process has at an address, in the order of addresses."""
+
+    addresses: Words
+    views: NDArray[np.intp]
+    rows: NDArray[np.intp]
+    is_common: NDArray[np.bool_]
+
+
+def of(views: Sequence[Snapshot], taken: Words) -> Inheritance:
+    """What these processes have in common.
+
+    Args:
+        taken: where the vessel has something mapped.
+    """
+    known = _Known(np.empty(0, np.uint64), np.empty(0, np.intp), np.empty(0, np.intp), np.empty(0, np.bool_))
+    plain = [pages.difference(pages.extents(vma for vma in view.vmas if _is_plain(vma)), taken) for view in views]
+    equal = [_compared(known, views, index, plain[index]) for index in range(len(views))]
+    common = known.addresses[known.is_common]
+    regions = _regions(views, plain, known)
+    legacies = tuple(
+        _legacy(view, pages.intersection(regions, ours), addresses, known, common, index)
+        for index, (view, ours, addresses) in enumerate(zip(views, plain, equal, strict=True))
+    )
+    sources = []
+    for index, view in enumerate(views):
+        mine = known.is_common & (known.views == index)
+        if mine.any():
+            sources.append((view, known.rows[mine], known.addresses[mine]))
+    return Inheritance(regions, tuple(sources), legacies)
+
+
+def _is_plain(vma: Vma) -> bool:
+    is_private = vma.kind in PLAIN_KINDS and not vma.shared and vma.file is None and not vma.guards
+    return is_private and vma.protection == abi.PROT_READ | abi.PROT_WRITE and PLAIN_FLAGS.issuperset(vma.flags)
+
+
+def _rows(view: Snapshot) -> NDArray[np.uint8]:
+    return np.frombuffer(view.contents, np.uint8).reshape(-1, abi.PAGE_SIZE)
+
+
+def _compared(known: _Known, views: Sequence[Snapshot], index: int, plain: Words) -> Words:
+    """Where a process has what is known, by address; what nobody has had before is known from then on."""
+    all_addresses = pages.addresses_of(pages.extents(views[index].runs), abi.PAGE_SIZE)
+    rows = np.flatnonzero(pages.covered(plain, all_addresses)) if len(plain) else np.empty(0, np.intp)
+    addresses = all_addresses[rows]
+    _, theirs, ours = np.intersect1d(known.addresses, addresses, assume_unique=True, return_indices=True)
+    is_equal = np.zeros(len(ours), np.bool_)
+    for view in np.unique(known.views[theirs]).tolist():
+        of_view = np.flatnonzero(known.views[theirs] == view)
+        for first in range(0, len(of_view), COMPARED_AT_ONCE):
+            some = of_view[first : first + COMPARED_AT_ONCE]
+            left = _rows(views[view])[known.rows[theirs[some]]]
+            is_equal[some] = (left == _rows(views[index])[rows[ours[some]]]).all(axis=1)
+    known.is_common[theirs[is_equal]] = True
+    fresh = np.ones(len(addresses), np.bool_)
+    fresh[ours] = False
+    _add(known, addresses[fresh], rows[fresh], index)
+    return addresses[ours[is_equal]]
+
+
+def _add(known: _Known, addresses: Words, rows: NDArray[np.intp], index: int) -> None:
+    merged = np.concatenate((known.addresses, addresses))
+    order = np.argsort(merged, kind="stable")
+    known.addresses = merged[order]
+    known.views = np.concatenate((known.views, np.full(len(addresses), index, np.intp)))[order]
+    known.rows = np.concatenate((known.rows, rows.astype(np.intp)))[order]
+    known.is_common = np.concatenate((known.is_common, np.zeros(len(addresses), np.bool_)))[order]
+
+
+def _regions(views: Sequence[Snapshot], plain: Sequence[Words], known: _Known) -> Words:
+    """The whole mappings in which something is common."""
+    found = NO_PAGES
+    for index, view in enumerate(views):
+        addresses = known.addresses[known.is_common & (known.views == index)]
+        if not len(addresses):
+            continue
+        for vma in filter(_is_plain, view.vmas):
+            first, last = np.searchsorted(addresses, np.array([vma.start, vma.end], np.uint64)).tolist()
+            if first < last:
+                found = pages.union(found, pages.intersection(pages.extents([vma]), plain[index]))
+    return found
+
+
+def _legacy(view: Snapshot, kept: Words, equal: Words, known: _Known, common: Words, index: int) -> Legacy:
+    mine = known.addresses[known.is_common & (known.views == index)]
+    there = pages.extents_of_addresses(np.union1d(equal, mine), abi.PAGE_SIZE)
+    inside = pages.intersection(pages.extents_of_addresses(common, abi.PAGE_SIZE), kept)
+    return Legacy(kept, there, pages.difference(inside, pages.extents(view.runs)))
