@@ -23,7 +23,7 @@ from agent.guest import Guest
 from agent.nursery import KeeperLink, connect
 from agent.places import Places, complete_logs, log_directory
 from agent.streams import discard, total_of
-from checkpoint import channel, epoch_variable, format
+from checkpoint import channel, epoch_variable, format, rights
 from checkpoint.carried import paths_of
 from checkpoint.engine import COOPERATIVE, NO_TERMS, PTRACE, Terms
 from checkpoint.engines.cooperative import age_ns as commit_age_ns
@@ -118,6 +118,7 @@ async def restore(
     *,
     outage_ns: int,
     owner: int | None = None,
+    groups: frozenset[int] | None = None,
     laps: Laps | None = None,
     task: guard_messages.Task | None = None,
     epoch: int = 0,
@@ -133,6 +134,7 @@ async def restore(
         outage_ns: added to the program's monotonic and boot time: how long ago the newest snapshot was taken.
         task: for a program that may still say that it keeps its state.
         owner: uid; None: whoever it ran as. What is not root's opens its files with its owner's rights, and gets no others.
+        groups: that it was started with; None: not known.
         terms: this robot's.
         stood_still: nothing of it has run since the newest snapshot.
 
@@ -143,8 +145,7 @@ async def restore(
     outline = await asyncio.to_thread(format.read_outline, chain[-1])
     theirs = outline.process.credentials
     owner = theirs.uids[0] if owner is None else owner
-    for one in (theirs, *(member.process.credentials for member in outline.members)):
-        check_rights(name, one, owner)
+    check_rights(name, outline, owner, groups)
     await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
     laps.lap("reading the newest")
     component = Component(name, await places.nursery.guard(), places)
@@ -223,7 +224,7 @@ async def begin_again(
     outline = await asyncio.to_thread(format.read_outline, chain[-1])
     _check_owner(name, program, owner)
     try:
-        check_rights(name, outline.process.credentials, owner)  # its carried files are laid down with them
+        check_rights(name, outline, owner, groups_of(program.inheritance))  # its carried files are laid down with them
     except MismatchError:
         if waiting is not None:
             await waiting.undo()
@@ -298,17 +299,33 @@ async def reconnect(socket_path: Path, places: Places) -> Component:
     return component
 
 
-def check_rights(name: str, credentials: Credentials, owner: int) -> None:
-    """Let a snapshot come back with the rights of its owner, and no more.
+def groups_of(inheritance: Inheritance | None) -> frozenset[int] | None:
+    """The groups that a program was started with; None where nobody told."""
+    return frozenset((inheritance.gid, *inheritance.groups)) if inheritance is not None else None
+
+
+def check_rights(name: str, outline: Snapshot, owner: int, groups: frozenset[int] | None) -> None:
+    """Let a snapshot come back with the rights of its owner, and no more: all threads of all of its processes.
+
+    Args:
+        groups: those that it was started with; None: not known, it may have one and call it by all four of its names.
 
     Raises:
-        MismatchError: it has become another user, as a set-user-id program does.
+        MismatchError: it has become another user or group, as a set-user-id or set-group-id program does.
     """
-    _, permitted, effective, _, ambient = credentials.capabilities
-    if owner == ROOT or os.geteuid() != ROOT or (set(credentials.uids) == {owner} and not permitted | effective | ambient):
+    if owner == ROOT or os.geteuid() != ROOT:
         return  # root may; where we are not root, there is nothing to be gained
+    if all(_are_no_more(one, owner, groups) for one in rights.everybodys(outline)):
+        return
     reason = f"it runs with other rights than those of its owner, uid {owner}: only a program of root may; start it as root"
     raise MismatchError(f"cannot restore {name}: {reason}", (reason,))
+
+
+def _are_no_more(theirs: Credentials, owner: int, groups: frozenset[int] | None) -> bool:
+    _, permitted, effective, _, ambient = theirs.capabilities
+    if set(theirs.uids) != {owner} or permitted | effective | ambient:
+        return False
+    return len(set(theirs.gids)) == 1 if groups is None else groups.issuperset((*theirs.gids, *theirs.groups))
 
 
 async def _vessel(component: Component, request: guard_messages.MakeVessel, keeper: KeeperLink) -> None:

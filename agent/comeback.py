@@ -58,6 +58,7 @@ async def brought_back(
             places,
             outage_ns=outage_ns,
             owner=owner,
+            groups=births.groups_of(program_of(spec.launch).inheritance) if spec is not None else None,
             laps=laps,
             task=task,
             epoch=act.epoch,

@@ -9,12 +9,12 @@ import asyncio
 import logging
 from collections.abc import Iterable, Mapping
 
-from agent.births import check_rights
+from agent.births import check_rights, groups_of
 from agent.charge import Charge
 from agent.errors import TROUBLE
 from agent.nursery import KeeperLink
 from agent.rules import terms_here
-from agent.surroundings import Surroundings
+from agent.surroundings import Surroundings, program_of
 from checkpoint import channel, format
 from checkpoint.channel import Compared, Failed, close_all
 from checkpoint.engine import COOPERATIVE
@@ -64,7 +64,7 @@ async def _compared(around: Surroundings, charge: Charge, keeper: KeeperLink) ->
     assert isinstance(reply, Compared)
     try:
         if spec is not None:
-            check_rights(name, outline.process.credentials, spec.owner)
+            check_rights(name, outline, spec.owner, groups_of(program_of(spec.launch).inheritance))
     except MismatchError as mismatch:
         return (*mismatch.reasons, *reply.lacks)
     return reply.lacks

@@ -28,7 +28,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from checkpoint import carried, epoch_variable
+from checkpoint import carried, epoch_variable, rights
 from checkpoint.arch import x86_64, x86_64_stub, x86_64_xstate
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import (
@@ -57,7 +57,6 @@ from checkpoint.resources import (
     memory_locks,
     remembered,
     system_v_memory,
-    thread_rights,
 )
 from checkpoint.resources.carried_connections import Arriving
 from checkpoint.resources.rebuild import deleted_directory, rebuild_all, rebuild_last
@@ -436,7 +435,7 @@ class ProcessRestore:
     def _thread_table(self, table: CallTable, thread: ThreadState, vessel: Vessel) -> CallTable:
         """What each thread must say for itself; its notes about rights are those of the first."""
         process = self._state.process
-        credentials = thread_rights.of_thread(self._state.resources, thread.tid, process.credentials)
+        credentials = rights.of_thread(self._state.resources, thread.tid, process.credentials)
         restore_process.thread_marks(table, thread)
         restore_process.scheduling(table, thread, vessel, f" for thread {thread.tid} ({thread.name})")
         deadlines.rebuild(table, self._state.resources, thread.tid, bool(thread.policy & os.SCHED_RESET_ON_FORK))

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Final
 
+from checkpoint import rights
 from checkpoint.engine import RestoreOptions
 from checkpoint.errors import RestoreError
 from checkpoint.linux import procfs
@@ -52,7 +53,6 @@ from checkpoint.resources import (
     system_v_memory,
     tcp_connections,
     terminals,
-    thread_rights,
     timerfds,
     unix_names,
     unix_sockets,
@@ -99,7 +99,7 @@ NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
 OF_KERNEL: Final = {netlink_sockets.KIND: netlink_sockets.prepare, packet_sockets.KIND: packet_sockets.prepare}
 """Sockets that lead to the kernel or an interface alone."""
 SOCKETS: Final = (unix_sockets.KIND, tcp_connections.KIND, internet_sockets.KIND, *OF_KERNEL)
-NOT_OPEN: Final = (memory_locks.KIND, system_v_memory.KIND, thread_rights.KIND, deadlines.KIND, stops.KIND)
+NOT_OPEN: Final = (memory_locks.KIND, system_v_memory.KIND, rights.KIND, deadlines.KIND, stops.KIND)
 """Kinds of what no descriptor stands for."""
 KINDS: Final = (files.KIND, streams.KIND, shared.KIND, pipes.KIND, terminals.KIND, *NOT_OPEN, *MADE, *SOCKETS)
 

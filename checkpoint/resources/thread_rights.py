@@ -11,7 +11,7 @@ Source: credentials(7); nptl(7) on why programs seldom do that.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 from checkpoint.capability import Area, preserved
@@ -20,9 +20,7 @@ from checkpoint.linux import procfs
 from checkpoint.linux.procfs import Status
 from checkpoint.linux.threads import thread_count, thread_ids
 from checkpoint.model import Credentials, Fact, Resource
-from checkpoint.resources.rebuilding import number_of
-
-KIND: Final = "thread_rights"
+from checkpoint.rights import KIND
 
 CAPABILITIES: Final = (
     preserved(
@@ -86,31 +84,3 @@ def _credentials(status: Status) -> Credentials:
 def _told(tid: int, rights: Credentials) -> list[Fact]:
     ids: list[Fact] = [list(rights.uids), list(rights.gids), list(rights.groups), list(rights.capabilities)]
     return [tid, *ids, rights.no_new_privs]
-
-
-def of_thread(resources: Iterable[Resource], tid: int, first: Credentials) -> Credentials:
-    """The rights of a thread: its own, or those of the first."""
-    for held in resources:
-        threads = held.facts["threads"] if held.kind == KIND else []
-        assert isinstance(threads, list)
-        for one in threads:
-            assert isinstance(one, list)
-            if one[0] == tid:
-                user, group, groups, capabilities = (_numbers(fact) for fact in one[1:5])
-                return Credentials(_four(user), _four(group), groups, _five(capabilities), bool(one[5]), first.securebits)
-    return first
-
-
-def _numbers(fact: Fact) -> tuple[int, ...]:
-    assert isinstance(fact, list)
-    return tuple(map(number_of, fact))
-
-
-def _four(numbers: tuple[int, ...]) -> tuple[int, int, int, int]:
-    real, effective, saved, of_files = numbers
-    return real, effective, saved, of_files
-
-
-def _five(numbers: tuple[int, ...]) -> tuple[int, int, int, int, int]:
-    inheritable, permitted, effective, bounding, ambient = numbers
-    return inheritable, permitted, effective, bounding, ambient

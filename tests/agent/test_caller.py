@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -21,10 +22,14 @@ from agent.errors import RefusedError
 from checkpoint.errors import MismatchError
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.linux.vessel import Birth, spawn_program
-from checkpoint.model import Credentials
+from checkpoint.model import Credentials, Member, Resource, Snapshot
+from checkpoint.rights import KIND
+from tests.samples.make import sample, tree_sample
 
 SOMEBODY = 7001
 OTHER = 7002
+GIVEN = 7003
+"""A group that he is a member of."""
 BOUND_S = 60.0
 SELF_PORTRAIT = "grep -E '^(Uid|Gid|Groups|CapEff|CapBnd|NoNewPrivs)' /proc/self/status; ulimit -n; nice; ionice; cat $OOM"
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root: it becomes another user")
@@ -33,6 +38,27 @@ as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root: it becomes a
 def credentials(uid: int, *, effective: int | None = None, capabilities: int = 0) -> Credentials:
     seen = uid if effective is None else effective
     return Credentials((uid, seen, seen, seen), (uid,) * 4, (), (0, capabilities, capabilities, 0, 0))
+
+
+def running_as(first: Credentials, second: Credentials | None = None) -> Snapshot:
+    """A program whose threads have these rights."""
+    state = sample()
+    thread = state.threads[0]
+    told = [list(words) for words in (second.uids, second.gids, second.groups, second.capabilities)] if second else []
+    odd = Resource(KIND, "rights of threads", {"descriptors": [], "threads": [[thread.tid + 1, *told, False]]})
+    return replace(
+        state,
+        process=replace(state.process, credentials=first),
+        threads=(thread, replace(thread, tid=thread.tid + 1)),
+        resources=(odd,) if second else (),
+        members=(),
+    )
+
+
+def a_member(of: Credentials) -> Member:
+    """Another process of a program, with these rights."""
+    member = tree_sample().members[0]
+    return replace(member, process=replace(member.process, credentials=of), resources=())
 
 
 @pytest.fixture
@@ -134,11 +160,24 @@ def test_somebody_elses_process_is_not_ones_own() -> None:
         (credentials(SOMEBODY, effective=0), SOMEBODY, False),
         (credentials(SOMEBODY, capabilities=1 << 7), SOMEBODY, False),
         (credentials(OTHER), SOMEBODY, False),
+        (replace(credentials(SOMEBODY), gids=(SOMEBODY, 42, 42, 42)), SOMEBODY, False),
+        (replace(credentials(SOMEBODY), gids=(GIVEN, GIVEN, SOMEBODY, GIVEN), groups=(GIVEN,)), SOMEBODY, True),
+        (replace(credentials(SOMEBODY), groups=(0,)), SOMEBODY, False),
     ],
 )
 def test_a_snapshot_comes_back_with_the_rights_of_its_owner_or_not_at_all(found: Credentials, owner: int, allowed: bool) -> None:
-    if allowed:
-        check_rights("/lab/r1/mapper", found, owner)
-    else:
-        with pytest.raises(MismatchError, match="other rights than those of its owner"):
-            check_rights("/lab/r1/mapper", found, owner)
+    groups, good = frozenset((SOMEBODY, GIVEN)), credentials(SOMEBODY)
+    of_one, of_all = running_as(found), running_as(good, found)
+    for outline in (of_one, of_all, replace(running_as(good), members=(a_member(found),))):
+        if allowed:
+            check_rights("/lab/r1/mapper", outline, owner, groups)
+        else:
+            with pytest.raises(MismatchError, match="other rights than those of its owner"):
+                check_rights("/lab/r1/mapper", outline, owner, groups)
+
+
+@as_root
+def test_where_nobody_told_its_groups_a_program_has_one_by_all_four_names() -> None:
+    check_rights("/lab/r1/mapper", running_as(replace(credentials(SOMEBODY), gids=(42,) * 4)), SOMEBODY, None)
+    with pytest.raises(MismatchError, match="other rights"):
+        check_rights("/lab/r1/mapper", running_as(replace(credentials(SOMEBODY), gids=(42, 43, 43, 43))), SOMEBODY, None)
