@@ -88,6 +88,7 @@ SYSTEM_CALLS: Final = {
     "flock": 73,
     "ftruncate": 77,
     "futex": 202,
+    "getdents64": 217,
     "getsockname": 51,
     "inotify_add_watch": 254,
     "inotify_init1": 294,

@@ -71,6 +71,8 @@ REOPENED_FLAGS: Final = (
 
 O_PATH: Final = 0o10000000
 AT_EMPTY_PATH: Final = 0x1000
+ENTRIES_SIZE: Final = 1024
+"""Bytes that hold the first entries of a directory, whatever their names."""
 STREAMS: Final = (0, 1, 2)
 MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
     eventfds.KIND: eventfds.rebuild,
@@ -402,6 +404,11 @@ def _written_pieces(begin: int, content: bytes) -> Iterator[tuple[int, bytes]]:
 def _seek(table: CallTable, descriptor: int, held: Resource) -> None:
     offset = number_of(held.facts.get("offset", 0))
     if offset:
+        if stat.S_ISDIR(number_of(held.facts.get("mode", 0))):
+            # ext4 forgets where it reads only when the place differs from where it last read (ext4_dx_readdir): a directory
+            # that goes on at its end, without having been read, would be empty after rewinddir(3)
+            begun = f"a part of the directory {held.name} may be read again"
+            table.attempt(begun, "getdents64", descriptor, table.place(bytes(ENTRIES_SIZE)), ENTRIES_SIZE)
         table.call(f"set the offset of {held.name}", "lseek", descriptor, offset, os.SEEK_SET, least=offset, most=offset)
 
 

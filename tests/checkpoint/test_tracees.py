@@ -127,7 +127,8 @@ PORTRAITS = cases(
 FILES = cases(
     "files",
     "read_offset write_offset append odd_flags shared_offset holes deleted deleted_read_only devices directory path_only "
-    "beyond_end odd_name owner_signal owner_thread asynchronous deleted_sparse deleted_with_a_link deleted_directory "
+    "beyond_end odd_name owner_signal owner_thread asynchronous "
+    "directory_at_its_end deleted_sparse deleted_with_a_link deleted_directory "
     "deleted_working_directory deleted_device deleted_place deleted_link mapped_memory",
 )
 

@@ -283,6 +283,17 @@ static void directory(const char *go) {
     EXPECT_EQUAL("entries", seen, 11);
 }
 
+static void directory_at_its_end(const char *go) {
+    DIR *entries = opendir(".");
+    int before = 0, after = 0;
+    while (entries && readdir(entries)) before++;
+    ready(), wait_for_go(go);
+    EXPECT(!readdir(entries), "there is more in a directory that was read to its end");
+    rewinddir(entries);
+    while (readdir(entries)) after++;
+    EXPECT_EQUAL("entries", after, before + 1); /* the go file */
+}
+
 static void path_only(const char *go) {
     close(make("target", O_RDONLY));
     int file = open("target", O_PATH), status = fcntl(file, F_GETFL);
@@ -376,7 +387,7 @@ int main(int count, char **arguments) {
                  {"deleted_directory", deleted_directory}, {"deleted_working_directory", deleted_working_directory},
                  {"deleted_device", deleted_device}, {"deleted_place", deleted_place},
                  {"deleted_link", deleted_link}, {"mapped_memory", mapped_memory},
-                 {"directory", directory},     {"path_only", path_only}, {"beyond_end", beyond_end},
+                 {"directory", directory},     {"directory_at_its_end", directory_at_its_end}, {"path_only", path_only}, {"beyond_end", beyond_end},
                  {"memory_file", memory_file}, {"odd_name", odd_name}, {"owner_signal", owner_signal},
                  {"owner_thread", owner_thread}, {"asynchronous", asynchronous},
                  {"mapped_and_closed", mapped_and_closed}};
