@@ -187,14 +187,14 @@ class TreeRestore:
         self._legacies = inheritance.legacies
         table = CallTable(estate.base)
         inheritance.leave(table)
-        self._make_common(table, vessel, estate, sizes, objects, resources)
+        self._make_nameless(table, vessel, estate, sizes, objects, resources)
         if table.end - base > AREA_SIZE:
             raise RestoreError(f"cannot restore: what its processes share takes more than {AREA_SIZE >> 20} MiB")
         self._notes += stub.run(table)
         inheritance.put_in(self._first.memory)
         return estate
 
-    def _make_common(
+    def _make_nameless(
         self,
         table: CallTable,
         vessel: Vessel,
