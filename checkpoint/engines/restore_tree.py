@@ -253,7 +253,8 @@ class TreeRestore:
     def _take_terminal(self, pid: int) -> None:
         """Give a session its controlling terminal, which all who are born into it from now on have as well."""
         if found := self._terminals.get(pid):
-            self._call(pid, f"take the controlling terminal of session {pid}", "ioctl", found.slave, termios.TIOCSCTTY, 0)
+            with self._opened(pid, found) as slave:
+                self._call(pid, f"take the controlling terminal of session {pid}", "ioctl", slave, termios.TIOCSCTTY, 0)
 
     def _set_foreground(self, base: int) -> None:
         """Say which group is in the foreground of each terminal, now that the groups are there."""
@@ -261,13 +262,27 @@ class TreeRestore:
             if pid in self._born and found.foreground not in (0, pid):
                 self._born[pid].memory.write(base + abi.PAGE_SIZE, struct.pack("<i", found.foreground))
                 what = f"bring group {found.foreground} to the foreground"
-                self._call(pid, what, "ioctl", found.slave, termios.TIOCSPGRP, base + abi.PAGE_SIZE)
+                with self._opened(pid, found) as slave:
+                    self._call(pid, what, "ioctl", slave, termios.TIOCSPGRP, base + abi.PAGE_SIZE)
 
-    def _call(self, pid: int, what: str, name: str, *arguments: int) -> None:
+    @contextlib.contextmanager
+    def _opened(self, pid: int, found: terminals.Controlling) -> Iterator[int]:
+        """A descriptor of a terminal, in a process; nobody may have it open any more."""
+        if found.slave is not None:
+            yield found.slave
+            return
+        assert found.master is not None, "a terminal is told of by one of its ends"
+        flags = os.O_RDWR | os.O_NOCTTY
+        slave = self._call(pid, f"open the terminal of session {pid}", "ioctl", found.master, terminals.TIOCGPTPEER, flags)
+        yield slave
+        self._call(pid, "close a terminal", "close", slave)
+
+    def _call(self, pid: int, what: str, name: str, *arguments: int) -> int:
         number = x86_64_stub.SYSTEM_CALLS[name]
         result = call_table.single_call(self._born[pid], self._registers, self._instruction, number, *arguments)
         if result < 0:
             raise RestoreError(f"cannot {what}: {os.strerror(-result)}")
+        return result
 
     def _exit(self, pid: int, status: int) -> None:
         tracee = self._born[pid]

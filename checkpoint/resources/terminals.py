@@ -343,11 +343,13 @@ class Controlling:
     """The controlling terminal of a session.
 
     Attributes:
-        slave: a descriptor of it.
+        slave: a descriptor of it; None where nobody has it open any more.
+        master: one of its other end, where that is open.
         foreground: the process group in its foreground, 0 for none.
     """
 
-    slave: int
+    slave: int | None
+    master: int | None
     foreground: int
 
 
@@ -359,11 +361,14 @@ def controlling(made: Mapping[int, Resource]) -> dict[int, Controlling]:
     """
     ends = {number: one for number, one in made.items() if one.kind == KIND}
     slaves = {number_of(one.facts["terminal"]): number for number, one in ends.items() if one.facts["end"] == SLAVE}
-    led = [one.facts for one in ends.values() if one.facts.get("session") and one.facts["terminal"] in slaves]
-    return {
-        number_of(facts["session"]): Controlling(slaves[number_of(facts["terminal"])], number_of(facts["foreground"]))
-        for facts in led
-    }
+    masters = {number_of(one.facts["terminal"]): number for number, one in ends.items() if one.facts["end"] != SLAVE}
+    found = {}
+    for facts in (one.facts for one in ends.values() if one.facts.get("session")):
+        terminal = number_of(facts["terminal"])
+        found[number_of(facts["session"])] = Controlling(
+            slaves.get(terminal), masters.get(terminal), number_of(facts["foreground"])
+        )
+    return found
 
 
 def settle(table: CallTable, held: Sequence[Resource], pid: int) -> None:
@@ -374,14 +379,20 @@ def settle(table: CallTable, held: Sequence[Resource], pid: int) -> None:
     """
     ends = [one for one in held if one.kind == KIND]
     led = {number_of(one.facts["terminal"]): one for one in ends if one.facts.get("session") == pid}
-    slave = next((one for one in ends if one.facts["end"] == SLAVE and one.facts["terminal"] in led), None)
-    if slave is None:
+    mine = [one for one in ends if one.facts["terminal"] in led]
+    if not mine:
         return
+    slave = next((one for one in mine if one.facts["end"] == SLAVE), mine[0])
     descriptors = slave.facts["descriptors"]
     assert isinstance(descriptors, list) and isinstance(descriptors[0], list)
     number = number_of(descriptors[0][0])
+    is_closed = slave.facts["end"] != SLAVE
+    if is_closed:  # it is a session's terminal also when nobody has it open
+        number = table.obtain(f"open the other end of {slave.name}", "ioctl", number, TIOCGPTPEER, os.O_RDWR | os.O_NOCTTY)
     table.call(f"take {slave.name} as the controlling terminal", "ioctl", number, termios.TIOCSCTTY, 0)
     foreground = number_of(led[number_of(slave.facts["terminal"])].facts["foreground"])
     if foreground not in (0, pid):
         place = table.place(struct.pack("<i", foreground))
         table.attempt(f"group {foreground} is not in the foreground of {slave.name}", "ioctl", number, termios.TIOCSPGRP, place)
+    if is_closed:
+        table.close(number)

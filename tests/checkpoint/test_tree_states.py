@@ -357,3 +357,47 @@ def test_memory_that_a_family_has_in_common_since_a_fork_is_there_once(tmp_path:
         assert len(taken[-1].contents) < 1.2 * once + 16 * MIB
         last.tell()
         expect_ok(last)
+
+
+TERMINAL = """
+import fcntl, pty, termios
+master, slave = pty.openpty()
+name = os.ttyname(slave)
+os.close(slave)
+read_end, write_end = os.pipe()
+
+def lead():
+    os.close(master)
+    os.setsid()
+    heard = []
+    signal.signal(signal.SIGHUP, lambda *_: heard.append(1))
+    os.close(os.open(name, os.O_RDWR))
+    other = born(wait_for_go)
+    os.setpgid(other, other)
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTTOU])
+    terminal = os.open("/dev/tty", os.O_RDWR)
+    os.tcsetpgrp(terminal, other)
+    os.close(terminal)
+    os.write(write_end, b".")
+    wait_for_go()
+    expect_child(other)
+    terminal = os.open("/dev/tty", os.O_RDWR)
+    expect("the terminal", os.ttyname(terminal), "/dev/tty")
+    expect("the foreground", os.tcgetpgrp(terminal), other)
+    os.close(terminal)
+    os.write(write_end, b".")
+    while not heard:
+        time.sleep(0.01)
+
+child = born(lead)
+os.read(read_end, 1)
+is_ready()
+os.read(read_end, 1)
+os.close(master)
+expect_child(child)
+print("ok", flush=True)
+"""
+
+
+def test_a_terminal_that_nobody_has_open_is_still_that_of_its_session(tmp_path: Path) -> None:
+    goes_through_three_lives(TERMINAL, tmp_path)
