@@ -24,6 +24,16 @@ CAPABILITIES: Final = (
     ),
     by_rule(
         Area.PROCESS,
+        "keys and keyrings of the kernel (keyctl)",
+        "they stay behind: the program has those of whoever restores it",
+    ),
+    by_rule(
+        Area.MEMORY,
+        "policies for the memory of several nodes (mbind, set_mempolicy)",
+        "the other machine’s own: its nodes are others",
+    ),
+    by_rule(
+        Area.PROCESS,
         "user, groups, capabilities",
         "as far as the agent has them; the program of an ordinary user comes back with his and no more",
         "of the program are not kept: we do not have them",

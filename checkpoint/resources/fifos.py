@@ -151,7 +151,8 @@ def mismatches(held: Resource) -> Iterator[str]:
 
 def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     """Open it as it was, without waiting for somebody at its other end, and fill it."""
-    path, flags, content = str(held.facts["path"]), number_of(held.facts["flags"]), held.facts["content"]
+    path, content = str(held.facts["path"]), held.facts["content"]
+    flags = number_of(held.facts["flags"]) & ~os.O_ASYNC  # opened with it nobody would be told: `signalling` sets it
     if held.facts.get("deleted"):
         path = f"/proc/self/fd/{_nameless(table, held, rebuilding)}"
     elif not os.path.lexists(path):

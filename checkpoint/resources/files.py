@@ -14,13 +14,14 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Final
 
 from blake3 import blake3
 
 from checkpoint.capability import Area, preserved, refused
+from checkpoint.engine import REFUSED, Finding
 from checkpoint.errors import CaptureError
 from checkpoint.linux import procfs
 from checkpoint.linux.descriptors import Descriptor
@@ -52,6 +53,12 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.FILES,
+        "more than 24 MiB in all in pipes, sockets, memory files and deleted files",
+        "use files with a name",
+        "hold {} MiB in all",
+    ),
+    refused(
+        Area.FILES,
         "secret memory (memfd_secret)",
         "it cannot be read, that is its purpose; run the program without it",
         "secret memory cannot be read",
@@ -68,6 +75,8 @@ DIGEST_LIMIT: Final = 256 << 20
 """Bytes of a file that are digested: about 50 ms of one core, once for each version of the file."""
 CONTENT_LIMIT: Final = 16 << 20
 """Bytes of a deleted file that a snapshot carries: it is copied while the program stands still."""
+CONTENTS_LIMIT: Final = 24 << 20
+"""Bytes of all that is carried beside memory: the section of a snapshot in which it stands takes 32 MiB."""
 DIGESTS_KEPT: Final = 1024
 """Digests remembered; a file is digested again only when its device, inode, size or time of change differ."""
 
@@ -320,3 +329,20 @@ def _digested(path: str, version: tuple[int, int, int, int]) -> bytes:
         while piece := file.read(CHUNK):
             digest.update(piece)
         return digest.digest()
+
+
+def findings(resources: Iterable[Resource]) -> Iterator[Finding]:
+    """Whether all open files of a component together hold more than there is room for beside its memory."""
+    size = sum(_size_of(fact) for held in resources for fact in held.facts.values())
+    if size > CONTENTS_LIMIT:
+        kept = f"up to {CONTENTS_LIMIT >> 20} are kept: use files with a name"
+        reason = f"its pipes, sockets, memory files and deleted files hold {size >> 20} MiB in all; {kept}"
+        yield Finding(KIND, "contents", REFUSED, reason)
+
+
+def _size_of(fact: Fact) -> int:
+    """Bytes of content in a fact."""
+    if isinstance(fact, bytes):
+        return len(fact)
+    parts = fact.values() if isinstance(fact, Mapping) else fact if isinstance(fact, list) else ()
+    return sum(map(_size_of, parts))

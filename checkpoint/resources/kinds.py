@@ -149,6 +149,7 @@ def findings_of_all(resources: Sequence[Resource], *, standing: bool) -> tuple[F
         *unix_sockets.findings(resources),
         *netlink_sockets.findings(resources),
         *packet_sockets.findings(resources),
+        *files.findings(resources),
     )
 
 

@@ -41,8 +41,8 @@ CASES = {
         "epoll_simple epoll_ready epoll_nested epoll_once epoll_edge epoll_exclusive epoll_renumbered epoll_waiting"
     ),
     "path_descriptors": (
-        "inotify_directories inotify_gaps inotify_deleted fifo_both fifo_reader fifo_deleted pipe_reopened path_only "
-        "kernel_files file_locks leases"
+        "inotify_directories inotify_gaps inotify_deleted fifo_both fifo_reader fifo_deleted fifo_signals pipe_reopened "
+        "path_only kernel_files file_locks leases"
     ),
     "memory_objects": "memfd_executed memfd_content memfd_sealed memfd_mapped posix_named posix_unlinked",
     "sockets": (

@@ -122,6 +122,31 @@ def test_a_program_that_handles_its_system_calls_itself_is_refused_and_hears_not
         expect_ok(tracee)
 
 
+def test_more_in_open_files_than_there_is_room_for_is_refused_by_name(tmp_path: Path) -> None:
+    """Each is small enough, all together are not."""
+    with ended(start([sys.executable, "-c", HOARDER, tmp_path], tmp_path)) as program, protected(program) as session:
+        program.wait_for_line("ready")
+        with pytest.raises(UnsupportedError, match="MiB in all"):
+            session.capture(CaptureOrder(sequence=1))
+        (tmp_path / "closed").touch()
+        program.wait_for_line("closed")
+        session.capture(CaptureOrder(sequence=2))
+
+
+HOARDER = """
+import os, sys, time
+files = [os.open(sys.argv[1], os.O_TMPFILE | os.O_RDWR) for _ in range(3)]
+for file in files:
+    os.write(file, os.urandom(9 << 20))
+print("ready", flush=True)
+while not os.path.exists(os.path.join(sys.argv[1], "closed")):
+    time.sleep(0.002)
+os.close(files.pop())
+print("closed", flush=True)
+time.sleep(1000)
+"""
+
+
 def test_a_program_that_holds_nothing_special_is_not_refused(compiled: Compiled, tmp_path: Path) -> None:
     with ended(start_tracee(compiled("refused", "-O2"), tmp_path, "nothing")) as tracee:
         report = ENGINE.probe(tracee.pid)

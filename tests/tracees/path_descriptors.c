@@ -80,6 +80,15 @@ static void fifo_both(void) {
     EXPECT(write(other, "name", 4) == 4 && read(reader, found, 20) == 4, "its name leads elsewhere");
 }
 
+static void fifo_signals(void) {
+    mkfifo("loud", 0600);
+    int both = open("loud", O_RDWR);
+    listen_for_signal();
+    if (fcntl(both, F_SETOWN, getpid()) || fcntl(both, F_SETSIG, SIGUSR1) || fcntl(both, F_SETFL, O_ASYNC)) cannot("ask for signals");
+    wait_here();
+    EXPECT(!told && write(both, "x", 1) == 1 && told, "no signal, or one too early");
+}
+
 static void fifo_deleted(void) {
     struct stat before, after;
     mkfifo("doomed", 0640);
@@ -268,7 +277,7 @@ int main(int count, char **arguments) {
         void (*act)(void);
     } cases[] = {{"inotify_directories", inotify_directories}, {"inotify_gaps", inotify_gaps}, {"fifo_both", fifo_both},
                  {"fifo_reader", fifo_reader}, {"fifo_gone", fifo_gone},
-                 {"leases", leases}, {"fifo_deleted", fifo_deleted}, {"inotify_deleted", inotify_deleted},
+                 {"leases", leases}, {"fifo_signals", fifo_signals}, {"fifo_deleted", fifo_deleted}, {"inotify_deleted", inotify_deleted},
                  {"pipe_reopened", pipe_reopened}, {"path_only", path_only}, {"kernel_files", kernel_files}, {"file_locks", file_locks}};
     go = arguments[1];
     for (size_t index = 0; index < sizeof cases / sizeof *cases; index++)
