@@ -140,7 +140,6 @@ class SeenOthers:
     def reasons(self, first: Look) -> tuple[str, ...]:
         """Why the component cannot be captured because of them."""
         found = [reason for seen in self.processes for reason in seen.reasons]
-        found += sharing.refuse(self.opened)
         found += births.refuse(first.standing.status, self.members(first), self.zombies(first))
         return tuple(dict.fromkeys(found))
 

@@ -160,8 +160,8 @@ def _others_findings(opened: sharing.OpenedByAll, first: int, looked: Mapping[in
         reasons += [why for line in lines if (why := unsupported.refuse_mapping(line, flags.get(line.start, ())))]
         for reason in reasons:
             yield Finding("process", f"pid {pid}", REFUSED, f"its process {pid} ({status.name}): {reason}")
-    for reason in (*sharing.refuse(opened), *_births_refused(first)):
-        yield Finding("process", "shared", REFUSED, reason)
+    for reason in _births_refused(first):
+        yield Finding("process", "births", REFUSED, reason)
 
 
 def _births_refused(first: int) -> tuple[str, ...]:

@@ -51,7 +51,7 @@ from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Tracee
 from checkpoint.model import PageRun, ProcessState, Resource, Snapshot, Vma, Zombie
-from checkpoint.resources import files, rebuild, shared, stops, streams, terminals
+from checkpoint.resources import epolls, files, rebuild, shared, stops, streams, terminals
 from checkpoint.resources.rebuilding import number_of
 
 PTRACE_O_TRACEFORK: Final = 2
@@ -355,6 +355,8 @@ def _first_told(views: tuple[Snapshot, ...]) -> dict[int, Resource]:
 
 
 def _at(held: Resource, number: int) -> Resource:
-    """The same, to be made at one number only; who owns its signals is said by its process."""
+    """The same, to be made at one number only; who owns its signals, and what it watches, is said by its process."""
     facts = {name: fact for name, fact in held.facts.items() if name not in ("signal", "owner", "locks", "description")}
+    if held.kind == epolls.KIND:
+        facts["watched"] = []
     return Resource(held.kind, held.name, {**facts, "descriptors": [[number, 1]]})

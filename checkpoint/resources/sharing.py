@@ -9,33 +9,15 @@ Source: kcmp(2), KCMP_FILE; pipe(7).
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
-from checkpoint.capability import Area, refused
 from checkpoint.linux import abi
 from checkpoint.linux.descriptors import Descriptor
-from checkpoint.resources import Kin, Opened, OpenFile, epolls, pipes, sockets, terminals, watches
-
-CAPABILITIES: Final = (
-    refused(
-        Area.PIPES,
-        "an epoll or inotify instance that several processes of a program share",
-        "let the child close it",
-        "that another of its processes has too, which is not kept yet",
-        "an epoll instance",
-        "an inotify instance",
-    ),
-)
+from checkpoint.resources import Kin, Opened, OpenFile, pipes, sockets, terminals
 
 _OTHER_END: Final = {os.O_RDONLY: os.O_WRONLY, os.O_WRONLY: os.O_RDONLY}
-_UNSHARED: Final[Mapping[str, str]] = {
-    epolls.TARGET: "an epoll instance",
-    watches.TARGET: "an inotify instance",
-}
-"""Kinds that are made of what one process alone has."""
-
 OpenedByAll = dict[int, Opened]
 """By process, the first process of the component first."""
 
@@ -101,13 +83,3 @@ def _leads_somewhere(one: Descriptor) -> bool:
 
 def _is_same(one: OpenFile, other: OpenFile) -> bool:
     return abi.kcmp(one.pid, other.pid, abi.KCMP_FILE, one.first.number, other.first.number) == 0
-
-
-def refuse(opened: Mapping[int, Sequence[OpenFile]]) -> Iterator[str]:
-    """Why what they share cannot be kept."""
-    for held in (held for ours in opened.values() for held in ours if held.is_echo):
-        if what := _UNSHARED.get(held.first.target):
-            yield (
-                f"{held.name} of pid {held.pid} is {what} that another of its processes has too, which is not kept yet: "
-                "let the child close it"
-            )

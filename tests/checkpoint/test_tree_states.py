@@ -401,3 +401,54 @@ print("ok", flush=True)
 
 def test_a_terminal_that_nobody_has_open_is_still_that_of_its_session(tmp_path: Path) -> None:
     goes_through_three_lives(TERMINAL, tmp_path)
+
+
+SERVERS = """
+import select, socket, ctypes
+libc = ctypes.CDLL(None, use_errno=True)
+listener = socket.socket(socket.AF_UNIX)
+listener.bind("server")
+listener.listen(64)
+listener.setblocking(False)
+waiting = select.epoll()
+waiting.register(listener, select.EPOLLIN | select.EPOLLEXCLUSIVE)
+watch = libc.inotify_init1(0o2000000)
+libc.inotify_add_watch(watch, b".", 0x100)  # IN_CREATE
+
+def serve():
+    while not Path("enough").exists():
+        for descriptor, _ in waiting.poll(0.02):
+            try:
+                one, _ = listener.accept()
+            except BlockingIOError:
+                continue
+            one.sendall(str(os.getpid()).encode())
+            one.close()
+
+def ask():
+    one = socket.socket(socket.AF_UNIX)
+    one.connect("server")
+    return int(one.recv(100))
+
+def look():
+    said = os.read(watch, 4096)
+    expect("who came first", said[16:].rstrip(b"\\0").split(b"\\0")[0], b"go")
+
+servers = [born(serve) for _ in range(3)]
+for _ in range(10):
+    expect("a server", ask() in servers, True)
+looker = born(look)
+is_ready()
+expect_child(looker)
+for _ in range(50):
+    expect("a server", ask() in servers, True)
+Path("enough").touch()
+for child in servers:
+    expect_child(child)
+os.unlink("server")
+print("ok", flush=True)
+"""
+
+
+def test_servers_that_wait_at_one_epoll_instance_go_on_serving(tmp_path: Path) -> None:
+    goes_through_three_lives(SERVERS, tmp_path)
