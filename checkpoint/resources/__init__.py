@@ -22,6 +22,7 @@ from checkpoint.model import Fact, Resource
 
 if TYPE_CHECKING:
     from checkpoint.resources.sockets import Noted
+    from checkpoint.resources.travelling import Lent
 
 STREAM_NUMBERS: Final = (1, 2)
 GLANCES_MORE: Final = 3
@@ -60,6 +61,7 @@ class OpenFile:
         kin: the other processes of its component.
         description: the number of an open file that several processes of a component share (`sharing`); 0: it is this one's.
         is_echo: another process of the component has told of it already.
+        lent: through which it is looked at, if it is on its way to the program (`travelling`); ``pid`` is ours then.
     """
 
     pid: int
@@ -71,6 +73,7 @@ class OpenFile:
     kin: Kin = ALONE
     description: int = 0
     is_echo: bool = False
+    lent: Lent | None = None
 
     @property
     def first(self) -> Descriptor:
@@ -136,6 +139,11 @@ class Opened(tuple[OpenFile, ...]):
     def groups(self) -> dict[int, tuple[Group, ...]]:
         """Multicast groups of the machine by family, as far as they were asked for."""
         return {}
+
+    @functools.cached_property
+    def travelling(self) -> list[OpenFile]:
+        """What is on its way to the process and not open in it, as far as it was found."""
+        return []
 
     @functools.cached_property
     def shut_down(self) -> dict[tuple[int, int], Mapping[int, int]]:
@@ -204,8 +212,8 @@ def with_contents(opened: Opened, noted: Noted | None, rules: tuple[DeviceRule, 
     from checkpoint.resources import attached_devices, files, kinds, pipes
 
     found = []
-    for held in opened:
-        if held.is_echo:
+    for held in _with_travelling(opened, noted):
+        if held.is_echo or held.observed:
             pass
         elif rules and attached_devices.is_ruled(held.first, rules):
             held = replace(held, observed=attached_devices.observe(held, opened))
@@ -218,6 +226,38 @@ def with_contents(opened: Opened, noted: Noted | None, rules: tuple[DeviceRule, 
             held = replace(held, both_ends=True, capacity=capacity, content=content)
         found.append(held)
     return tuple(found)
+
+
+def _with_travelling(opened: Opened, noted: Noted | None) -> list[OpenFile]:
+    """All of them, sockets looked into, and what was found on its way in these."""
+    from checkpoint.resources import travelling
+
+    found = [_looked_into(held, opened, noted) for held in opened]
+    for held in opened.travelling:  # which grows meanwhile
+        found.append(_looked_into(held, opened, noted and travelling.unnoted))
+    is_hidden = travelling.may_hide(found, noted)
+    if not (opened.travelling or is_hidden):
+        return found
+    whole = travelling.together(found)
+    inodes = {held.first.inode for held in opened.travelling}
+
+    def completed(held: OpenFile) -> OpenFile:
+        if held.first.target in whole or (is_hidden and held.first.target.startswith("pipe:")):
+            return replace(held, both_ends=True)
+        peer = held.observed.get("peer")
+        return replace(held, observed={**held.observed, "peer_is_ours": True}) if peer and (is_hidden or peer in inodes) else held
+
+    return list(map(completed, found))
+
+
+def _looked_into(held: OpenFile, opened: Opened, noted: Noted | None) -> OpenFile:
+    """A socket as it is observed; as it was where it cannot be, of which whoever asks next is told."""
+    from checkpoint.resources import kinds, sockets
+
+    if not held.is_echo and sockets.is_socket(held.first):
+        with contextlib.suppress(CaptureError):
+            return replace(held, observed=kinds.observe_socket(held, opened, noted=noted))
+    return held
 
 
 def _may_be_half(held: OpenFile) -> bool:
@@ -255,8 +295,10 @@ def _glanced(pid: int, kin: Kin) -> tuple[OpenFile, ...]:
 
     opened = Opened(replace(held, kin=kin) for held in gather(pid))
     found = []
-    for held in opened:
-        if observe := kinds.observer_of(held.first, None):
+    for held in _with_travelling(opened, None):
+        if held.observed:
+            pass
+        elif observe := kinds.observer_of(held.first, None):
             with contextlib.suppress(CaptureError):  # closed meanwhile
                 held = replace(held, observed=observe(held, opened))
         elif pipes.is_pipe(held.first) and not held.both_ends and pipes.is_half(held):
@@ -270,7 +312,7 @@ def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
 
     What can be told only of all processes of a component together is told by `kinds.findings_of_all`.
     """
-    from checkpoint.resources import kinds, locks, signalling
+    from checkpoint.resources import kinds, locks, signalling, travelling
 
     resources, findings = [], []
     for held in opened:
@@ -280,7 +322,11 @@ def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
                 findings.append(Finding(kind.KIND, held.name, REFUSED, reason))
                 break
             if resource := kind.describe(held, surroundings):
-                resources.append(replace(resource, facts={**resource.facts, **_of_every_kind(held, resource)}))
+                of_every = _of_every_kind(held, resource)
+                if reason := travelling.refuse(held, kind.KIND, of_every):
+                    findings.append(Finding(kind.KIND, held.name, REFUSED, reason))
+                    break
+                resources.append(replace(resource, facts={**resource.facts, **of_every, **travelling.describe(held)}))
                 findings.append(Finding(kind.KIND, held.name, KEPT, f"{held.name} is {held.first.target}"))
                 break
     return Held(tuple(resources), tuple(findings))

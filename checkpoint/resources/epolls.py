@@ -74,7 +74,7 @@ def _now(held: OpenFile, slot: abi.EpollSlot, opened: Sequence[OpenFile]) -> int
     """A descriptor that leads to what is watched: that of the same number if it does, else the first that does, else `GONE`."""
 
     def leads_there(number: int) -> bool:
-        return abi.kcmp(held.pid, held.pid, abi.KCMP_EPOLL_TFD, number, ctypes.addressof(slot)) == 0
+        return abi.kcmp(opened[0].pid, held.pid, abi.KCMP_EPOLL_TFD, number, ctypes.addressof(slot)) == 0
 
     if leads_there(slot.number):
         return int(slot.number)

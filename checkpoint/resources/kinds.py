@@ -99,7 +99,7 @@ def observer_of(one: Descriptor, noted: sockets.Noted | None) -> Observer | None
         noted: see `sockets.queue_of`; None for a process that runs.
     """
     if sockets.is_socket(one):
-        return functools.partial(_observe_socket, noted=noted)
+        return functools.partial(observe_socket, noted=noted)
     if terminals.is_terminal(one):
         return terminals.observe
     if memory_files.is_memory_file(one):
@@ -107,7 +107,7 @@ def observer_of(one: Descriptor, noted: sockets.Noted | None) -> Observer | None
     return fifos.observe if fifos.is_fifo(one) else _OBSERVED.get(one.target)
 
 
-def _observe_socket(held: OpenFile, opened: Opened, *, noted: sockets.Noted | None) -> Mapping[str, Fact]:
+def observe_socket(held: OpenFile, opened: Opened, *, noted: sockets.Noted | None) -> Mapping[str, Fact]:
     """A socket of a family that is kept; nothing of another.
 
     Raises:

@@ -176,6 +176,9 @@ def rebuild_all(
     for number in (*moved, *piped.values(), *connected.values(), *lines.values(), *rebuilding.objects.values(), *inherited):
         table.close(number)
     _settle(table, wanted, holders)
+    for one in wanted:
+        if one.resource.facts.get("travelling"):  # it was sent, and is open no more
+            table.close(one.number)
     of_tcp = tcp_connections.notes([held for held in state.resources if _is_own(held, given, tcp_connections.KIND)])
     return (*of_tcp, *unix.notes())
 

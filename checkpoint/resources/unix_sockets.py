@@ -7,7 +7,7 @@ datagrams that was connected to a name outside (``/dev/log``) is connected to th
 Facts besides those of every socket, of ``unix_names`` and of ``unix_makers``: ``state`` of `checkpoint.linux.unix_sockets`;
 ``name``; ``peer``: inode number of its other end, 0 when that is gone; ``peer_name``; ``backlog``; ``shutdown``; ``clients``:
 whose connections wait to be accepted, inode numbers in their order; ``passed``: of each message in the queue the descriptors that
-came with it, as numbers of the program's own, -1 for one that it has closed; no list if none has any; ``too_long``: the queue;
+came with it, as numbers of the program's own, or of ``travelling``; no list if none has any; ``too_long``: the queue;
 ``sources``: of each message in the queue the name of its sender; no list if none has any; ``not_accepted``: of one whose
 connection waits itself, how much of what it sent is unread, -1 of any other.
 
@@ -27,10 +27,9 @@ from typing import Final
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.engine import REFUSED, Finding
 from checkpoint.errors import CaptureError
-from checkpoint.linux import abi
 from checkpoint.linux.unix_sockets import ESTABLISHED, UnixSocket, unix_socket
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import Opened, OpenFile, Surroundings, elsewhere, sockets, unix_makers, unix_names
+from checkpoint.resources import Opened, OpenFile, Surroundings, elsewhere, sockets, travelling, unix_makers, unix_names
 from checkpoint.resources.rebuilding import number_of
 
 KIND: Final = "unix_sockets"
@@ -55,7 +54,7 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.SOCKETS,
-        "a unix socket with descriptors on their way that the program has closed, or over 4 MiB that wait",
+        "a unix socket with descriptors on their way between several processes, or over 4 MiB that wait",
         "it is kept as soon as the program has taken them",
         "with descriptors on their way",
         "MiB wait: it is kept as soon as",
@@ -89,7 +88,7 @@ def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: socket
         raise CaptureError(f"cannot ask the kernel about the unix socket {held.name} (sock_diag): load the module unix_diag")
     facts = sockets.general_facts(held.first, looked)
     has_queue = told.state == ESTABLISHED or told.type == socket.SOCK_DGRAM
-    identify = partial(_number_of, held.pid, opened)
+    identify = partial(travelling.number_of, opened)
     queue = sockets.queue_of(looked, held.first.number, noted, identify) if has_queue else sockets.NOTHING
     return (
         facts
@@ -130,16 +129,6 @@ def _packed_name(source: object) -> bytes:
     return source if isinstance(source, bytes) else os.fsencode(str(source)) + b"\0"
 
 
-def _number_of(pid: int, opened: Sequence[OpenFile], ours: int) -> int:
-    """Which of the program's descriptors leads to the same open file as one of ours, which was on its way to it."""
-    about = os.fstat(ours)
-    for one in opened:
-        is_alike = (one.first.device, one.first.inode) == (about.st_dev, about.st_ino)
-        if is_alike and abi.kcmp(pid, os.getpid(), abi.KCMP_FILE, one.first.number, ours) == 0:
-            return one.first.number
-    return sockets.UNKNOWN
-
-
 def _peer_name(looked: socket.socket) -> bytes:
     try:
         name = looked.getpeername()
@@ -169,10 +158,9 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return f"{what} connected to a socket of another process that has no name: protect the program while it has none"
     if any(isinstance(numbers, list) and sockets.UNKNOWN in numbers for numbers in _list(seen["passed"])):
         return (
-            f"{what} with descriptors on their way in it (SCM_RIGHTS) that the program has closed already: it is kept as soon as "
-            "they are received"
+            f"{what} with descriptors on their way in it (SCM_RIGHTS) that cannot be looked at: it is kept as soon as they arrive"
         )
-    if seen["passed"] and held.kin.pids:
+    if seen["passed"] and held.kin.pids and held.lent is None:
         return f"{what} with descriptors on their way in it between several processes: it is kept as soon as they are received"
     if 0 in _list(seen["clients"]):
         return f"{what} where a connection waits to be accepted whose client has gone: {_ACCEPTED}"

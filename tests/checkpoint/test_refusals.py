@@ -30,7 +30,7 @@ REFUSED = {
     "child_in_the_same_memory": "shares its memory",
     "shared_files_child": "shares its open files",
     "traced_child": "traced",
-    "unix_rights": "scm_rights",
+    "unix_rights": "is on its way in a unix socket",
     "unix_waiting_data": "accepted with data",
     "unix_waiting_gone": "client has gone",
     "unix_other_name": "something else",

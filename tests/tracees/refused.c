@@ -134,7 +134,8 @@ static void take_unix_rights(void) {
     struct msghdr message = {.msg_iov = &content, .msg_iovlen = 1, .msg_control = room, .msg_controllen = sizeof room};
     struct cmsghdr *rights = CMSG_FIRSTHDR(&message);
     rights->cmsg_level = SOL_SOCKET, rights->cmsg_type = SCM_RIGHTS, rights->cmsg_len = CMSG_LEN(sizeof(int));
-    int passed = open("/dev/null", O_RDONLY);
+    int passed = open("locked", O_RDWR | O_CREAT, 0600);
+    if (flock(passed, LOCK_EX)) cannot("lock a file");
     memcpy(CMSG_DATA(rights), &passed, sizeof(int));
     if (sendmsg(ends[0], &message, 0) != 1 || close(passed)) cannot("send a descriptor");
     keep(ends[1], "a socket");

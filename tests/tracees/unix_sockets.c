@@ -1,6 +1,8 @@
 /* Unix sockets: their names, who made them, and connections that nobody has accepted; the case is named by the second argument. */
 #include "sockets.h"
 
+#include <sys/epoll.h>
+
 static struct sockaddr_un named(const char *name, socklen_t *size) {
     struct sockaddr_un address = {.sun_family = AF_UNIX};
     size_t length = strlen(name + 1) + 1;
@@ -209,6 +211,59 @@ static void makers(void) {
     EXPECT(sender.pid == getpid() && sender.uid == 65534 && sender.gid == 65533, "pid %d, uid %u has sent it", sender.pid, sender.uid);
 }
 
+static void pass(int file, int passed) {
+    char room[CMSG_SPACE(sizeof(int))] = {0};
+    struct iovec content = {"x", 1};
+    struct msghdr message = {.msg_iov = &content, .msg_iovlen = 1, .msg_control = room, .msg_controllen = sizeof room};
+    struct cmsghdr *rights = CMSG_FIRSTHDR(&message);
+    rights->cmsg_level = SOL_SOCKET, rights->cmsg_type = SCM_RIGHTS, rights->cmsg_len = CMSG_LEN(sizeof(int));
+    memcpy(CMSG_DATA(rights), &passed, sizeof(int));
+    if (sendmsg(file, &message, 0) != 1) cannot("pass a descriptor");
+}
+
+static int receive(int file) {
+    char content, room[CMSG_SPACE(sizeof(int))];
+    struct iovec piece = {&content, 1};
+    struct msghdr message = {.msg_iov = &piece, .msg_iovlen = 1, .msg_control = room, .msg_controllen = sizeof room};
+    int passed = -1;
+    if (recvmsg(file, &message, MSG_DONTWAIT) != 1 || !CMSG_FIRSTHDR(&message)) differs("no descriptor came: %s", strerror(errno));
+    else memcpy(&passed, CMSG_DATA(CMSG_FIRSTHDR(&message)), sizeof(int));
+    return passed;
+}
+
+static int pass_and_close(int file, int passed) {
+    pass(file, passed), close(passed);
+    return passed;
+}
+
+/* On their way, and closed by the program: a file, both ends of a pipe with something in it, a socket whose other end stays, an epoll
+ * that watches what stays, and a socket in which a file is on its way. */
+static void travelling(void) {
+    int ends[2], pipes[2], others[2], nested[2], file = open("file", O_RDWR | O_CREAT, 0600);
+    if (socketpair(AF_UNIX, SOCK_SEQPACKET, 0, ends) || pipe(pipes) || socketpair(AF_UNIX, SOCK_STREAM, 0, others)) cannot("begin");
+    if (socketpair(AF_UNIX, SOCK_DGRAM, 0, nested) || write(file, "content", 7) != 7) cannot("begin");
+    pass(ends[0], file), lseek(file, 3, SEEK_SET), pass_and_close(nested[0], file);
+    int watching = epoll_create1(0);
+    struct epoll_event event = {.events = EPOLLIN, .data.u64 = 77};
+    if (epoll_ctl(watching, EPOLL_CTL_ADD, others[0], &event) || write(pipes[1], "in the pipe", 11) != 11) cannot("watch");
+    say(others[0], "waits"), say(others[1], "wakes");
+    pass_and_close(ends[0], pipes[0]), pass_and_close(ends[0], pipes[1]), pass_and_close(ends[0], others[1]);
+    pass_and_close(ends[0], watching), pass_and_close(ends[0], nested[1]), close(nested[0]);
+    wait_here();
+    char found[20] = "";
+    file = receive(ends[1]), pipes[0] = receive(ends[1]), pipes[1] = receive(ends[1]), others[1] = receive(ends[1]);
+    watching = receive(ends[1]), nested[1] = receive(ends[1]), expect_nothing(ends[1]);
+    EXPECT(read(pipes[0], found, 20) == 11 && write(pipes[1], "more", 4) == 4 && read(pipes[0], found, 20) == 4, "it is not the pipe");
+    expect_text(others[1], "waits"), say(others[1], "back");
+    EXPECT(epoll_wait(watching, &event, 1, 0) == 1 && event.data.u64 == 77, "it does not watch");
+    expect_text(others[0], "wakesback");
+    int same = receive(nested[1]);
+    EXPECT_EQUAL("offset", lseek(file, 0, SEEK_CUR), 3);
+    lseek(same, 5, SEEK_SET);
+    EXPECT_EQUAL("shared offset", lseek(file, 0, SEEK_CUR), 5);
+    EXPECT_EQUAL("what is open", open("/dev/null", O_RDONLY), same + 1);
+}
+
 int main(int count, char **arguments) {
     static const struct socket_case cases[] = {
         {"ghost_left", ghost_left},
@@ -219,6 +274,7 @@ int main(int count, char **arguments) {
         {"named_senders", named_senders},
         {"named_pair", named_pair},
         {"makers", makers},
+        {"travelling", travelling},
     };
     return run_case(count, arguments, cases, sizeof cases / sizeof *cases);
 }
