@@ -35,8 +35,8 @@ from dataclasses import dataclass
 from typing import Final, NoReturn
 
 from checkpoint.arch import x86_64_stub as stub
-from checkpoint.errors import RestoreError
-from checkpoint.linux import namespaces
+from checkpoint.errors import ProbeError, ProcessGoneError, RestoreError
+from checkpoint.linux import namespaces, procfs
 from checkpoint.linux.brought import BroughtFile, User, show
 from checkpoint.linux.inheritance import Inheritance, take_on
 from checkpoint.model import Clocks
@@ -231,8 +231,17 @@ def _sibling_with_pid(wanted: int) -> tuple[int, list[str]]:
     except OSError as error:
         if not wanted or error.errno not in (errno.EEXIST, errno.EPERM, errno.EINVAL):
             raise
-        reason = "it is in use" if error.errno == errno.EEXIST else "that needs CAP_CHECKPOINT_RESTORE"
+        reason = _why_taken(wanted) if error.errno == errno.EEXIST else "that needs CAP_CHECKPOINT_RESTORE"
         return namespaces.sibling(), [f"new PID: {wanted} cannot be had, {reason}"]
+
+
+def _why_taken(pid: int) -> str:
+    """By whom a PID is in use, where that can be mended."""
+    with contextlib.suppress(ProbeError, ProcessGoneError):
+        found = procfs.status(pid)
+        if found.state == "Z":
+            return f"it has ended, but its parent, pid {found.ppid}, has not waited for it yet (wait(2))"
+    return "it is in use"
 
 
 def _end_after(act: Callable[..., object], lines: _Lines, *arguments: object) -> NoReturn:

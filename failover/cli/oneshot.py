@@ -18,8 +18,8 @@ from checkpoint import channel, format
 from checkpoint.channel import Capture, Captured, Protect, Protected, Release, Released, Restore, Restored, Resume, Resumed
 from checkpoint.device_rules import DeviceRule, rule_from
 from checkpoint.engine import Terms
-from checkpoint.errors import CaptureError, CheckpointError, NothingCommittedError, ProcessGoneError
-from checkpoint.linux import kinship, namespaces, vessel
+from checkpoint.errors import CaptureError, CheckpointError, NothingCommittedError, ProbeError, ProcessGoneError
+from checkpoint.linux import kinship, namespaces, procfs, vessel
 from checkpoint.linux.vessel import Birth, Born
 from checkpoint.model import Member, Snapshot
 from failover.cli import picture, render
@@ -34,6 +34,9 @@ CAPTURE_PAUSE_S: Final = 0.25
 END_TIMEOUT_S: Final = 10.0
 """How long a killed program may take to be dead; the kernel gives a large memory back first."""
 
+IDS_TIMEOUT_S: Final = 2.0
+IDS_PAUSE_S: Final = 0.01
+"""How long the ids of a program that has just been ended may take to be free, and how often that is looked at."""
 OWN_PIDS: Final = "it goes on in PIDs of its own, in which it has its old ones: here they are taken, or not ours to choose"
 
 A = TypeVar("A")
@@ -198,10 +201,25 @@ def birth_of(outline: Snapshot, elapsed_ns: int, own_session: bool) -> Birth:
 
 
 def _lacks_its_ids(outline: Snapshot) -> bool:
-    """Whether a program of several processes or threads finds one of its ids taken, or may not choose them at all."""
+    """Whether a program of several processes or threads finds one of its ids taken, or may not choose them at all.
+
+    Ids of what has just ended are waited for, for a while: its parent, or init, has yet to take note of that.
+    """
     processes: tuple[Snapshot | Member, ...] = (outline, *outline.members)
     ids = {thread.tid for one in processes for thread in one.threads} | {zombie.pid for zombie in outline.zombies}
-    return len(ids) > 1 and (not namespaces.may_choose_pids() or any(Path(f"/proc/{number}").exists() for number in ids))
+    if len(ids) == 1 or not namespaces.may_choose_pids():
+        return len(ids) > 1
+    deadline = time.monotonic() + IDS_TIMEOUT_S
+    while any(map(_is_ending, ids)) and time.monotonic() < deadline:
+        time.sleep(IDS_PAUSE_S)
+    return any(Path(f"/proc/{number}").exists() for number in ids)
+
+
+def _is_ending(pid: int) -> bool:
+    """Whether a PID is of a process that has ended, and was not reaped."""
+    with contextlib.suppress(ProbeError, ProcessGoneError):
+        return procfs.status(pid).state in "ZX"
+    return False
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import subprocess
 import time
 from pathlib import Path
 
@@ -84,6 +85,16 @@ def test_a_pid_in_use_becomes_another_and_a_note() -> None:
     vessel.discard(born)
     assert born.pid != os.getpid()
     assert any(note.startswith("new PID") for note in born.notes)
+
+
+@pytest.mark.root
+def test_a_pid_of_one_that_was_not_waited_for_is_said_to_be_so() -> None:
+    with subprocess.Popen(["true"]) as ended:
+        os.waitid(os.P_PID, ended.pid, os.WEXITED | os.WNOWAIT)
+        born = vessel.spawn_vessel(Birth(inner_pid=ended.pid))
+        vessel.discard(born)
+        wanted = f"{ended.pid} cannot be had, it has ended, but its parent, pid {os.getpid()}, has not waited for it yet"
+        assert any(wanted in note for note in born.notes), born.notes
 
 
 @pytest.mark.user_namespaces
