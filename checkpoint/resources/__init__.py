@@ -222,8 +222,10 @@ def with_contents(opened: Opened, noted: Noted | None, rules: tuple[DeviceRule, 
         elif files.must_carry(held):
             held = replace(held, observed=files.observe_deleted(held, opened))
         elif pipes.is_pipe(held.first) and (held.both_ends or (_may_be_half(held) and pipes.is_half(held))):
-            capacity, content = pipes.look_into(held)
-            held = replace(held, both_ends=True, capacity=capacity, content=content)
+            capacity, pieces = pipes.look_into(held)
+            packets: list[Fact] = [len(piece) for piece in pieces]
+            content = b"".join(pieces)
+            held = replace(held, both_ends=True, capacity=capacity, content=content, observed={"packets": packets})
         found.append(held)
     return tuple(found)
 

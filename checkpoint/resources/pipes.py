@@ -4,7 +4,8 @@ Programs wake themselves by such a pipe from a signal handler (xz does). A pipe 
 until that somebody can come along.
 
 Facts: ``descriptors``; ``pipe``, a number that both ends have in common; ``end``, 0 to read, 1 to write; ``flags`` of fcntl(2);
-``capacity`` in bytes; ``content``: the bytes in it, with the reading end, b"" with the writing one.
+``capacity`` in bytes; ``content``: the bytes in it, with the reading end, b"" with the writing one; ``packets``: how long each
+packet of that is, where there are several (O_DIRECT).
 
 Sources: pipe(7), tee(2), fcntl(2) F_SETPIPE_SZ.
 """
@@ -42,7 +43,6 @@ CAPABILITIES: Final = (
         "to somebody else: only pipes of which",
         "that another process holds too",
     ),
-    refused(Area.PIPES, "a pipe in packet mode (O_DIRECT)", "use an ordinary one", "in packet mode"),
 )
 
 F_SETPIPE_SZ: Final = 1031
@@ -67,6 +67,9 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
         "capacity": held.capacity,
         "content": held.content or b"",
     }
+    packets = held.observed.get("packets")
+    if isinstance(packets, list) and len(packets) > 1:
+        facts["packets"] = packets
     return Resource(KIND, held.name, facts)
 
 
@@ -75,8 +78,6 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     if not is_pipe(held.first):
         return None
     what = f"{held.name} is a pipe"
-    if held.first.flags & os.O_DIRECT:
-        return f"{what} in packet mode, which is not kept: let the program use an ordinary one"
     if not held.both_ends:
         return f"{what} to somebody else: only pipes of which the program holds both ends are kept; redirect it to a file"
     if elsewhere.has_end(held):
@@ -108,8 +109,8 @@ def is_half(held: OpenFile) -> bool:
         return False  # closed meanwhile
 
 
-def look_into(held: OpenFile) -> tuple[int, bytes]:
-    """A pipe's capacity and, for the reading end, what is in it; it stays there. The process stands still.
+def look_into(held: OpenFile) -> tuple[int, list[bytes]]:
+    """A pipe's capacity and, for the reading end, what is in it, by packets; it stays there. The process stands still.
 
     Raises:
         CaptureError: it cannot be looked into.
@@ -118,15 +119,15 @@ def look_into(held: OpenFile) -> tuple[int, bytes]:
     try:
         with copy_of(held.pid, held.first.number) as pipe:
             capacity = fcntl.fcntl(pipe, F_GETPIPE_SZ)
-            return capacity, copy_of_content(pipe, capacity) if reads else b""
+            return capacity, packets_in(pipe, capacity) if reads else []
     except OSError as error:
         raise CaptureError(
             f"cannot look into the pipe {held.name} of pid {held.pid}: {error.strerror}; capture it again"
         ) from error
 
 
-def copy_of_content(pipe: int, capacity: int) -> bytes:
-    """What is in a pipe, by its reading end; it stays there.
+def packets_in(pipe: int, capacity: int) -> list[bytes]:
+    """What is in a pipe, by its reading end, each packet for itself; what is in none is one piece. It stays there.
 
     Raises:
         OSError: somebody reads it meanwhile.
@@ -134,24 +135,36 @@ def copy_of_content(pipe: int, capacity: int) -> bytes:
     waiting = array.array("i", [0])
     fcntl.ioctl(pipe, termios.FIONREAD, waiting)
     if not waiting[0]:
-        return b""
-    content = _teed(pipe, waiting[0], capacity)
-    if len(content) != waiting[0]:
+        return []
+    pieces = _teed(pipe, waiting[0], capacity)
+    if sum(map(len, pieces)) != waiting[0]:
         raise BlockingIOError(errno.EAGAIN, "somebody reads it meanwhile")
-    return content
+    return pieces
+
+
+def copy_of_content(pipe: int, capacity: int) -> bytes:
+    """The same of a pipe without packets.
+
+    Raises:
+        OSError: somebody reads it meanwhile, or there are packets.
+    """
+    pieces = packets_in(pipe, capacity)
+    if len(pieces) > 1:
+        raise OSError(errno.EOPNOTSUPP, "it holds several packets (O_DIRECT)")
+    return b"".join(pieces)
 
 
 def peek(pipe: int) -> bytes:
     """What waits in a pipe, by its reading end; it stays there. Nothing where it cannot be looked into, as a terminal cannot."""
     try:
         capacity = fcntl.fcntl(pipe, F_GETPIPE_SZ)
-        return _teed(pipe, capacity, capacity)
+        return b"".join(_teed(pipe, capacity, capacity))
     except OSError:
         return b""
 
 
-def _teed(pipe: int, size: int, capacity: int) -> bytes:
-    """A copy of the first bytes of a pipe, as far as there are any.
+def _teed(pipe: int, size: int, capacity: int) -> list[bytes]:
+    """A copy of the first bytes of a pipe, as far as there are any; each packet for itself.
 
     Raises:
         OSError: it is no pipe, or there is none to copy into.
@@ -162,7 +175,11 @@ def _teed(pipe: int, size: int, capacity: int) -> bytes:
         copied = _libc.tee(pipe, writer, size, SPLICE_F_NONBLOCK)
         if copied < 0 and ctypes.get_errno() != errno.EAGAIN:
             abi.raise_errno("tee of a pipe")
-        return os.read(reader, copied) if copied > 0 else b""
+        pieces: list[bytes] = []
+        while copied > 0:
+            pieces.append(os.read(reader, copied))
+            copied -= len(pieces[-1])
+        return pieces
     finally:
         os.close(reader)
         os.close(writer)
@@ -195,8 +212,16 @@ def _fill(table: CallTable, opened: Sequence[Resource], pair: tuple[int, int]) -
         table.call(f"size the pipe of {name}", "fcntl", pair[0], F_SETPIPE_SZ, capacity, least=capacity)
     content = next((one.facts["content"] for one in opened if one.facts["content"]), b"")
     assert isinstance(content, bytes)
-    if content:
-        table.call(f"fill the pipe of {name}", "write", pair[1], table.place(content), len(content), least=len(content))
+    packets = next((one.facts["packets"] for one in opened if "packets" in one.facts), [len(content)] if content else [])
+    assert isinstance(packets, list)
+    if any(number_of(one.facts["flags"]) & os.O_DIRECT for one in opened) or len(packets) > 1:
+        table.call(f"have the pipe of {name} keep packets", "fcntl", pair[1], fcntl.F_SETFL, os.O_DIRECT)
+    begin = 0
+    for size in map(number_of, packets):
+        place = table.place(content[begin : begin + size])
+        table.call(f"fill the pipe of {name}", "write", pair[1], place, size, least=size)
+        begin += size
+    table.call(f"set the flags of the pipe of {name}", "fcntl", pair[1], fcntl.F_SETFL, 0)
 
 
 def _opened(table: CallTable, held: Resource, pair: tuple[int, int], opened: Sequence[Resource], place: int) -> int:
@@ -209,6 +234,6 @@ def _opened(table: CallTable, held: Resource, pair: tuple[int, int], opened: Seq
         again = table.open(f"/proc/self/fd/{pair[end]}", flags & os.O_ACCMODE)
         table.duplicate(again, place, os.O_CLOEXEC)
         table.close(again)
-    if flags & os.O_NONBLOCK:
-        table.call(f"set the flags of {held.name}", "fcntl", place, fcntl.F_SETFL, os.O_NONBLOCK)
+    if status := flags & (os.O_NONBLOCK | os.O_DIRECT):
+        table.call(f"set the flags of {held.name}", "fcntl", place, fcntl.F_SETFL, status)
     return place

@@ -42,7 +42,7 @@ CASES = {
     ),
     "path_descriptors": (
         "inotify_directories inotify_gaps inotify_deleted fifo_both fifo_reader fifo_deleted fifo_signals pipe_reopened "
-        "path_only kernel_files file_locks leases"
+        "path_only kernel_files file_locks leases pipe_of_packets"
     ),
     "memory_objects": "memfd_executed memfd_content memfd_sealed memfd_mapped posix_named posix_unlinked",
     "sockets": (

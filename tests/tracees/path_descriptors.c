@@ -80,6 +80,22 @@ static void fifo_both(void) {
     EXPECT(write(other, "name", 4) == 4 && read(reader, found, 20) == 4, "its name leads elsewhere");
 }
 
+static void pipe_of_packets(void) {
+    int ends[2], once[2];
+    char found[PAGE], *large = calloc(1, 3000);
+    if (pipe2(ends, O_DIRECT | O_NONBLOCK) || pipe2(once, O_DIRECT)) cannot("make a pipe of packets");
+    memset(large, 'x', 3000);
+    if (write(ends[1], "ab", 2) != 2 || write(ends[1], large, 3000) != 3000 || write(ends[1], "c", 1) != 1) cannot("write packets");
+    if (write(once[1], "alone", 5) != 5) cannot("write a packet");
+    wait_here();
+    EXPECT_EQUAL("flags", fcntl(ends[1], F_GETFL) & (O_DIRECT | O_NONBLOCK), O_DIRECT | O_NONBLOCK);
+    EXPECT_EQUAL("first packet", read(ends[0], found, sizeof found), 2);
+    EXPECT_EQUAL("a part of the second", read(ends[0], found, 10), 10);
+    EXPECT_EQUAL("third packet", read(ends[0], found, sizeof found), 1);
+    EXPECT(read(ends[0], found, sizeof found) == -1 && errno == EAGAIN, "there are more");
+    EXPECT(write(once[1], "two", 3) == 3 && read(once[0], found, sizeof found) == 5, "two packets are one");
+}
+
 static void fifo_signals(void) {
     mkfifo("loud", 0600);
     int both = open("loud", O_RDWR);
@@ -277,7 +293,7 @@ int main(int count, char **arguments) {
         void (*act)(void);
     } cases[] = {{"inotify_directories", inotify_directories}, {"inotify_gaps", inotify_gaps}, {"fifo_both", fifo_both},
                  {"fifo_reader", fifo_reader}, {"fifo_gone", fifo_gone},
-                 {"leases", leases}, {"fifo_signals", fifo_signals}, {"fifo_deleted", fifo_deleted}, {"inotify_deleted", inotify_deleted},
+                 {"leases", leases}, {"pipe_of_packets", pipe_of_packets}, {"fifo_signals", fifo_signals}, {"fifo_deleted", fifo_deleted}, {"inotify_deleted", inotify_deleted},
                  {"pipe_reopened", pipe_reopened}, {"path_only", path_only}, {"kernel_files", kernel_files}, {"file_locks", file_locks}};
     go = arguments[1];
     for (size_t index = 0; index < sizeof cases / sizeof *cases; index++)
