@@ -8,7 +8,9 @@ How none is missed (each step is a race):
    stopped yet, goes on. One that takes long makes the capture begin anew.
 3. A child that is met for the first time is entered while it stands; one that has executed another program since, anew.
 4. A child that ends before it stands is a zombie from then on: its parent, which stands, cannot ask for it.
-5. A child may end as soon as it runs on: everything that is said of it is looked up before.
+5. A child may end, or execute another program, as soon as it runs on. What is said of one that no snapshot tells of yet is looked
+   up before: many do little else. One that has been there longer is described when it runs on; if it is gone by then, the capture
+   is made anew.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import itertools
 import operator
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -77,11 +79,15 @@ class SeenOthers:
 
     Attributes:
         opened: what every process has open, the first one's included.
+        taken: what was seen of each.
+        later: those that are still to be described, by `describe`.
     """
 
     opened: sharing.OpenedByAll
     ended: tuple[tuple[Status, Stat], ...]
+    taken: list[tuple[CapturedProcess, Look]] = field(default_factory=list)
     processes: list[SeenProcess] = field(default_factory=list)
+    later: list[tuple[CapturedProcess, Callable[[], SeenProcess]]] = field(default_factory=list)
 
     @property
     def pids(self) -> frozenset[int]:
@@ -91,11 +97,27 @@ class SeenOthers:
     @property
     def xstate_mask(self) -> int:
         """Which parts of the processor's state any of them uses."""
-        return functools.reduce(operator.or_, (seen.look.xstate_mask for seen in self.processes), 0)
+        return functools.reduce(operator.or_, (look.xstate_mask for _, look in self.taken), 0)
+
+    def describe(self) -> None:
+        """Say what is still to be said; they may run.
+
+        Raises:
+            MovedError: one is not what it was any more.
+        """
+        for process, tell in self.later:
+            try:
+                with _gone_if_ended(process.pid):
+                    self.processes.append(tell())
+                if not process.onlooker.is_entered():
+                    raise MovedError(f"process {process.pid} has executed another program; capture it again")
+            except ProcessGoneError as error:
+                raise MovedError(f"process {process.pid} ended while it was being described; capture it again") from error
+        self.later.clear()
 
     def looks(self) -> list[tuple[CapturedProcess, Look]]:
         """What was seen of each."""
-        return [(seen.captured, seen.look) for seen in self.processes]
+        return self.taken
 
     def resources(self) -> tuple[Resource, ...]:
         """What all of them have open."""
@@ -338,7 +360,13 @@ class CapturedTree:
                 with _gone_if_ended(pid):
                     look, process = self._look_at(process, threads, seen, told, base=base)
                     told |= process.memory.shared_places()
-                    seen.processes.append(_told_of(process, look, seen, around, stands=stands))
+                    stopped_by = 0 if stands else threads.leader.stopped_by
+                    seen.taken.append((process, look))
+                    tell = functools.partial(_told_of, process, look, seen, around, stopped_by)
+                    if process.is_new:
+                        seen.processes.append(tell())
+                    else:
+                        seen.later.append((process, tell))
             except ProcessGoneError as error:
                 raise MovedError(f"process {pid} ended in the middle of a capture; capture it again") from error
 
@@ -429,16 +457,15 @@ def _end_of(pid: int) -> tuple[Status, Stat] | None:
         time.sleep(0.0005)
 
 
-def _told_of(process: CapturedProcess, look: Look, seen: SeenOthers, around: Surroundings, *, stands: bool) -> SeenProcess:
-    """All that is said of a process, while it stands for us.
+def _told_of(process: CapturedProcess, look: Look, seen: SeenOthers, around: Surroundings, stopped_by: int) -> SeenProcess:
+    """All that is said of a process.
 
     Args:
-        stands: its component was stopped as a whole before.
+        stopped_by: the signal that had stopped it, by itself, before we did; 0: it ran.
     """
     held = sorted_into_kinds(look.standing.opened, around)
     named = f"its process {process.pid} ({look.standing.status.name})"
     reasons = [*held.reasons, *process.reasons(look, seen.pids), *_of_namespaces(process.pid, seen)]
-    stopped_by = 0 if stands else process.threads.leader.stopped_by
     return SeenProcess(
         captured=process,
         look=look,

@@ -200,7 +200,10 @@ class PtraceSession:
                 self._tree.admit(held=self._held)
                 copied = self._first.copy_running(base=base)
                 self._tree.copy_running(base=base)
-                return self._frozen_look(copied, base=base, hold=order.hold)
+                frozen = self._frozen_look(copied, base=base, hold=order.hold)
+                if frozen.others:
+                    frozen.others.describe()
+                return frozen
             except MovedError:
                 if time.monotonic() > deadline:
                     raise
