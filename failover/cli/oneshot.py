@@ -18,7 +18,7 @@ from checkpoint import channel, format
 from checkpoint.channel import Capture, Captured, Protect, Protected, Release, Released, Restore, Restored, Resume, Resumed
 from checkpoint.device_rules import DeviceRule, rule_from
 from checkpoint.engine import Terms
-from checkpoint.errors import CaptureError, CheckpointError, NothingCommittedError, ProbeError, ProcessGoneError
+from checkpoint.errors import CaptureError, CheckpointError, NothingCommittedError, ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import kinship, namespaces, procfs, vessel
 from checkpoint.linux.vessel import Birth, Born
 from checkpoint.model import Member, Snapshot
@@ -29,6 +29,7 @@ from failover.core.types import CARRY
 from failover.errors import FailoverError
 
 CAPTURE_TRIES: Final = 12
+REFUSED_TRIES: Final = 4
 CAPTURE_PAUSE_S: Final = 0.25
 """How often, and how soon, a capture is made again that was begun in a bad moment: a machine without a processor to spare."""
 END_TIMEOUT_S: Final = 10.0
@@ -69,16 +70,20 @@ def capture(arguments: argparse.Namespace) -> int:
 def _at_last(ask: Callable[[], A]) -> A:
     """The answer to what is asked again where the moment was bad: nobody else is there to do so, unlike with an agent.
 
+    What is refused is asked again a few times, too: a child that has not executed its program yet (vfork), bytes on their way.
+
     Raises:
         CheckpointError: what the last try said, or the first one that no other moment would have helped.
     """
+    refused = 0
     for left in reversed(range(CAPTURE_TRIES)):
         try:
             return ask()
         except (ProcessGoneError, NothingCommittedError):
             raise
-        except CaptureError:
-            if not left:
+        except (CaptureError, UnsupportedError) as error:
+            refused += isinstance(error, UnsupportedError)
+            if not left or refused == REFUSED_TRIES:
                 raise
             time.sleep(CAPTURE_PAUSE_S)
     raise AssertionError("the last try answers or raises")

@@ -18,10 +18,11 @@ import pytest
 
 from checkpoint import capabilities
 from checkpoint.channel import Restore, Restored
-from checkpoint.errors import CheckpointError
+from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import kinship, procfs
 from checkpoint.linux.threads import thread_ids
 from checkpoint.linux.vessel import Birth, spawn_vessel
+from failover.cli import oneshot
 from failover.cli.keeper import Keeper
 from tests.failover.cli.test_verbs import failover
 
@@ -183,6 +184,40 @@ def test_a_program_whose_pids_are_taken_goes_on_in_pids_of_its_own(taken: tuple[
     finally:
         os.kill(back, signal.SIGKILL)
         wait_for("its end", lambda: has_ended(back))
+
+
+@pytest.mark.parametrize(
+    ("error", "tries"),
+    [(CaptureError("no processor"), oneshot.CAPTURE_TRIES), (UnsupportedError("a vfork"), oneshot.REFUSED_TRIES)],
+    ids=["a bad moment", "a refusal"],
+)
+def test_what_fails_is_asked_again_a_few_times(error: CheckpointError, tries: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(oneshot, "CAPTURE_PAUSE_S", 0.0)
+    asked = []
+
+    def ask(helps: int) -> str:
+        asked.append(helps)
+        if len(asked) < helps:
+            raise error
+        return "captured"
+
+    assert oneshot._at_last(lambda: ask(tries)) == "captured"
+    asked.clear()
+    with pytest.raises(type(error)):
+        oneshot._at_last(lambda: ask(tries + 1))
+    assert len(asked) == tries
+
+
+def test_a_program_that_has_gone_is_not_asked_for_again() -> None:
+    asked = []
+
+    def ask() -> None:
+        asked.append(1)
+        raise ProcessGoneError("it ended")
+
+    with pytest.raises(ProcessGoneError):
+        oneshot._at_last(ask)
+    assert len(asked) == 1
 
 
 def test_who_was_captured_is_dead_when_the_command_returns(tmp_path: Path) -> None:
