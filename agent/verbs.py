@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import logging
 import os
 from collections.abc import Awaitable, Callable
 from typing import Any, Final, Protocol
@@ -43,9 +44,13 @@ from failover.errors import NameFormatError
 STANDING_POLL_S: Final = 0.01
 """Between two questions to the robot that a component moves to: what an operator reads as the move's time."""
 
+LOOK_PATIENCE_S: Final = 15.0
+"""How long the robot that a component is to move to may take to look what it lacks: it reads files."""
+
 START_PATIENCE_S: Final = 30.0
 """How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
 
+log = logging.getLogger("failover.verbs")
 
 Act = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
 """Carries an order out, for whoever may give it: its arguments → its result."""
@@ -211,14 +216,20 @@ class Verbs(Questions):
         return {"lacks": list(await self._lanes.lacking(name) if name in await self._names() else ())}
 
     async def _check_fit(self, name: str, verb: str, robot: str) -> None:
-        """Ask the robot that a component is to move to whether it could go on there; one that cannot be asked the core refuses.
+        """Ask the robot that a component is to move to whether it could go on there.
+
+        Where it cannot tell (it is not reached, or of another release) the core decides alone.
 
         Raises:
             RefusedError: it lacks something, all of it by name.
         """
         if robot not in await self._reachable():
             return
-        found = await self._lanes.errands.send(robot, "lacks", {"name": name})
+        try:
+            found = await self._lanes.errands.send(robot, "lacks", {"name": name}, patience_s=LOOK_PATIENCE_S)
+        except RefusedError as untold:
+            log.warning("%s: whether it could go on at %s is not known: %s", name, robot, untold)
+            return
         if reasons := tuple(str(reason) for reason in found.get("lacks", ())):
             sentence = f"cannot {verb} {name} to {robot}, where it could not go on: {'; '.join(reasons)}"
             raise RefusedError(sentence, "MismatchError", reasons)
