@@ -111,6 +111,7 @@ class CapturedProcess:
     def close(self) -> None:
         """Let go; the process is not changed."""
         self.memory.close()
+        self.onlooker.close()
         self.threads.close()
 
     def settle(self, position: Position) -> None:

@@ -16,6 +16,7 @@ from checkpoint.engines.outputs import Outputs
 from checkpoint.engines.standing_threads import ThreadOnlooker, ThreadPlace, ThreadStanding
 from checkpoint.errors import CaptureError
 from checkpoint.linux import procfs
+from checkpoint.linux.descriptors import KeptTexts, lending
 from checkpoint.linux.procfs import Stat, Status
 from checkpoint.linux.remote import Answers
 from checkpoint.linux.threads import Threads
@@ -100,12 +101,26 @@ class Onlooker:
         self._devices = devices
         self._tracee = threads.leader
         self._threads = threads
+        self._texts = KeptTexts(threads.pid)
         self._others = ThreadOnlooker(threads, entered)
         self.rights = ThreadRights(threads.pid)
         self._borrowed = entered.pages
         self._interruptions = entered.interruptions
         self._inquiry: Inquiry | None = None
         self._inquiry_key: tuple[int, bytes] = (0, b"")
+
+    def gather(self) -> Opened:
+        """What it has open; for an exact picture it stands still."""
+        return gather(self._tracee.pid, self._texts)
+
+    def _with_contents(self, opened: Opened) -> tuple[OpenFile, ...]:
+        with lending(self._tracee.pid):
+            return with_contents(opened, self._borrowed.noted, self._devices)
+
+    def close(self) -> None:
+        """Close what is kept open of it."""
+        self._texts.close()
+        self._others.close()
 
     def is_entered(self) -> bool:
         """Whether it still is the program that was entered."""
@@ -117,7 +132,7 @@ class Onlooker:
             special, _, _ = procfs.signal_sets(procfs.read_bytes(self._tracee.pid, "status"))
             self._questions(special)
             with contextlib.suppress(CaptureError):  # it runs: one of its threads has just closed something
-                with_contents(gather(self._tracee.pid), None, self._devices)
+                with_contents(self.gather(), None, self._devices)
         self._others.prepare()
         self.rights.prepare()
 
@@ -163,7 +178,7 @@ class Onlooker:
             inquiry=inquiry,
             answers=answers,
             waiting=waiting,
-            opened=with_contents(gather(tracee.pid) if opened is None else opened, self._borrowed.noted, self._devices),
+            opened=self._with_contents(self.gather() if opened is None else opened),
             totals=outputs.totals() if outputs else NOTHING_WRITTEN,
         )
 

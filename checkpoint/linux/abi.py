@@ -319,6 +319,7 @@ def set_timerfd(timer: int, period_ns: int) -> None:
 
 
 NR_GET_ROBUST_LIST: Final[dict[str, int]] = {"x86_64": 274, "aarch64": 100}
+_robust_list_number: Final = NR_GET_ROBUST_LIST.get(os.uname().machine)
 
 
 def robust_list(tid: int) -> tuple[int, int]:
@@ -330,23 +331,23 @@ def robust_list(tid: int) -> tuple[int, int]:
     Source: get_robust_list(2).
     """
     head, length = ctypes.c_uint64(), ctypes.c_uint64()
-    number = NR_GET_ROBUST_LIST[os.uname().machine]
-    if int(_syscall(number, ctypes.c_int(tid), ctypes.byref(head), ctypes.byref(length))) < 0:
+    assert _robust_list_number is not None, "there are registers for this processor, so there are numbers"
+    if int(_syscall(_robust_list_number, ctypes.c_int(tid), ctypes.byref(head), ctypes.byref(length))) < 0:
         raise_errno(f"get_robust_list of thread {tid}")
     return head.value, length.value
 
 
 NR_IOPRIO_GET: Final[dict[str, int]] = {"x86_64": 252, "aarch64": 31}
+_io_priority_number: Final = NR_IOPRIO_GET.get(os.uname().machine)
 NR_IOPRIO_SET: Final[dict[str, int]] = {"x86_64": 251, "aarch64": 30}
 IOPRIO_WHO_PROCESS: Final = 1
 
 
 def io_priority(pid: int) -> int:
     """The I/O priority as ioprio_set(2) takes it; 0 (none of its own) where the kernel does not tell."""
-    number = NR_IOPRIO_GET.get(os.uname().machine)
-    if number is None:
+    if _io_priority_number is None:
         return 0
-    return max(int(_syscall(number, ctypes.c_int(IOPRIO_WHO_PROCESS), ctypes.c_int(pid))), 0)
+    return max(int(_held_syscall(_io_priority_number, IOPRIO_WHO_PROCESS, pid, 0, 0, 0)), 0)
 
 
 def set_io_priority(priority: int) -> None:

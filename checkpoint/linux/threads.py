@@ -70,8 +70,10 @@ def _seized_at_last(tracee: Tracee) -> None:
         ProbeError: we may not, or somebody else traces it.
     """
     for _ in range(SEIZINGS):
-        with contextlib.suppress(ProbeError):
+        try:
             return tracee.seize()
+        except ProbeError:
+            pass
         if procfs.status(tracee.pid).tracer:
             break
         time.sleep(0.0001)

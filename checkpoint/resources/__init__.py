@@ -17,7 +17,7 @@ from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import KEPT, REFUSED, Finding
 from checkpoint.errors import CaptureError
 from checkpoint.linux import abi, entry
-from checkpoint.linux.descriptors import Descriptor, descriptors
+from checkpoint.linux.descriptors import Descriptor, KeptTexts, descriptors
 from checkpoint.model import Fact, Resource
 
 if TYPE_CHECKING:
@@ -156,11 +156,15 @@ class Opened(tuple[OpenFile, ...]):
         return frozenset(one.first.inode for one in self)
 
 
-def gather(pid: int) -> Opened:
-    """Read every descriptor, and which of them share an open file. For an exact picture the process stands still."""
+def gather(pid: int, kept: KeptTexts | None = None) -> Opened:
+    """Read every descriptor, and which of them share an open file. For an exact picture the process stands still.
+
+    Args:
+        kept: of a process that is looked at again and again.
+    """
     groups: list[list[Descriptor]] = []
     alike: dict[tuple[int | bytes, ...], list[list[Descriptor]]] = {}
-    for one in descriptors(pid):
+    for one in descriptors(pid, kept):
         if entry.is_left_open(one):  # ours, and closed when it is entered
             continue
         identity = (one.device, one.inode, one.offset, one.flags & ~os.O_CLOEXEC, _own_number(one))

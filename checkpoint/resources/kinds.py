@@ -98,6 +98,8 @@ def observer_of(one: Descriptor, noted: sockets.Noted | None) -> Observer | None
     Args:
         noted: see `sockets.queue_of`; None for a process that runs.
     """
+    if one.target.startswith(("anon_inode:", "pipe:")):
+        return _OBSERVED.get(one.target)
     if sockets.is_socket(one):
         return functools.partial(observe_socket, noted=noted)
     if terminals.is_terminal(one):

@@ -140,6 +140,13 @@ def is_socket(one: Descriptor) -> bool:
     return stat.S_ISSOCK(one.mode) and one.target.startswith("socket:")
 
 
+class _Plain(socket.socket):
+    """A socket whose family and type are told as plain numbers: to make enumerations of them takes longer than to ask."""
+
+    family = socket.SocketType.family  # type: ignore[assignment]
+    type = socket.SocketType.type  # type: ignore[assignment]
+
+
 @contextlib.contextmanager
 def looked_into(pid: int, number: int) -> Iterator[socket.socket]:
     """A socket of another process, for the body; what is set on it is set there, too.
@@ -148,7 +155,7 @@ def looked_into(pid: int, number: int) -> Iterator[socket.socket]:
         OSError: it was closed meanwhile.
     """
     with copy_of(pid, number) as descriptor:
-        lent = socket.socket(fileno=descriptor)
+        lent = _Plain(fileno=descriptor)
         try:
             yield lent
         finally:
