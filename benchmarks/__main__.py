@@ -39,8 +39,9 @@ def _freeze(quick: bool, directory: Path) -> Findings:
 
 def _crowd(quick: bool, directory: Path) -> Findings:
     return Findings(
-        "Threads and descriptors",
-        "How much longer a program stands still for each thread that sleeps, and each descriptor, that it has more.",
+        "Threads, descriptors and carried files",
+        "How much longer a program stands still for each thread that sleeps, each descriptor, and each name in a carried folder, "
+        "that it has more.",
         tuple(crowd.crowd(quick, directory)),
     )
 
