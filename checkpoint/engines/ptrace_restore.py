@@ -127,6 +127,7 @@ def restore(vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restor
             else _run_one(vessel_pid, program, options, brought[0], arriving)
         )
         restored.arriving = arriving
+        restored.notes += arriving.notes
         restored.notes += laid.notes
         return restored
     except RestoreError:

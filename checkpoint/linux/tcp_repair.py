@@ -161,6 +161,16 @@ def read(looked: socket.socket) -> Kept:
         )
 
 
+def leave_behind(looked: socket.socket) -> None:
+    """Set a connection free in which somebody died while he looked at it; its SO_REUSEADDR nobody knows any more.
+
+    Raises:
+        OSError: we may not.
+    """
+    if looked.getsockopt(socket.IPPROTO_TCP, TCP_REPAIR):
+        _leave_repair(looked, _OFF_QUIETLY, 0)
+
+
 def _require_plain(looked: socket.socket) -> None:
     """Refuse what has more to it than the kernel tells."""
     with contextlib.suppress(OSError):

@@ -30,7 +30,7 @@ from checkpoint.linux.descriptors import copy_of
 from checkpoint.linux.silence import Connection
 from checkpoint.linux.tcp_repair import CannotCarryError, InUseError, Kept
 from checkpoint.model import Fact, Resource, Snapshot
-from checkpoint.resources import OpenFile, tcp_connections
+from checkpoint.resources import OpenFile, internet_sockets, tcp_connections
 from checkpoint.resources.rebuilding import number_of
 from checkpoint.resources.tcp_connections import KIND, LEFT, TAKEN
 
@@ -41,6 +41,7 @@ CAPABILITIES: Final = (
         "a handover, a failback, and `failover capture` with `restore`, take established ones along with what waits in them "
         "(TCP_REPAIR); their address is to follow (docs/connections.md). After a crash they are reset",
         "it takes CAP_NET_ADMIN",
+        "goes on once this machine has its address",
     ),
 )
 
@@ -152,9 +153,12 @@ def _borrowed(descriptor: int) -> Iterator[socket.socket]:
 
 def heard_again(opened: Iterable[OpenFile]) -> None:
     """What somebody silenced who died over it, and left the program running, is heard again."""
-    silent = [_connection(one.observed) for one in _with_others(opened)]
+    found = list(_with_others(opened))
     with contextlib.suppress(OSError):  # then nobody could have silenced them either
-        silence.lift(silent)
+        for one in found:
+            with copy_of(one.pid, one.first.number) as descriptor, _borrowed(descriptor) as looked:
+                tcp_repair.leave_behind(looked)
+        silence.lift(_connection(one.observed) for one in found)
 
 
 # --- Restored ----------------------------------------------------------------------------------------------------------
@@ -175,10 +179,15 @@ class _Arrival:
 
 
 class Arriving:
-    """Connections that a program takes up again: made once it has its descriptors, and heard from when it goes on."""
+    """Connections that a program takes up again: made once it has its descriptors, and heard from when it goes on.
+
+    Attributes:
+        notes: what is to be done for them.
+    """
 
     def __init__(self, arrivals: Iterable[_Arrival] = ()) -> None:
         self._arrivals = tuple(arrivals)
+        self.notes = tuple(_missing(one) for one in self._arrivals if not internet_sockets.is_ours(_ends(one.resource)[0]))
         self._made: list[tuple[socket.socket, _Arrival, int]] = []
 
     def connect(self, pids: Sequence[int]) -> None:
@@ -218,6 +227,13 @@ class Arriving:
                 made.close()
         except OSError as error:
             raise RestoreError(f"cannot let TCP connections go on: {error.strerror}") from error
+
+
+def _missing(one: _Arrival) -> str:
+    ours = one.connection.ours[0]
+    return (
+        f"the TCP connection {one.resource.name} goes on once this machine has its address: add {ours} to one of its interfaces"
+    )
 
 
 def arriving(state: Snapshot, *, wanted: bool) -> tuple[Arriving, Snapshot]:

@@ -10,7 +10,6 @@ little, and ends its side before it is ready.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import socket
 import sys
@@ -53,11 +52,14 @@ def heard(end: socket.socket) -> bytes:
 def talk(end: socket.socket, *, ends: bool) -> str:
     """What was wrong; "ok" if nothing."""
     total = LITTLE if ends else fill(end)
+    complaints: list[str] = []
 
     def say() -> None:
-        with contextlib.suppress(OSError):  # whoever reads says so
+        try:
             end.sendall((said(total) if ends else b"") + LAST + b" %d" % total)
             end.shutdown(socket.SHUT_WR)
+        except OSError as error:  # the kernel tells it once, to whoever asks first
+            complaints.append(f"{error.strerror} ({error.errno})")
 
     if ends:
         say()
@@ -71,6 +73,8 @@ def talk(end: socket.socket, *, ends: bool) -> str:
     except OSError as error:
         return f"{error.strerror} ({error.errno})"
     saying.join()
+    if complaints:
+        return complaints[0]
     body, mark, size = found.rpartition(LAST)
     if not mark or int(size) != len(body):
         return f"{len(found)} bytes, which end in {found[-40:]!r}"

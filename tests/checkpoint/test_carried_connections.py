@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -168,6 +169,13 @@ def restored(machines: Machines, machine: str, file: Path, *words: str) -> tuple
     return int(ran.stdout), ran.stderr
 
 
+def asked_again(machines: Machines) -> int:
+    """How often the peer's kernel has asked in vain whether there is room for what it has to say. Source: ss(8), -o."""
+    shown = run("ip", "netns", "exec", machines.name("peer"), "ss", "-Htno", "sport", "=", f":{PORT}")
+    found = re.search(r"timer:\(\w+,[^,]*,(\d+)\)", shown)
+    return int(found[1]) if found else 0
+
+
 def decoded(file: Path) -> Snapshot:
     """What a snapshot's file says."""
     with file.open("rb") as opened:
@@ -199,9 +207,12 @@ def test_a_connection_goes_along_with_all_that_waits_in_it(machines: Machines) -
     caller, called = conversation(machines)
     file = captured(machines, caller.pid, "--connections", "carry")
     caller.wait()
+    before = asked_again(machines)
+    until(lambda: asked_again(machines) > before, "the peer to ask once more where nobody is left who could answer")
     machines.take_address("one")
     pid, notes = restored(machines, "two", file)
     assert "is reset (" not in notes, notes
+    assert f"add {ADDRESSES[machines.version][0].partition('/')[0]} to one of its interfaces" in notes
     machines.give_address("two")
     expect_unbroken(machines, pid, called)
 
