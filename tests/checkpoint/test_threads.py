@@ -75,6 +75,7 @@ def open_descriptors() -> list[str]:
     return sorted(os.listdir("/proc/self/fd"))
 
 
+@pytest.mark.timeout(3600)
 def test_captures_that_race_with_births_and_ends_lose_nothing(compiled: Compiled, tmp_path: Path) -> None:
     with ended(start_tracee(compiled("births", "-O2"), tmp_path)) as tracee:
         before = open_descriptors()
