@@ -4,11 +4,11 @@ A socket is bound to the same address again. Datagrams that wait come back where
 others are lost, as the network may lose them. So are connections that nobody has accepted yet: who asked for one is
 reset. Connections of TCP are in ``tcp_connections``.
 
-Facts besides those of every socket: ``state`` of tcp(7), `CLOSED` for UDP; ``address`` and ``peer``: [host, port] or [host, port,
-flow, scope], empty if there is none; ``backlog``; ``waiting``: connections not accepted yet; ``sources``: addresses from which
-what is in the queue came; ``groups``: a list of [interface, group, filter as MCAST_MSFILTER takes it]; ``shutdown`` of a socket
-for datagrams: 1 what it reads, 2 what it sends; ``lost``: something waits in one that is raw or of ICMP; ``foreign``: the
-machine does not have its address (any more).
+Facts besides those of every socket: ``state`` of tcp(7), `CLOSED` for UDP; ``address`` and ``peer``: [host, port] or [host,
+port, flow, scope], empty if there is none; ``backlog``; ``waiting``: connections not accepted yet; ``sources``: addresses from
+which what is in the queue came; ``groups``: a list of [interface, group, filter as MCAST_MSFILTER takes it]; ``shutdown`` of a
+socket for datagrams: 1 what it reads, 2 what it sends; ``lost``: something waits in one that is raw or of ICMP; ``failed``: an
+error does; ``foreign``: the machine does not have its address (any more).
 
 Source: tcp(7), udp(7), ip(7); linux/in.h for group_filter.
 """
@@ -117,6 +117,7 @@ def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: socket
         "sources": [list(source) for source in queue.sources if isinstance(source, tuple)],
         "groups": list(_groups(looked, _machine_groups(held.pid, opened, looked.family))) if is_datagram else [],
         "shutdown": _shutdown(held, looked, opened) if is_datagram else 0,
+        "failed": may_queue and bool(sockets.readiness(looked) & select.POLLERR),
         "lost": is_datagram and not may_queue and bool(sockets.readiness(looked)),
     }
 
@@ -254,6 +255,9 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
 def findings(held: Iterable[Resource]) -> Iterator[Finding]:
     """Connections and datagrams that are lost."""
     for one in held:
+        if one.kind == KIND and one.facts.get("failed"):
+            text = f"an error, and what else waits in {one.name}, is lost when the program comes back"
+            yield Finding(KIND, one.name, NOTED, text)
         if one.kind == KIND and one.facts.get("lost"):
             yield Finding(
                 KIND, one.name, NOTED, f"what waits in {one.name}, a raw or ICMP socket, is lost when the program comes back"

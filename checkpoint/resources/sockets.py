@@ -1,9 +1,10 @@
 """What all sockets have in common: their family and kind, options, and what waits in them to be read.
 
 Facts of every socket: ``descriptors``; ``flags`` of fcntl(2); ``socket``: its inode number, by which others refer to it;
-``family``, ``type`` and ``protocol`` of socket(2); ``options``: a list of [level, number, value] of those that are not as in a
-fresh socket; ``filter``, where there is one: the classic BPF program that sifts what comes, and ``filter_locked``; ``queue``:
-what waits to be read, a list of messages, of a stream the pieces in which it was found.
+``family``, ``type`` and ``protocol`` of socket(2); ``user``: uid and gid of who made it, as fstat(2) tells them; ``options``: a
+list of [level, number, value] of those that are not as in a fresh socket; ``filter``, where there is one: the classic BPF
+program that sifts what comes, and ``filter_locked``; ``queue``: what waits to be read, a list of messages, of a stream the
+pieces in which it was found.
 
 A datagram of no bytes that waits is lost by the second capture after it came: it cannot be looked at twice.
 
@@ -65,26 +66,27 @@ SO_LOCK_FILTER: Final = 44
 UNTOLD: Final = b"?"
 """In place of a filter: it is of extended BPF, which the kernel does not tell."""
 SO_PEEK_OFF: Final = 42
-_GENERAL: Final = (2, 5, 6, 9, 10, 11, 12, 13, 15, 16, 18, 20, 21, 25, 29, 34, 35, 36, 37, 40, SO_PEEK_OFF, 46, 60, 69)
+_GENERAL: Final = (2, 5, 6, 9, 10, 11, 12, 13, 15, 16, 18, 20, 21, 25, 29, 34, 35, 36, 37, 40, SO_PEEK_OFF, 46, 47, 60, 69)
 """SO_REUSEADDR, DONTROUTE, BROADCAST, KEEPALIVE, OOBINLINE, NO_CHECK, PRIORITY, LINGER, REUSEPORT, PASSCRED, RCVLOWAT, RCVTIMEO,
-SNDTIMEO, BINDTODEVICE, TIMESTAMP, PASSSEC, TIMESTAMPNS, MARK, TIMESTAMPING, RXQ_OVFL, PEEK_OFF, BUSY_POLL, ZEROCOPY,
-PREFER_BUSY_POLL."""
+SNDTIMEO, BINDTODEVICE, TIMESTAMP, PASSSEC, TIMESTAMPNS, MARK, TIMESTAMPING, RXQ_OVFL, PEEK_OFF, BUSY_POLL, MAX_PACING_RATE,
+ZEROCOPY, PREFER_BUSY_POLL."""
 _BUFFERS: Final = {socket.SO_SNDBUF: 1, socket.SO_RCVBUF: 2}
 """Which bit of SO_BUF_LOCK says that the program has set it; else the kernel chooses. It doubles what it is told."""
 SO_BUF_LOCK: Final = 72
 _FORCED: Final = {socket.SO_SNDBUF: 32, socket.SO_RCVBUF: 33}
 """SO_SNDBUFFORCE and SO_RCVBUFFORCE."""
-_IP: Final = (1, 2, 8, 10, 11, 12, 13, 15, 19, 20, 21, 32, 33, 34, 49, 50)
-"""IP_TOS, TTL, PKTINFO, MTU_DISCOVER, RECVERR, RECVTTL, RECVTOS, FREEBIND, TRANSPARENT, ORIGDSTADDR, MINTTL, MULTICAST_IF,
-MULTICAST_TTL, MULTICAST_LOOP, MULTICAST_ALL, UNICAST_IF."""
+_IP: Final = (1, 2, 4, 8, 10, 11, 12, 13, 15, 19, 20, 21, 24, 32, 33, 34, 49, 50, 51)
+"""IP_TOS, TTL, OPTIONS, PKTINFO, MTU_DISCOVER, RECVERR, RECVTTL, RECVTOS, FREEBIND, TRANSPARENT, ORIGDSTADDR, MINTTL,
+BIND_ADDRESS_NO_PORT, MULTICAST_IF, MULTICAST_TTL, MULTICAST_LOOP, MULTICAST_ALL, UNICAST_IF, LOCAL_PORT_RANGE."""
 _OF_DATAGRAMS: Final = tuple((level, number) for level, numbers in ((0, (32, 33)), (41, (17, 18))) for number in numbers)
 """Options that a stream shows and cannot be given: whereby and how far it would send to groups."""
-_IPV6: Final = (16, 17, 18, 19, 23, 25, 26, 29, 49, 51, 66, 67, 70, 78)
+_IPV6: Final = (16, 17, 18, 19, 23, 25, 26, 29, 49, 51, 53, 54, 56, 57, 58, 59, 60, 62, 66, 67, 70, 72, 73, 74, 75, 76, 78)
 """IPV6_UNICAST_HOPS, MULTICAST_IF, MULTICAST_HOPS, MULTICAST_LOOP, MTU_DISCOVER, RECVERR, V6ONLY, MULTICAST_ALL, RECVPKTINFO,
-RECVHOPLIMIT, RECVTCLASS, TCLASS, AUTOFLOWLABEL, FREEBIND."""
-_TCP: Final = (1, 3, 4, 5, 6, 7, 8, 9, 10, 13, 18, 23, 25, 37)
+RECVHOPLIMIT, RECVHOPOPTS, HOPOPTS, RECVRTHDR, RTHDR, RECVDSTOPTS, DSTOPTS, RECVPATHMTU, DONTFRAG, RECVTCLASS, TCLASS,
+AUTOFLOWLABEL, ADDR_PREFERENCES, MINHOPCOUNT, ORIGDSTADDR, TRANSPARENT, UNICAST_IF, FREEBIND."""
+_TCP: Final = (1, 3, 4, 5, 6, 7, 8, 9, 10, 13, 18, 23, 25, 30, 36, 37)
 """TCP_NODELAY, CORK, KEEPIDLE, KEEPINTVL, KEEPCNT, SYNCNT, LINGER2, DEFER_ACCEPT, WINDOW_CLAMP, CONGESTION, USER_TIMEOUT,
-FASTOPEN, NOTSENT_LOWAT, TX_DELAY."""
+FASTOPEN, NOTSENT_LOWAT, FASTOPEN_CONNECT, INQ, TX_DELAY."""
 _UDP: Final = (1, 101, 102, 103, 104)
 """UDP_CORK, NO_CHECK6_TX, NO_CHECK6_RX, SEGMENT, GRO."""
 _UDPLITE: Final = 136
@@ -116,12 +118,14 @@ class Queue:
         passed: of each message the descriptors of the program that are on their way in it, `UNKNOWN` for what it has not open.
         sources: of each message its sender's address, as recvmsg(2) tells it.
         too_long: more than `QUEUE_LIMIT` bytes.
+        urgent: an out-of-band byte waits, too.
     """
 
     messages: tuple[bytes, ...] = ()
     sources: tuple[object, ...] = ()
     passed: tuple[tuple[int, ...], ...] = ()
     too_long: bool = False
+    urgent: bool = False
 
 
 NOTHING: Final = Queue()
@@ -170,6 +174,7 @@ def general_facts(one: Descriptor, looked: socket.socket) -> dict[str, Fact]:
         "family": int(form.family),
         "type": int(form.type),
         "protocol": form.protocol,
+        "user": [one.uid, one.gid],
         "options": list(_options(looked, form)),
     }
     if sieve := _filter(looked):
@@ -277,6 +282,8 @@ def queue_of(looked: socket.socket, number: int, noted: Noted | None, identify: 
         if looked.family == socket.AF_UNIX:
             raise OSError(errno.EBUSY, "an error waits in it, which the program has not been told yet")
         return NOTHING  # datagrams of UDP may be lost, the error may not
+    if ready & select.POLLPRI:
+        return Queue(urgent=True)
     if not ready & select.POLLIN:
         return NOTHING
     before = looked.getsockopt(socket.SOL_SOCKET, SO_PEEK_OFF)
@@ -302,7 +309,7 @@ def set_peek_offset(looked: socket.socket, offset: int) -> None:
 def readiness(looked: socket.socket) -> int:
     """What poll(2) says of reading it."""
     poll = select.poll()
-    poll.register(looked, select.POLLIN)
+    poll.register(looked, select.POLLIN | select.POLLPRI)
     return next((events for _, events in poll.poll(0)), 0)
 
 
@@ -364,6 +371,9 @@ def set_options(table: CallTable, held: Resource, made: int, *, is_bound: bool =
     Args:
         is_bound: it has its address already, and so what must come before that.
     """
+    user = held.facts.get("user")
+    if isinstance(user, list) and user:
+        table.attempt(f"{held.name} is another user's socket", "fchown", made, number_of(user[0]), number_of(user[1]))
     for level, number, value in options_of(held):
         if is_bound and (level, number) == V6ONLY:
             continue

@@ -13,8 +13,8 @@ What a program takes along when it moves, as its operator may have it, is in ``c
 are `TAKEN`, `LEFT` and `MAY_MOVE`.
 
 Facts besides those of ``internet_sockets``: ``local``: both addresses are one machine's; ``queue``: what waits to be read in a
-local one, one message; ``unread``: bytes that wait; ``sent`` and ``received``: bytes that went over it; ``unsent``: bytes still
-to be sent; ``ends``: what poll(2) says of its end, `READ_ENDED` and `FAILED`.
+local one, one message; ``unread``: bytes that wait; ``urgent``: an out-of-band one does; ``sent`` and ``received``: bytes that
+went over it; ``unsent``: bytes still to be sent; ``ends``: what poll(2) says of its end, `READ_ENDED` and `FAILED`.
 
 Source: tcp(7), tcp_ioctl() and tcp_poll() in net/ipv4/tcp.c; linux/tcp.h for struct tcp_info.
 """
@@ -61,6 +61,7 @@ CAPABILITIES: Final = (
         "it is kept as soon as what was sent has arrived, or was read",
         "have not arrived at its other end",
         "in which more than {} MiB wait",
+        "in which an out-of-band byte waits (MSG_OOB)",
     ),
 )
 
@@ -116,6 +117,7 @@ def observe(held: OpenFile, looked: socket.socket, facts: Mapping[str, Fact]) ->
         "local": is_local,
         "queue": [_peek(looked, unread)] if is_local and 0 < unread <= sockets.QUEUE_LIMIT else [],
         "unread": unread,
+        "urgent": is_local and bool(sockets.readiness(looked) & select.POLLPRI),
         "sent": sent - again,
         "received": _RECEIVED.unpack_from(told, _RECEIVED_AT)[0],
         "unsent": int.from_bytes(told[_UNSENT_AT : _UNSENT_AT + 4], "little"),
@@ -204,10 +206,12 @@ def findings(held: Sequence[Resource], *, standing: bool) -> Iterator[Finding]:
 
 def _refuse_end(one: Resource, other: Resource) -> Iterator[str]:
     """Why a connection of the program with itself cannot be made again."""
+    what = f"{one.name} is a TCP connection of the program with itself"
+    if one.facts.get("urgent"):
+        yield f"{what}, in which an out-of-band byte waits (MSG_OOB): it is kept as soon as that is read"
     if one.facts["state"] == CLOSED:
         return
     underway = _number(one, "unsent") + _number(one, "sent") - _number(other, "received") + (other.facts["state"] in _PEER_ENDED)
-    what = f"{one.name} is a TCP connection of the program with itself"
     if underway > 0:
         yield f"{what}, {underway} bytes of which have not arrived at its other end: it is kept as soon as they have"
     if _number(one, "unread") > sockets.QUEUE_LIMIT:

@@ -6,10 +6,10 @@ datagrams that was connected to a name outside (``/dev/log``) is connected to th
 
 Facts besides those of every socket, of ``unix_names`` and of ``unix_makers``: ``state`` of `checkpoint.linux.unix_sockets`;
 ``name``; ``peer``: inode number of its other end, 0 when that is gone; ``peer_name``; ``backlog``; ``shutdown``; ``clients``:
-whose connections wait to be accepted, inode numbers in their order; ``passed``: of each message in the queue the descriptors that
-came with it, as numbers of the program's own, or of ``travelling``; no list if none has any; ``too_long``: the queue;
-``sources``: of each message in the queue the name of its sender; no list if none has any; ``not_accepted``: of one whose
-connection waits itself, how much of what it sent is unread, -1 of any other.
+whose connections wait to be accepted, inode numbers in their order; ``passed``: of each message in the queue the descriptors
+that came with it, as numbers of the program's own, or of ``travelling``; no list if none has any; ``too_long``: the queue;
+``urgent``: an out-of-band byte waits; ``sources``: of each message in the queue the name of its sender; no list if none has
+any; ``not_accepted``: of one whose connection waits itself, how much of what it sent is unread, -1 of any other.
 
 Source: unix(7).
 """
@@ -54,8 +54,9 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.SOCKETS,
-        "a unix socket with descriptors on their way between several processes, or over 4 MiB that wait",
+        "a unix socket with descriptors on their way between several processes, an out-of-band byte, or over 4 MiB that wait",
         "it is kept as soon as the program has taken them",
+        "in which an out-of-band byte waits (MSG_OOB): it",
         "with descriptors on their way",
         "MiB wait: it is kept as soon as",
     ),
@@ -107,6 +108,7 @@ def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: socket
             "queue": list(queue.messages),
             "passed": [list(numbers) for numbers in queue.passed] if any(queue.passed) else [],
             "too_long": queue.too_long,
+            "urgent": queue.urgent,
             "sources": list(map(_packed_name, queue.sources)) if told.type == socket.SOCK_DGRAM and any(queue.sources) else [],
         }
     )
@@ -166,6 +168,8 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return f"{what} where a connection waits to be accepted whose client has gone: {_ACCEPTED}"
     if number_of(seen["not_accepted"]) > 0:
         return f"{what} whose connection waits to be accepted with data in it, which nobody can look at: {_ACCEPTED}"
+    if seen["urgent"]:
+        return f"{what} in which an out-of-band byte waits (MSG_OOB): it is kept as soon as that is read"
     if seen["too_long"]:
         return f"{what} in which more than {sockets.QUEUE_LIMIT >> 20} MiB wait: it is kept as soon as they are read"
     return unix_names.refuse(held) or sockets.refuse_filter(held) or elsewhere.refuse(held, "a unix socket")

@@ -55,7 +55,7 @@ CASES = {
         "ghost_left ghost_directory name_taken_again waiting_stream waiting_packets named_senders named_pair makers travelling"
     ),
     "kernel_sockets": "netlink raw light_datagrams packets",
-    "internet_sockets": "udp_shut_down foreign_address closed_connection_4 closed_connection_6",
+    "internet_sockets": "udp_shut_down foreign_address rare_options closed_connection_4 closed_connection_6",
 }
 
 

@@ -96,6 +96,25 @@ static void closed_connection(int family, const char *host) {
     }
 }
 
+/* Options that a socket carries in every packet, and whose socket it is. */
+static void rare_options(void) {
+    unsigned char four[4] = {148, 4, 0, 0}, six[8] = {0, 0, 1, 4, 0, 0, 0, 0}, found[16] = "";
+    int file = udp(), other = socket(AF_INET6, SOCK_DGRAM, 0), stream = socket(AF_INET, SOCK_STREAM, 0);
+    if (setsockopt(file, IPPROTO_IP, IP_OPTIONS, four, 4) || setsockopt(other, IPPROTO_IPV6, IPV6_DSTOPTS, six, 8)) cannot("set options");
+    set(other, IPPROTO_IPV6, IPV6_DONTFRAG, 1), set(stream, IPPROTO_IP, 24 /* IP_BIND_ADDRESS_NO_PORT */, 1);
+    if (fchown(file, 1234, 4321)) cannot("give a socket away");
+    wait_here();
+    socklen_t size = sizeof found;
+    EXPECT(getsockopt(file, IPPROTO_IP, IP_OPTIONS, found, &size) == 0 && size == 4 && !memcmp(found, four, 4), "%u bytes", size);
+    size = sizeof found;
+    EXPECT(getsockopt(other, IPPROTO_IPV6, IPV6_DSTOPTS, found, &size) == 0 && size == 8 && !memcmp(found, six, 8), "%u bytes", size);
+    EXPECT_EQUAL("fragments", option(other, IPPROTO_IPV6, IPV6_DONTFRAG), 1);
+    EXPECT_EQUAL("no port", option(stream, IPPROTO_IP, 24), 1);
+    struct stat about = {0};
+    fstat(file, &about);
+    EXPECT(about.st_uid == 1234 && about.st_gid == 4321, "it is %u's", about.st_uid);
+}
+
 static void closed_connection_4(void) { closed_connection(AF_INET, "127.0.0.1"); }
 static void closed_connection_6(void) { closed_connection(AF_INET6, "::1"); }
 
@@ -105,6 +124,7 @@ int main(int count, char **arguments) {
         {"foreign_address", foreign_address},
         {"accepted_stream_4", accepted_stream_4},
         {"accepted_stream_6", accepted_stream_6},
+        {"rare_options", rare_options},
         {"closed_connection_4", closed_connection_4},
         {"closed_connection_6", closed_connection_6},
     };

@@ -156,6 +156,12 @@ static void take_unix_waiting_data(void) {
 
 static void take_unix_waiting_gone(void) { close(ask_for_connection()); }
 
+static void take_unix_urgent(void) {
+    int ends[2];
+    if (socketpair(AF_UNIX, SOCK_STREAM, 0, ends) || send(ends[0], "ab", 2, MSG_OOB) != 2) cannot("send out of band");
+    keep(ends[1], "a socket");
+}
+
 static void take_unix_other_name(void) {
     struct sockaddr_un address = {.sun_family = AF_UNIX};
     if (!getcwd(address.sun_path, 80)) cannot("see where I am");
@@ -371,6 +377,7 @@ static const struct kind {
              {"unix_rights", take_unix_rights},
              {"unix_waiting_data", take_unix_waiting_data},
              {"unix_waiting_gone", take_unix_waiting_gone},
+             {"unix_urgent", take_unix_urgent},
              {"unix_other_name", take_unix_other_name},
              {"netlink_socket", take_netlink_socket},
              {"netlink_answer", take_netlink_answer},
