@@ -4,24 +4,24 @@ While a connection moves, nobody may answer in its place: not a kernel that has 
 peer's), nor one whose program was ended with the connection open. The peer hears nothing and sends again, as after a lost packet.
 
 Each connection has a table of its own in nf_tables, named by its two ends, so that whoever takes the connection up finds it,
-whichever process that is. It ceases to have an effect by itself after `SILENCE_S`.
+whichever process that is. It ceases to have an effect by itself after `SILENCE_S`, and is cleared away by the next one.
 
 Source: linux/netfilter/nf_tables.h, linux/netfilter/nfnetlink.h; nf_tables_newrule() in net/netfilter/nf_tables_api.c.
 """
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import socket
 import struct
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from ipaddress import ip_address
 from typing import Final
 
+PREFIX: Final = "failover_"
 NS_PER_S: Final = 1_000_000_000
 SILENCE_S: Final = 924
 """How long a peer that hears nothing goes on sending again before it gives up. Source: tcp_retries2 in tcp(7)."""
@@ -35,17 +35,23 @@ _BATCH_BEGIN: Final = 0x10
 _BATCH_END: Final = 0x11
 _NEW_TABLE: Final = _SUBSYSTEM << 8
 _DELETE_TABLE: Final = _SUBSYSTEM << 8 | 2
+_GET_TABLE: Final = _SUBSYSTEM << 8 | 1
 _NEW_CHAIN: Final = _SUBSYSTEM << 8 | 3
 _NEW_RULE: Final = _SUBSYSTEM << 8 | 6
 _ERROR: Final = 2
 _REQUEST: Final = 1
 _ACKNOWLEDGE: Final = 4
 _CREATE: Final = 0x400
+_DUMP: Final = 0x300
 _APPEND: Final = 0x800
 _NESTED: Final = 0x8000
 _HEADER: Final = struct.Struct("<IHHII")
 _GENERAL: Final = struct.Struct(">BBH")
 """struct nlmsghdr and struct nfgenmsg."""
+
+_USER_DATA: Final = 6
+"""NFTA_TABLE_USERDATA: bytes that the kernel keeps for us; `_UNTIL`, nanoseconds of the clock of the day."""
+_UNTIL: Final = struct.Struct("<Q")
 
 _BEFORE_ALL: Final = -300
 """NF_IP_PRI_RAW: before connections are tracked."""
@@ -90,7 +96,7 @@ class Connection:
     @property
     def table(self) -> str:
         """How its table is called."""
-        return f"failover_{hashlib.blake2s(repr((self.ours, self.peer)).encode(), digest_size=12).hexdigest()}"
+        return f"{PREFIX}{hashlib.blake2s(repr((self.ours, self.peer)).encode(), digest_size=12).hexdigest()}"
 
 
 def _plain(host: str) -> str:
@@ -103,8 +109,10 @@ def impose(connections: Iterable[Connection]) -> None:
     Raises:
         OSError: we may not (CAP_NET_ADMIN), or this kernel has no nf_tables.
     """
-    until_ns = time.time_ns() + SILENCE_S * NS_PER_S
-    _transact([message for one in connections for message in (*_removal(one), *_rules(one, until_ns))])
+    now_ns = time.time_ns()
+    until_ns = now_ns + SILENCE_S * NS_PER_S
+    spent = [message for table, end_ns in _tables() if end_ns <= now_ns for message in _removal(table)]
+    _transact(spent + [message for one in connections for message in (*_removal(one.table), *_rules(one, until_ns))])
 
 
 def lift(connections: Iterable[Connection]) -> None:
@@ -113,18 +121,50 @@ def lift(connections: Iterable[Connection]) -> None:
     Raises:
         OSError: we may not, or this kernel has no nf_tables.
     """
-    _transact([message for one in connections for message in _removal(one)])
+    _transact([message for one in connections for message in _removal(one.table)])
 
 
-def _removal(one: Connection) -> list[_Message]:
+def _removal(table: str) -> list[_Message]:
     """Whether it is there or not: it is made, which changes one that is there in nothing, and then taken away."""
-    return [_message(_NEW_TABLE, _CREATE, _text(1, one.table)), _message(_DELETE_TABLE, 0, _text(1, one.table))]
+    return [_message(_NEW_TABLE, _CREATE, _text(1, table)), _message(_DELETE_TABLE, 0, _text(1, table))]
+
+
+def _tables() -> Iterator[tuple[str, int]]:
+    """All tables of connections on this machine, and until when each has an effect."""
+    with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC, NETLINK_NETFILTER) as asked:
+        asked.settimeout(ANSWER_S)
+        question = _GENERAL.pack(_FAMILY_INET, 0, 0)
+        asked.send(_HEADER.pack(_HEADER.size + len(question), _GET_TABLE, _REQUEST | _DUMP, 1, 0) + question)
+        while True:
+            for kind, content in _answers(asked.recv(1 << 16)):
+                if kind != _NEW_TABLE:
+                    return
+                found = dict(_attributes(content[_GENERAL.size :]))
+                name, until = found.get(1, b"").rstrip(b"\0").decode(), found.get(_USER_DATA, b"")
+                if name.startswith(PREFIX) and len(until) == _UNTIL.size:
+                    yield name, _UNTIL.unpack(until)[0]
+
+
+def _answers(told: bytes) -> Iterator[tuple[int, bytes]]:
+    place = 0
+    while place + _HEADER.size <= len(told):
+        size, kind, *_ = _HEADER.unpack_from(told, place)
+        yield kind, told[place + _HEADER.size : place + size]
+        place += max(-(-size // 4) * 4, _HEADER.size)
+
+
+def _attributes(content: bytes) -> Iterator[tuple[int, bytes]]:
+    place = 0
+    while place + 4 <= len(content):
+        size, kind = struct.unpack_from("<HH", content, place)
+        yield kind, content[place + 4 : place + size]
+        place += max(-(-size // 4) * 4, 4)
 
 
 def _rules(one: Connection, until_ns: int) -> list[_Message]:
     """The table of a connection: what comes is dropped, and what goes."""
     table = one.table
-    messages = [_message(_NEW_TABLE, _CREATE, _text(1, table))]
+    messages = [_message(_NEW_TABLE, _CREATE, _text(1, table) + _attribute(_USER_DATA, _UNTIL.pack(until_ns)))]
     for name, hook, source, target in (("input", _INPUT, one.peer, one.ours), ("output", _OUTPUT, one.ours, one.peer)):
         place = _nested(4, _number(1, hook) + _number(2, _BEFORE_ALL & 0xFFFFFFFF))
         chain = _text(1, table) + _text(3, name) + place + _number(5, _ACCEPT) + _text(7, "filter")
@@ -214,24 +254,11 @@ def _acknowledged(answer: bytes) -> int:
     Raises:
         OSError: one was not, so none will be.
     """
-    count = place = 0
-    while place + _HEADER.size <= len(answer):
-        size, kind, *_ = _HEADER.unpack_from(answer, place)
+    count = 0
+    for kind, content in _answers(answer):
         if kind == _ERROR:
-            code = -int.from_bytes(answer[place + _HEADER.size : place + _HEADER.size + 4], "little", signed=True)
+            code = -int.from_bytes(content[:4], "little", signed=True)
             if code:
                 raise OSError(code, f"nf_tables: {os.strerror(code)}")
             count += 1
-        place += max(-(-size // 4) * 4, _HEADER.size)
     return count
-
-
-def hindrance() -> str:
-    """Why connections cannot be silenced here; "" where they can."""
-    try:
-        lift([Connection(("0.0.0.0", 0), ("0.0.0.0", 0))])
-    except OSError as error:
-        if error.errno == errno.EPERM:
-            return "CAP_NET_ADMIN is missing"
-        return f"this kernel has no nf_tables ({error.strerror})"
-    return ""
