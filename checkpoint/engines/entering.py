@@ -79,6 +79,7 @@ def _enter_once(threads: Threads, interruptions: Interruptions, *, last: bool) -
     if dispatching := [one.pid for one in (tracee, *threads.others) if one.dispatches_calls()]:
         reason = refused_threads.of_dispatching(dispatching[0])
         raise UnsupportedError(f"cannot enter pid {tracee.pid}: {reason}", (reason,))
+    require_answers(tracee.pid, procfs.read_bytes(tracee.pid, "status"))
     mask = tracee.signal_mask()
     decoded = where_it_stands(tracee, interruptions, tracee.rseq())
     lines = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
@@ -124,6 +125,20 @@ def _put_back(pid: int, borrowed: BorrowedPages) -> None:
     number, offset = note
     with contextlib.suppress(OSError), sockets.looked_into(pid, number) as looked:  # it has closed it since
         sockets.set_peek_offset(looked, offset)
+
+
+def require_answers(pid: int, status: bytes) -> None:
+    """Look whether a process that stands still may be asked at all: the kernel kills who makes a call that its filter forbids.
+
+    Args:
+        status: its /proc/PID/status, now: it may have come under the filter since it was looked at.
+
+    Raises:
+        UnsupportedError: it may not.
+    """
+    if b"\nSeccomp:" in status and b"\nSeccomp:\t0\n" not in status:
+        reason = "it runs under a seccomp filter, which forbids what a capture asks of it: run it without the filter"
+        raise UnsupportedError(f"cannot capture pid {pid}: {reason}", (reason,))
 
 
 def where_it_stands(tracee: Tracee, interruptions: Interruptions, rseq: Rseq | None) -> arch.Registers:

@@ -10,7 +10,7 @@ from typing import Final
 
 from checkpoint.arch import x86_64 as arch
 from checkpoint.device_rules import DeviceRule
-from checkpoint.engines.entering import Entered, where_it_stands
+from checkpoint.engines.entering import Entered, require_answers, where_it_stands
 from checkpoint.engines.inquiry import Inquiry, Told, rearmed
 from checkpoint.engines.outputs import Outputs
 from checkpoint.engines.standing_threads import ThreadOnlooker, ThreadPlace, ThreadStanding
@@ -141,9 +141,11 @@ class Onlooker:
 
         Raises:
             CaptureError: it has not left the code of an earlier look yet.
+            UnsupportedError: it has come under a seccomp filter since.
         """
         tracee = self._tracee
         status = procfs.read_bytes(tracee.pid, "status")
+        require_answers(tracee.pid, status)
         special, waits_here, waits_shared = procfs.signal_sets(status)
         pending = tracee.pending(shared=False) if waits_here else ()
         shared_pending = tracee.pending(shared=True) if waits_shared else ()

@@ -16,7 +16,17 @@ from checkpoint import capabilities
 from checkpoint.capability import Verdict
 from checkpoint.engine import CaptureOrder, ProtectOrder
 from checkpoint.errors import ProbeError, UnsupportedError
-from tests.checkpoint.round_trip import ENGINE, as_nobody, captured, ended, expect_ok, protected, start, start_tracee
+from tests.checkpoint.round_trip import (
+    ENGINE,
+    as_nobody,
+    captured,
+    captured_at_last,
+    ended,
+    expect_ok,
+    protected,
+    start,
+    start_tracee,
+)
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
@@ -325,3 +335,14 @@ def test_a_stopped_program_is_still_stopped_after_a_capture(compiled: Compiled, 
 
 def _state(pid: int) -> str:
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+
+
+def test_a_program_that_enters_a_sandbox_while_it_is_protected_is_not_asked_any_more(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("sandboxed", "-O2"), tmp_path)) as tracee, protected(tracee) as session:
+        captured_at_last(session, CaptureOrder())
+        tracee.tell()
+        tracee.wait_for_output(100)
+        with pytest.raises(UnsupportedError, match="seccomp filter"):
+            captured_at_last(session, CaptureOrder())
+        size = (tmp_path / "out").stat().st_size
+        tracee.wait_for_output(size)

@@ -15,27 +15,20 @@ from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 
 CHANGING = """
-import os, socket, subprocess, sys, time
-flag, kind, number, held = sys.argv[1], sys.argv[2], 0, None
-
-class Child:
-    def __init__(self):
-        self.child = subprocess.Popen(["/bin/sleep", "600"])
-    def close(self):
-        self.child.kill()
-        self.child.wait()
+import os, sys, time
+flag, number, held = sys.argv[1], 0, None
 
 while True:
     print(number, flush=True)
     number += 1
     time.sleep(0.01)
     if os.path.exists(flag) and held is None:
-        held = socket.socket(socket.AF_NETLINK, socket.SOCK_RAW) if kind == "socket" else Child()
+        held = os.pidfd_open(1)
     elif held is not None and not os.path.exists(flag):
-        held.close()
+        os.close(held)
         held = None
 """
-"""Counts, and holds a socket of a family that is not kept, or has a child, for as long as a file exists."""
+"""Counts, and holds another process by a pidfd, which is not kept, for as long as a file exists."""
 
 STOPPING = '[components."/demo/robot1/count"]\non_unsupported = "stop_protecting"\n'
 
@@ -50,20 +43,19 @@ def pair(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Pair]:
 
 @pytest.fixture
 def flag(pair: Pair, tmp_path: Path) -> Path:
-    """A protected program at robot1 that holds a socket while this file exists."""
-    return start(pair, tmp_path, "socket")
+    """A protected program at robot1 that holds what is not kept while this file exists."""
+    return start(pair, tmp_path)
 
 
-def start(pair: Pair, tmp_path: Path, kind: str) -> Path:
+def start(pair: Pair, tmp_path: Path) -> Path:
     path = tmp_path / "flag"
-    robots.run(pair[0], "count", "/usr/bin/python3", "-S", "-c", CHANGING, str(path), kind)
+    robots.run(pair[0], "count", "/usr/bin/python3", "-S", "-c", CHANGING, str(path))
     robots.until_protected(pair[0])
     return path
 
 
-@pytest.mark.parametrize(("kind", "named"), [("socket", "is a socket"), ("child", "it has child processes")])
-def test_what_a_program_turned_into_is_named_and_it_recovers(pair: Pair, tmp_path: Path, kind: str, named: str) -> None:
-    flag = start(pair, tmp_path, kind)
+def test_what_a_program_turned_into_is_named_and_it_recovers(pair: Pair, flag: Path) -> None:
+    named = "is a pidfd"
     flag.touch()
     for robot in pair:
         shown = robots.until_status(robot, 1, "degraded", "not captured: ", named, "the last checkpoint is")
@@ -92,7 +84,7 @@ def test_a_takeover_from_an_old_checkpoint_says_how_old_it_is(pair: Pair, flag: 
 def test_protection_that_was_given_up_is_said_and_nothing_is_taken_over(pair: Pair, flag: Path) -> None:
     first, second = pair
     flag.touch()
-    robots.until_status(first, 1, "protected no longer", "a socket", "failover release, then protect, begins anew")
+    robots.until_status(first, 1, "protected no longer", "a pidfd", "failover release, then protect, begins anew")
     robots.until(lambda: robots.component(second, "count").get("standby") == "", "robot2 to forget its checkpoints")
     flag.unlink()
     shown = robots.component(first, "count")

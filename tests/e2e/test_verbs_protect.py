@@ -15,7 +15,7 @@ from tests.e2e.robots import RobotMachine
 from tests.e2e.test_deaths import parts
 
 COUNT = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.01)\n"
-HOLDING_A_SOCKET = "import socket\nkept = socket.socket(socket.AF_NETLINK, socket.SOCK_RAW)\n" + COUNT
+HOLDING_ANOTHER = "import os\nkept = os.pidfd_open(1)\n" + COUNT
 
 Pair = tuple[RobotMachine, RobotMachine]
 
@@ -66,11 +66,11 @@ def test_a_stranger_is_protected_again_by_the_robot_that_took_it_over(pair: Pair
 
 def test_a_stranger_that_cannot_be_kept_is_refused_by_name_and_not_touched(pair: Pair, tmp_path: Path) -> None:
     written = tmp_path / "stranger.out"
-    pid = stranger(pair[0], HOLDING_A_SOCKET, written)
+    pid = stranger(pair[0], HOLDING_ANOTHER, written)
     ran = robots.failover(pair[0], "protect", str(pid))
     assert ran.returncode == 1
-    assert "fd 3 is a" in ran.stderr and "socket" in ran.stderr, ran.stderr
-    assert "protect the program while it has none" in ran.stderr
+    assert "fd 3 is a pidfd" in ran.stderr, ran.stderr
+    assert "let the program close it" in ran.stderr
     expect_more(written)
     assert robots.failover(pair[0], "status").returncode == 0, "a refusal leaves nothing behind"
 
