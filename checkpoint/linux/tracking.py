@@ -110,10 +110,11 @@ MEMORY_PLACE: Final = "/dev/shm/"
 def is_shared_object(line: MapsLine) -> bool:
     """Whether it is shared memory that may hold more than was touched through this mapping, and that no other machine has.
 
-    A memory file (memfd), POSIX shared memory, and any file that was deleted; anonymous memory is no file.
+    A memory file (memfd), POSIX and System V shared memory, and any file that was deleted; anonymous memory is no file. The first
+    System V segment after a boot has the inode number 0.
     """
     is_gone = line.name.endswith(procfs.DELETED) and line.name != f"/dev/zero{procfs.DELETED}"
-    return is_shared(line) and line.has_file and (is_gone or line.name.startswith(MEMORY_PLACE))
+    return is_shared(line) and (is_gone or line.name.startswith(MEMORY_PLACE))
 
 
 def extents_of(lines: Sequence[MapsLine]) -> Words:

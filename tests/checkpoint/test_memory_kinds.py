@@ -18,6 +18,7 @@ from checkpoint.capability import Verdict
 from checkpoint.engine import CaptureOrder
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import procfs, system_v
+from checkpoint.linux.tracking import is_shared_object
 from checkpoint.resources import system_v_memory, unsupported
 from tests.checkpoint.round_trip import (
     NOBODY,
@@ -266,3 +267,10 @@ def test_a_restore_that_fails_leaves_no_segment(compiled: Compiled, tmp_path: Pa
         with pytest.raises(CheckpointError, match="id is in use"):
             restored(beside, tmp_path).kill()
         assert set(system_v.segments()) == known
+
+
+def test_the_first_segment_of_a_machine_is_read_as_all_others_are() -> None:
+    """Its inode number is its id, 0: what was not touched through this mapping is in it all the same."""
+    (line,) = procfs.parse_maps("7f0000000000-7f0000004000 rw-s 00000000 00:01 0                     /SYSV00000007 (deleted)\n")
+    assert line.inode == 0
+    assert is_shared_object(line)
