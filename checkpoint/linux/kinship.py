@@ -95,8 +95,8 @@ class Kinship:
         ours = _circles([self._pid, *found]) | {self._pid, *found}
         ours -= _circles(one.pid for one in self._of_ancestors)
         known = elders | set(found)
-        fresh = [pid for one in self._of_ancestors for pid in one.read([one.pid]) if pid not in known]
-        return [pid for pid in fresh if _circles([pid]) & ours]
+        theirs = ((one.pid, pid) for one in self._of_ancestors for pid in one.read([one.pid]) if pid not in known)
+        return [pid for ancestor, pid in theirs if _given_to(ancestor, pid) & ours]
 
     @staticmethod
     def _walk(waiting: list[int], known: Iterable[int]) -> Iterator[int]:
@@ -140,6 +140,14 @@ def _circles(pids: Iterable[int]) -> set[int]:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             found |= {os.getsid(pid), os.getpgid(pid)}
     return found - {0}
+
+
+def _given_to(ancestor: int, pid: int) -> set[int]:
+    """By which circles a child of an ancestor may be known as a stray: in its own session a shell makes groups of its jobs."""
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        session = os.getsid(pid)
+        return {session} if session == os.getsid(ancestor) else _circles([pid])
+    return set()
 
 
 def reaper_of(pid: int, *, is_guarded: bool) -> int:

@@ -452,3 +452,13 @@ print("ok", flush=True)
 
 def test_servers_that_wait_at_one_epoll_instance_go_on_serving(tmp_path: Path) -> None:
     goes_through_three_lives(SERVERS, tmp_path)
+
+
+def test_the_other_half_of_a_pipeline_of_a_shell_is_nobody_s_orphan(tmp_path: Path) -> None:
+    pipeline = "set -m; sleep 60 | sleep 60 & jobs -p; wait"
+    program = start(["/bin/bash", "-c", pipeline], tmp_path, isolate=True)
+    with ended(program):
+        program.wait_until(lambda: len(kinship.descendants(program.pid)) == 2, "both halves")
+        leader, _ = kinship.descendants(program.pid)
+        assert os.getpgid(leader) == leader
+        assert kinship.component(leader) == []
