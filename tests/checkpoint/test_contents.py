@@ -18,7 +18,8 @@ from checkpoint.errors import StoreError
 from checkpoint.model import FileIdentity, Snapshot, ThreadState
 from checkpoint.store import Store
 from tests.checkpoint.snapshots import COMPONENT, page, snapshot
-from tests.checkpoint.test_store import CuttingDisk, PowerCutError, laid_out, opened, put
+from tests.checkpoint.test_store import opened, put
+from tests.checkpoint.test_store_power import CuttingDisk, PowerCutError, laid_out
 
 CONTENT = bytes(range(256)) * 64
 

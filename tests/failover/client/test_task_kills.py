@@ -21,7 +21,7 @@ from failover.client.task import Task, open_task
 from failover.client.task_file import StateFile, folder_of
 from failover.client.task_state import KeptState
 from failover.state import Schema
-from tests.checkpoint.test_store import CuttingDisk, PowerCutError, laid_out
+from tests.checkpoint.test_store_power import CuttingDisk, PowerCutError, laid_out
 
 KILLS = int(os.environ.get("FAILOVER_TASK_KILLS", "200"))
 SEED = int(os.environ.get("FAILOVER_SEED", str(random.randrange(1 << 32))))
