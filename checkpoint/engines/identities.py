@@ -92,7 +92,10 @@ class Identities:
         if key not in self._known or is_shared_object(line):  # the size of such a one is told by nothing else
             deleted = line.name.endswith(DELETED)
             path = line.name.removesuffix(DELETED) if deleted else line.name
-            self._known[key] = self._identity(path, self._place(line), deleted, is_memory=is_shared_object(line))
+            identity = self._identity(path, self._place(line), deleted, is_memory=is_shared_object(line))
+            if deleted and not identity.inode:  # an ordinary user may not look at it, but is told which it is
+                identity = replace(identity, device=line.device, inode=line.inode)
+            self._known[key] = identity
         return self._known[key]
 
     def _place(self, line: MapsLine) -> str:

@@ -31,6 +31,7 @@ from checkpoint.model import PageRun, Snapshot, Vma, VmaKind
 from checkpoint.pages import Words
 from checkpoint.resources import memory_files, nameless, system_v_memory
 
+OWNERS_ALONE: Final = 0o600
 MREMAP_MAYMOVE_FIXED: Final = 1 | 2
 MAP_LOCKED_ON_FAULT: Final = 1
 
@@ -222,6 +223,8 @@ def make_object(table: CallTable, vmas: Sequence[Vma]) -> int:
     file = vmas[0].file
     assert file is not None
     size, mode = file.size, file.mode & 0o7777
+    if not file.mode:  # an ordinary user captured it, who is not told its size: what is mapped counts
+        size, mode = max(vma.offset + vma.size for vma in vmas), OWNERS_ALONE
     if file.path.startswith(memory_files.PREFIX):
         return memory_files.make(table, file.path.removeprefix(memory_files.PREFIX), mode, size)
     made = nameless.make_file(table, file.path, mode)

@@ -5,6 +5,7 @@ Needs nothing of the kernel, and costs a pass over the memory.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterator, Sequence
 from typing import Final
@@ -139,12 +140,14 @@ class SharedPages:
         return pages.union(populated, self._memory.readable_pages(orphans)[0]) if len(orphans) else populated
 
     def _held_by_object(self, line: MapsLine) -> Words:
-        """The mapped pages of an object that hold something, whoever wrote them: reading would make some where none are."""
-        path = f"/proc/{self._pid}/map_files/{line.start:x}-{line.end:x}"
-        try:
-            file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-        except OSError:  # without the right to look there: what was touched through this mapping must do
-            return NONE
+        """The mapped pages of an object that hold something, whoever wrote them.
+
+        Where we may not look into the object itself (it has no name, and we are not root) all that can be read counts: reading
+        makes pages where none are, but nothing is lost that was written by other means than through this mapping.
+        """
+        file = self._open_object(line)
+        if file is None:
+            return self._memory.readable_pages(extents_of([line]))[0]
         try:
             found = [
                 (line.start + max(first - line.offset, 0), line.start + min(last - line.offset, line.size))
@@ -154,6 +157,18 @@ class SharedPages:
         finally:
             os.close(file)
         return np.array(found, dtype=np.uint64).reshape(-1, 2)
+
+    def _open_object(self, line: MapsLine) -> int | None:
+        """A descriptor of what is mapped; None where we may not have one."""
+        with contextlib.suppress(OSError):  # root alone may look there
+            return os.open(f"/proc/{self._pid}/map_files/{line.start:x}-{line.end:x}", os.O_RDONLY | os.O_CLOEXEC)
+        with contextlib.suppress(OSError):  # it has no name any more
+            file = os.open(f"/proc/{self._pid}/root{line.name}", os.O_RDONLY | os.O_CLOEXEC)
+            about = os.fstat(file)
+            if (about.st_dev, about.st_ino) == (line.device, line.inode):
+                return file
+            os.close(file)
+        return None
 
     def forget(self) -> None:
         """Let the next scan find everything."""

@@ -20,8 +20,10 @@ from tests.checkpoint.round_trip import (
     captured_and_killed,
     ended,
     expect_ok,
+    expect_three_lives,
     restored,
     start,
+    start_tracee,
 )
 
 Compiled = Callable[..., Path]
@@ -88,6 +90,18 @@ def test_an_ordinary_user_gets_the_same_in_a_user_namespace(compiled: Compiled, 
         with ended(program):
             program.tell()
             expect_ok(program)
+        return "ok"
+
+    assert as_nobody(act) == "ok"
+
+
+def test_an_ordinary_user_has_each_of_its_shared_memories_to_itself_again(compiled: Compiled, tmp_path: Path) -> None:
+    """The kernel shows files that are mapped to root alone: which is which is told all the same."""
+    tracee = compiled("memory_objects", "-O2")
+    let_nobody_in(tmp_path, tracee)
+
+    def act() -> str:
+        expect_three_lives(start_tracee(tracee, tmp_path, "posix_unlinked"), tmp_path)
         return "ok"
 
     assert as_nobody(act) == "ok"

@@ -136,9 +136,14 @@ static void posix_unlinked(void) {
     snprintf(name, sizeof name, "/dev/shm/failover-tracee-%d", getpid());
     char *place = shared_memory(name, 12 * PAGE, O_EXCL);
     unlink(name);
+    int file = open(name, O_RDWR | O_CREAT | O_EXCL, 0600);
+    EXPECT(pwrite(file, "by the file", 12, 0) == 12 && ftruncate(file, 2 * PAGE) == 0, "cannot write %s", name);
+    char *other = map_shared(file, 2 * PAGE, PROT_READ | PROT_WRITE);
+    close(file), unlink(name);
     fill(place, 10 * PAGE, 9);
     wait_here();
     expect_filled("content", place, 10 * PAGE, 9), expect_zero("rest", place + 10 * PAGE, 2 * PAGE);
+    EXPECT(!strcmp(other, "by the file"), "what was never touched by its mapping is lost");
     EXPECT(access(name, F_OK) != 0, "it has a name again");
 }
 
