@@ -277,7 +277,7 @@ def wait_for(name):
         time.sleep(0.002)
 print("ready", flush=True)
 wait_for("open")
-held = os.pidfd_open(os.getpid())
+held = os.pidfd_open(1)
 print("a pidfd", flush=True)
 wait_for("end")
 os.close(held)
