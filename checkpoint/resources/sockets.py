@@ -169,12 +169,13 @@ def looked_into(pid: int, number: int) -> Iterator[socket.socket]:
 def general_facts(one: Descriptor, looked: socket.socket) -> dict[str, Fact]:
     """Family, kind and options."""
     form = Form(looked.family, looked.type, looked.proto)
+    about = os.fstat(looked.fileno())  # what a descriptor is told to be is what all sockets have in common
     facts: dict[str, Fact] = {
         "socket": one.inode,
         "family": int(form.family),
         "type": int(form.type),
         "protocol": form.protocol,
-        "user": [one.uid, one.gid],
+        "user": [about.st_uid, about.st_gid],
         "options": list(_options(looked, form)),
     }
     if sieve := _filter(looked):
