@@ -19,7 +19,8 @@ while not os.path.exists("go"):
     time.sleep(0.01)
 """
 THREADED = """
-import threading, time
+import os, threading, time
+held = os.pidfd_open(1)  # of somebody else, which nobody can bring back
 threading.Thread(target=time.sleep, args=(1e6,), daemon=True).start()
 time.sleep(2.5)
 """
