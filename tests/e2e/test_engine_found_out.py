@@ -118,6 +118,18 @@ def test_a_program_with_threads_below_a_shell_is_protected_without_a_word_of_ala
     taken_over(first, second)
 
 
+def test_a_shell_and_its_child_are_traced_until_the_child_says_that_it_keeps_its_state(
+    pair: tuple[RobotMachine, RobotMachine], tmp_path: Path
+) -> None:
+    first, second = pair
+    start(first, tmp_path, WAITS + COUNTS, shell=True)
+    robots.until(lambda: captured_by(second, "ptrace"), "a checkpoint from outside")
+    (tmp_path / "go").touch()
+    robots.until(lambda: captured_by(second, "cooperative"), "a checkpoint of its own")
+    assert (shown(first)["state"], shown(first)["reasons"], words_of_alarm(first)) == ("running", [], [])
+    taken_over(first, second)
+
+
 def test_a_program_that_is_taken_over_before_it_says_so_can_still_say_it(
     pair: tuple[RobotMachine, RobotMachine], tmp_path: Path
 ) -> None:
