@@ -11,6 +11,7 @@ Source: linux/netfilter/nf_tables.h, linux/netfilter/nfnetlink.h; nf_tables_newr
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import socket
@@ -43,6 +44,7 @@ _REQUEST: Final = 1
 _ACKNOWLEDGE: Final = 4
 _CREATE: Final = 0x400
 _DUMP: Final = 0x300
+SO_SNDBUFFORCE: Final = 32
 _APPEND: Final = 0x800
 _NESTED: Final = 0x8000
 _HEADER: Final = struct.Struct("<IHHII")
@@ -223,11 +225,13 @@ def _number(kind: int, value: int) -> bytes:
 
 
 def _message(kind: int, flags: int, attributes: bytes) -> _Message:
-    return kind, _REQUEST | _ACKNOWLEDGE | flags, _GENERAL.pack(_FAMILY_INET, 0, 0) + attributes
+    return kind, _REQUEST | flags, _GENERAL.pack(_FAMILY_INET, 0, 0) + attributes
 
 
 def _transact(messages: Sequence[_Message]) -> None:
-    """Have the kernel obey all of them, or none.
+    """Have the kernel obey all of them, or none; it tells of the last one, and of each that it does not obey.
+
+    Of hundreds it could not tell: its answers have to fit in our buffer before we read the first (ENOBUFS, and all was obeyed).
 
     Raises:
         OSError: none.
@@ -235,30 +239,33 @@ def _transact(messages: Sequence[_Message]) -> None:
     if not messages:
         return
     mark = _GENERAL.pack(0, 0, _SUBSYSTEM)
-    batch = [(_BATCH_BEGIN, _REQUEST, mark), *messages, (_BATCH_END, _REQUEST, mark)]
+    *others, (last, flags, content) = messages
+    told = (last, flags | _ACKNOWLEDGE, content)
+    batch = [(_BATCH_BEGIN, _REQUEST, mark), *others, told, (_BATCH_END, _REQUEST, mark)]
     packed = b"".join(
         _HEADER.pack(_HEADER.size + len(content), kind, flags, number, 0) + content
         for number, (kind, flags, content) in enumerate(batch)
     )
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC, NETLINK_NETFILTER) as asked:
         asked.settimeout(ANSWER_S)
+        with contextlib.suppress(PermissionError):  # it suffices for some hundred connections as it is
+            asked.setsockopt(socket.SOL_SOCKET, SO_SNDBUFFORCE, len(packed))
         asked.send(packed)
-        missing = len(messages)
-        while missing:
-            missing -= _acknowledged(asked.recv(1 << 16))
+        while not _is_acknowledged(asked.recv(1 << 16)):
+            pass
 
 
-def _acknowledged(answer: bytes) -> int:
-    """How many messages were obeyed.
+def _is_acknowledged(answer: bytes) -> bool:
+    """Whether the last message was obeyed, and so all.
 
     Raises:
         OSError: one was not, so none will be.
     """
-    count = 0
+    is_told = False
     for kind, content in _answers(answer):
         if kind == _ERROR:
             code = -int.from_bytes(content[:4], "little", signed=True)
             if code:
                 raise OSError(code, f"nf_tables: {os.strerror(code)}")
-            count += 1
-    return count
+            is_told = True
+    return is_told

@@ -98,6 +98,8 @@ def depart(opened: Iterable[OpenFile]) -> Departing:
     try:
         silence.impose(between.values())
     except OSError as error:
+        with contextlib.suppress(OSError):  # it may have been obeyed for all that
+            silence.lift(between.values())
         return Departing((), {number: {LEFT: _without_right(error)} for number in wanted})
     facts: dict[int, dict[str, Fact]] = {}
     try:

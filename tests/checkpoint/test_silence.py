@@ -23,9 +23,19 @@ silence.lift([first, second])
 assert not list(silence._tables())
 """
 
+MANY = """
+from checkpoint.linux import silence
+connections = [silence.Connection(("10.0.0.1", port), ("10.0.0.2", 80)) for port in range(1, 401)]
+silence.impose(connections)
+assert {name for name, _ in silence._tables()} == {one.table for one in connections}
+silence.lift(connections)
+assert not list(silence._tables())
+"""
 
-def test_what_has_no_effect_any_more_is_cleared_away_by_the_next() -> None:
+
+@pytest.mark.parametrize("script", [SPENT, MANY], ids=["spent", "many"])
+def test_tables_come_and_go_all_at_once(script: str) -> None:
     ran = subprocess.run(
-        ["unshare", "--net", sys.executable, "-c", SPENT], capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL
+        ["unshare", "--net", sys.executable, "-c", script], capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL
     )
     assert ran.returncode == 0, ran.stderr
