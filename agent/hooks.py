@@ -69,7 +69,7 @@ def signal_in(command: Sequence[str]) -> int:
     """
     if not command or not command[0].startswith(SIGNAL):
         return 0
-    number = getattr(signal.Signals, command[0].removeprefix(SIGNAL), None)
+    number = signal.Signals.__members__.get(command[0].removeprefix(SIGNAL))
     if len(command) > 1 or number is None or number in (signal.SIGKILL, signal.SIGSTOP):
         raise ValueError(f"{' '.join(command)!r} names no signal that a program can handle: say {SIGNAL}SIGUSR2, for one")
     return int(number)
