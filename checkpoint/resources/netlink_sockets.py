@@ -25,6 +25,7 @@ from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile, Surroundings, elsewhere, sockets
 from checkpoint.resources.rebuilding import number_of
+from checkpoint.resources.unix_makers import Disguise
 
 KIND: Final = "netlink_sockets"
 
@@ -133,11 +134,19 @@ def findings(held: Iterable[Resource]) -> Iterator[Finding]:
 # --- Restore -----------------------------------------------------------------------------------------------------------
 
 
-def prepare(table: CallTable, held: Sequence[Resource], first: int) -> dict[int, int]:
-    """Make all of them at numbers from ``first`` on: the descriptor of each, by the socket's number in the snapshot."""
+def prepare(table: CallTable, held: Sequence[Resource], first: int, disguise: Disguise) -> dict[int, int]:
+    """Make all of them at numbers from ``first`` on: the descriptor of each, by the socket's number in the snapshot.
+
+    What may be said by one depends on who opened it, too, not only on who says it.
+
+    Source: netlink_ns_capable() in net/netlink/af_netlink.c.
+    """
     made: dict[int, int] = {}
     for one in held:
-        opened, number = sockets.make(table, one), first + len(made)
+        with disguise.as_owner(table, one):
+            opened = sockets.fresh(table, one)
+        sockets.set_options(table, one, opened)
+        number = first + len(made)
         table.duplicate(opened, number, os.O_CLOEXEC)
         table.close(opened)
         made[number_of(one.facts["socket"])] = number

@@ -27,6 +27,7 @@ from checkpoint.linux.packet_sockets import packet_sockets
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile, Surroundings, elsewhere, sockets
 from checkpoint.resources.rebuilding import number_of
+from checkpoint.resources.unix_makers import Disguise
 
 KIND: Final = "packet_sockets"
 
@@ -140,7 +141,7 @@ def _memberships(held: Resource) -> list[list[Fact]]:
 # --- Restore -----------------------------------------------------------------------------------------------------------
 
 
-def prepare(table: CallTable, held: Sequence[Resource], first: int) -> dict[int, int]:
+def prepare(table: CallTable, held: Sequence[Resource], first: int, _: Disguise) -> dict[int, int]:
     """Make all of them at numbers from ``first`` on: the descriptor of each, by the socket's number in the snapshot."""
     made: dict[int, int] = {}
     for one in held:

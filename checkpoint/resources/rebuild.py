@@ -71,6 +71,8 @@ REOPENED_FLAGS: Final = (
 
 O_PATH: Final = 0o10000000
 AT_EMPTY_PATH: Final = 0x1000
+OWN_ATTRIBUTES: Final = ("user.", "system.posix_acl_")
+"""How attributes begin that belong to a file as its content does. Source: xattr(7)."""
 ENTRIES_SIZE: Final = 1024
 """Bytes that hold the first entries of a directory, whatever their names."""
 STREAMS: Final = (0, 1, 2)
@@ -215,7 +217,7 @@ def _prepare_sockets(
     tcp_connections.settle(table, of_tcp, connected)
     for kind, prepare in OF_KERNEL.items():
         of_kernel = [held for held in state.resources if _is_own(held, given, kind)]
-        made |= prepare(table, of_kernel, max((unix.end - 1, *made.values())) + 1)
+        made |= prepare(table, of_kernel, max((unix.end - 1, *made.values())) + 1, disguise)
     return unix, made
 
 
@@ -374,6 +376,8 @@ def _finish(table: CallTable, made: int, held: Resource, mode: int) -> None:
     assert isinstance(attributes, dict)
     for name, value in attributes.items():
         assert isinstance(value, bytes)
+        if not name.startswith(OWN_ATTRIBUTES):
+            continue  # it would come with our rights: capabilities of a file, which its user gave it where they do not count
         lost = f"the deleted file {path} is without its attribute {name}"
         table.attempt(lost, "setxattr", table.place_path(again), table.place_path(name), table.place(value), len(value), 0)
     if "mtime_ns" in facts:

@@ -355,10 +355,15 @@ def _identified(ancillary: Iterable[tuple[int, int, bytes]], identify: Identify)
 # --- Restore -----------------------------------------------------------------------------------------------------------
 
 
+def fresh(table: CallTable, held: Resource) -> int:
+    """A socket of the same kind."""
+    form = [number_of(held.facts[name]) for name in ("family", "type", "protocol")]
+    return table.obtain(f"make the socket of {held.name}", "socket", form[0], form[1] | socket.SOCK_CLOEXEC, form[2])
+
+
 def make(table: CallTable, held: Resource) -> int:
     """A fresh socket of the same kind, with its options."""
-    form = [number_of(held.facts[name]) for name in ("family", "type", "protocol")]
-    made = table.obtain(f"make the socket of {held.name}", "socket", form[0], form[1] | socket.SOCK_CLOEXEC, form[2])
+    made = fresh(table, held)
     set_options(table, held, made)
     return made
 

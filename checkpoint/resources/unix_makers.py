@@ -88,6 +88,16 @@ class Disguise:
         with self._as(table, self.program.credentials.uids[1], self.program.credentials.gids[1], ""):
             yield
 
+    @contextlib.contextmanager
+    def as_owner(self, table: CallTable, one: Resource) -> Iterator[None]:
+        """Make calls for the body as whom a socket belongs to."""
+        owner = one.facts.get("user")
+        if isinstance(owner, list) and owner:
+            with self._as(table, number_of(owner[0]), number_of(owner[1]), ""):
+                yield
+        else:
+            yield
+
     def notes(self, held: Iterable[Resource]) -> tuple[str, ...]:
         """Which sockets tell another process than before."""
         return tuple(

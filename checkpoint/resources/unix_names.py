@@ -52,6 +52,7 @@ DELETED: Final = " (deleted)"
 GONE: Final = -1
 FREED_S: Final = 1.0
 """How long the kernel may take to find sockets that nobody can reach any more."""
+AT_EMPTY_PATH: Final = 0x1000
 REMOVE_DIRECTORY: Final = 0x200
 """AT_REMOVEDIR of unlinkat(2)."""
 
@@ -155,9 +156,19 @@ def is_answered(path: str) -> bool:
         with socket.socket(socket.AF_UNIX, kind) as asked:
             asked.setblocking(False)
             refused = asked.connect_ex(path)
-            if refused in (0, errno.EAGAIN):
+            if refused in (0, errno.EAGAIN, errno.EPERM):  # EPERM: it hears only whom it is connected with
                 return True
     return False
+
+
+def is_abandoned(path: str) -> bool:
+    """Whether a name, a whole path, can be had for a moment: it is free, or a socket's that nobody has any more.
+
+    Names of senders are what these say, and may lead to anything.
+    """
+    if not os.path.isdir(os.path.dirname(path)):
+        return False
+    return not os.path.lexists(path) or (stat.S_ISSOCK(os.lstat(path).st_mode) and not is_answered(path))
 
 
 def is_ghost(held: Resource) -> bool:
@@ -225,11 +236,15 @@ class Naming:
         table.attempt("", "unlinkat", AT_FDCWD, place, 0)
         with self._inside(directory):
             self._bind(one, made)
+        made_file = table.open(path, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC)  # a link may have taken its place meanwhile
         owner = one.facts.get("file_owner")
         if isinstance(owner, list) and owner:
             lost = f"the name of the unix socket {path} belongs to whom the program runs as"
-            table.attempt(lost, "fchownat", AT_FDCWD, place, number_of(owner[0]), number_of(owner[1]), 0)
-        table.call(f"set the mode of {path}", "fchmodat", AT_FDCWD, place, number_of(one.facts["mode"]) & 0o7777)
+            ids = number_of(owner[0]), number_of(owner[1])
+            table.attempt(lost, "fchownat", made_file, table.place_path(""), *ids, AT_EMPTY_PATH)
+        again = table.place_path(f"/proc/self/fd/{made_file}")
+        table.call(f"set the mode of {path}", "fchmodat", AT_FDCWD, again, number_of(one.facts["mode"]) & 0o7777)
+        table.close(made_file)
         if directory:
             self._keep(one, path)
 

@@ -18,7 +18,7 @@ from checkpoint.resources import sockets
 from checkpoint.resources.rebuilding import number_of
 from checkpoint.resources.sockets import Way
 from checkpoint.resources.unix_makers import Disguise
-from checkpoint.resources.unix_names import Naming, is_answered, is_ghost, packed
+from checkpoint.resources.unix_names import Naming, is_abandoned, is_ghost, packed
 from checkpoint.resources.unix_sockets import NOT_WAITING
 
 CLOSE_ON_EXEC: Final = socket.SOCK_CLOEXEC
@@ -58,6 +58,7 @@ class Work:
         self._held = {_of(one, "socket"): one for one in held}
         self._next = first
         self._disguise = disguise
+        self._working = working_directory
         self._naming = Naming(table, working_directory, self._away)
         self._made: dict[int, int] = {}
         self._closing: list[int] = []
@@ -238,9 +239,8 @@ class Work:
         messages = _list(one.facts["queue"])
         if not messages:
             return
-        sources = [source if isinstance(source, bytes) else b"" for source in _list(one.facts["sources"])] or [b""] * len(
-            messages
-        )
+        told = one.facts["sources"] or []  # versions before said False where none has any
+        sources = [source if isinstance(source, bytes) else b"" for source in _list(told)] or [b""] * len(messages)
         ways = {source: self._from(one, source) if source else self._way_to(one) for source in dict.fromkeys(sources)}
         sockets.fill(self._table, one, [ways[source] for source in sources])
 
@@ -262,7 +262,7 @@ class Work:
         table, sender = self._table, self._fresh(one)
         path = os.fsdecode(source.rstrip(b"\0")) if source[:1] != b"\0" else ""
         place, address = table.place(source.rstrip(b"\0") + b"\0"), packed(source)
-        may_remove = bool(path) and not is_answered(path)
+        may_remove = bool(path) and is_abandoned(os.path.join(self._working, path))
         if may_remove:
             table.attempt("", "unlinkat", AT_FDCWD, place, 0)
         lost = f"what waits in {one.name} came from {os.fsdecode(source)!r}, and comes from nobody now"
