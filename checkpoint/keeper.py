@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+import resource
 import signal
 import socket
 import sys
@@ -275,6 +276,8 @@ def main(arguments: list[str]) -> int:
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # a Ctrl-C at the terminal is for our peer to act on
     gc.disable()  # no collection inside a freeze; what a capture makes is freed by counting
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # some for each process and thread that is followed
     try:
         end = socket.socket(fileno=int(arguments[1])) if arguments[1].isdigit() else called_at(arguments[1])
     except OSError as error:
