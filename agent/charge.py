@@ -113,6 +113,11 @@ class Charge:
 
         self.standby.warm(comeback.again(self.around, act.spec, newest_of(self.around.store, self.name)), act.spec.owner, tell)
 
+    @property
+    def is_prepared_first(self) -> bool:
+        """Whether a hook gets this robot ready before the program goes on here."""
+        return self._occasions.prepares(self.figures.spec)
+
     def adopt(self, component: Component, epoch: int) -> None:
         """A guard was found alive after a restart."""
         component.keeper.terms = self.around.records.terms(self.name)

@@ -311,8 +311,13 @@ class Lanes(Switchboard):
                 charge.figures.lacks = found.get(charge.name)
 
     async def lacking(self, name: str) -> tuple[str, ...]:
-        """What this robot lacks, now, of what a component needs to go on here; nothing where it holds no checkpoint of it."""
+        """What this robot lacks, now, of what a component needs to go on here; nothing where it holds no checkpoint of it.
+
+        Nor where a hook gets it ready first, which may bring what is lacking: then the restore itself tells.
+        """
         charge = self.charge(name)
+        if charge.is_prepared_first:
+            return ()
         found = (await lacks.look(self._around, (charge,))).get(name)
         if charge.figures.spec is not None:
             charge.figures.lacks = found

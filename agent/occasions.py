@@ -73,6 +73,10 @@ class Occasions:
         await self._prepare("before_resume", act.spec, occasion)
         return occasion
 
+    def prepares(self, spec: ComponentSpec | None) -> bool:
+        """Whether this robot is got ready before it goes on here: an address is taken over, a device attached."""
+        return bool(self._hook("before_resume", spec).command)
+
     def told_by(self, act: acts.Restore) -> tuple[int, int] | None:
         """The signal by which the program itself is told that it goes on here, and its value; None where a command is run."""
         number = _signal_in(self._hook("after_resume", act.spec).command)

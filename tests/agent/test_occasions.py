@@ -63,3 +63,10 @@ def test_nothing_waits_longer_for_a_hook_before_a_capture_than_a_handover_can() 
     one = occasions(HooksConfig(before_capture=("/bin/true",), after_resume=("/bin/true",), limit_s=50))
     assert one._hook("before_capture", None).limit_s == CAPTURE_LIMIT_S
     assert one._hook("after_resume", None).limit_s == 50
+
+
+def test_a_robot_is_got_ready_first_by_its_own_hook_or_by_the_programs() -> None:
+    its = ComponentSpec(NAME, launch=Launch(hooks=(("before_resume", ("/bin/true",)),)))
+    assert occasions(HooksConfig(before_resume=("/bin/true",))).prepares(None)
+    assert occasions(HooksConfig()).prepares(its)
+    assert not occasions(HooksConfig(after_resume=("/bin/true",))).prepares(ComponentSpec(NAME))
