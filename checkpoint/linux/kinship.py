@@ -2,7 +2,7 @@
 
 Who has lost its parent is given to the nearest ancestor that asks for such (a *reaper*). That of a component in PIDs of its own,
 or under a guard, has no other children. Elsewhere a *stray* is told from the children of others by its session or process group,
-where one of the component leads it or is in it, and no ancestor is.
+where one of the component leads it, and no ancestor is in it: programs that somebody else has started together stay apart.
 
 Source: proc_pid_task(5) (children), credentials(7), pid_namespaces(7); PR_SET_CHILD_SUBREAPER of prctl(2).
 """
@@ -92,8 +92,7 @@ class Kinship:
         if not self._of_ancestors:
             return []
         elders = {self._pid, *(one.pid for one in self._of_ancestors)}
-        ours = _circles([self._pid, *found]) | {self._pid, *found}
-        ours -= _circles(one.pid for one in self._of_ancestors)
+        ours = {self._pid, *found} - _circles(one.pid for one in self._of_ancestors)
         known = elders | set(found)
         theirs = ((one.pid, pid) for one in self._of_ancestors for pid in one.read([one.pid]) if pid not in known)
         return [pid for ancestor, pid in theirs if _given_to(ancestor, pid) & ours]
