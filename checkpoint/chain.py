@@ -111,7 +111,8 @@ def fold(chain: Sequence[Snapshot]) -> Snapshot:
     newest = chain[-1]
     page_size = newest.machine.page_size
     sources = _newest_sources(chain, page_size)
-    carried, copies = _told_once(sources, page_size) if any(snapshot.copies for snapshot in chain) else (sources, ())
+    has_copies = newest.is_tree and any(snapshot.copies for snapshot in chain)  # one process alone has none
+    carried, copies = _told_once(sources, page_size) if has_copies else (sources, ())
     contents = gathered([snapshot.contents for snapshot in chain], carried, page_size)
     runs = pages.page_runs(pages.extents_of_addresses(carried.addresses, page_size))
     check_state(newest, PageTable.empty(page_size).apply((), runs, contents, every_mapping(newest), copies).page_sum)

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from checkpoint import chain, tree
+from checkpoint import chain, format, tree
 from checkpoint.errors import ChainError
 from checkpoint.model import Position, Snapshot
+from checkpoint.pages import PageTable
 from tests.checkpoint.snapshots import PAGE, family, history, page, pages_of, snapshot, vma
 
 STEPS = st.lists(
@@ -99,3 +100,16 @@ def test_a_chain_of_several_processes_folds_to_what_each_of_them_has() -> None:
     parent, child = tree.views(folded)
     assert pages_of(parent) == {0: page("both"), 1: page("parent 3")}
     assert pages_of(child) == {0: page("both"), 1: page("child 3")}
+
+
+def test_equal_pages_of_one_process_are_all_there_when_the_others_have_ended() -> None:
+    """A snapshot of one process has no copies: a restore would pass them over."""
+    whole = tree.expanded(family(1)[0])
+    runs, contents, copies = tree.told_once(whole.runs, memoryview(page("both") * 4), PAGE)
+    whole = replace(whole, runs=runs, contents=bytes(contents), copies=copies)
+    whole = replace(whole, page_sum=chain.applied(PageTable.empty(PAGE), whole).page_sum)
+    base = replace(whole, position=chain.position_of(whole, 1, 1))
+    alone = {0: page("both"), 1: page("both")}
+    folded = chain.fold((base, snapshot(alone, carried={}, parent=base.position, sequence=2)))
+    assert not folded.copies
+    assert pages_of(format.decode(format.encode_bytes(folded))) == alone
