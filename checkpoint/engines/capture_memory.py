@@ -284,8 +284,10 @@ class MemoryCapture:
             self._sort_shared()
 
     def shared_places(self) -> SharedPlaces:
-        """The shared memory that this process has, as `leave_out` takes it."""
-        return frozenset(map(_place_of, filter(tracking.is_shared, self.lines)))
+        """The shared memory that this process tells all of, as `leave_out` takes it."""
+        may_look = digests.may_look_into_mappings()  # of a file with a name each tells what it has in its page tables
+        told = (one for one in self.lines if tracking.is_shared_object(one) or (may_look and tracking.is_shared_anonymous(one)))
+        return frozenset(map(_place_of, told))
 
     def _sort_shared(self) -> None:
         self._shared_lines = [

@@ -269,7 +269,7 @@ class CapturedTree:
         for pid, process in tuple(self._known.items()):
             try:
                 with _gone_if_ended(pid):
-                    self._copied[pid] = process.copy_running(base=base or process.is_new)
+                    self._copied[pid] = process.copy_running(base=base or process.memory.acknowledged is None)
             except ProcessGoneError:  # or it has executed another program
                 self._forget(pid)
             except CaptureError as error:
@@ -284,7 +284,8 @@ class CapturedTree:
             MovedError: one of them does not stop.
         """
         first = self._first.threads
-        if not self._standing and not self._kin.has_others([first.pid, *(tracee.pid for tracee in first.others)]):
+        followed = self._standing or self._known  # one may have become an orphan since, whom a glance does not find
+        if not followed and not self._kin.has_others([first.pid, *(tracee.pid for tracee in first.others)]):
             return False
         ended = set(self._ended)
         quiet = 0
@@ -384,7 +385,7 @@ class CapturedTree:
         if process is not None and pid in self._copied:
             try:
                 process.memory.leave_out(told)
-                is_base = base or process.is_new
+                is_base = base or process.memory.acknowledged is None  # a delta may be of a position that has not heard of it
                 return process.look(self._copied[pid], None, base=is_base, opened=seen.opened[pid]), process
             except ProcessGoneError:
                 self._forget(pid)

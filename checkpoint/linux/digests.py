@@ -6,6 +6,7 @@ Needs nothing of the kernel, and costs a pass over the memory.
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 from collections.abc import Iterator, Sequence
 from typing import Final
@@ -17,7 +18,7 @@ from checkpoint.linux import abi
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.pagetables import existence
 from checkpoint.linux.procfs import MapsLine
-from checkpoint.linux.tracking import NONE, Scan, extents_of, is_orphan, is_shared_object
+from checkpoint.linux.tracking import NONE, Scan, extents_of, is_orphan, is_shared_anonymous, is_shared_object
 from checkpoint.pages import PageMap, Words
 
 READ_CHUNK: Final = 8 << 20
@@ -111,6 +112,17 @@ def filled_extents(file: int, begin: int = 0) -> Iterator[tuple[int, int]]:
         yield first & -abi.PAGE_SIZE, -(-place // abi.PAGE_SIZE) * abi.PAGE_SIZE
 
 
+@functools.cache
+def may_look_into_mappings() -> bool:
+    """Whether what is mapped can be opened: root's right (CAP_CHECKPOINT_RESTORE), as proc_pid_map_files(5) says."""
+    try:
+        names = os.listdir("/proc/self/map_files")
+        os.close(os.open(f"/proc/self/map_files/{names[0]}", os.O_RDONLY | os.O_CLOEXEC))
+    except (OSError, IndexError):
+        return False
+    return True
+
+
 class SharedPages:
     """Mappings that are compared by page digest at every scan: shared ones, which others may write behind our page tables, and
     those of deleted files, of which every page is carried."""
@@ -135,8 +147,9 @@ class SharedPages:
         shared = extents_of([line for line in lines if not is_orphan(line)])
         orphans = extents_of([line for line in lines if is_orphan(line)])
         populated = self._existence.existing(shared, own=False) if len(shared) else NONE
-        for line in filter(is_shared_object, lines):
-            populated = pages.union(populated, self._held_by_object(line))
+        for line in lines:
+            if is_shared_object(line) or (is_shared_anonymous(line) and may_look_into_mappings()):
+                populated = pages.union(populated, self._held_by_object(line))
         return pages.union(populated, self._memory.readable_pages(orphans)[0]) if len(orphans) else populated
 
     def _held_by_object(self, line: MapsLine) -> Words:

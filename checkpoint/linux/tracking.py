@@ -107,13 +107,22 @@ MEMORY_PLACE: Final = "/dev/shm/"
 """Where files are memory (shm_overview(7)): on another machine they are missing."""
 
 
+ANONYMOUS: Final = f"/dev/zero{procfs.DELETED}"
+"""What the kernel calls shared memory without a file."""
+
+
+def is_shared_anonymous(line: MapsLine) -> bool:
+    """Whether it is shared memory without a file: who was born since may have written what was never touched here."""
+    return is_shared(line) and line.name == ANONYMOUS
+
+
 def is_shared_object(line: MapsLine) -> bool:
     """Whether it is shared memory that may hold more than was touched through this mapping, and that no other machine has.
 
     A memory file (memfd), POSIX and System V shared memory, and any file that was deleted; anonymous memory is no file. The first
     System V segment after a boot has the inode number 0.
     """
-    is_gone = line.name.endswith(procfs.DELETED) and line.name != f"/dev/zero{procfs.DELETED}"
+    is_gone = line.name.endswith(procfs.DELETED) and line.name != ANONYMOUS
     return is_shared(line) and (is_gone or line.name.startswith(MEMORY_PLACE))
 
 

@@ -462,3 +462,75 @@ def test_the_other_half_of_a_pipeline_of_a_shell_is_nobody_s_orphan(tmp_path: Pa
         leader, _ = kinship.descendants(program.pid)
         assert os.getpgid(leader) == leader
         assert kinship.component(leader) == []
+
+
+SHARED = """
+import mmap
+size = 64 * mmap.PAGESIZE
+memory = mmap.mmap(-1, size)
+read_end, write_end = os.pipe()
+
+def write():
+    memory[size // 2 : size // 2 + 5] = b"child"
+
+def work():
+    memory[size - 4 : size] = b"tail"
+    os.write(write_end, b".")
+    wait_for_go()
+    expect("what was written by one that has ended", memory[size // 2 : size // 2 + 5], b"child")
+    expect("what it has written itself", memory[size - 4 : size], b"tail")
+
+os.waitpid(born(write), 0)
+child = born(work)
+os.read(read_end, 1)
+is_ready()
+expect_child(child)
+expect("what a child has written", memory[size - 4 : size], b"tail")
+print("ok", flush=True)
+"""
+
+
+def test_shared_memory_that_only_children_have_written_is_whole(tmp_path: Path) -> None:
+    """The parent's page tables tell nothing of it."""
+    goes_through_three_lives(SHARED, tmp_path)
+
+
+BORN_LATE = """
+import hashlib
+read_end, write_end = os.pipe()
+
+def work():
+    memory = os.urandom(1 << 20)
+    digest = hashlib.sha256(memory).digest()
+    os.write(write_end, b".")
+    wait_for_go()
+    expect("its memory", hashlib.sha256(memory).digest(), digest)
+
+print("begun", flush=True)
+while not os.path.exists("fork"):
+    time.sleep(0.01)
+child = born(work)
+os.read(read_end, 1)
+is_ready()
+expect_child(child)
+print("ok", flush=True)
+"""
+
+
+def test_a_child_whose_first_delta_was_lost_is_whole_in_the_next(tmp_path: Path) -> None:
+    program = start([sys.executable, "-c", PREAMBLE + BORN_LATE], tmp_path, isolate=True)
+    with ended(program), protected(program) as session:
+        program.wait_for_line("begun")
+        base = captured_at_last(session, CaptureOrder(base=True, sequence=1))
+        session.acknowledge(base.position)
+        (tmp_path / "fork").touch()
+        program.wait_for_line("ready")
+        lost = captured_at_last(session, CaptureOrder(base=False, sequence=2))
+        delta = captured_at_last(session, CaptureOrder(base=False, sequence=3, hold=True))
+        assert lost.parent == delta.parent == base.position
+        chain = [transported(base), transported(delta)]
+        program.kill()
+    program = restored(chain, tmp_path)
+    with ended(program):
+        program.tell()
+        expect_ok(program)
