@@ -31,6 +31,9 @@ USAGE: Final = "usage: python -m checkpoint keeper FD|PATH\n"
 CALL_S: Final = 30.0
 """How long one that listens waits for its peer."""
 
+FILES: Final = 65536
+"""Descriptors that it may have, as its unit says."""
+
 STREAM_DESCRIPTORS: Final = 5
 """Counters, two outputs, two logs: what a message brings along for streams."""
 
@@ -275,6 +278,7 @@ def main(arguments: list[str]) -> int:
         return 2
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # a Ctrl-C at the terminal is for our peer to act on
+    _allow_many_files()
     gc.disable()  # no collection inside a freeze; what a capture makes is freed by counting
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # some for each process and thread that is followed
@@ -286,6 +290,14 @@ def main(arguments: list[str]) -> int:
     link: Channel[Request] = Channel(end, Request)
     Keeper(link, engine.engine_named(engine.PTRACE)).serve()
     return 0
+
+
+def _allow_many_files() -> None:
+    """Threads and processes take some descriptors each, and a shell allows 1,024."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = FILES if hard == resource.RLIM_INFINITY else min(FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def called_at(path: str) -> socket.socket:

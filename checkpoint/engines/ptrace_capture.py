@@ -190,7 +190,10 @@ class PtraceSession:
         try:
             return self._described(order, parent, frozen)
         except (FileNotFoundError, ProcessLookupError) as error:
-            raise ProcessGoneError(f"{self.component} (pid {self.pid}) ended while it was being described") from error
+            gone = ProcessGoneError(f"{self.component} (pid {self.pid}) ended while it was being described")
+            raise self._explained(gone) from error
+        except ProcessGoneError as error:  # a child that it has a pidfd of, for one
+            raise self._explained(error) from error
 
     def _frozen(self, order: CaptureOrder, *, base: bool) -> Frozen:
         """One freeze; again where processes came and went in the middle of it."""
@@ -229,7 +232,7 @@ class PtraceSession:
                 self._first.memory.start_over()
                 return ProcessGoneError(f"{self.component} (pid {self.pid}) has become another program (exec): protect it anew")
             if isinstance(error, ProcessGoneError):
-                return CaptureError(f"{error}: it was a thread of pid {self.pid}, which lives on; capture it again")
+                return CaptureError(f"{error}: it was a thread or a child of pid {self.pid}, which lives on; capture it again")
         return error
 
     # While it stands still

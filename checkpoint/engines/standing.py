@@ -133,6 +133,8 @@ class Onlooker:
             self._questions(special)
             with contextlib.suppress(CaptureError):  # it runs: one of its threads has just closed something
                 with_contents(self.gather(), None, self._devices)
+            if self._threads.is_one_of_many:  # what all of them have open is read for all of them, not by what stays open
+                self._texts.close()
         self._others.prepare()
         self.rights.prepare()
 

@@ -14,8 +14,10 @@ import pytest
 
 from checkpoint import tree
 from checkpoint.engine import CaptureOrder
+from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import kinship, procfs
-from checkpoint.model import Snapshot
+from checkpoint.model import Resource, Snapshot
+from checkpoint.resources import OpenFile, Surroundings, pidfds
 from tests.checkpoint.round_trip import (
     Program,
     captured_at_last,
@@ -234,3 +236,52 @@ def test_make_builds_on(tmp_path: Path) -> None:
     with ended(program):
         assert program.finish() == 0, program.complaints
     assert subprocess.run([tmp_path / "prog"], capture_output=True, text=True, check=True).stdout == "42\n"
+
+
+WATCHED = """
+import os, subprocess, time
+child = subprocess.Popen(["sleep", "60"])
+watched = os.pidfd_open(child.pid)
+print("ready", flush=True)
+child.wait()
+"""
+
+
+def test_a_child_that_ends_while_it_is_described_is_not_taken_for_the_program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = start([sys.executable, "-c", WATCHED], tmp_path, isolate=True)
+
+    def ended_just_now(held: OpenFile, surroundings: Surroundings) -> Resource | None:
+        if held.pid == program.pid and held.first.target == pidfds.TARGET:
+            raise ProcessGoneError("there is no process 12345 any more")
+        return genuine(held, surroundings)
+
+    genuine = pidfds.describe
+    with ended(program), protected(program) as session:
+        program.wait_for_line("ready")
+        captured_at_last(session, CaptureOrder())
+        monkeypatch.setattr(pidfds, "describe", ended_just_now)
+        with pytest.raises(CaptureError, match="lives on") as raised:
+            session.capture(CaptureOrder())
+        assert not isinstance(raised.value, ProcessGoneError)
+        monkeypatch.setattr(pidfds, "describe", genuine)
+        captured_at_last(session, CaptureOrder())
+
+
+def test_what_is_known_of_processes_costs_few_descriptors(tmp_path: Path) -> None:
+    opens = "many = [os.eventfd(0) for _ in range(100)]"
+    many = f"import os, time; {opens}; os.fork(); os.fork(); print(1, flush=True); time.sleep(60)"
+    program = start([sys.executable, "-c", many], tmp_path, isolate=True)
+    with ended(program), protected(program) as session:
+        program.wait_until(lambda: program.output.count("1") == 4, "all of them")
+        captured_at_last(session, CaptureOrder())
+        kept = [target for target in map(_target, os.listdir("/proc/self/fd")) if "/fdinfo/" in target]
+        assert len(kept) < 200
+
+
+def _target(number: str) -> str:
+    try:
+        return os.readlink(f"/proc/self/fd/{number}")
+    except OSError:
+        return ""
