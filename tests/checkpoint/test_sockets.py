@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import socket
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from checkpoint.engine import RestoreOptions
+from checkpoint.linux import internet_sockets
 from checkpoint.linux.vessel import Birth, discard, spawn_vessel
 from checkpoint.model import Snapshot
 from tests.checkpoint.round_trip import ENGINE, Program, captured_and_killed, ended, expect_ok, start_tracee
@@ -47,3 +49,11 @@ def test_options_that_a_stream_shows_but_cannot_be_given_are_not_noted_as_lost(
         assert notes == ()
         tracee.tell()
         expect_ok(tracee)
+
+
+def test_a_list_that_the_kernel_does_not_have_is_asked_for_once() -> None:
+    """It would look for a module each time, while the program stands still."""
+    unassigned = socket.AF_INET, 200
+    for _ in range(2):
+        assert internet_sockets.shut_down(*unassigned) == {}
+        assert unassigned in internet_sockets._WITHOUT
