@@ -280,8 +280,6 @@ def main(arguments: list[str]) -> int:
         signal.signal(number, signal.SIG_IGN)  # a Ctrl-C at the terminal is for our peer to act on
     _allow_many_files()
     gc.disable()  # no collection inside a freeze; what a capture makes is freed by counting
-    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # some for each process and thread that is followed
     try:
         end = socket.socket(fileno=int(arguments[1])) if arguments[1].isdigit() else called_at(arguments[1])
     except OSError as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 
 import numpy as np
@@ -113,11 +113,27 @@ def _check_members(snapshot: Snapshot, page_size: int) -> None:
     ):
         if parent not in (0, *pids) or parent == pid:
             raise FormatError(f"members: the parent {parent} of {pid} is none of them")
+    _check_descent({process.pid: process.ppid for process in processes[1:]})
     for member in snapshot.members:
         _check_extents(member.vmas, page_size, f"vmas of {member.process.pid}")
         if member.vmas and member.vmas[-1].end > 1 << SLOT_SHIFT:
             raise FormatError(f"vmas of {member.process.pid}: beyond its slot")
+        if not member.threads:
+            raise FormatError(f"threads of {member.process.pid}: there are none")
         _check_threads(member.process.pid, member.threads)
+
+
+def _check_descent(parents: Mapping[int, int]) -> None:
+    """Nobody is an ancestor of its own: whoever is followed upwards comes to the first process, or to nobody."""
+    settled: set[int] = set()
+    for pid in parents:
+        line: set[int] = set()
+        while pid in parents and pid not in settled:
+            if pid in line:
+                raise FormatError(f"members: {pid} is an ancestor of its own")
+            line.add(pid)
+            pid = parents[pid]
+        settled |= line
 
 
 def _check_runs_mapped(runs: Iterable[PageRun | PageCopy], vmas: Iterable[PageRun | Vma]) -> None:

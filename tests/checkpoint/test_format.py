@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from checkpoint import format, layout
 from checkpoint.errors import FormatError
 from checkpoint.model import OutputPiece, PageRun, Resource, Snapshot
-from tests.checkpoint.snapshots import PAGE, START, history, page, snapshot, vma
+from tests.checkpoint.snapshots import PAGE, START, family, history, page, snapshot, vma
 
 FACTS = st.recursive(
     st.none() | st.booleans() | st.integers(-(1 << 63), (1 << 64) - 1) | st.text(max_size=8) | st.binary(max_size=8),
@@ -140,6 +140,35 @@ BROKEN = {
 def test_a_snapshot_that_does_not_hold_together_is_not_written(words: str) -> None:
     with pytest.raises(FormatError, match=words):
         format.encode_bytes(BROKEN[words](snapshot({n: page("x") for n in range(4)})))
+
+
+def with_child(made: Snapshot, **changes: object) -> Snapshot:
+    child = made.members[0]
+    return replace(made, members=(replace(child, **changes),))
+
+
+BROKEN_FAMILIES = {
+    "there are none": lambda made: with_child(made, threads=()),
+    "none of them": lambda made: with_child(made, process=replace(made.members[0].process, ppid=77)),
+    "ancestor of its own": lambda made: replace(
+        made,
+        members=(
+            replace(made.members[0], process=replace(made.members[0].process, ppid=5)),
+            replace(
+                made.members[0],
+                slot=2,
+                process=replace(made.members[0].process, pid=5, ppid=3),
+                threads=(replace(made.members[0].threads[0], tid=5),),
+            ),
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("words", [*BROKEN_FAMILIES])
+def test_a_family_that_does_not_hold_together_is_not_written(words: str) -> None:
+    with pytest.raises(FormatError, match=words):
+        format.encode_bytes(BROKEN_FAMILIES[words](family(1)[0]))
 
 
 FUZZ = """
