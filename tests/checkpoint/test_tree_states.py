@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -12,7 +13,6 @@ import pytest
 
 from checkpoint.engine import CaptureOrder
 from checkpoint.linux import kinship
-from checkpoint.linux.namespaces import prctl
 from tests.checkpoint.round_trip import (
     Program,
     captured_at_last,
@@ -27,7 +27,6 @@ from tests.checkpoint.test_trees import three_lives
 
 pytestmark = pytest.mark.root
 
-PR_SET_CHILD_SUBREAPER = 36
 FAMILY_MIB = int(os.environ.get("FAILOVER_TEST_FAMILY_MIB", "8"))
 """What each process of a family has, untouched since the fork; the issue says 100."""
 MIB = 1 << 20
@@ -281,30 +280,26 @@ print("ok", flush=True)
 
 
 def test_processes_that_have_lost_their_parent_are_told_by_their_session(tmp_path: Path) -> None:
-    prctl(PR_SET_CHILD_SUBREAPER, 1)  # so that we can reap whom it leaves behind
-    try:
-        program = start([sys.executable, "-c", PREAMBLE + STRAYS], tmp_path)
-        with ended(program):
-            program.wait_for_line("ready")
-            strays = set(kinship.component(program.pid)) - set(kinship.descendants(program.pid))
-            with protected(program) as session:
-                snapshot = transported(captured_at_last(session, CaptureOrder(hold=True)))
-                everybody = [member.process.pid for member in snapshot.members]
-                assert (len(everybody), len(strays)) == (3, 2)
-                for pid in everybody:
-                    os.kill(pid, signal.SIGKILL)
-                program.kill()
-            for pid in strays | set(everybody):
-                with contextlib.suppress(ChildProcessError):
-                    os.waitpid(pid, 0)
-        again = restored(snapshot, tmp_path)
-        with ended(again):
-            again.tell()
-            expect_ok(again)
-        for pid in strays:
-            os.waitpid(pid, 0)
-    finally:
-        prctl(PR_SET_CHILD_SUBREAPER, 0)
+    program = start([sys.executable, "-c", PREAMBLE + STRAYS], tmp_path)
+    with ended(program):
+        program.wait_for_line("ready")
+        strays = set(kinship.component(program.pid)) - set(kinship.descendants(program.pid))
+        with protected(program) as session:
+            snapshot = transported(captured_at_last(session, CaptureOrder(hold=True)))
+            everybody = [member.process.pid for member in snapshot.members]
+            assert (len(everybody), len(strays)) == (3, 2)
+            for pid in everybody:
+                os.kill(pid, signal.SIGKILL)
+            program.kill()
+        for pid in strays | set(everybody):
+            with contextlib.suppress(ChildProcessError):
+                os.waitpid(pid, 0)
+    again = restored(snapshot, tmp_path)
+    with ended(again):
+        again.tell()
+        expect_ok(again)
+    for pid in strays:
+        os.waitpid(pid, 0)
 
 
 FORKED = """
@@ -462,6 +457,20 @@ def test_the_other_half_of_a_pipeline_of_a_shell_is_nobody_s_orphan(tmp_path: Pa
         leader, _ = kinship.descendants(program.pid)
         assert os.getpgid(leader) == leader
         assert kinship.component(leader) == []
+
+
+def test_what_a_shell_has_started_together_and_left_behind_are_strangers(tmp_path: Path) -> None:
+    shell = subprocess.run(
+        ["/bin/bash", "-c", "sleep 60 >&2 & sleep 60 >&2 & jobs -p"], stdout=subprocess.PIPE, check=True, start_new_session=True
+    )
+    left = [int(line) for line in shell.stdout.split()]
+    try:
+        assert os.getsid(left[0]) == os.getsid(left[1])
+        assert [kinship.component(pid) for pid in left] == [[], []]
+    finally:
+        for pid in left:
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
 
 
 SHARED = """
