@@ -102,6 +102,7 @@ def test_a_thread_that_did_not_stop_and_executes_a_program_instead_is_let_go(
         monkeypatch.setattr(Tracee, "detach", detach_then_execute)
         with pytest.raises(CaptureError, match="did not stop"):
             threads.freeze()
+        tracee.wait_until((tmp_path / "go").exists, "the first thread to be let go, which may not have stopped yet either")
         monkeypatch.undo()
         expect_unharmed(tracee, threads)
 
