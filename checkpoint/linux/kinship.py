@@ -18,7 +18,10 @@ from checkpoint.errors import CheckpointError
 from checkpoint.linux import procfs
 
 CHILDREN_SIZE: Final = 1 << 16
-"""Bytes that one read of a list of children may have: nine thousand of them."""
+NEARLY_A_PAGE: Final = 4000
+"""Bytes: the kernel gives a list in pieces of a page at most, so what is shorter is the end.
+
+Source: seq_read_iter() in fs/seq_file.c."""
 
 
 class Children:
@@ -33,7 +36,7 @@ class Children:
         found: list[int] = []
         for tid in tids:
             with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended; its children are another one's now
-                found += map(int, os.pread(self._file(tid), CHILDREN_SIZE, 0).split())
+                found += map(int, _whole(self._file(tid)).split())
         if len(self._files) > len(tids):
             for tid in set(self._files) - set(tids):
                 os.close(self._files.pop(tid))
@@ -49,6 +52,15 @@ class Children:
         for file in self._files.values():
             os.close(file)
         self._files.clear()
+
+
+def _whole(file: int) -> bytes:
+    """A list from its beginning; a process with few children is read once."""
+    found = piece = os.pread(file, CHILDREN_SIZE, 0)
+    while len(piece) >= NEARLY_A_PAGE:
+        piece = os.pread(file, CHILDREN_SIZE, len(found))
+        found += piece
+    return found
 
 
 class Kinship:
@@ -119,7 +131,7 @@ def children(pid: int) -> list[int]:
     with contextlib.suppress(FileNotFoundError, ProcessLookupError):
         for tid in os.listdir(f"/proc/{pid}/task"):
             with contextlib.suppress(CheckpointError):  # it has ended; its children are those of another one now
-                found += map(int, procfs.read_line(pid, f"task/{tid}/children").split())
+                found += map(int, procfs.read_bytes(pid, f"task/{tid}/children").split())
     return found
 
 

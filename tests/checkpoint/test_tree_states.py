@@ -473,6 +473,18 @@ def test_what_a_shell_has_started_together_and_left_behind_are_strangers(tmp_pat
             os.waitpid(pid, 0)
 
 
+def test_a_thousand_children_are_all_seen(tmp_path: Path) -> None:
+    """The kernel tells some seven hundred at once."""
+    births = "for _ in range(1000):\n    if not os.fork():\n        time.sleep(600)\n"
+    births = f"import os, time\n{births}print('ready', flush=True)\ntime.sleep(600)"
+    program = start([sys.executable, "-c", births], tmp_path, isolate=True)
+    with ended(program):
+        program.wait_for_line("ready")
+        children = kinship.Children(program.pid)
+        assert len(set(children.read([program.pid]))) == len(set(kinship.children(program.pid))) == 1000
+        children.close()
+
+
 SHARED = """
 import mmap
 size = 64 * mmap.PAGESIZE
