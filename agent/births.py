@@ -16,7 +16,7 @@ from typing import Any
 
 from agent import guard_messages
 from agent.caller import ROOT
-from agent.clock import Laps
+from agent.clock import Laps, now_ns
 from agent.component import Component, Prepared
 from agent.errors import GuardError, GuardLostError, KeeperLostError
 from agent.guest import Guest
@@ -25,9 +25,10 @@ from agent.places import Places, complete_logs, log_directory
 from agent.streams import discard, total_of
 from checkpoint import channel, epoch_variable, format, rights
 from checkpoint.carried import paths_of
-from checkpoint.engine import COOPERATIVE, NO_TERMS, PTRACE, Terms
+from checkpoint.channel import Laid
+from checkpoint.engine import COOPERATIVE, COPY_CLOCKS_AHEAD_NS, NO_TERMS, PTRACE, Terms
 from checkpoint.engines.cooperative import age_ns as commit_age_ns
-from checkpoint.errors import CheckpointError, MismatchError
+from checkpoint.errors import ChainError, CheckpointError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Credentials, Snapshot
 from checkpoint.needs import names_of_contents, needs
@@ -149,18 +150,7 @@ async def restore(
     await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
     laps.lap("reading the newest")
     component = Component(name, await places.nursery.guard(), places)
-    request = guard_messages.MakeVessel(
-        component=name,
-        inner_pid=outline.process.pid,
-        isolate=outline.process.isolated,
-        clocks=outline.clocks,
-        elapsed_ns=outage_ns,
-        totals=total_of(outline.output),
-        log_directory=str(log_directory(name, places)),
-        cgroup=places.cgroup,
-        user=(theirs.uids[1], theirs.gids[1]),
-        task=task,
-    )
+    request = _vessel_for(name, outline, places, outage_ns, total_of(outline.output), task)
     component.engine_wanted = task.engine if task is not None else PTRACE
     component.keeper.terms = terms_of(outline, terms)
     component.keeper.names = names_of_contents(needs(outline), places.contents)
@@ -188,6 +178,114 @@ async def restore(
         raise
     component.notes = (*component.notes, *restored.notes)
     return component
+
+
+def _vessel_for(
+    name: str,
+    outline: Snapshot,
+    places: Places,
+    elapsed_ns: int,
+    totals: tuple[int, int] | None,
+    task: guard_messages.Task | None = None,
+    counted_ns: int = 0,
+) -> guard_messages.MakeVessel:
+    theirs = outline.process.credentials
+    return guard_messages.MakeVessel(
+        component=name,
+        inner_pid=outline.process.pid,
+        isolate=outline.process.isolated,
+        clocks=outline.clocks,
+        elapsed_ns=elapsed_ns,
+        totals=totals,
+        log_directory=str(log_directory(name, places)),
+        cgroup=places.cgroup,
+        user=(theirs.uids[1], theirs.gids[1]),
+        task=task,
+        counted_ns=counted_ns,
+    )
+
+
+async def lay(
+    name: str, chain: Sequence[int], places: Places, *, age_ns: int, owner: int, groups: frozenset[int] | None, terms: Terms
+) -> tuple[Component, Laid]:
+    """Make a ready copy of a component from a chain: a vessel with its mappings and memory, which ends with this agent.
+
+    Args:
+        age_ns: of the newest snapshot.
+        groups: that it was started with; None: not known.
+        terms: this robot's.
+
+    Raises:
+        checkpoint.errors.UnsupportedError: it can have none, with the reasons.
+        MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError: nothing of it is left.
+    """
+    counted_ns = now_ns()
+    outline = await asyncio.to_thread(format.read_outline, chain[-1])
+    check_rights(name, outline, owner, groups)
+    component = Component(name, await places.nursery.guard(), places)
+    component.keeper.terms = terms_of(outline, terms)
+    request = _vessel_for(name, outline, places, age_ns + COPY_CLOCKS_AHEAD_NS, None, counted_ns=counted_ns)
+    try:
+        keeper = await component.keeper.give()
+        await _vessel(component, request, keeper)
+        order = channel.Lay(component.pid, name, age_ns, owner != ROOT, places.contents, component.keeper.terms)
+        laid, _ = await component.keeper.ask(order, tuple(chain))
+    except (CheckpointError, GuardError, KeeperLostError):
+        await component.undo()
+        raise
+    return component, laid
+
+
+def stale(name: str) -> ChainError:
+    """A ready copy does not lead to what the store holds now: a base has come."""
+    return ChainError(f"the ready copy of {name} must be laid again: a new chain has begun")
+
+
+async def finish(
+    component: Component,
+    outline: Snapshot,
+    places: Places,
+    *,
+    outage_ns: int,
+    owner: int | None,
+    groups: frozenset[int] | None,
+    task: guard_messages.Task | None,
+    epoch: int,
+    terms: Terms,
+    stood_still: bool,
+) -> None:
+    """Make the program of its ready copy, stopped, committed to nothing; arguments as of `restore`.
+
+    Args:
+        outline: of the snapshot that it stands at.
+
+    Raises:
+        checkpoint.errors.MismatchError, RestoreError; GuardError, KeeperLostError: nothing of it is left.
+    """
+    name, theirs = component.name, outline.process.credentials
+    owner = theirs.uids[0] if owner is None else owner
+    try:
+        check_rights(name, outline, owner, groups)
+        component.engine_wanted = task.engine if task is not None else PTRACE
+        component.keeper.terms = terms_of(outline, terms)
+        component.keeper.names = names_of_contents(needs(outline), places.contents)
+        order = channel.Restore(
+            component.pid,
+            name,
+            outage_ns,
+            robot=places.robot,
+            own_eyes=owner != ROOT,
+            epoch=epoch,
+            contents=places.contents,
+            terms=component.keeper.terms,
+            stood_still=stood_still,
+        )
+        restored, _ = await component.keeper.ask(channel.Finish(order, outline.position))
+    except (CheckpointError, GuardError, KeeperLostError):
+        await component.undo()
+        raise
+    component.commit = guard_messages.Commit(total_of(outline.output), task)
+    component.notes = (*component.notes, *restored.notes)
 
 
 def terms_of(outline: Snapshot, here: Terms) -> Terms:
@@ -225,7 +323,7 @@ async def begin_again(
     _check_owner(name, program, owner)
     try:
         check_rights(name, outline, owner, groups_of(program.inheritance))  # its carried files are laid down with them
-    except MismatchError:
+    except CheckpointError:
         if waiting is not None:
             await waiting.undo()
         raise
@@ -311,13 +409,19 @@ def check_rights(name: str, outline: Snapshot, owner: int, groups: frozenset[int
         groups: those that it was started with; None: not known, it may have one and call it by all four of its names.
 
     Raises:
-        MismatchError: it has become another user or group, as a set-user-id or set-group-id program does.
+        MismatchError: it has become another user or group, as a set-user-id or set-group-id program does; or it has filters of
+            seccomp(2) that a set-user-id program would run under.
+        FormatError: it does not tell them as we know it.
     """
     if owner == ROOT or os.geteuid() != ROOT:
         return  # root may; where we are not root, there is nothing to be gained
-    if all(_are_no_more(one, owner, groups) for one in rights.everybodys(outline)):
+    if not all(_are_no_more(one, owner, groups) for one in rights.everybodys(outline)):
+        reason = f"it runs with other rights than those of its owner, uid {owner}"
+    elif rights.could_gain(outline):
+        reason = "it is under a seccomp filter, but may gain rights by what it executes (no_new_privs is off)"
+    else:
         return
-    reason = f"it runs with other rights than those of its owner, uid {owner}: only a program of root may; start it as root"
+    reason += ": only a program of root may; start it as root"
     raise MismatchError(f"cannot restore {name}: {reason}", (reason,))
 
 

@@ -18,9 +18,10 @@ from typing import Any, Final
 from agent import births, clock, comeback
 from agent.component import Component
 from agent.errors import TROUBLE, AgentError, GuardError, KeeperLostError
-from agent.figures import Commits, Figures, shortened
+from agent.figures import NOT_WANTED, Commits, CopyFigures, Figures, shortened
 from agent.mistake import end_lanes_on_mistake
 from agent.occasions import Occasions
+from agent.ready_copy import ReadyCopy
 from agent.rules import begun_on
 from agent.snapshots import Snapshots, newest_of
 from agent.standby import Standby
@@ -44,7 +45,7 @@ class Charge:
 
     Attributes:
         component: None while nothing of it runs here.
-        standby: what waits here to take it over.
+        standby, copy: what waits here to take it over: a program that keeps its state, or any other's memory.
         epoch: of the newest act; an older one is dropped.
         ended: set by the core's word that the component's end is a record.
     """
@@ -57,6 +58,7 @@ class Charge:
     started: asyncio.Event = field(default_factory=asyncio.Event)
     ended: asyncio.Future[acts.ReportExit] | None = None
     standby: Standby = field(init=False)
+    copy: ReadyCopy = field(init=False)
     _snapshots: Snapshots = field(init=False)
     _occasions: Occasions = field(init=False)
     _queue: asyncio.Queue[Act] = field(default_factory=asyncio.Queue)
@@ -73,6 +75,7 @@ class Charge:
 
     def __post_init__(self) -> None:
         self.standby = Standby(self.name, self.around.places)
+        self.copy = ReadyCopy(self.name, self.around, self.figures)
         self._snapshots = Snapshots(self.name, self.around, self.figures)
         self._occasions = Occasions(self.name, self.around, self.figures)
 
@@ -88,7 +91,7 @@ class Charge:
         elif isinstance(act, acts.Warm):
             self._warm(act)
         elif isinstance(act, acts.Cool):
-            self.standby.cool()
+            self._cool()
         else:
             self._queue.put_nowait(act)
 
@@ -103,15 +106,25 @@ class Charge:
                 self._is_held, self._is_thaw_owed = True, False
 
     def _warm(self, act: acts.Warm) -> None:
-        """Have the program wait, unless this robot's operator does not want that."""
-        here = self.around.here(self.name)
-        if not here.warm:
+        """Have the program wait, or its copy stand ready, unless this robot's operator does not want that."""
+        here, newest = self.around.here(self.name), newest_of(self.around.store, self.name)
+        keeps_state = newest is not None and newest.engine == COOPERATIVE
+        self._cool()
+        if not (here.warm if keeps_state else here.ready_copy):
+            self.figures.copy = CopyFigures(why="" if keeps_state else NOT_WANTED, wanted=False)
             return
 
         def tell(ready: bool, why: str) -> None:
             self.around.tell(events.Warmed(self.name, act.epoch, ready, why))
 
-        self.standby.warm(comeback.again(self.around, act.spec, newest_of(self.around.store, self.name)), act.spec.owner, tell)
+        if keeps_state:
+            self.standby.warm(comeback.again(self.around, act.spec, newest), act.spec.owner, tell)
+        else:
+            self.copy.keep(act.spec, tell)
+
+    def _cool(self) -> None:
+        self.standby.cool()
+        self.copy.drop()
 
     @property
     def is_prepared_first(self) -> bool:
@@ -131,6 +144,7 @@ class Charge:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self.standby.close()
+        await self.copy.close()
         if self.component is not None:
             self.component.close()
 
@@ -175,7 +189,7 @@ class Charge:
                 if self.component is not None:
                     self._task(self._end(self.component, act.signal))
             case acts.Stop():
-                self.standby.cool()
+                self._cool()
                 await self._stop()
                 self.around.tell(events.Stopped(self.name, act.epoch))
             case acts.LetGo():
@@ -228,7 +242,7 @@ class Charge:
             log.warning("%s: %s: %s", self.name, type(act).__name__, trouble)
 
     async def _start(self, act: acts.Start) -> None:
-        self.standby.cool()
+        self._cool()
         adopted = self.component is not None
         self._occasions.runs_here(act.spec)
         terms = begun_on(act.spec.launch, self.around.here(self.name))
@@ -297,6 +311,15 @@ class Charge:
 
     async def _resumed(self, act: acts.Restore, chain: list[int], outage_ns: int, laps: clock.Laps) -> tuple[Component, int]:
         """The component, running, and the age of its state: what waits here for it, or, where that fails, from its beginning."""
+        copied = await self.copy.take(act.position)
+        if copied is not None:
+            laps.lap("taking the ready copy")
+            try:
+                await comeback.finished(self.around, act, copied.component, copied.outline, outage_ns)
+                laps.lap("its descriptors, timers and registers")
+                return await self._let_it_run(copied.component, act, outage_ns, laps)
+            except TROUBLE as trouble:
+                log.warning("%s: its ready copy cannot go on, it is restored from its chain: %s", self.name, trouble)
         waiting = self.standby.take()
         if waiting is not None:
             try:

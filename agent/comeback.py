@@ -82,6 +82,30 @@ async def brought_back(
     )
 
 
+async def finished(around: Surroundings, act: acts.Restore, component: Component, outline: Snapshot, outage_ns: int) -> None:
+    """Make the program of its ready copy; `Component.resume` lets it run.
+
+    Args:
+        outline: of the snapshot that it stands at.
+
+    Raises:
+        CheckpointError, AgentError: as `births.finish`; nothing of it is left.
+    """
+    spec = act.spec
+    await births.finish(
+        component,
+        outline,
+        around.places,
+        outage_ns=outage_ns,
+        owner=spec.owner if spec is not None else None,
+        groups=births.groups_of(program_of(spec.launch).inheritance) if spec is not None else None,
+        task=Task(act.epoch, engine=AUTO) if spec is not None and spec.launch.engine == AUTO else None,
+        epoch=act.epoch,
+        terms=terms_here(spec.launch if spec is not None else None, around.here(act.component)),
+        stood_still=act.why is Resumption.HANDED_OVER,
+    )
+
+
 def again(around: Surroundings, spec: ComponentSpec, newest: Snapshot | None) -> births.Program:
     """What is to be started again, with what was brought of it; a command of this robot's own needs nothing of that."""
     here = around.here(spec.name)

@@ -57,6 +57,7 @@ class Captured:
         snapshot: a sealed memfd with the encoded snapshot; the receiver closes it.
         size: bytes of it.
         commit, age_ns: of a program that keeps its state: number of the commit that it holds, and how old that was.
+        known_bytes: of its pages, those whose last content was remembered.
     """
 
     position: Position
@@ -68,6 +69,7 @@ class Captured:
     notes: tuple[str, ...]
     commit: int = 0
     age_ns: int = 0
+    known_bytes: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +115,7 @@ class Component:
         committed: called at its first commit to each segment.
         last_words: what its guard noted at its end.
         keeper: what captures it.
+        commit: what `resume` commits to it with.
         prepared: a program that is to be started with a state, by `resume`.
         streams: what its guard gave of them: counters, two read ends, two logs; none of somebody else's child.
         ended: the wait status once the program has ended (None: it was not our child); GuardLostError if the guard died first.
@@ -139,6 +142,7 @@ class Component:
         self.connected = asyncio.Event()
         self.last_words: tuple[str, ...] = ()
         self.prepared: Prepared | None = None
+        self.commit = guard_messages.Commit()
         self._lease_until_ns = 0
         self._held = False
         self._output_limited: bool | None = None
@@ -179,9 +183,10 @@ class Component:
             return "a program that is started again from its state is called back by on_resume" if told else ""
         untold = ""
         try:
-            await self.ask_guard(guard_messages.Commit())
+            _, streams = await self.ask_guard(self.commit)
             untold = await self._tell(*told) if told else ""
-            resumed, _ = await self.keeper.ask(channel.Resume())
+            self.streams = streams or self.streams
+            resumed, _ = await self.keeper.ask(channel.Resume(bool(streams)), streams)
         except (CheckpointError, GuardError, KeeperLostError):
             await self.undo()
             raise
@@ -276,7 +281,7 @@ class Component:
         if self._awaits_commit:
             what = "it has committed nothing yet" if self.task_pid else "it has not said yet that it keeps a state"
             raise NothingCommittedError(f"cannot capture {self.name}: {what}")
-        order = channel.Capture(base, generation, sequence, epoch, hold)
+        order = channel.Capture(base, generation, sequence, epoch, hold, self._places.xor_cache)
         async with self._standing_still(is_held_by_guard):
             with self._patience():
                 captured, descriptors = await self.keeper.ask(order)
@@ -300,6 +305,7 @@ class Component:
             captured.notes,
             captured.commit,
             captured.age_ns,
+            captured.known_bytes,
         )
 
     async def acknowledge(self, position: Position, *, is_safe: bool = True) -> None:

@@ -87,6 +87,7 @@ class ComponentConfig:
         portable: a level of processors that it must be able to go on at, see ``checkpoint.portable``; true for the usual one;
             "" for the agent's own.
         warm: a program that keeps its state itself is started here in advance, where this robot is its standby, and waits.
+        ready_copy: of any other program the newest checkpoint's memory stands ready here, where this robot is its standby.
         command: a program that keeps its state itself is started here again by this; () for the command line of `failover run`.
         directory: and in this one, an absolute path; "" for that of `failover run`.
         environment: and with these variables besides, or instead.
@@ -107,6 +108,7 @@ class ComponentConfig:
     snapshot_period_ms: int = 0
     portable: Portable = ""
     warm: bool = True
+    ready_copy: bool = False
     command: tuple[str, ...] = field(default_factory=tuple)
     directory: str = ""
     environment: dict[str, str] = field(default_factory=dict)
@@ -149,6 +151,8 @@ class Config:
         snapshot_period_ms: between two snapshots of a component; grows by itself when link or standby is slower.
         realtime: ask for SCHED_FIFO and locked memory.
         link_mbit_s: cap on snapshot traffic; 0 for none.
+        xor_cache: of each component, on either side: memory for pages that deltas are told as differences from; "": no
+            differences are made here.
         snapshots_over: wired: they never leave over a wireless link; any: over whichever has the bulk address.
         bring: files of programs that this robot lacks, or has in another version, are brought here and kept, by content.
         bring_size: of all that is brought for one component; beyond it its checkpoints are refused.
@@ -173,6 +177,7 @@ class Config:
     snapshot_period_ms: int = 100
     realtime: bool = True
     link_mbit_s: int = 0
+    xor_cache: str = "64MB"
     snapshots_over: Literal["wired", "any"] = "wired"
     wireless: list[str] = field(default_factory=list)
     bring: bool = True
@@ -183,6 +188,11 @@ class Config:
     keep_size: str = ""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     components: dict[str, ComponentConfig] = field(default_factory=dict)
+
+    @property
+    def xor_cache_size(self) -> int:
+        """The same in bytes."""
+        return size_bytes(self.xor_cache) if self.xor_cache else 0
 
     def __post_init__(self) -> None:
         """Refuse values that contradict each other.
@@ -208,6 +218,8 @@ class Config:
             raise ValueError(f"keep_checkpoints is {self.keep_checkpoints}; at most {KEEP_MAX}, and 0 keeps none")
         _check_quantity("keep_for", span_ms, self.keep_for)
         _check_quantity("bring_size", size_bytes, self.bring_size)
+        if self.xor_cache:
+            _check_quantity("xor_cache", size_bytes, self.xor_cache)
         if self.keep_size:
             _check_quantity("keep_size", size_bytes, self.keep_size)
         if self.link_mbit_s < 0:

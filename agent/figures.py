@@ -8,6 +8,7 @@ from typing import Final
 
 from agent.component import Captured
 from checkpoint.device_rules import DeviceRule, rules_of
+from checkpoint.digests_of_files import KnownDigest
 from checkpoint.engine import PTRACE
 from checkpoint.model import Position, Snapshot
 from failover.core.types import ComponentSpec
@@ -64,6 +65,27 @@ class Commits:
         )
 
 
+NOT_WANTED: Final = "agent.toml says ready_copy = false"
+"""Why there is no ready copy, where that is as it should be."""
+
+
+@dataclass(frozen=True, slots=True)
+class CopyFigures:
+    """Of the ready copy at a standby.
+
+    Attributes:
+        size: bytes of memory that it takes.
+        why: there is none.
+        wanted: by this robot's operator.
+    """
+
+    ready: bool = False
+    size: int = 0
+    position: Position | None = None
+    why: str = ""
+    wanted: bool = True
+
+
 @dataclass(slots=True)
 class Figures:
     """What ``failover status`` shows of one component on this robot; None where it is not known."""
@@ -75,6 +97,9 @@ class Figures:
     freeze_us_max: int | None = None
     snapshot_size: int | None = None
     dirty_bytes: int | None = None
+    written_bytes: int = 0
+    """Of the pages of all deltas that were taken here; ``known_bytes``: of those whose last content was in the cache."""
+    known_bytes: int = 0
     newest: Position | None = None
     exit_status: int | None = None
     outage_ms: float | None = None
@@ -84,6 +109,8 @@ class Figures:
     """Of a standby: as its primary told it with the newest snapshot."""
     lacks: tuple[str, ...] | None = None
     """Of a standby: what this robot lacks of what the program needs, by `agent.lacks`; None: nobody has looked."""
+    digests: tuple[KnownDigest, ...] = ()
+    """Of files that were read for that."""
     devices: tuple[DeviceRule, ...] = ()
     """Of those that it has open, as the newest snapshot from its primary tells."""
     hooks: dict[str, str] = field(default_factory=dict)
@@ -92,6 +119,12 @@ class Figures:
     """By robot: how far its files are on their way there."""
     engine: str = PTRACE
     commits: Commits = field(default_factory=Commits)
+    copy: CopyFigures = field(default_factory=CopyFigures)
+
+    @property
+    def xor_hit_rate(self) -> float | None:
+        """Which part of what deltas carried could be told as a difference; None before the first one."""
+        return self.known_bytes / self.written_bytes if self.written_bytes else None
 
     def captured(self, captured: Captured) -> None:
         """Count one snapshot that was taken here."""
@@ -99,6 +132,9 @@ class Figures:
         self.freeze_us = captured.freeze_us
         self.freeze_us_max = max(self.freeze_us_max or 0, captured.freeze_us)
         self.snapshot_size, self.dirty_bytes = captured.size, captured.dirty_bytes
+        if captured.parent is not None:
+            self.written_bytes += captured.dirty_bytes
+            self.known_bytes += captured.known_bytes
         self.newest = captured.position
         self.notes = captured.notes
 

@@ -9,7 +9,7 @@ It listens on SOCKET_PATH (0600) for one agent at a time; a new one takes the pl
 * when the agent says `Forget` after the program's end;
 * when the program has ended, no agent is there, and the system told the guard to end (SIGTERM: a shutdown);
 * when the program ends that was let go (`LetGo`); at once, if it is somebody else's child;
-* when the agent is lost before anything was started, or before a restore was committed;
+* when the agent is lost before anything was started, or before a restore was committed, also where that has ended already;
 * when no agent ever came, after `FIRST_CALL_S`.
 """
 
@@ -83,6 +83,7 @@ class Guard:
         self._over = False
         self._ends_with_ward = False
         self._told_to_end = False
+        self._is_unfinished = False
         self._started_at = time.monotonic()
         self._signals = _wake_on_signals()
         self._alarm = kernel.Alarm()
@@ -120,7 +121,7 @@ class Guard:
         """Whether no agent will ask for what this guard knows."""
         if self._ward is None:
             return time.monotonic() > self._started_at + FIRST_CALL_S
-        return self._told_to_end and self._ward.exited is not None
+        return (self._told_to_end or self._is_unfinished) and self._ward.exited is not None
 
     def _wait(self) -> list[Callable[[], None]]:
         """Sleep until something is to be done, or a deadline passes; returns what is to be done."""
@@ -197,6 +198,7 @@ class Guard:
     def _undo_unfinished(self, ward: Ward) -> None:
         if not ward.committed:
             ward.abandon()
+            self._is_unfinished = True  # its end is no component's: the next agent must not find it
             self._ends_with_ward = self._agent is None  # nobody is left to be told
 
     def _drop_keeper(self) -> None:
@@ -243,10 +245,17 @@ class Guard:
         self._ward = Ward.watch(request)
         self._reply(Watching(self._all_notes()))
 
-    def _commit(self, _: Commit, __: tuple[int, ...]) -> None:
-        self._guarded().commit()
+    def _commit(self, request: Commit, _: tuple[int, ...]) -> None:
+        ward = self._guarded()
+        if request.totals is None:
+            ward.commit()
+            self._drop_keeper()
+            self._reply(Done())
+            return
+        ward.commit_copy(request.totals, request.task)
         self._drop_keeper()
-        self._reply(Done())
+        born = ward.born
+        self._reply(VesselReady(born.pid, born.inner_pid, born.isolated, self._all_notes()), ward.descriptors())
 
     def _commit_safe(self, request: CommitSafe, _: tuple[int, ...]) -> None:
         if self._ward is not None and self._ward.task is not None and self._ward.exited is None:
@@ -372,6 +381,7 @@ def _settle() -> tuple[str, ...]:
     with contextlib.suppress(PermissionError):  # it leads a session already: whoever started it saw to that
         os.setsid()
     notes = []
+    kernel.small_stacks()
     try:
         kernel.lock_memory()
     except OSError as error:

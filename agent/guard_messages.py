@@ -67,8 +67,8 @@ class MakeVessel(Message, frozen=True):
 
     Attributes:
         inner_pid: the PID that the program knows itself by; 0 for any.
-        clocks: as the program read them when its snapshot was taken, ``elapsed_ns`` ago.
-        totals: bytes that the program had written to its two streams.
+        clocks: as the program read them when its snapshot was taken, ``elapsed_ns`` before ``counted_ns`` on CLOCK_BOOTTIME.
+        totals: bytes that the program had written to its two streams; None: of a ready copy, whose logs `Commit` opens.
         user: uid and gid that the program ran as.
         task: for a program that may still say that it keeps its state: its new guard listens where it was told to look.
     """
@@ -78,11 +78,12 @@ class MakeVessel(Message, frozen=True):
     isolate: bool
     clocks: Clocks
     elapsed_ns: int
-    totals: tuple[int, int]
+    totals: tuple[int, int] | None
     log_directory: str
     cgroup: str = ""
     user: tuple[int, int] | None = None
     task: Task | None = None
+    counted_ns: int = 0
 
 
 class Watch(Message, frozen=True):
@@ -105,7 +106,15 @@ class BeginTask(Message, frozen=True):
 
 
 class Commit(Message, frozen=True):
-    """The vessel has become the component: from here on it outlives agent and keeper."""
+    """The vessel has become the component: from here on it outlives agent and keeper. Answer: `Done`.
+
+    Attributes:
+        totals: where its output goes on, of a vessel that was made without; the answer is `VesselReady` with its streams.
+        task: of the same; see `MakeVessel`.
+    """
+
+    totals: tuple[int, int] | None = None
+    task: Task | None = None
 
 
 class Lease(Message, frozen=True):

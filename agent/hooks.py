@@ -43,11 +43,17 @@ CAPTURED: Final = "captured"
 OUTPUT_MAX: Final = 4_096
 """Bytes of what a hook said that stand in the log: the last ones."""
 
+CHUNK: Final = 1 << 16
+"""Bytes of it that are read at a time."""
+
 LINE_MAX: Final = 300
 """Characters of the last line that ``failover why`` shows."""
 
 END_S: Final = 2.0
 """How long the end of a hook that took too long is waited for."""
+
+SWEEPS: Final = 5
+"""Looks for processes of a hook that is ended: what was born during one is found by the next."""
 
 SYSTEMD_S: Final = 2.0
 """How much later than that systemd tells of a hook that it has ended."""
@@ -162,7 +168,7 @@ class Hooks:
         except (OSError, ValueError) as error:  # a command that came from another robot may hold a zero byte
             return self._told(kind, hook, occasion, f"cannot be started: {error}")
         try:
-            said, _ = await asyncio.wait_for(process.communicate(), hook.limit_s + (SYSTEMD_S if self.starter else 0))
+            said = await asyncio.wait_for(_last_said(process), hook.limit_s + (SYSTEMD_S if self.starter else 0))
         except TimeoutError:
             await _end(process)
             return self._told(kind, hook, occasion, f"took longer than {hook.limit_s:g} s and was ended")
@@ -202,6 +208,16 @@ class Hooks:
         return Outcome(sentence, last_line)
 
 
+async def _last_said(process: asyncio.subprocess.Process) -> bytes:
+    """Wait for the end of a hook; of what it said, which may be without end, the last bytes."""
+    assert process.stdout is not None, "it was begun with a pipe"
+    said = b""
+    while piece := await process.stdout.read(CHUNK):
+        said = (said + piece)[-OUTPUT_MAX:]
+    await process.wait()
+    return said
+
+
 def _user_of(user: Inheritance | None) -> dict[str, Any]:
     """What subprocess is told to become, where we can become somebody."""
     if user is None or os.geteuid() != 0 or user.uid == 0:
@@ -210,16 +226,34 @@ def _user_of(user: Inheritance | None) -> dict[str, Any]:
 
 
 async def _end(process: asyncio.subprocess.Process) -> None:
-    """End a hook and whatever it started in its session."""
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
+    """End a hook and whatever it started in its session, in whichever process group."""
+    for _ in range(SWEEPS):
+        if not sum(_kill_of(process.pid, int(name)) for name in os.listdir("/proc") if name.isdigit()):
+            break
     with contextlib.suppress(TimeoutError):
         await asyncio.wait_for(process.wait(), END_S)
 
 
+def _kill_of(session: int, pid: int) -> bool:
+    """Kill a process if it lives and belongs to a session; whether it did."""
+    try:
+        itself = os.pidfd_open(pid)
+    except OSError:
+        return False
+    try:
+        if os.getsid(pid) != session:
+            return False
+        signal.pidfd_send_signal(itself, signal.SIGKILL)
+        return True
+    except OSError:  # ended meanwhile
+        return False
+    finally:
+        os.close(itself)
+
+
 def _log_output(kind: Kind, occasion: Occasion, said: bytes) -> str:
     """Put what a hook said into the log; its last line."""
-    lines = said[-OUTPUT_MAX:].decode(errors="replace").splitlines()
+    lines = said.decode(errors="replace").splitlines()
     for line in lines:
         log.info("%s: %s said: %s", occasion.component, kind, line)
     return next((line.strip() for line in reversed(lines) if line.strip()), "")[:LINE_MAX]

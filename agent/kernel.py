@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import threading
 import time
 from typing import Final
 
@@ -19,6 +20,8 @@ TFD_TIMER_ABSTIME: Final = 1
 TFD_NONBLOCK: Final = os.O_NONBLOCK
 TFD_CLOEXEC: Final = os.O_CLOEXEC
 NS_PER_S: Final = 1_000_000_000
+THREAD_STACK: Final = 512 << 10
+"""Bytes; the usual 8 MB are for programs that know nothing of their threads."""
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _libc.fallocate.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_int64, ctypes.c_int64)
@@ -33,8 +36,15 @@ def become_subreaper() -> None:
     _check(_libc.prctl(PR_SET_CHILD_SUBREAPER, ctypes.c_ulong(1), 0, 0, 0), "prctl(PR_SET_CHILD_SUBREAPER)")
 
 
+def small_stacks() -> None:
+    """Have threads that are started from now on use `THREAD_STACK`: where memory is locked, every byte of it is there."""
+    threading.stack_size(THREAD_STACK)
+
+
 def lock_memory() -> None:
     """Keep every page of this process in memory, also those that are still to come; children do not inherit it.
+
+    Who has threads calls `small_stacks` before the first of them.
 
     Raises:
         OSError: RLIMIT_MEMLOCK is too small and CAP_IPC_LOCK is missing.

@@ -8,10 +8,12 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Iterable, Mapping
+from typing import Final
 
 from agent.births import check_rights, groups_of
 from agent.charge import Charge
-from agent.errors import TROUBLE
+from agent.errands import Errands
+from agent.errors import TROUBLE, RefusedError
 from agent.nursery import KeeperLink
 from agent.rules import terms_here
 from agent.surroundings import Surroundings, program_of
@@ -20,7 +22,21 @@ from checkpoint.channel import Compared, Failed, close_all
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CheckpointError, MismatchError, StoreError
 
+PATIENCE_S: Final = 15.0
+"""How long another robot may take to look what it lacks: it reads files."""
+
 log = logging.getLogger("failover.lacks")
+
+
+async def asked_of(errands: Errands, robot: str, name: str) -> tuple[str, ...]:
+    """What another robot lacks of what a component needs to go on there; nothing where it cannot be asked."""
+    try:
+        found = await errands.send(robot, "lacks", {"name": name}, patience_s=PATIENCE_S)
+    except RefusedError as untold:
+        log.warning("%s: whether it could go on at %s is not known: %s", name, robot, untold)
+        return ()
+    reasons = found.get("lacks")
+    return tuple(map(str, reasons)) if isinstance(reasons, list) else ()
 
 
 async def look(around: Surroundings, charges: Iterable[Charge]) -> Mapping[str, tuple[str, ...]]:
@@ -55,13 +71,14 @@ async def _compared(around: Surroundings, charge: Charge, keeper: KeeperLink) ->
         if outline.engine == COOPERATIVE and around.here(name).command:
             return ()  # it is started by that
         terms = terms_here(spec.launch if spec is not None else None, around.here(name))
-        order = channel.Compare(around.places.contents, terms)
+        order = channel.Compare(around.places.contents, terms, charge.figures.digests)
         reply, _ = await keeper.dialogue.ask(order, (chain[-1],))
     finally:
         close_all(tuple(chain))
     if isinstance(reply, Failed):
         raise CheckpointError(reply.message)
     assert isinstance(reply, Compared)
+    charge.figures.digests = reply.known
     try:
         if spec is not None:
             check_rights(name, outline, spec.owner, groups_of(program_of(spec.launch).inheritance))

@@ -46,7 +46,7 @@ from checkpoint.model import Snapshot
 from checkpoint.needs import Need, names_of_contents, needs
 from checkpoint.store import Store, open_store
 from failover.client.quantities import size_bytes
-from failover.core import acts
+from failover.core import acts, events
 from failover.core.messages import (
     Belongings,
     Bulk,
@@ -84,6 +84,7 @@ class Lanes(Switchboard):
     def __init__(self, settings: Settings, heart: Channel[ToLanes]) -> None:
         super().__init__(settings, heart)
         self.charges: dict[str, Charge] = {}
+        self._inquiries: set[str] = set()
         config = settings.config
         state, runtime = Path(config.state_directory), Path(config.runtime_directory)
         self._store_path = state / "store"
@@ -91,7 +92,7 @@ class Lanes(Switchboard):
         self._starter = starter()
         self._nursery = Nursery(sockets, self._starter)
         contents = str(self._store_path / CONTENTS_FOLDER) if config.bring else ""
-        self.places = Places(sockets, state / "logs", self._nursery, robot=config.robot, contents=contents)
+        self.places = Places(sockets, state / "logs", self._nursery, "", config.robot, contents, config.xor_cache_size)
         self._shipper = Shipper(self._lane, config.link_mbit_s * BYTES_A_MEGABIT)
         self.connect(Verbs(self))
 
@@ -143,7 +144,8 @@ class Lanes(Switchboard):
         """Have the store to ourselves; an earlier life of the agent that still ends is waited for."""
         for _ in range(STORE_TRIES):
             try:
-                return await asyncio.to_thread(open_store, self._store_path, None, retention(self.settings.config))
+                config = self.settings.config
+                return await asyncio.to_thread(open_store, self._store_path, None, retention(config), config.xor_cache_size)
             except StoreError as error:
                 trouble: StoreError = error
                 await asyncio.sleep(STORE_PAUSE_S)
@@ -160,6 +162,8 @@ class Lanes(Switchboard):
                 self._dispatch.ship(act)
             case acts.CancelShip():
                 self._dispatch.cancel(act)
+            case acts.Inquire():
+                self._task(self._inquire(act))
             case _:
                 self.charge(act.component).order(act)
 
@@ -298,6 +302,7 @@ class Lanes(Switchboard):
         if figures.spec is None:
             self._new_here.set()  # the first one of it: look at once whether it could go on here
         figures.stored(snapshot, offer.size, offer.spec)
+        self.charge(offer.component).copy.stored()
 
     async def _look_what_is_lacking(self) -> None:
         """Now and then, and when this robot becomes a standby: what it lacks of what it stands by for."""
@@ -322,6 +327,17 @@ class Lanes(Switchboard):
         if charge.figures.spec is not None:
             charge.figures.lacks = found
         return found or ()
+
+    async def _inquire(self, act: acts.Inquire) -> None:
+        """Ask another robot what it lacks of what a component needs; where it cannot tell, the core decides alone."""
+        if act.component in self._inquiries:
+            return  # its answer is on its way, as late as it may be
+        self._inquiries.add(act.component)
+        try:
+            found = await lacks.asked_of(self.errands, act.to, act.component)
+        finally:
+            self._inquiries.discard(act.component)
+        self.tell(events.Inquired(act.component, act.epoch, act.to, found))
 
     async def _silence_ns(self, component: str) -> int:
         """For how long the robot that last sent this component's snapshots has been silent; 0 if there is none."""

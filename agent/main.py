@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from agent import config as configuration
+from agent import kernel
 from agent.errors import AgentError
 from agent.journal import set_up_log
 from agent.systemd import notifier
@@ -58,6 +59,7 @@ def _run(settings: configuration.Settings) -> int:
     from agent.loop import beat
 
     set_up_log(settings.config.log_level)
+    kernel.small_stacks()
     if settings.config.insecure:
         log.warning("%s", INSECURE)
     beat(settings, notifier())

@@ -23,6 +23,7 @@ class Places:
         cgroup: a delegated cgroup v2 directory that each component gets a cgroup of its own in; "" for the guard's own.
         robot: this robot's name, for the snapshots.
         contents: directory of files that programs brought along; "": none are brought to this robot.
+        xor_cache: see `checkpoint.channel.Capture`.
     """
 
     sockets: Path
@@ -31,6 +32,7 @@ class Places:
     cgroup: str = ""
     robot: str = ""
     contents: str = ""
+    xor_cache: int = 0
 
 
 def guard_sockets(places: Places) -> tuple[Path, ...]:

@@ -10,16 +10,29 @@ from pathlib import Path
 
 import msgspec
 
-from checkpoint.engine import NO_TERMS, Terms
+from checkpoint.device_rules import DeviceRule
+from checkpoint.engine import NO_TERMS, NOTHING_CARRIED, Carry, Terms
 from checkpoint.shelf import folder_name
 
 
-class Running(msgspec.Struct, frozen=True):
-    """One note."""
+class Running(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One note.
+
+    Attributes:
+        carry, devices: its terms as agents noted them that knew no others. They are read only: a program outlives its agent, and
+            so the version that noted them.
+    """
 
     component: str
     epoch: int
     terms: Terms = NO_TERMS
+    carry: Carry = NOTHING_CARRIED
+    devices: tuple[DeviceRule, ...] = ()
+
+    @property
+    def all_terms(self) -> Terms:
+        """Whoever noted them."""
+        return Terms(self.carry, self.devices) if self.terms == NO_TERMS else self.terms
 
 
 class Records:
@@ -48,7 +61,7 @@ class Records:
     def terms(self, component: str) -> Terms:
         """What its operator has ruled."""
         noted = self._noted(component)
-        return noted.terms if noted else NO_TERMS
+        return noted.all_terms if noted else NO_TERMS
 
     def _noted(self, component: str) -> Running | None:
         try:

@@ -105,7 +105,10 @@ class Standby:
             if self._ready is component:
                 self._ready = None
             if component is not self._given:
-                await component.undo()
+                undone = asyncio.create_task(component.undo())  # whole, whoever waits for it: what is left would be found again
+                self._ending.add(undone)
+                undone.add_done_callback(self._ending.discard)
+                await asyncio.shield(undone)
 
     async def _born(self, program: Program, owner: int) -> Component:
         """Start it; one that nobody wants by then is not left behind."""

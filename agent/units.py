@@ -30,9 +30,10 @@ Kind = Literal["guard", "keeper", "hook"]
 PROPERTIES: Final[dict[Kind, tuple[str, ...]]] = {
     "guard": ("Delegate=yes", f"TimeoutStopSec={STOP_S}s", "OOMScoreAdjust=-900", "UMask=0077"),
     "keeper": (f"TimeoutStopSec={STOP_S}s", "LimitNOFILE=65536", "UMask=0077"),
-    "hook": (f"TimeoutStopSec={STOP_S}s",),
+    "hook": (f"TimeoutStopSec={STOP_S}s", "KillSignal=SIGKILL"),
 }
-"""Without its guard a program ends, so memory is taken from others first; a keeper is replaced."""
+"""Without its guard a program ends, so memory is taken from others first; a keeper is replaced; of a hook nothing outlives its
+limit, for what comes after it begins then: asked to end first, it could go on for as long as a stop may take."""
 
 
 def starter() -> str:

@@ -11,7 +11,7 @@ from typing import Any, Final, Protocol
 
 import msgspec
 
-from agent import clock
+from agent import clock, lacks
 from agent.arguments import (
     HandoverArguments,
     LogsArguments,
@@ -43,9 +43,6 @@ from failover.errors import NameFormatError
 
 STANDING_POLL_S: Final = 0.01
 """Between two questions to the robot that a component moves to: what an operator reads as the move's time."""
-
-LOOK_PATIENCE_S: Final = 15.0
-"""How long the robot that a component is to move to may take to look what it lacks: it reads files."""
 
 START_PATIENCE_S: Final = 30.0
 """How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
@@ -218,19 +215,14 @@ class Verbs(Questions):
     async def _check_fit(self, name: str, verb: str, robot: str) -> None:
         """Ask the robot that a component is to move to whether it could go on there.
 
-        Where it cannot tell (it is not reached, or of another release) the core decides alone.
+        Where it cannot tell the core decides alone.
 
         Raises:
             RefusedError: it lacks something, all of it by name.
         """
         if robot not in await self._reachable():
             return
-        try:
-            found = await self._lanes.errands.send(robot, "lacks", {"name": name}, patience_s=LOOK_PATIENCE_S)
-        except RefusedError as untold:
-            log.warning("%s: whether it could go on at %s is not known: %s", name, robot, untold)
-            return
-        if reasons := tuple(str(reason) for reason in found.get("lacks", ())):
+        if reasons := await lacks.asked_of(self._lanes.errands, robot, name):
             sentence = f"cannot {verb} {name} to {robot}, where it could not go on: {'; '.join(reasons)}"
             raise RefusedError(sentence, "MismatchError", reasons)
 

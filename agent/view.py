@@ -124,6 +124,16 @@ def _lacks(view: ComponentView, figures: Figures | None) -> tuple[str, ...] | No
     return figures.lacks if figures is not None and view.state is State.STANDBY else None
 
 
+def told_lacks(view: ComponentView, charge: Charge | None, robot: str) -> list[str]:
+    """The same for people; what a hook perhaps brings before the program goes on is no refusal yet."""
+    if charge is None:
+        return []
+    lacks = _lacks(view, charge.figures) or ()
+    if charge.is_prepared_first:
+        return [f"{robot} lacks now, and its hook before_resume is to bring: {lack}" for lack in lacks]
+    return [f"{robot} could not go on with it: {lack}" for lack in lacks]
+
+
 def _hung_up_devices(view: ComponentView, figures: Figures | None, settings: Settings) -> tuple[str, ...]:
     """Which devices a standby lacks that the program would find hung up there."""
     if figures is None or view.state is not State.STANDBY:
@@ -164,6 +174,8 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, s
         "engine": engine,
         "warm": view.warm if engine == COOPERATIVE else None,
         "cold": view.cold,
+        "ready": view.warm if engine != COOPERATIVE and view.standby else None,
+        "ready_copy": _ready_copy(view, figures),
         "pid": running.pid if running is not None else None,
         "inner_pid": running.inner_pid if running is not None else None,
         "isolated": running.isolated if running is not None else None,
@@ -176,6 +188,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, s
         "freeze_us_max": figures.freeze_us_max if figures else None,
         "snapshot_size": figures.snapshot_size if figures else None,
         "dirty_bytes": figures.dirty_bytes if figures else None,
+        "xor_hit_rate": figures.xor_hit_rate if figures else None,
         "snapshots": figures.snapshots if figures else 0,
         "restores": figures.restores if figures else 0,
         "crashes": figures.crashes if figures else 0,
@@ -184,6 +197,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, s
         "kept": _kept(store.kept(view.name) if store is not None else None),
         "unstored": view.unstored,
         "lacks": _lacks(view, figures),
+        "prepared_first": charge is not None and charge.is_prepared_first,
         "promise": view.promise,
         "promise_differs": view.differs,
         "home": view.home,
@@ -194,12 +208,33 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, s
         "reasons": list(figures.reasons) if figures else [],
         "notes": [
             *view.notes,
-            *(f"{settings.config.robot} could not go on with it: {lack}" for lack in _lacks(view, figures) or ()),
+            *told_lacks(view, charge, settings.config.robot),
+            *_copy_notes(view, figures, settings.config.robot),
             *_own_notes(view, figures),
             *_hung_up_devices(view, figures, settings),
             *_waiting_output(view, waiting),
         ],
     }
+
+
+def _ready_copy(view: ComponentView, figures: Figures | None) -> dict[str, Any] | None:
+    """Of the ready copy at this robot, where it stands by: its memory, where it stands, or why there is none."""
+    if figures is None or view.state is not State.STANDBY or figures.engine == COOPERATIVE:
+        return None
+    copy = figures.copy
+    position = {"generation": copy.position.generation, "sequence": copy.position.sequence} if copy.position else None
+    return {"ready": copy.ready, "wanted": copy.wanted, "size": copy.size, "position": position, "why": copy.why}
+
+
+def _copy_notes(view: ComponentView, figures: Figures | None, robot: str) -> tuple[str, ...]:
+    """The same as sentences."""
+    shown = _ready_copy(view, figures)
+    if shown is None or not (shown["ready"] or shown["why"]) or not shown["wanted"]:
+        return ()
+    if not shown["ready"]:
+        return (f"ready copy at {robot}: no, because {shown['why']}; a takeover restores it from its chain",)
+    size, position = shown["size"] / 1e6, shown["position"]
+    return (f"ready copy at {robot}: {size:.1f} MB of memory, at checkpoint {position['generation']}.{position['sequence']}",)
 
 
 def _kept(kept: Kept | None) -> dict[str, Any] | None:

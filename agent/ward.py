@@ -23,10 +23,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Literal
 
+import msgspec
+
 from agent import freezer as freezing
 from agent.clock import now_ns
 from agent.freezer import Freezer
-from agent.guard_messages import BeginTask, Described, Exited, MakeVessel, Start, Watch
+from agent.guard_messages import BeginTask, Described, Exited, MakeVessel, Start, Task, Watch
 from agent.kernel import queue_signal
 from agent.pump import Pump
 from agent.streams import STREAMS, OutputLogs
@@ -115,7 +117,7 @@ class Ward:
         Raises:
             RestoreError, OSError: it could not be made; nothing is left of it.
         """
-        birth = Birth(order.inner_pid, order.isolate, order.clocks, order.elapsed_ns)
+        birth = Birth(order.inner_pid, order.isolate, order.clocks, order.elapsed_ns, counted_ns=order.counted_ns)
         ward = cls._bear(order, order.totals, birth, spawn_vessel, order.user)
         ward.committed = False
         ward.offered, ward.engine = order, order.task.engine if order.task is not None else PTRACE
@@ -218,6 +220,23 @@ class Ward:
         self.committed = True
         self._listen_again()
         self.lapse(now_ns())
+
+    def commit_copy(self, totals: tuple[int, int], task: Task | None) -> None:
+        """The vessel was a ready copy, and is the component now: its output goes on in the logs from ``totals`` on.
+
+        Raises:
+            WardError: it has ended in the meantime, or its logs are open already.
+            OSError: they cannot be written; nothing has changed.
+        """
+        self._check_alive("commit to it")
+        if self.offered is None or self.pump is None or self.pump.is_open:
+            raise WardError("cannot commit to it as to a ready copy: its logs are open already")
+        _open(self.pump, self.log_directory, totals)
+        self.note_logs()
+        self.offered = msgspec.structs.replace(self.offered, task=task)
+        self.engine = task.engine if task is not None else PTRACE
+        self.commit()
+        self.pump.begin()
 
     def _listen_again(self) -> None:
         """A program that was restored before it said that it keeps its state looks for its guard where the last one listened."""

@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from benchmarks import beside, crowd, encoding, engine, interference, machine, outage, results, task
+from benchmarks import beside, costs, crowd, encoding, engine, interference, machine, outage, results, task
 from benchmarks.figures import Absent, Findings
 from benchmarks.running import BenchmarkError
 from checkpoint.errors import CheckpointError
@@ -75,6 +75,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "restore": _restore,
     "outage": _outage,
     "throughput": interference.throughput,
+    "costs": costs.costs,
     "beats": interference.beats,
     "encoding": encoding.encoding,
     "task": task.task,

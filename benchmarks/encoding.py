@@ -66,8 +66,9 @@ def encoding(quick: bool, directory: Path) -> Findings:
         "The format, beside what one would reach for",
         f"Pages as captured from a Python program with {cells:,} objects in a dictionary, {CHANGES} of them replaced each 50 "
         "ms. Ours checks the snapshot, packs pages and state by zstd −1 and seals every byte by a digest; reading verifies it "
-        "all. The bare tools pack the same pages and prove nothing. “XOR” packs the difference from the pages' last content "
-        "(our format does not). “pickle” is what a program does for itself: all its objects each time, and it stands still "
+        "all. The bare tools pack the same pages and prove nothing. “XOR” packs the difference from the pages' last content; "
+        "so does our keeper where it has that at hand, which it has not here. “pickle” is what a program does for itself: "
+        "all its objects each time, and it stands still "
         "meanwhile.",
         tuple(sorted(figures, key=lambda figure: (figure.benchmark, figure.case))),
         () if _lz4() else (Absent("lz4", "liblz4.so.1 is not installed"),),

@@ -59,11 +59,11 @@ def _in_turns(stage: Stage, program: Running, dirty_kb: int, turns: int) -> list
     protected: list[float] = []
     released: list[float] = []
     for _ in range(turns):
-        released.append(_rate(program))
+        released.append(rate(program))
         with primary.control() as link:
             link.ask("protect", pid=program.pid, name=NAME)
-        _until_protected(primary)
-        protected.append(_rate(program))
+        until_protected(primary)
+        protected.append(rate(program))
         with primary.control() as link:
             link.ask("release", name=NAME)
     case = f"{dirty_kb} KB written each 50 ms"
@@ -73,7 +73,7 @@ def _in_turns(stage: Stage, program: Running, dirty_kb: int, turns: int) -> list
     ]
 
 
-def _rate(program: Running) -> float:
+def rate(program: Running) -> float:
     """Steps a second over the next `WINDOW_S`."""
     began = time.monotonic_ns()
     time.sleep(WINDOW_S)
@@ -82,12 +82,12 @@ def _rate(program: Running) -> float:
     return (after - before) / ((last - first) / 1e9)
 
 
-def _until_protected(robot: RobotMachine) -> None:
+def until_protected(robot: RobotMachine) -> None:
     """Wait until the first snapshots have been acknowledged: they are whole ones."""
-    _until(robot, lambda one: one["protection"] == "protected" and one["snapshots"] >= WARM_SNAPSHOTS)
+    until(robot, lambda one: one["protection"] == "protected" and one["snapshots"] >= WARM_SNAPSHOTS)
 
 
-def _until(robot: RobotMachine, condition: Any) -> None:
+def until(robot: RobotMachine, condition: Any) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
         if any(condition(one) for one in robot.status()["components"] if one["name"] == NAME):
@@ -121,7 +121,7 @@ def beats(quick: bool, directory: Path) -> Findings:
             shipping = time.time()
             with stage.robots[0].control() as link:
                 link.ask("protect", pid=program.pid, name=NAME)
-            _until(stage.robots[1], lambda one: (one["snapshots"] or 0) >= 1)
+            until(stage.robots[1], lambda one: (one["snapshots"] or 0) >= 1)
             ended = time.time()
     figures = [
         Figure("between two beats", f"{megabytes} MB on their way", "ms", gaps(instants, shipping, ended)),

@@ -3,26 +3,30 @@
 A *chain* is a tuple of snapshots of one component: a base, then deltas, each the child of the one before it.
 
 A delta changes the state of its parent in steps: pages outside its own mappings go, pages in ``cleared`` go, pages in
-``runs`` are set, pages in ``copies`` as those that they name. A position's digest covers the result (``state_digest``), so a
-fold proves itself.
+``runs`` are set (those in ``differences`` to what is there XOR their bytes), pages in ``copies`` as those that they name. A
+position's digest covers the result (``state_digest``), so a fold proves itself.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
-from checkpoint import pages
+from checkpoint import differences, pages
+from checkpoint.differences import Rows
 from checkpoint.errors import ChainError
-from checkpoint.gathering import gathered
+from checkpoint.gathering import gathered_bytes
 from checkpoint.model import OutputPiece, PageCopy, Position, Snapshot
-from checkpoint.pages import PageMap, PageTable
+from checkpoint.pages import PageMap, PageTable, Words
 from checkpoint.state import state_digest
 from checkpoint.tree import every_mapping
 from checkpoint.validity import STREAMS, place
+
+NONE: Words = np.empty(0, dtype=np.uint64)
 
 __all__ = ["append", "applied", "check_continues", "check_state", "fold", "position_of", "state_digest"]
 
@@ -69,7 +73,8 @@ def append(chain: Sequence[Snapshot], snapshot: Snapshot) -> tuple[Snapshot, ...
 
 
 def applied(table: PageTable, snapshot: Snapshot) -> PageTable:
-    """The page table of a state after one more snapshot."""
+    """The page table of a state after one more snapshot, which tells its pages whole (`checkpoint.differences.resolved`)."""
+    assert not snapshot.differences, "a difference is not the page"
     contents = memoryview(snapshot.contents)
     return table.apply(snapshot.cleared, snapshot.runs, contents, every_mapping(snapshot), snapshot.copies)
 
@@ -110,10 +115,13 @@ def fold(chain: Sequence[Snapshot]) -> Snapshot:
     _check_chain(chain)
     newest = chain[-1]
     page_size = newest.machine.page_size
-    sources = _newest_sources(chain, page_size)
+    sources, layers = _newest_sources(chain, page_size)
     has_copies = newest.is_tree and any(snapshot.copies for snapshot in chain)  # one process alone has none
-    carried, copies = _told_once(sources, page_size) if has_copies else (sources, ())
-    contents = gathered([snapshot.contents for snapshot in chain], carried, page_size)
+    carried, copies = _told_once(sources, layers, page_size) if has_copies else (sources, ())
+    gathered = gathered_bytes([snapshot.contents for snapshot in chain], carried, page_size)
+    for layer in layers:
+        _lay_on(gathered, carried, layer, page_size)
+    contents = gathered.data.toreadonly()
     runs = pages.page_runs(pages.extents_of_addresses(carried.addresses, page_size))
     check_state(newest, PageTable.empty(page_size).apply((), runs, contents, every_mapping(newest), copies).page_sum)
     return replace(
@@ -123,14 +131,39 @@ def fold(chain: Sequence[Snapshot]) -> Snapshot:
         runs=runs,
         contents=contents,
         copies=copies,
+        differences=(),
         output=_joined_output(chain),
         notes=tuple(dict.fromkeys(note for snapshot in chain for note in snapshot.notes)),
     )
 
 
-def _told_once(sources: PageMap, page_size: int) -> tuple[PageMap, tuple[PageCopy, ...]]:
-    """Pages that lie at different places, and copies of them: those that lie at the same one."""
-    _, firsts, which = np.unique(sources.words, axis=0, return_index=True, return_inverse=True)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Layer:
+    """The pages that one snapshot tells as differences.
+
+    Attributes:
+        index: of the snapshot in its chain.
+        differences: of ``addresses``, which are in order, one row a page.
+    """
+
+    index: int
+    addresses: Words
+    differences: Rows
+
+
+def _lay_on(gathered: NDArray[np.uint8], carried: PageMap, layer: _Layer, page_size: int) -> None:
+    """Change those pages of a layer that no later snapshot has set or taken away."""
+    found, places = pages.found_among(carried.addresses, layer.addresses)
+    still = carried.words[places, 0] < np.uint64(layer.index)
+    gathered.reshape(-1, page_size)[places[still]] ^= layer.differences[found][still]
+
+
+def _told_once(sources: PageMap, layers: Sequence[_Layer], page_size: int) -> tuple[PageMap, tuple[PageCopy, ...]]:
+    """Pages that lie at different places, and copies of them: those that lie at the same one, and that no layer changes."""
+    changed = np.unique(np.concatenate([NONE, *(layer.addresses for layer in layers)]))
+    own = np.where(np.isin(sources.addresses, changed, assume_unique=True), sources.addresses, np.uint64(0))
+    words = np.column_stack((sources.words, own))
+    _, firsts, which = np.unique(words, axis=0, return_index=True, return_inverse=True)
     source = sources.addresses[firsts[which.reshape(-1)]]
     is_copy = source != sources.addresses
     kept = PageMap(sources.addresses[~is_copy], sources.words[~is_copy])
@@ -158,20 +191,57 @@ def _check_kin(parent: Snapshot, delta: Snapshot) -> None:
         )
 
 
-def _newest_sources(chain: Sequence[Snapshot], page_size: int) -> PageMap:
-    """For every page of the folded state where its content lies: (index in the chain, index of the page there)."""
+def _newest_sources(chain: Sequence[Snapshot], page_size: int) -> tuple[PageMap, list[_Layer]]:
+    """For every page of the folded state where it was last told whole: (index in the chain, index of the page there).
+
+    Returns:
+        That, and what was told as differences, oldest first.
+
+    Raises:
+        ChainError: a page is told as the difference from one that is not there.
+    """
     state = PageMap.empty()
+    layers: list[_Layer] = []
     for index, snapshot in enumerate(chain):
-        addresses = pages.addresses_of(pages.extents(snapshot.runs), page_size)
+        addresses = differences.addresses_of(snapshot.runs, page_size)
         places = np.empty((len(addresses), 2), dtype=np.uint64)
         places[:, 0] = index
         places[:, 1] = np.arange(len(addresses))
-        kept, _ = state.without(pages.extents(every_mapping(snapshot)), pages.extents(snapshot.cleared))
-        state, _ = kept.overlaid(addresses, places)
+        state, _ = state.without(pages.extents(every_mapping(snapshot)), pages.extents(snapshot.cleared))
+        whole = np.ones(len(addresses), dtype=np.bool_)
+        if snapshot.differences:
+            layers.append(_layer_of(snapshot, index, addresses, page_size))
+            whole = ~pages.covered(pages.extents(snapshot.differences), addresses)
+            _check_there(snapshot, layers[-1].addresses, state.addresses)
         if snapshot.copies:
             copied, taken_from = pages.copied_pages(snapshot.copies, addresses, page_size)
             state, _ = state.overlaid(copied, places[taken_from])
-    return state
+        state, _ = state.overlaid(addresses[whole], places[whole])
+    return state, layers
+
+
+def _layer_of(snapshot: Snapshot, index: int, carried: Words, page_size: int) -> _Layer:
+    addresses = differences.addresses_of(snapshot.differences, page_size)
+    rows = differences.rows_of(snapshot.contents, page_size)
+    return _Layer(index, addresses, rows[np.searchsorted(carried, addresses)])
+
+
+def _check_there(snapshot: Snapshot, wanted: Words, held: Words) -> None:
+    """Refuse a delta that tells a page as the difference from one that its parent's state does not hold.
+
+    Args:
+        wanted, held: addresses, in order.
+
+    Raises:
+        ChainError: names the first one.
+    """
+    found, _ = pages.found_among(held, wanted)
+    lacking = wanted[~found]
+    if len(lacking):
+        raise ChainError(
+            f"delta {place(snapshot.position)} of {snapshot.component} tells the page at {int(lacking[0]):#x} as a difference "
+            "from one that its parent does not hold; ask for a base"
+        )
 
 
 def _joined_output(chain: Sequence[Snapshot]) -> tuple[OutputPiece, ...]:

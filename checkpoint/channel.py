@@ -18,6 +18,7 @@ from typing import Any, Final, Generic, TypeVar
 import msgspec
 
 from checkpoint.capability import Capability
+from checkpoint.digests_of_files import KnownDigest
 from checkpoint.engine import NO_TERMS, PTRACE, Report, Terms
 from checkpoint.errors import UNDECODABLE, CheckpointError
 from checkpoint.model import Position
@@ -223,6 +224,7 @@ class Capture(msgspec.Struct, frozen=True, tag=True):
 
     Attributes:
         hold: leave the program standing still afterwards, until `Release`: who ends it now ends it in exactly this state.
+        xor_cache: bytes in which the keeper may remember pages, to tell deltas as differences from them; 0: not at all.
     """
 
     base: bool
@@ -230,6 +232,7 @@ class Capture(msgspec.Struct, frozen=True, tag=True):
     sequence: int
     epoch: int = 0
     hold: bool = False
+    xor_cache: int = 0
 
 
 class Acknowledge(msgspec.Struct, frozen=True, tag=True):
@@ -260,15 +263,54 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
     stood_still: bool = False
 
 
+class Lay(msgspec.Struct, frozen=True, tag=True):
+    """Make the vessel ``pid`` a ready copy; with descriptors: the chain's files, oldest first. Answer: `Laid`.
+
+    Attributes:
+        elapsed_ns: since the newest was taken.
+        own_eyes, contents, terms: see `checkpoint.engine.RestoreOptions`.
+    """
+
+    pid: int
+    component: str
+    elapsed_ns: int = 0
+    own_eyes: bool = False
+    contents: str = ""
+    terms: Terms = NO_TERMS
+
+
+class Advance(msgspec.Struct, frozen=True, tag=True):
+    """Bring the ready copy on; with descriptors: deltas, oldest first. Answer: `Laid`. A copy for which that fails is ended.
+
+    Attributes:
+        elapsed_ns: since the newest was taken.
+    """
+
+    elapsed_ns: int = 0
+
+
+class Finish(msgspec.Struct, frozen=True, tag=True):
+    """Make the ready copy the program, as a restore would; its streams come with `Resume`. Answer: `Restored`.
+
+    Attributes:
+        position: that it must stand at.
+    """
+
+    order: Restore
+    position: Position
+
+
 class Compare(msgspec.Struct, frozen=True, tag=True):
     """Look whether the program of a snapshot could go on here; with a descriptor: its newest snapshot. Answer: `Compared`.
 
     Attributes:
         contents, terms: see `checkpoint.engine.RestoreOptions`.
+        known: what the last `Compared` told, so that only files that have changed are read again.
     """
 
     contents: str = ""
     terms: Terms = NO_TERMS
+    known: tuple[KnownDigest, ...] = ()
 
 
 class OpenFile(msgspec.Struct, frozen=True, tag=True):
@@ -297,7 +339,13 @@ class Fill(msgspec.Struct, frozen=True, tag=True):
 
 
 class Resume(msgspec.Struct, frozen=True, tag=True):
-    """Let the restored program go on. Answer: `Resumed`; it is protected from now on."""
+    """Let the restored program go on. Answer: `Resumed`; it is protected from now on.
+
+    Attributes:
+        streams: with descriptors, as with `Protect`: those of a ready copy, which had none before.
+    """
+
+    streams: bool = False
 
 
 class Release(msgspec.Struct, frozen=True, tag=True):
@@ -331,6 +379,7 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
     Attributes:
         size: bytes of the encoded snapshot.
         dirty_bytes: of the pages that it carries, before compression.
+        known_bytes: of those whose last content was remembered.
         totals: bytes that the component had written to standard output and standard error at the freeze, or the commit.
         commit: its number, of a cooperative snapshot; ``age_ns``: how old it was by then.
     """
@@ -344,6 +393,7 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
     totals: tuple[int, int] = (0, 0)
     commit: int = 0
     age_ns: int = 0
+    known_bytes: int = 0
 
 
 class Unchanged(msgspec.Struct, frozen=True, tag=True):
@@ -377,14 +427,22 @@ class Restored(msgspec.Struct, frozen=True, tag=True):
     notes: tuple[str, ...] = ()
 
 
+class Laid(msgspec.Struct, frozen=True, tag=True):
+    """The ready copy stands at a position, and takes ``size`` bytes of memory."""
+
+    position: Position
+    size: int
+
+
 UNPROTECTED: Final = "it runs, unprotected"
 """Begins the note of a `Resumed` whose program could not be followed again: another keeper may."""
 
 
 class Compared(msgspec.Struct, frozen=True, tag=True):
-    """What is lacking here, one sentence each."""
+    """What is lacking here, one sentence each; and the files that were read for that."""
 
     lacks: tuple[str, ...] = ()
+    known: tuple[KnownDigest, ...] = ()
 
 
 class Resumed(msgspec.Struct, frozen=True, tag=True):
@@ -410,7 +468,34 @@ class Failed(msgspec.Struct, frozen=True, tag=True):
     reasons: tuple[str, ...] = ()
 
 
-Request = Probe | Tabulate | Protect | Capture | Acknowledge | Restore | Compare | OpenFile | Fill | Resume | Release
+Request = (
+    Probe
+    | Tabulate
+    | Protect
+    | Capture
+    | Acknowledge
+    | Restore
+    | Lay
+    | Advance
+    | Finish
+    | Compare
+    | OpenFile
+    | Fill
+    | Resume
+    | Release
+)
 Reply = (
-    Probed | Tabulated | Protected | Captured | Unchanged | Restored | Compared | Opened | Filled | Resumed | Released | Failed
+    Probed
+    | Tabulated
+    | Protected
+    | Captured
+    | Unchanged
+    | Restored
+    | Laid
+    | Compared
+    | Opened
+    | Filled
+    | Resumed
+    | Released
+    | Failed
 )

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 from checkpoint.device_rules import DeviceRule
+from checkpoint.digests_of_files import DigestOf
 from checkpoint.errors import ProbeError
 from checkpoint.model import Position, Snapshot
 
@@ -146,6 +147,11 @@ class ProtectOrder:
     terms: Terms = NO_TERMS
     names: Mapping[str, str] | None = None
 
+    @property
+    def is_guarded(self) -> bool:
+        """Whether it has a guard, which may hold it by SIGSTOP: that the whole of it is stopped says nothing then."""
+        return self.streams is not None or self.names is not None
+
 
 def is_carriable(path: str) -> bool:
     """Whether a path names a file or folder in full: absolute, normal, and not the root of everything."""
@@ -195,6 +201,11 @@ class RestoreOptions:
     contents: str = ""
     terms: Terms = NO_TERMS
     stood_still: bool = False
+
+
+COPY_CLOCKS_AHEAD_NS: Final = 250_000_000
+"""How far ahead a ready copy's clocks begin: they are fixed at its birth, and a later snapshot may have come quicker than the one
+that they were taken from. A clock never goes back."""
 
 
 class Session(Protocol):
@@ -255,6 +266,58 @@ class Restored(Protocol):
         ...
 
 
+class Copy(Protocol):
+    """A ready copy: a stopped process that has a program's mappings and memory. Calls come from the thread that laid it."""
+
+    position: Position
+    """That it stands at."""
+
+    @property
+    def state(self) -> Snapshot:
+        """The same, without its pages."""
+        ...
+
+    @property
+    def size(self) -> int:
+        """Bytes of memory that it takes."""
+        ...
+
+    def advance(self, delta: Snapshot) -> None:
+        """Bring it to the position of a delta: all of it, or it can be used no more.
+
+        Raises:
+            ChainError: the delta does not continue its position.
+            UnsupportedError: its program can have no ready copy any more.
+            MismatchError: this machine lacks a file that is mapped now.
+            RestoreError: it must be laid again.
+        """
+        ...
+
+    def require_clocks(self, elapsed_ns: int) -> None:
+        """Refuse it where its clocks have come too far from the program's.
+
+        Args:
+            elapsed_ns: since the snapshot that it stands at was taken.
+
+        Raises:
+            RestoreError: it must be laid again.
+        """
+        ...
+
+    def finish(self, options: RestoreOptions) -> Restored:
+        """Make it the program, which stands still.
+
+        Raises:
+            MismatchError: this machine lacks something.
+            RestoreError: it did not work; the caller kills the vessel, and may restore from the chain.
+        """
+        ...
+
+    def end(self) -> None:
+        """Kill it."""
+        ...
+
+
 class Engine(Protocol):
     """A way to capture and restore."""
 
@@ -277,11 +340,12 @@ class Engine(Protocol):
         """
         ...
 
-    def lacks(self, outline: Snapshot, options: RestoreOptions) -> tuple[str, ...]:
+    def lacks(self, outline: Snapshot, options: RestoreOptions, digest_of: DigestOf = ...) -> tuple[str, ...]:
         """What this machine lacks of what a program needs that runs elsewhere, one sentence each; without touching anything.
 
         Args:
             outline: of its newest snapshot (`checkpoint.format.read_outline`).
+            digest_of: tells what files of this machine contain (`checkpoint.digests_of_files`).
         """
         ...
 
@@ -291,6 +355,16 @@ class Engine(Protocol):
         Raises:
             MismatchError: this machine lacks something; nothing was started.
             RestoreError: it did not work; the caller kills the vessel and nothing is left.
+        """
+        ...
+
+    def lay(self, vessel_pid: int, base: Snapshot, options: RestoreOptions) -> Copy:
+        """Begin a ready copy in a waiting vessel.
+
+        Raises:
+            UnsupportedError: the program can have none, with the reasons.
+            MismatchError: this machine lacks a file that is mapped.
+            RestoreError: it did not work; the caller kills the vessel.
         """
         ...
 

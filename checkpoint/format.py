@@ -13,7 +13,7 @@ import mmap
 import os
 import stat
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import BinaryIO, Protocol
@@ -21,11 +21,14 @@ from typing import BinaryIO, Protocol
 import numpy as np
 import zstandard
 from blake3 import blake3
+from numpy.typing import NDArray
 
-from checkpoint import layout, state
+from checkpoint import layout, pages, state
+from checkpoint.differences import Rows
 from checkpoint.errors import FormatError
 from checkpoint.layout import Codec, FrameHead, Preamble, Section, SectionKind
 from checkpoint.model import PageCopy, PageRun, Snapshot
+from checkpoint.pages import Flags, Words
 from checkpoint.state import Header
 from checkpoint.validity import check_snapshot
 
@@ -47,7 +50,7 @@ WORTH_COMPRESSING = 15 / 16
 
 _COUNTS = struct.Struct("<QQ")  # of the run table: cleared runs, carried runs
 _RUN_SIZE = 16
-_COPY_COUNT = struct.Struct("<Q")
+_COUNT = struct.Struct("<Q")  # of its copies, and of its differences
 _COPY_SIZE = 24
 
 
@@ -68,7 +71,7 @@ def encode(snapshot: Snapshot, file: Sink) -> int:
     contents = memoryview(snapshot.contents).cast("B")
     compressor = zstandard.ZstdCompressor(level=COMPRESSION_LEVEL)
     sections, stored = _pack_sections(snapshot, compressor)
-    preamble = Preamble(len(contents), sections, layout.TREE_VERSION if snapshot.is_tree else layout.VERSION)
+    preamble = Preamble(len(contents), sections, _version_of(snapshot))
     seal = blake3(preamble.pack())
     _write_all(file, preamble.pack() + b"".join(stored))
     offset = preamble.frames_offset
@@ -78,6 +81,11 @@ def encode(snapshot: Snapshot, file: Sink) -> int:
     file_size = offset + layout.TRAILER_SIZE
     _write_all(file, layout.pack_trailer(file_size, seal))
     return file_size
+
+
+def _version_of(snapshot: Snapshot) -> int:
+    version = layout.TREE_VERSION if snapshot.is_tree else layout.VERSION
+    return version + layout.DIFFERENCES if snapshot.differences else version
 
 
 def encode_bytes(snapshot: Snapshot) -> bytes:
@@ -142,14 +150,19 @@ def _write_all(file: Sink, content: bytes | memoryview) -> None:
 
 
 def _pack_runs(snapshot: Snapshot) -> bytes:
-    """The run table: two counts, then (start, end) of every cleared and every carried run; of trees also the copies."""
-    cleared, runs = snapshot.cleared, snapshot.runs
-    pairs = np.array([(run.start, run.end) for run in (*cleared, *runs)], dtype="<u8")
-    packed = _COUNTS.pack(len(cleared), len(runs)) + pairs.tobytes()
-    if not snapshot.is_tree:
-        return packed
-    copies = np.array([(copy.start, copy.end, copy.source) for copy in snapshot.copies], dtype="<u8")
-    return packed + _COPY_COUNT.pack(len(snapshot.copies)) + copies.tobytes()
+    """The run table: two counts, then (start, end) of every cleared and every carried run; of trees also the copies; where there
+    are any, the differences."""
+    packed = _COUNTS.pack(len(snapshot.cleared), len(snapshot.runs)) + _pairs((*snapshot.cleared, *snapshot.runs))
+    if snapshot.is_tree:
+        copies = np.array([(copy.start, copy.end, copy.source) for copy in snapshot.copies], dtype="<u8")
+        packed += _COUNT.pack(len(snapshot.copies)) + copies.tobytes()
+    if snapshot.differences:
+        packed += _COUNT.pack(len(snapshot.differences)) + _pairs(snapshot.differences)
+    return packed
+
+
+def _pairs(runs: Iterable[PageRun]) -> bytes:
+    return np.array([(run.start, run.end) for run in runs], dtype="<u8").tobytes()
 
 
 # Reading
@@ -199,6 +212,50 @@ def read_outline(source: Source) -> Snapshot:
         return _read_outline(reader, _read_preamble(reader))
 
 
+def read_pages(source: Source, wanted: Words) -> tuple[Snapshot, Flags, Rows]:
+    """Read some pages of a file, and nothing of the others but the heads of their frames.
+
+    Args:
+        wanted: addresses, in order.
+
+    Returns:
+        The outline; which of the wanted pages the file tells (as a copy, perhaps, or as a difference); the bytes of those.
+
+    Raises:
+        FormatError: as ``decode``; frames without any of these pages are not looked at.
+    """
+    with _opened(source) as reader:
+        preamble = _read_preamble(reader)
+        outline = _read_outline(reader, preamble)
+        page_size = outline.machine.page_size
+        found, places = _places_of(outline, wanted)
+        rows = np.empty((len(places), page_size), dtype=np.uint8)
+        frame_of = places * page_size // layout.FRAME_SIZE
+        needed = set(frame_of.tolist())
+        buffer = np.empty(layout.FRAME_SIZE, dtype=np.uint8)
+        decompressor = zstandard.ZstdDecompressor()
+        for index, frame in enumerate(_frames(reader, preamble)):
+            if index in needed:
+                _read_frame(reader, frame, buffer.data[: frame.head.raw_size], decompressor)
+                ours = frame_of == index
+                rows[ours] = buffer.reshape(-1, page_size)[places[ours] - index * (layout.FRAME_SIZE // page_size)]
+    return outline, found, rows
+
+
+def _places_of(outline: Snapshot, wanted: Words) -> tuple[Flags, NDArray[np.intp]]:
+    """Which of the wanted pages a snapshot tells, and the places of their bytes among the carried pages."""
+    page_size = outline.machine.page_size
+    addresses = pages.addresses_of(pages.extents(outline.runs), page_size)
+    places = np.arange(len(addresses))
+    if outline.copies:
+        copied, sources = pages.copied_pages(outline.copies, addresses, page_size)
+        addresses, places = np.concatenate((addresses, copied)), np.concatenate((places, sources))
+        order = np.argsort(addresses)
+        addresses, places = addresses[order], places[order]
+    found, at = pages.found_among(addresses, wanted)
+    return found, places[at]
+
+
 def verify(source: Source) -> Header:
     """Check that every byte of a file is as it was written, without decompressing a page.
 
@@ -227,9 +284,8 @@ def _read_header(reader: _Reader, preamble: Preamble) -> Header:
 def _read_outline(reader: _Reader, preamble: Preamble) -> Snapshot:
     """Every section, checked against one another."""
     header = _read_header(reader, preamble)
-    is_tree = preamble.version == layout.TREE_VERSION
-    decoded = state.decode_state(_read_section(reader, preamble, SectionKind.STATE), is_tree=is_tree)
-    cleared, runs, copies = _parse_runs(_read_section(reader, preamble, SectionKind.RUNS), is_tree=is_tree)
+    decoded = state.decode_state(_read_section(reader, preamble, SectionKind.STATE), is_tree=preamble.is_tree)
+    table = _parse_runs(_read_section(reader, preamble, SectionKind.RUNS), preamble)
     output = state.decode_output(_read_section(reader, preamble, SectionKind.OUTPUT))
     snapshot = Snapshot(
         component=decoded.component,
@@ -242,8 +298,8 @@ def _read_outline(reader: _Reader, preamble: Preamble) -> Snapshot:
         threads=decoded.threads,
         vmas=decoded.vmas,
         resources=decoded.resources,
-        cleared=cleared,
-        runs=runs,
+        cleared=table.cleared,
+        runs=table.runs,
         page_sum=header.page_sum,
         output=output,
         epoch=decoded.epoch,
@@ -251,10 +307,11 @@ def _read_outline(reader: _Reader, preamble: Preamble) -> Snapshot:
         notes=header.notes,
         members=decoded.members,
         zombies=decoded.zombies,
-        copies=copies,
+        copies=table.copies,
+        differences=table.differences,
     )
-    if is_tree and not snapshot.is_tree:
-        raise FormatError(f"format version {layout.TREE_VERSION}: one process alone has version {layout.VERSION}")
+    if (expected := _version_of(snapshot)) != preamble.version:
+        raise FormatError(f"format version {preamble.version}: what it holds has version {expected}")
     if state.header_of(snapshot) != header:
         raise FormatError("header: does not describe what the other sections hold")
     check_snapshot(snapshot, contents_size=preamble.contents_size)
@@ -289,27 +346,50 @@ def _decompressed(stored: bytes | memoryview, raw_size: int, where: str, decompr
     return raw
 
 
-Runs = tuple[PageRun, ...]
+@dataclass(frozen=True, slots=True)
+class _RunTable:
+    """The fields of ``Snapshot`` with the same names."""
+
+    cleared: tuple[PageRun, ...]
+    runs: tuple[PageRun, ...]
+    copies: tuple[PageCopy, ...]
+    differences: tuple[PageRun, ...]
 
 
-def _parse_runs(table: bytes | memoryview, *, is_tree: bool) -> tuple[Runs, Runs, tuple[PageCopy, ...]]:
-    """The cleared and the carried runs of a run table, and the copies."""
-    if len(table) < _COUNTS.size:
-        raise FormatError(f"section runs: {len(table)} bytes are too few")
-    cleared_count, run_count = _COUNTS.unpack_from(table)
+def _parse_runs(table: bytes | memoryview, preamble: Preamble) -> _RunTable:
+    """Each list is as long as the count before it says, and nothing follows the last one."""
+    cleared_count, run_count = _COUNTS.unpack(_part(table, 0, _COUNTS.size))
     end = _COUNTS.size + (cleared_count + run_count) * _RUN_SIZE
-    if end > len(table) or (end != len(table) and not is_tree):
+    runs = _runs(_part(table, _COUNTS.size, end))
+    copied: bytes | memoryview = b""
+    differing: bytes | memoryview = b""
+    if preamble.is_tree:
+        copied, end = _counted(table, end, _COPY_SIZE)
+    if preamble.has_differences:
+        differing, end = _counted(table, end, _RUN_SIZE)
+    if end != len(table):
         raise FormatError(f"section runs: {len(table)} bytes cannot hold {cleared_count} cleared and {run_count} carried runs")
-    pairs = np.frombuffer(table[_COUNTS.size : end], dtype="<u8").reshape(-1, 2)
-    runs = tuple(map(PageRun, pairs[:, 0].tolist(), pairs[:, 1].tolist()))
-    return runs[:cleared_count], runs[cleared_count:], _parse_copies(table[end:]) if is_tree else ()
+    rows = np.frombuffer(copied, dtype="<u8").reshape(-1, 3)
+    copies = tuple(map(PageCopy, rows[:, 0].tolist(), rows[:, 1].tolist(), rows[:, 2].tolist()))
+    return _RunTable(runs[:cleared_count], runs[cleared_count:], copies, _runs(differing))
 
 
-def _parse_copies(table: bytes | memoryview) -> tuple[PageCopy, ...]:
-    if len(table) < _COPY_COUNT.size or len(table) != _COPY_COUNT.size + _COPY_COUNT.unpack_from(table)[0] * _COPY_SIZE:
-        raise FormatError(f"section runs: {len(table)} bytes after the runs are not copies")
-    rows = np.frombuffer(table[_COPY_COUNT.size :], dtype="<u8").reshape(-1, 3)
-    return tuple(map(PageCopy, rows[:, 0].tolist(), rows[:, 1].tolist(), rows[:, 2].tolist()))
+def _counted(table: bytes | memoryview, offset: int, size: int) -> tuple[bytes | memoryview, int]:
+    """A list of entries of one size with its count before it, and where it ends."""
+    begin = offset + _COUNT.size
+    end = begin + _COUNT.unpack(_part(table, offset, begin))[0] * size
+    return _part(table, begin, end), end
+
+
+def _part(table: bytes | memoryview, begin: int, end: int) -> bytes | memoryview:
+    if end > len(table):
+        raise FormatError(f"section runs: {len(table)} bytes are too few for its lists, which need {end}")
+    return table[begin:end]
+
+
+def _runs(packed: bytes | memoryview) -> tuple[PageRun, ...]:
+    pairs = np.frombuffer(packed, dtype="<u8").reshape(-1, 2)
+    return tuple(map(PageRun, pairs[:, 0].tolist(), pairs[:, 1].tolist()))
 
 
 @dataclass(frozen=True, slots=True)

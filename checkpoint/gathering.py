@@ -51,7 +51,12 @@ def are_zero(copies: Sequence[Copy], sources: PageMap, page_size: int) -> Flags:
 
 
 def gathered(contents: Sequence[Buffer], sources: PageMap, page_size: int) -> memoryview:
-    """The content of every page, in address order: neighbours from one copy are copied at once."""
+    """The content of every page, in address order."""
+    return gathered_bytes(contents, sources, page_size).data.toreadonly()
+
+
+def gathered_bytes(contents: Sequence[Buffer], sources: PageMap, page_size: int) -> NDArray[np.uint8]:
+    """The same, for who has to change them yet. Neighbours from one copy are copied at once."""
     carried = [memoryview(content).cast("B") for content in contents]
     arrays = [np.frombuffer(content, dtype=np.uint8) for content in contents]
     buffer = np.empty(len(sources.addresses) * page_size, dtype=np.uint8)
@@ -62,7 +67,7 @@ def gathered(contents: Sequence[Buffer], sources: PageMap, page_size: int) -> me
             target[begin : begin + size] = carried[index][start : start + size]
         else:
             buffer[begin : begin + size] = arrays[index][start : start + size]
-    return target.toreadonly()
+    return buffer
 
 
 def _stretches(places: Words) -> list[tuple[int, tuple[int, int], int]]:

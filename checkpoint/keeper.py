@@ -21,8 +21,10 @@ import msgspec
 
 from checkpoint import carried, chain, channel, engine, format
 from checkpoint.channel import Channel, ChannelClosedError, ChannelError, Failed, Reply, Request
-from checkpoint.engine import CaptureOrder, Engine, ProtectOrder, Restored, RestoreOptions, Session, Streams
+from checkpoint.digests_of_files import DigestsOfFiles
+from checkpoint.engine import CaptureOrder, Copy, Engine, ProtectOrder, Restored, RestoreOptions, Session, Streams
 from checkpoint.errors import CaptureError, CheckpointError, RestoreError
+from checkpoint.hot_pages import Sender
 from checkpoint.linux.address import address_of
 from checkpoint.model import Position, Snapshot
 from checkpoint.needs import names_of_contents, needs
@@ -49,7 +51,9 @@ class Keeper:
         self._tracer = tracer
         self._session: Session | None = None
         self._restored: Restored | None = None
+        self._copy: Copy | None = None
         self._revived: tuple[channel.Restore, Streams | None] | None = None
+        self._sender = Sender()
         self._robot = ""
         self._names: dict[str, str] | None = None
         self._verbs: dict[type[msgspec.Struct], Callable[..., Answer | None]] = {
@@ -59,6 +63,9 @@ class Keeper:
             channel.Capture: self._capture,
             channel.Acknowledge: self._acknowledge,
             channel.Restore: self._restore,
+            channel.Lay: self._lay,
+            channel.Advance: self._advance,
+            channel.Finish: self._finish,
             channel.Fill: self._fill,
             channel.Compare: self._compare,
             channel.OpenFile: self._open_file,
@@ -99,7 +106,7 @@ class Keeper:
         return channel.Tabulated(capabilities.rows()), ()
 
     def _protect(self, request: channel.Protect, descriptors: Descriptors) -> Answer:
-        if self._session is not None or self._restored is not None:
+        if self._is_busy:
             channel.close_all(descriptors)
             raise CaptureError(f"cannot protect pid {request.pid}: this keeper follows another one already; start another")
         self._robot = request.robot
@@ -115,7 +122,8 @@ class Keeper:
             return unchanged, ()
         order = CaptureOrder(request.base, request.generation, request.sequence, request.epoch, self._robot, request.hold)
         snapshot = session.capture(order)
-        encoded, size = encoded_in_memory(snapshot)
+        told, known_bytes = self._sender.told(snapshot, request.xor_cache)
+        encoded, size = encoded_in_memory(told)
         commit, age_ns = _commit_at(session, snapshot.position)
         answer = channel.Captured(
             position=snapshot.position,
@@ -127,12 +135,14 @@ class Keeper:
             totals=session.totals,
             commit=commit,
             age_ns=age_ns,
+            known_bytes=known_bytes,
         )
         return answer, (encoded,)
 
     def _acknowledge(self, request: channel.Acknowledge, _: Descriptors) -> None:
         if self._session is not None:
             self._session.acknowledge(request.position)
+            self._sender.acknowledge(request.position)
 
     def _restore(self, request: channel.Restore, descriptors: Descriptors) -> Answer:
         files, ends = descriptors, None
@@ -140,23 +150,56 @@ class Keeper:
             files, last = descriptors[:-STREAM_DESCRIPTORS], descriptors[-STREAM_DESCRIPTORS:]
             ends = streams_of(last)
         try:
-            if self._session is not None or self._restored is not None:
+            if self._is_busy:
                 raise RestoreError(f"cannot restore into pid {request.pid}: this keeper follows a process already")
             state = carried.relocated(folded(files), dict(request.terms.carry.places))
         finally:
             channel.close_all(files)
-        options = RestoreOptions(
-            request.elapsed_ns,
-            request.accept_changed,
-            request.own_eyes,
-            request.epoch,
-            request.contents,
-            terms=request.terms,
-            stood_still=request.stood_still,
-        )
-        self._restored = self._tracer.restore(request.pid, state, options)
+        self._restored = self._tracer.restore(request.pid, state, _options(request))
         self._revived = request, ends
         self._names = names_of_contents(needs(state), request.contents) if request.robot else None
+        return channel.Restored(self._restored.pid, self._restored.position, self._restored.notes), ()
+
+    def _lay(self, request: channel.Lay, descriptors: Descriptors) -> Answer:
+        try:
+            if self._is_busy:
+                raise RestoreError(f"cannot lay a ready copy in pid {request.pid}: this keeper follows a process already")
+            options = RestoreOptions(own_eyes=request.own_eyes, contents=request.contents, terms=request.terms)
+            self._copy = self._tracer.lay(request.pid, format.decode(descriptors[0]), options)
+            return self._brought_on(self._copy, descriptors[1:], request.elapsed_ns)
+        finally:
+            channel.close_all(descriptors)
+
+    def _advance(self, request: channel.Advance, descriptors: Descriptors) -> Answer:
+        try:
+            if self._copy is None:
+                raise RestoreError("cannot bring a ready copy on: this keeper has none")
+            return self._brought_on(self._copy, descriptors, request.elapsed_ns)
+        finally:
+            channel.close_all(descriptors)
+
+    def _brought_on(self, copy: Copy, deltas: Descriptors, elapsed_ns: int) -> Answer:
+        """Apply deltas to the copy, each as soon as it is verified; what does not come as far as the last is ended."""
+        try:
+            for delta in deltas:
+                copy.advance(format.decode(delta))
+            copy.require_clocks(elapsed_ns)
+            return channel.Laid(copy.position, copy.size), ()
+        except CheckpointError:
+            self._copy = None
+            copy.end()
+            raise
+
+    def _finish(self, request: channel.Finish, _: Descriptors) -> Answer:
+        copy, self._copy = self._copy, None
+        if copy is None or copy.position != request.position:
+            if copy is not None:
+                copy.end()
+            raise RestoreError(f"cannot make {request.order.component} of a ready copy: this keeper has none of that position")
+        needed = needs(copy.state)
+        self._restored = copy.finish(_options(request.order))
+        self._revived = request.order, None
+        self._names = names_of_contents(needed, request.order.contents) if request.order.robot else None
         return channel.Restored(self._restored.pid, self._restored.position, self._restored.notes), ()
 
     def _fill(self, request: channel.Fill, descriptors: Descriptors) -> Answer:
@@ -177,21 +220,25 @@ class Keeper:
         finally:
             channel.close_all(descriptors)
         chosen = self._tracer if outline.engine == self._tracer.name else engine.engine_named(outline.engine)
-        return channel.Compared(chosen.lacks(outline, RestoreOptions(contents=request.contents, terms=request.terms))), ()
+        digests = DigestsOfFiles(request.known)
+        found = chosen.lacks(outline, RestoreOptions(contents=request.contents, terms=request.terms), digests.of)
+        return channel.Compared(found, tuple(digests.used.values())), ()
 
     def _open_file(self, request: channel.OpenFile, _: Descriptors) -> Answer:
         session = self._following("open a file of what is followed")
         return channel.Opened(), (session.open_file(request.path, request.digest),)
 
-    def _resume(self, _: channel.Resume, __: Descriptors) -> Answer:
+    def _resume(self, request: channel.Resume, descriptors: Descriptors) -> Answer:
         restored, revived = self._restored, self._revived
+        late = streams_of(descriptors) if request.streams else None
         if restored is None or revived is None:
+            channel.close_all(descriptors)
             raise RestoreError("cannot resume: nothing was restored by this keeper")
         self._restored = self._revived = None
         restored.resume()
-        request, streams = revived
-        self._robot = request.robot
-        return channel.Resumed(self._follow(restored.pid, request, streams)), ()
+        order, streams = revived
+        self._robot = order.robot
+        return channel.Resumed(self._follow(restored.pid, order, streams or late)), ()
 
     def _follow(self, pid: int, request: channel.Restore, streams: Streams | None) -> tuple[str, ...]:
         """Protect what has just been let go; that it cannot be protected again must not end it."""
@@ -211,11 +258,32 @@ class Keeper:
             raise CaptureError(f"cannot {verb}: this keeper follows no process; protect one first")
         return self._session
 
+    @property
+    def _is_busy(self) -> bool:
+        """Whether it follows a process, or is to."""
+        return any(one is not None for one in (self._session, self._restored, self._copy))
+
     def _let_go(self) -> None:
+        copy, self._copy = self._copy, None
+        if copy is not None:
+            copy.end()
         session, self._session = self._session, None
+        self._sender = Sender()
         self._restored = self._revived = None
         if session is not None:
             session.close()
+
+
+def _options(order: channel.Restore) -> RestoreOptions:
+    return RestoreOptions(
+        order.elapsed_ns,
+        order.accept_changed,
+        order.own_eyes,
+        order.epoch,
+        order.contents,
+        terms=order.terms,
+        stood_still=order.stood_still,
+    )
 
 
 def _commit_at(session: Session, position: Position) -> tuple[int, int]:

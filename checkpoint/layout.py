@@ -24,7 +24,13 @@ VERSION = 1
 """Version of the format for a component of one process."""
 
 TREE_VERSION = 2
-"""Version for one of several processes; both are written and read."""
+"""Version for one of several processes."""
+
+DIFFERENCES = 2
+"""Added to either by a delta that tells pages as differences: versions 3 and 4."""
+
+VERSIONS = range(VERSION, TREE_VERSION + DIFFERENCES + 1)
+"""All of them are written and read."""
 
 DIGEST_SIZE = 32
 """Bytes of a blake3 digest."""
@@ -114,12 +120,22 @@ class Preamble:
     Attributes:
         contents_size: bytes of page contents, all frames together, before compression.
         sections: one of each kind, in the order of SectionKind, without gaps.
-        version: `VERSION` or `TREE_VERSION`.
+        version: one of `VERSIONS`.
     """
 
     contents_size: int
     sections: tuple[Section, ...]
     version: int = VERSION
+
+    @property
+    def is_tree(self) -> bool:
+        """Whether it is of several processes."""
+        return self.version in (TREE_VERSION, TREE_VERSION + DIFFERENCES)
+
+    @property
+    def has_differences(self) -> bool:
+        """Whether it tells pages as differences from its parent's."""
+        return self.version > TREE_VERSION
 
     @property
     def frames_offset(self) -> int:
@@ -155,8 +171,8 @@ class Preamble:
         if len(packed) < PREAMBLE_SIZE:
             raise FormatError(f"the file ends inside its preamble, after {len(packed)} of {PREAMBLE_SIZE} bytes: it is cut off")
         _, version, section_count, contents_size, frame_size, frame_count = _PREAMBLE.unpack_from(packed)
-        if version not in (VERSION, TREE_VERSION):
-            known = f"versions {VERSION} and {TREE_VERSION}"
+        if version not in VERSIONS:
+            known = f"versions {VERSIONS[0]} to {VERSIONS[-1]}"
             raise FormatError(f"format version {version}: this program reads {known}; use the one that wrote it")
         if digest_of(packed[:-DIGEST_SIZE]) != packed[-DIGEST_SIZE:]:
             raise FormatError("the preamble does not match its digest: the file was altered or damaged")

@@ -404,6 +404,8 @@ class Snapshot:
         freeze_us: how long the program stood still for it.
         members, zombies: of a component of several processes, those besides the first, which the other fields are of.
         copies: pages that it carries by naming others that it carries, of processes that have memory in common since a fork.
+        differences: those of ``runs`` whose bytes in ``contents`` are to be XORed with what the parent's state holds there
+            (see ``checkpoint.differences``); none in a base.
     """
 
     component: str
@@ -427,6 +429,7 @@ class Snapshot:
     members: tuple[Member, ...] = ()
     zombies: tuple[Zombie, ...] = ()
     copies: tuple[PageCopy, ...] = ()
+    differences: tuple[PageRun, ...] = ()
 
     @property
     def is_base(self) -> bool:

@@ -120,9 +120,10 @@ def _opened(state: Snapshot) -> Iterator[Need]:
         if held.kind != OPEN_FILES or facts.get("deleted") or not facts.get("digest"):
             continue
         flags, mode, size = (_number(facts.get(name)) for name in ("flags", "mode", "size"))
-        digest = facts["digest"]
-        if stat.S_ISREG(mode) and not flags & (ACCESS_MODE | PATH_ONLY) and isinstance(digest, bytes):
-            yield Need(str(facts["path"]), size, digest)
+        digest, path = facts["digest"], facts.get("path")
+        is_read = stat.S_ISREG(mode) and not flags & (ACCESS_MODE | PATH_ONLY)
+        if is_read and isinstance(digest, bytes) and isinstance(path, str):
+            yield Need(path, size, digest)
 
 
 def _number(fact: Fact) -> int:

@@ -97,6 +97,17 @@ def covered(pages: Words, addresses: Words) -> Flags:
     return opened > closed
 
 
+def covers(pages: Words, others: Words) -> bool:
+    """Whether every page of the second set is in the first."""
+    if not len(others):
+        return True
+    place = np.searchsorted(pages[:, 1], others[:, 0], side="right")
+    if place[-1] >= len(pages):
+        return False
+    around = pages[place]
+    return bool((around[:, 0] <= others[:, 0]).all() and (others[:, 1] <= around[:, 1]).all())
+
+
 def total_size(pages: Words) -> int:
     """Bytes that the set covers."""
     return int((pages[:, 1] - pages[:, 0]).sum())
@@ -108,6 +119,14 @@ def addresses_of(pages: Words, page_size: int) -> Words:
     firsts = np.repeat(pages[:, 0], counts)
     index_in_run = np.arange(len(firsts)) - np.repeat(np.cumsum(counts) - counts, counts)
     return firsts + index_in_run.astype(np.uint64) * np.uint64(page_size)
+
+
+def found_among(addresses: Words, wanted: Words) -> tuple[Flags, NDArray[np.intp]]:
+    """Which of the wanted addresses are among these, and the places of those; both in order and all different."""
+    places = np.searchsorted(addresses, wanted)
+    found: Flags = places < len(addresses)
+    found[found] = addresses[places[found]] == wanted[found]
+    return found, places[found]
 
 
 def copied_pages(copies: Sequence[PageCopy], carried: Words, page_size: int) -> tuple[Words, NDArray[np.intp]]:

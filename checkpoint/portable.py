@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from checkpoint.arch import x86_64_levels as arch
-from checkpoint.arch import x86_64_stub
+from checkpoint.arch import levels as arch
+from checkpoint.arch import stubs
 
 VARIABLE: Final = "FAILOVER_PORTABLE"
 """Holds the level, for whoever looks at the program later."""
@@ -43,10 +43,10 @@ def features_used(features: tuple[str, ...], level: str) -> tuple[str, ...]:
     """Of a processor's features those that a program may have chosen its code by."""
     if not level:
         return features
-    beyond = x86_64_stub.INSTRUCTION_SETS - arch.flags_of(level)
+    beyond = stubs.INSTRUCTION_SETS - arch.flags_of(level)
     return tuple(feature for feature in features if feature not in beyond)
 
 
 def lacking(needed: tuple[str, ...], here: tuple[str, ...]) -> tuple[str, ...]:
     """Instruction sets that a program may use and a processor has not, in alphabetical order."""
-    return tuple(sorted(set(needed) & x86_64_stub.INSTRUCTION_SETS - set(here)))
+    return tuple(sorted(set(needed) & stubs.INSTRUCTION_SETS - set(here)))

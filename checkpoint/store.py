@@ -25,9 +25,10 @@ from checkpoint.contents import Contents
 from checkpoint.disk import Disk, lock_exclusively
 from checkpoint.errors import ChainError, FormatError, StoreError
 from checkpoint.history import HISTORY_FOLDER, History, Retention
+from checkpoint.hot_pages import CACHE_SIZE
 from checkpoint.model import OutputPiece, Position, Snapshot
 from checkpoint.needs import needs
-from checkpoint.pages import PageTable
+from checkpoint.proofs import Proofs
 from checkpoint.shelf import BASE_SUFFIX, DELTA_SUFFIX, FOLDER_PREFIX, Entry, Shelf, file_name, folder_name, order_of_name
 from checkpoint.state import header_of
 from checkpoint.validity import place
@@ -62,14 +63,6 @@ FOLDED_OUTPUT_SIZE = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
-class _Proved:
-    """The pages of the newest position that was proved, so that the next delta is proved by its own pages alone."""
-
-    position: Position
-    table: PageTable
-
-
-@dataclass(frozen=True, slots=True)
 class Kept:
     """What the store has of one component, for people.
 
@@ -91,7 +84,7 @@ class Store:
     Made by ``open_store``. Every method raises StoreError when the disk fails; what the store already held is intact.
     """
 
-    def __init__(self, root: Path, disk: Disk, lock: int, retention: Retention) -> None:
+    def __init__(self, root: Path, disk: Disk, lock: int, retention: Retention, cache_size: int = CACHE_SIZE) -> None:
         self._root = root
         self._files = WholeFiles(disk)
         self.contents = Contents(root, self._files)
@@ -102,7 +95,7 @@ class Store:
         self._lock = threading.RLock()
         self._changing: dict[str, threading.RLock] = {}
         self._shelves: dict[str, Shelf] = {}
-        self._proved: dict[str, _Proved] = {}
+        self._proofs = Proofs(cache_size, self._decoded)
         self.notices: list[str] = []
         """What was found damaged or left over: one sentence each."""
 
@@ -223,14 +216,14 @@ class Store:
         with self._change_of(snapshot.component):
             shelf = self._shelf(snapshot.component)
             self._check_parent(shelf, snapshot)
-            proved = self._prove(shelf, snapshot) if prove else None
+            proved = self._proofs.prove(shelf, snapshot) if prove else None
             final = self._root / folder_name(header.component) / file_name(header)
             if all(entry.path != final for entry in shelf.entries):
                 size = self._files.write(final, lambda file: file.copy_from(source), source)
                 self._add(snapshot.component, _entry_of(final, snapshot, size))
             if proved is not None:
-                self._proved[snapshot.component] = proved
-        return replace(snapshot, runs=(), cleared=(), contents=b"")
+                self._proofs.keep(snapshot.component, proved)
+        return replace(snapshot, runs=(), cleared=(), copies=(), differences=(), contents=b"")
 
     @contextmanager
     def _change_of(self, component: str) -> Iterator[None]:
@@ -252,26 +245,6 @@ class Store:
                 f"delta {place(snapshot.position)} of {snapshot.component} continues {place(snapshot.parent)}, "
                 f"which is not held with that digest: {ours}; ask for a base"
             )
-
-    def _prove(self, shelf: Shelf, snapshot: Snapshot) -> _Proved:
-        """Apply a snapshot to the page table of its parent and compare."""
-        table = PageTable.empty(snapshot.machine.page_size) if snapshot.parent is None else self._table_at(shelf, snapshot.parent)
-        table = chain.applied(table, snapshot)
-        chain.check_state(snapshot, table.page_sum)
-        return _Proved(snapshot.position, table)
-
-    def _table_at(self, shelf: Shelf, position: Position) -> PageTable:
-        """The page table of a position: remembered, or counted again from the files."""
-        known = self._proved.get(shelf.component)
-        if known is not None and known.position == position:
-            return known.table
-        table: PageTable | None = None
-        for entry in shelf.chain_to(position):
-            snapshot = self._decoded(shelf.component, entry)
-            table = table or PageTable.empty(snapshot.machine.page_size)
-            table = chain.applied(table, snapshot)
-        assert table is not None, "a chain has a base"
-        return table
 
     def _decoded(self, component: str, entry: Entry) -> Snapshot:
         try:
@@ -369,7 +342,7 @@ class Store:
             self._remove_damaged(component, lambda _: True)
             self._history.forget(folder_name(component))
             self._shelves.pop(component, None)
-            self._proved.pop(component, None)
+            self._proofs.forget(component)
 
     def collect_contents(self) -> int:
         """Remove the brought files that no snapshot here names any more; how many bytes that were.
@@ -426,7 +399,7 @@ class Store:
             if entry in shelf.entries:
                 self._files.set_out_of_use(entry.path)
             self._shelves[component] = shelf.without((entry,))
-            self._proved.pop(component, None)
+            self._proofs.forget(component)
             newest = self.newest(component)
             self._notice(f"{why}; going back to position {place(newest)}" if newest else f"{why}; nothing older is intact")
 
@@ -471,11 +444,12 @@ class Store:
         self._shelves[header.component] = self._shelf(header.component).with_entry(entry)
 
 
-def open_store(root: Path, disk: Disk | None = None, retention: Retention = NOTHING_OLD) -> Store:
+def open_store(root: Path, disk: Disk | None = None, retention: Retention = NOTHING_OLD, cache_size: int = CACHE_SIZE) -> Store:
     """Open a store, or make an empty one; removes leftovers and verifies what is there.
 
     Args:
         retention: what is kept for people besides what is needed; nothing.
+        cache_size: bytes of each component's pages that are remembered to prove deltas by; more are read from the files.
 
     Raises:
         StoreError: another process has it open, or the folder cannot be used.
@@ -491,7 +465,7 @@ def open_store(root: Path, disk: Disk | None = None, retention: Retention = NOTH
         raise StoreError(f"cannot open the store {root}: {error.strerror}; it must be a folder that we may write") from error
     if lock is None:
         raise StoreError(f"cannot open the store {root}: another process has it open; one agent uses one store")
-    store = Store(root, disk, lock, retention)
+    store = Store(root, disk, lock, retention, cache_size)
     try:
         store.read_folders()
     except StoreError:

@@ -9,6 +9,7 @@ import numpy as np
 
 from checkpoint import pages
 from checkpoint.errors import FormatError
+from checkpoint.layout import MAX_CONTENTS_SIZE
 from checkpoint.model import OutputPiece, PageCopy, PageRun, Position, Snapshot, ThreadState, Vma
 from checkpoint.state import STATE_DIGEST_SIZE
 from checkpoint.tree import SLOT_LIMIT, SLOT_SHIFT, every_mapping, shifted_runs
@@ -46,6 +47,7 @@ def check_snapshot(snapshot: Snapshot, contents_size: int | None = None) -> None
     _check_members(snapshot, page_size)
     _check_runs_mapped(snapshot.runs, every_mapping(snapshot))
     _check_copies(snapshot, page_size)
+    _check_differences(snapshot, page_size)
     _check_guards(snapshot, page_size)
     _check_contents(snapshot, len(memoryview(snapshot.contents).cast("B")) if contents_size is None else contents_size)
     _check_threads(snapshot.process.pid, snapshot.threads)
@@ -158,6 +160,25 @@ def _check_copies(snapshot: Snapshot, page_size: int) -> None:
         raise FormatError("copies: a source is not of whole pages, or beyond the address space")
     if len(stray := pages.difference(pages.extents(sources), carried)):
         raise FormatError(f"copies: {_span(stray, np.intp(0))}, of which one is, is not carried")
+    size = sum(copy.size for copy in snapshot.copies) + sum(run.size for run in snapshot.runs)
+    if size > MAX_CONTENTS_SIZE:
+        raise FormatError(f"copies: {size} bytes with what they are of, above the limit of {MAX_CONTENTS_SIZE}")
+
+
+def _check_differences(snapshot: Snapshot, page_size: int) -> None:
+    """Differences are of a delta, carried, from a page that is still there when they are applied, and no copy is of one."""
+    if not snapshot.differences:
+        return
+    if snapshot.parent is None:
+        raise FormatError("differences: a base has nothing that they could be from")
+    _check_extents(snapshot.differences, page_size, "differences")
+    told = pages.extents(snapshot.differences)
+    if len(stray := pages.difference(told, pages.extents(snapshot.runs))):
+        raise FormatError(f"differences: {_span(stray, np.intp(0))} is not carried")
+    sources = pages.extents(PageRun(copy.source, copy.source + copy.size) for copy in snapshot.copies)
+    for what, others in (("cleared", pages.extents(snapshot.cleared)), ("copied", sources)):
+        if len(both := pages.intersection(told, others)):
+            raise FormatError(f"differences: {_span(both, np.intp(0))} is {what}, too")
 
 
 def _check_guards(snapshot: Snapshot, page_size: int) -> None:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from failover.client.control import Control
     from failover.client.epoch import epoch
     from failover.client.gateway import Gateway
+    from failover.client.scratch import scratch
     from failover.client.task import Resumed, activations, commit, resume, resumed, transaction, wait_committed
     from failover.client.task_component import component, kept, run
     from failover.client.task_loop import FINISHED, every
@@ -61,6 +62,7 @@ _HOMES = {
     "FINISHED": "failover.client.task_loop",
     "every": "failover.client.task_loop",
     "resumable": "failover.client.task_resumable",
+    "scratch": "failover.client.scratch",
     "AgentRefusedError": "failover.errors",
     "FailoverError": "failover.errors",
     "GatewayError": "failover.errors",
@@ -97,6 +99,7 @@ __all__ = [
     "resume",
     "resumed",
     "run",
+    "scratch",
     "transaction",
     "wait_committed",
 ]

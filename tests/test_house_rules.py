@@ -14,7 +14,10 @@ import pytest
 ROOT = Path(__file__).parent.parent
 FLOORS = ("checkpoint", "failover", "agent")
 
-PURE_CHECKPOINT = ("errors", "model", "pages", "layout", "state", "validity", "chain", "gathering", "task_channel", "tree")
+PURE_CHECKPOINT = (
+    *("errors", "model", "pages", "layout", "state", "validity", "chain", "gathering", "task_channel", "tree", "differences"),
+    "hot_pages",
+)
 
 PURE_FILES = (
     *(f"checkpoint/{name}.py" for name in PURE_CHECKPOINT),

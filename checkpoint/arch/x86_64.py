@@ -12,10 +12,13 @@ import errno
 import operator
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final
 
+from checkpoint.arch.calls import MILLISECONDS, SOCKET, TIMESPEC, Call, EntryCalls, Registers, TablePlaces, Timeout, Unkept
+
 NAME: Final = "x86_64"
+AUDIT_ARCHITECTURE: Final = 0xC000003E
+"""AUDIT_ARCH_X86_64 of linux/audit.h, which filters of seccomp(2) look at."""
 
 # Registers
 
@@ -29,9 +32,6 @@ _REGISTERS: Final = struct.Struct(f"<{len(REGISTER_NAMES)}Q")
 REGISTERS_SIZE: Final = _REGISTERS.size
 CODE_SEGMENT_64: Final = 0x33
 """``cs`` of a 64-bit program; 0x23 is a 32-bit one."""
-
-Registers = dict[str, int]
-"""General registers by name, unsigned."""
 
 
 def decode_registers(content: bytes) -> Registers:
@@ -70,10 +70,31 @@ SYSCALLS: Final[Mapping[str, int]] = {
     "futex": 202, "io_getevents": 208, "restart_syscall": 219, "semtimedop": 220, "timer_gettime": 224,
     "timer_getoverrun": 225, "clock_gettime": 228, "clock_nanosleep": 230, "epoll_wait": 232, "waitid": 247,
     "pselect6": 270, "ppoll": 271, "get_robust_list": 274, "epoll_pwait": 281, "accept4": 288, "userfaultfd": 323,
-    "membarrier": 324, "io_uring_enter": 426, "epoll_pwait2": 441, "futex_waitv": 449,
+    "membarrier": 324, "modify_ldt": 154, "arch_prctl": 158, "io_uring_enter": 426, "epoll_pwait2": 441, "futex_waitv": 449,
 }  # fmt: skip
 """Numbers by name: those that we make or tell of."""
 SYSCALL_NAMES: Final[Mapping[int, str]] = {number: name for name, number in SYSCALLS.items()}
+
+ARCH_GET_CPUID: Final = 0x1011
+UNKEPT_OUTPUT_SIZE: Final = 16
+
+
+def unkept(output: int) -> tuple[Unkept, ...]:
+    """What of this processor a process may have switched for itself, and no restore gives back.
+
+    Args:
+        output: address of `UNKEPT_OUTPUT_SIZE` bytes that the calls may write to.
+
+    Source: modify_ldt(2), arch_prctl(2).
+    """
+    return (
+        Unkept(Call("modify_ldt", (0, output, UNKEPT_OUTPUT_SIZE)), 0, "segments of its own (modify_ldt)"),
+        Unkept(Call("arch_prctl", (ARCH_GET_CPUID, 0)), 1, "the cpuid instruction switched off (ARCH_SET_CPUID)"),
+    )
+
+
+PORT_RIGHTS: Final = 0x201
+"""NT_386_IOPERM of linux/elf.h: the register set of who may use I/O ports; nobody else has it."""
 
 # Interrupted system calls
 
@@ -86,39 +107,18 @@ REMAINING_TIME: Final[Mapping[str, tuple[int, int]]] = {"nanosleep": (0, 1), "cl
 ERESTARTNOHAND: Final = -514
 """What a stopped call returns when it is to be made again, unless a signal handler comes first: that makes it EINTR."""
 
-MILLISECONDS: Final = "ms"
-TIMESPEC: Final = "timespec"
-SOCKET: Final = "socket"
-
-
-@dataclass(frozen=True, slots=True)
-class Timeout:
-    """How long a call waits.
-
-    Attributes:
-        argument: index of the argument that tells; of a `SOCKET`, of its descriptor.
-        form: `MILLISECONDS` (an int, negative for ever), `TIMESPEC` (address of one, 0 for ever), or `SOCKET`.
-        at_end: what the call returns when that time is over.
-        option: of a `SOCKET`: SO_RCVTIMEO or SO_SNDTIMEO.
-    """
-
-    argument: int
-    form: str
-    at_end: int
-    option: int = 0
-
-
 _RECEIVING: Final = Timeout(0, SOCKET, -errno.EAGAIN, 20)
 _SENDING: Final = Timeout(0, SOCKET, -errno.EAGAIN, 21)
 ENDED_BY_A_STOP: Final[Mapping[str, Timeout | None]] = {
     "semop": None,
     "rt_sigtimedwait": Timeout(2, TIMESPEC, -errno.EAGAIN),
     "semtimedop": Timeout(3, TIMESPEC, -errno.EAGAIN),
+    "io_getevents": Timeout(4, TIMESPEC, 0),
     "epoll_wait": Timeout(3, MILLISECONDS, 0),
     "epoll_pwait": Timeout(3, MILLISECONDS, 0),
     "epoll_pwait2": Timeout(3, TIMESPEC, 0),
 }
-"""Calls that return EINTR merely because of a stop, and their timeouts. Source: signal(7)."""
+"""Calls that return EINTR merely because of a stop, and their timeouts. Source: signal(7); io_getevents() in fs/aio.c."""
 SOCKET_TIMEOUT: Final[Mapping[str, Timeout]] = {
     **dict.fromkeys(("read", "readv", "recvfrom", "recvmsg", "accept", "accept4"), _RECEIVING),
     **dict.fromkeys(("write", "writev", "sendto", "sendmsg"), _SENDING),
@@ -171,30 +171,6 @@ _MOVE_IMMEDIATE: Final = {"rax": 0, "rcx": 1, "rdx": 2, "rbx": 3, "rsp": 4, "rbp
 """Register numbers of the instruction encoding; 8 and above need a REX bit."""
 CLOBBERED: Final = ("rax", "rdi", "rsi", "rdx", "r10", "r8", "r9", "rcx", "r11")
 """What the calls change: ours to give back, in this order in the table."""
-
-
-@dataclass(frozen=True, slots=True)
-class Call:
-    """One system call to be made inside the tracee; its result goes to the next word of the table's results."""
-
-    name: str
-    arguments: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class TablePlaces:
-    """Addresses inside the borrowed table that the code reads and writes."""
-
-    state: int
-    ended: int
-    done: int
-    serial: int
-    mask: int
-    timeout: int
-    empty_set: int
-    resume: int
-    registers: int
-    results: int
 
 
 class _Code:
@@ -272,16 +248,6 @@ def batch_code(address: int, calls: Sequence[Call], places: TablePlaces) -> byte
 
 ENTRY_REGISTERS: Final = ("r12", "r13", "r14")
 """Where the entry keeps its results, and gives them back: the code pages, the table pages, the userfaultfd."""
-
-
-@dataclass(frozen=True, slots=True)
-class EntryCalls:
-    """What the first entry does, in this order: map the code pages, map the table pages, advise, open a userfaultfd."""
-
-    code_pages: Call
-    table_pages: Call
-    advice: Call
-    faults: Call
 
 
 def entry_code(address: int, calls: EntryCalls, registers: Registers, mask: int) -> bytes:

@@ -63,6 +63,36 @@ Needs no stack. Each call is ten little-endian words: number, six arguments, res
 
 CALL: Final = struct.Struct("<7Q3q")
 
+OWN_LOOP: Final = bytes.fromhex(
+    "53"  #                push rbx
+    "55"  #                push rbp
+    "4889fb"  #            mov  rbx, rdi        first argument: this call
+    "4889f5"  #            mov  rbp, rsi        second: end of the table
+    "4839eb"  #     next:  cmp  rbx, rbp
+    "742f"  #              je   done
+    "488b03"  #            mov  rax, [rbx]
+    "488b7b08"  #          mov  rdi, [rbx+8]
+    "488b7310"  #          mov  rsi, [rbx+16]
+    "488b5318"  #          mov  rdx, [rbx+24]
+    "4c8b5320"  #          mov  r10, [rbx+32]
+    "4c8b4328"  #          mov  r8,  [rbx+40]
+    "4c8b4b30"  #          mov  r9,  [rbx+48]
+    "0f05"  #              syscall
+    "488b4b38"  #          mov  rcx, [rbx+56]   where the result goes
+    "4885c9"  #            test rcx, rcx
+    "7403"  #              jz   on
+    "488901"  #            mov  [rcx], rax
+    "4883c340"  #   on:    add  rbx, 64
+    "ebcc"  #              jmp  next
+    "5d"  #         done:  pop  rbp
+    "5b"  #                pop  rbx
+    "c3"  #                ret
+)
+"""A function of C that makes the calls of a table in a process of ours, all of them, whatever comes of each.
+
+Each call is eight little-endian words: number, six arguments, address where the result goes, 0 for nowhere.
+"""
+
 SYSTEM_CALLS: Final = {
     "accept4": 288,
     "arch_prctl": 158,
@@ -86,15 +116,26 @@ SYSTEM_CALLS: Final = {
     "fchownat": 260,
     "fcntl": 72,
     "flock": 73,
+    "fstat": 5,
     "ftruncate": 77,
     "futex": 202,
     "getdents64": 217,
+    "getpeername": 52,
+    "get_robust_list": 274,
+    "getpid": 39,
     "getsockname": 51,
+    "getsockopt": 55,
     "inotify_add_watch": 254,
     "inotify_init1": 294,
     "inotify_rm_watch": 255,
+    "io_destroy": 207,
+    "io_getevents": 208,
+    "io_setup": 206,
+    "io_submit": 209,
     "ioctl": 16,
+    "ioprio_get": 252,
     "ioprio_set": 251,
+    "kcmp": 312,
     "linkat": 265,
     "kill": 62,
     "listen": 50,
@@ -111,8 +152,11 @@ SYSTEM_CALLS: Final = {
     "mremap": 25,
     "mseal": 462,
     "munmap": 11,
+    "newfstatat": 262,
+    "open_by_handle_at": 304,
     "openat": 257,
     "personality": 135,
+    "pidfd_getfd": 438,
     "pidfd_open": 434,
     "pipe2": 293,
     "pkey_alloc": 330,
@@ -120,16 +164,25 @@ SYSTEM_CALLS: Final = {
     "pkey_mprotect": 329,
     "poll": 7,
     "prctl": 157,
+    "pread64": 17,
     "prlimit64": 302,
+    "process_vm_readv": 310,
+    "process_vm_writev": 311,
+    "ptrace": 101,
     "pwrite64": 18,
     "read": 0,
+    "readlinkat": 267,
+    "recvfrom": 45,
     "rseq": 334,
     "rt_sigaction": 13,
     "rt_sigqueueinfo": 129,
     "rt_tgsigqueueinfo": 297,
+    "sched_getaffinity": 204,
+    "sched_getscheduler": 145,
     "sched_setaffinity": 203,
     "sched_setattr": 314,
     "sched_setscheduler": 144,
+    "seccomp": 317,
     "sendmsg": 46,
     "sendto": 44,
     "set_robust_list": 273,
@@ -161,9 +214,10 @@ SYSTEM_CALLS: Final = {
     "unlinkat": 263,
     "utimensat": 280,
     "wait4": 61,
+    "waitid": 247,
     "write": 1,
 }
-"""Numbers of the system calls that a restore makes inside a vessel (asm/unistd_64.h)."""
+"""Numbers of the system calls that a restore makes inside a vessel, and of those of `OWN_LOOP` (asm/unistd_64.h)."""
 
 
 VDSO_CALLS: Final = {

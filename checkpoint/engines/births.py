@@ -3,15 +3,17 @@
 A child is born into the session of its parent, and into its group; a session cannot be joined, a group only within its session.
 So a leader makes its session when those of its children are born that have an older one, and before the others. Whoever has lost
 its parent, and whoever lives in a session or group whose leader has ended, is born with the help of a *stand-in*: a process that
-ends again when it has done its part, as the one that it stands for has.
+ends again when it has done its part, as the one that it stands for has. So is whoever was given to another parent, one that asks
+for orphans: it is born below that one and given to it once more.
 
-Pure: no process is touched here. Sources: fork(2), setsid(2), setpgid(2), credentials(7).
+Pure: no process is touched here. Sources: fork(2), setsid(2), setpgid(2), credentials(7); PR_SET_CHILD_SUBREAPER of prctl(2).
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -19,12 +21,14 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import RestoreError
 from checkpoint.linux.procfs import Status
 from checkpoint.model import Member, ProcessState, Snapshot, Zombie
+from checkpoint.resources import joint
 
 CAPABILITIES: Final = (
     preserved(
         Area.PROCESS,
         "child processes, zombies and orphans: who is whose parent, process groups, sessions, exit statuses",
-        "all together, under the PIDs that they had; orphans of a program that `failover run` started",
+        "all together, under the PIDs that they had; orphans of a program that `failover run` started, of others those that are "
+        "known by their session, or by standard streams that only the program has",
     ),
     preserved(
         Area.MEMORY,
@@ -38,7 +42,7 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.PROCESS,
-        "a session that is older than its leader's children, a namespace that only a child lives in",
+        "a session or process group of another program, a namespace that only a child lives in",
         "start such processes as components of their own",
         "namespace of its own, which is not kept yet",
     ),
@@ -59,6 +63,8 @@ CAPABILITIES: Final = (
 )
 
 SIGCHLD: Final = 17
+GENERATIONS_MAX: Final = 200
+"""In how many generations processes may descend from one another: whoever gives birth to one plans for its children, too."""
 PIDS_EVERYWHERE: Final = 1 << 15
 """Pids below this can be had on every machine (/proc/sys/kernel/pid_max)."""
 
@@ -69,11 +75,13 @@ class Birth:
 
     Attributes:
         exit_signal: what the parent is sent at its end.
+        flags: of clone(2): what both share from then on.
     """
 
     parent: int
     pid: int
     exit_signal: int = SIGCHLD
+    flags: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +107,19 @@ class End:
     pid: int
 
 
-Step = Birth | NewSession | Join | End
+@dataclass(frozen=True, slots=True)
+class Reaper:
+    """``pid`` is given the orphans among its descendants from now on, or no more.
+
+    Attributes:
+        is_one: True while it is given them.
+    """
+
+    pid: int
+    is_one: bool
+
+
+Step = Birth | NewSession | Join | End | Reaper
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +131,7 @@ class Person:
     pgid: int
     sid: int
     exit_signal: int = SIGCHLD
+    flags: int = 0
 
 
 class NoWayError(RestoreError):
@@ -130,12 +151,12 @@ def steps_of(state: Snapshot, is_taken: Callable[[int], bool]) -> list[Step]:
 
 
 def _persons(members: Sequence[Member], zombies: Sequence[Zombie]) -> list[Person]:
-    living = [_person(member.process, member.exit_signal) for member in members]
+    living = [_person(member.process, member.exit_signal, joint.flags_of(member.resources)) for member in members]
     return [*living, *(Person(one.pid, one.ppid, one.pgid, one.sid, one.exit_signal) for one in zombies)]
 
 
-def _person(process: ProcessState, exit_signal: int = SIGCHLD) -> Person:
-    return Person(process.pid, process.ppid, process.pgid, process.sid, exit_signal)
+def _person(process: ProcessState, exit_signal: int = SIGCHLD, flags: int = 0) -> Person:
+    return Person(process.pid, process.ppid, process.pgid, process.sid, exit_signal, flags)
 
 
 def _numbers(state: Snapshot) -> set[int]:
@@ -144,19 +165,20 @@ def _numbers(state: Snapshot) -> set[int]:
     return {thread.tid for thread in threads}
 
 
-def refuse(first: Status, members: Sequence[Member], zombies: Sequence[Zombie]) -> Iterator[str]:
+def refuse(first: Status, members: Sequence[Member], zombies: Sequence[Zombie], is_taken: Callable[[int], bool]) -> Iterator[str]:
     """Why processes could not be born again.
 
     Args:
         first: of the first process.
+        is_taken: whether a pid, as they see it, is that of anybody.
     """
-    yield from refuse_persons(first, _persons(members, zombies))
+    yield from refuse_persons(first, _persons(members, zombies), is_taken)
 
 
-def refuse_persons(first: Status, others: Sequence[Person]) -> Iterator[str]:
+def refuse_persons(first: Status, others: Sequence[Person], is_taken: Callable[[int], bool]) -> Iterator[str]:
     """The same of those of whom no more is known."""
     try:
-        steps(Person(first.pids[-1], 0, first.pgids[-1], first.sids[-1]), others, set())
+        steps(Person(first.pids[-1], 0, first.pgids[-1], first.sids[-1]), others, set(), is_taken)
     except NoWayError as error:
         yield str(error)
 
@@ -175,7 +197,17 @@ def steps(
     Args:
         numbers: ids that no stand-in may take, besides those of the processes.
     """
+    _require_few_generations({one.pid: one.ppid for one in others})
     return _Plan(first, others, numbers, is_taken).made()
+
+
+def _require_few_generations(parents: Mapping[int, int]) -> None:
+    for pid in parents:
+        ancestor, generations = pid, 0
+        while ancestor in parents:
+            ancestor, generations = parents[ancestor], generations + 1
+            if generations > GENERATIONS_MAX:
+                raise NoWayError(f"process {pid} has more than {GENERATIONS_MAX} ancestors in it, which is the limit")
 
 
 @dataclass(slots=True)
@@ -184,6 +216,7 @@ class _Plan:
 
     Attributes:
         session: the one that a process is in by now.
+        given: children that were somebody else's first, with the parents that they were given to.
         standins: who stands for the leader of a session that has ended, and is not ended itself yet; their parents.
     """
 
@@ -193,16 +226,20 @@ class _Plan:
     is_taken: Callable[[int], bool]
     steps: list[Step] = field(default_factory=list)
     session: dict[int, int] = field(default_factory=dict)
+    given: list[tuple[int, Person]] = field(default_factory=list)
     standins: dict[int, int] = field(default_factory=dict)
 
     def made(self) -> list[Step]:
         everybody = {person.pid: person for person in (self.first, *self.others)}
         self._everybody = everybody
+        for person in self.others:
+            self._children[person.ppid].append(person)
         self._spare = self._free(max((*everybody, *self.numbers, *(one.sid for one in self.others))))
         self.session[self.first.pid] = self.first.sid
         self._grow(self.first)
         for orphan in [one for one in self.others if one.ppid not in everybody]:
             self._bear_orphan(orphan)
+        self._give_all()
         for person in self.others:
             assert person.pid in self.session, "everybody has a parent, or none that lives"
         self._group()
@@ -212,6 +249,8 @@ class _Plan:
 
     _everybody: dict[int, Person] = field(default_factory=dict)
     _spare: Iterator[int] = field(default_factory=itertools.count)
+    _children: dict[int, list[Person]] = field(default_factory=lambda: defaultdict(list))
+    _needs: dict[int, int | None] = field(default_factory=dict)
 
     def _free(self, last: int) -> Iterator[int]:
         """Numbers for stand-ins: above all that are wanted, else between them."""
@@ -221,21 +260,39 @@ class _Plan:
 
     # Sessions
 
-    def _children(self, person: Person) -> list[Person]:
-        return [one for one in self.others if one.ppid == person.pid]
-
     def _needed(self, person: Person) -> int | None:
         """The session that a process must be born in; None: any."""
         if person.sid != person.pid:
             return person.sid
-        older = {need for child in self._children(person) if (need := self._needed(child)) not in (None, person.pid)}
+        if person.pid not in self._needs:
+            self._needs[person.pid] = self._needed_by_leader(person)
+        return self._needs[person.pid]
+
+    def _needed_by_leader(self, person: Person) -> int | None:
+        """The same of who has left that session since: what its children are of that were not given to it."""
+        older = {need for child in self._children[person.pid] if (need := self._needed(child)) not in (None, person.pid)}
+        if older:
+            beyond = (session for session in older if self._reaches_beyond(session, person.pid))
+            older = older & self._sessions_of_ancestors(person) or set(beyond)
         if len(older) > 1:
             raise NoWayError(f"the children of process {person.pid} are of several sessions that it was never in itself")
         return next(iter(older), None)
 
+    def _sessions_of_ancestors(self, person: Person) -> set[int]:
+        """Those that a process was born in, unless it was given to its parent later."""
+        found = set()
+        while person.ppid in self._everybody:
+            person = self._everybody[person.ppid]
+            found.add(person.sid)
+        return found
+
+    def _reaches_beyond(self, session: int, ancestor: int) -> bool:
+        """Whether a session has members that do not descend from a process."""
+        return any(one.sid == session and not self._is_below(one.pid, ancestor) for one in self._everybody.values())
+
     def _grow(self, person: Person) -> None:
         """Have a process, which is born, come to its session and give birth to its children."""
-        children = self._children(person)
+        children = self._children[person.pid]
         leads_already = self.session[person.pid] == person.pid
         later = [child for child in children if self._needed(child) in (None, person.sid)]
         for child in children:
@@ -250,18 +307,59 @@ class _Plan:
     def _bear(self, parent: int, child: Person) -> None:
         needed = self._needed(child)
         if needed is not None and self.session[parent] != needed:
-            raise NoWayError(
-                f"process {child.pid} is of session {needed}, in which its parent {child.ppid} is not (any more), which is not "
-                "kept yet"
-            )
-        self._birth(parent, child.pid, child.exit_signal)
+            self.given.append((parent, child))
+            return
+        self._birth(parent, child.pid, child.exit_signal, child.flags)
         self._grow(child)
 
-    def _birth(self, parent: int, pid: int, exit_signal: int) -> None:
-        self.steps.append(Birth(parent, pid, exit_signal))
+    def _birth(self, parent: int, pid: int, exit_signal: int, flags: int = 0) -> None:
+        self.steps.append(Birth(parent, pid, exit_signal, flags))
         self.session[pid] = self.session[parent]
 
     # Who has lost somebody
+
+    def _give_all(self) -> None:
+        """Have those born that were given to their parents, as far as somebody of their session is there."""
+        while self.given:
+            parent, child = next((one for one in self.given if self._can_give(*one)), self.given[0])
+            self.given.remove((parent, child))
+            self._give(parent, child)
+
+    def _can_give(self, parent: int, child: Person) -> bool:
+        session = self._needed(child)
+        return session not in self._everybody or session in self.session
+
+    def _give(self, parent: int, child: Person) -> None:
+        """By a stand-in for the parent that has ended, below the one that was given the child then."""
+        session = self._needed(child)
+        assert session is not None, "who may be born anywhere is born by its parent"
+        if child.flags:
+            raise NoWayError(f"process {child.pid} shares its open files or directory with a parent that it was given to later")
+        if session not in self._everybody and session not in self.standins:
+            self._stand_in_for_leader(parent, session)
+        if self.session.get(session) != session or not self._is_below(session, parent):
+            raise NoWayError(
+                f"process {child.pid} is of session {session}, in which its parent {child.ppid} is not (any more), which is not "
+                "kept yet"
+            )
+        between = next(self._spare)
+        self._birth(session, between, 0)
+        self._bear(between, child)
+        self.steps += [Reaper(parent, True), End(session, between), Reaper(parent, False)]
+
+    def _is_below(self, pid: int, ancestor: int) -> bool:
+        """Whether a process descends from another, by those that live now."""
+        while pid != ancestor and (pid in self.standins or pid in self._everybody):
+            pid = self.standins[pid] if pid in self.standins else self._everybody[pid].ppid
+        return pid == ancestor
+
+    def _stand_in_for_leader(self, parent: int, session: int) -> None:
+        if self.is_taken(session):
+            raise NoWayError(f"session {session} is that of another program, which has its number: start both as one")
+        self._birth(parent, session, 0)
+        self.steps.append(NewSession(session))
+        self.session[session] = session
+        self.standins[session] = parent
 
     def _bear_orphan(self, orphan: Person) -> None:
         """By a stand-in for its parent, in the session that it must be born in."""
@@ -279,10 +377,7 @@ class _Plan:
         if session is None or session == self.session[self.first.pid]:
             return self.first.pid
         if session not in self._everybody and session not in self.standins:
-            self._birth(self.first.pid, session, 0)
-            self.steps.append(NewSession(session))
-            self.session[session] = session
-            self.standins[session] = self.first.pid
+            self._stand_in_for_leader(self.first.pid, session)
         if self.session.get(session) != session:
             raise NoWayError(f"session {session} has lost its leader in a way that is not kept yet")
         return session
@@ -301,6 +396,10 @@ class _Plan:
         for person in waiting:
             if person.pgid not in self._everybody and person.pgid not in self.standins:
                 source = self._in_session(ours[person.pid])
+                if self.is_taken(person.pgid):
+                    raise NoWayError(
+                        f"process group {person.pgid} is that of another program, which has its number: start both as one"
+                    )
                 self._birth(source, person.pgid, 0)
                 self.steps.append(Join(person.pgid, person.pgid))
                 self.standins[person.pgid] = source

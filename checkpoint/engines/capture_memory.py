@@ -18,16 +18,18 @@ from typing import Final
 import numpy as np
 
 from checkpoint import gathering, pages
-from checkpoint.errors import CaptureError
+from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.gathering import Copy
 from checkpoint.linux import abi, digests, pagetables, tracking
 from checkpoint.linux.digests import SharedPages
+from checkpoint.linux.guards import Guards
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import MapsLine, MapsReader
 from checkpoint.linux.remote import BorrowedPages
 from checkpoint.linux.tracking import NONE, Scan, Tracker
 from checkpoint.model import Position
 from checkpoint.pages import Words
+from checkpoint.resources import aio_rings
 
 BUFFER_SIZE: Final = 8 << 20
 """Bytes that a freeze may copy without asking for memory first."""
@@ -95,6 +97,7 @@ class Taken:
         cleared: pages whose earlier content is forgotten, relative to the acknowledged position; ``carried`` comes on top.
         guards: see ``checkpoint.model.Vma.guards``.
         copies: oldest first; the last one was made while the program stood still, in a buffer that the next one uses again.
+        untouched: see `checkpoint.resources.untouched`.
     """
 
     lines: tuple[MapsLine, ...]
@@ -102,6 +105,7 @@ class Taken:
     cleared: Words
     guards: Words
     copies: tuple[Copy, ...]
+    untouched: Words = field(default_factory=lambda: NONE)
 
     @property
     def frozen_size(self) -> int:
@@ -128,6 +132,7 @@ class MemoryCapture:
         lines: the mappings when they were last read, without our own.
         acknowledged: the newest acknowledged position; None if only a base can be captured.
         borrowed: our own pages in the process, which belong to no snapshot.
+        has_rings: some of them are rings of asynchronous I/O.
 
     Args:
         tracker: owned from now on.
@@ -143,6 +148,7 @@ class MemoryCapture:
         except BaseException:
             self._shared.close()
             raise
+        self._guards = Guards(self._page_tables.guards)
         self._maps = MapsReader(memory.pid)
         self._has_moved = False
         self._private: list[MapsLine] = []
@@ -157,6 +163,7 @@ class MemoryCapture:
         self._unacknowledged: list[Unacknowledged] = []
         self.acknowledged: Position | None = None
         self.lines: tuple[MapsLine, ...] = ()
+        self.has_rings = False
 
     def close(self) -> None:
         """Stop following; the process is not changed."""
@@ -184,6 +191,7 @@ class MemoryCapture:
     def start_over(self) -> None:
         """Follow from the beginning with the next base: what was written is not known any more."""
         self._is_armed, self.acknowledged = False, None
+        self._guards.forget()
         self._unacknowledged.clear()
 
     # While the program runs
@@ -257,13 +265,20 @@ class MemoryCapture:
     def take(self, copied: RunningCopy, *, base: bool) -> Taken:
         """Copy what is not copied yet, or not any more. The program stands still."""
         self.refresh()
-        guards = self._page_tables.guards(self._mapped)
         scan = self._scan()
         self._remember(scan)
+        copied.spoil(scan)
+        try:
+            return self._taken(copied, self._guards.found(self._mapped, self._tracker.watched), base=base)
+        except ProcessGoneError:
+            raise
+        except CaptureError:  # a page that has become a guard cannot be read
+            return self._taken(copied, self._guards.found_everywhere(self._mapped, self._tracker.watched), base=base)
+
+    def _taken(self, copied: RunningCopy, guards: Words, *, base: bool) -> Taken:
         self._leave_out(guards)
         written, cleared = self._since_acknowledged(base=base)
         if copied.copies:
-            copied.spoil(scan)
             copied.valid = pages.intersection(copied.valid, self._mapped if base else written)
         missing = pages.difference(written, copied.valid)
         if base:
@@ -275,7 +290,14 @@ class MemoryCapture:
             cleared=cleared,
             guards=guards,
             copies=(*copied.copies, Copy(missing, content)),
+            untouched=self._untouched(),
         )
+
+    def _untouched(self) -> Words:
+        """Pages of files without a name that the process has mapped for itself, and has no copy of."""
+        if not len(self._orphans):
+            return NONE
+        return pages.difference(self._orphans, self._page_tables.existing(self._orphans))
 
     def leave_out(self, places: SharedPlaces) -> None:
         """Do not tell of shared memory that another process of the component tells of."""
@@ -304,7 +326,9 @@ class MemoryCapture:
         self.lines = tuple(line for line in self._maps.lines if not self.borrowed.holds(line.start))
         self._private = [line for line in self.lines if tracking.is_private(line)]
         self._sort_shared()
+        self.has_rings = any(map(aio_rings.is_ring, self._shared_lines))
         self._followed = tracking.extents_of(self._private)
+        self._orphans = tracking.extents_of([line for line in self.lines if tracking.is_orphan(line)])
         self._mapped = tracking.extents_of([line for line in self.lines if line.name not in tracking.NOT_CARRIED])
         self._vdso = tracking.extents_of([line for line in self.lines if line.name == VDSO])
 
@@ -327,6 +351,7 @@ class MemoryCapture:
 
     def _remember(self, scan: Scan) -> None:
         """Keep what a scan found until it is acknowledged; one that has become no snapshot is joined with the next."""
+        self._guards.named(scan)
         written, cleared = scan.written, scan.cleared
         if self._unacknowledged and self._unacknowledged[-1].position is None:
             last = self._unacknowledged.pop()

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 
-from checkpoint.arch import x86_64 as arch
-from checkpoint.arch import x86_64_xstate
+from checkpoint.arch import cpu as arch
+from checkpoint.arch import extended
 from checkpoint.engines import description
 from checkpoint.engines.identities import Identities
 from checkpoint.engines.standing import Standing
 from checkpoint.engines.standing_threads import ThreadStanding
-from checkpoint.linux import abi, processor, procfs
+from checkpoint.linux import processor, procfs
 from checkpoint.model import PosixTimer, ProcessState, ThreadState
 
 
@@ -25,18 +25,18 @@ def _other_thread(standing: ThreadStanding) -> ThreadState:
     return ThreadState(
         tid=place.inner_tid,
         name=standing.stat.name,
-        registers={"prstatus": arch.encode_registers(standing.settled), "xstate": standing.xstate},
+        registers={"prstatus": arch.encode_registers(standing.settled), "xstate": standing.reading.xstate},
         signal_mask=place.mask,
         pending=place.pending,
         altstack=standing.altstack,
-        robust_list=standing.robust_list,
+        robust_list=standing.reading.robust_list,
         clear_tid=standing.clear_tid,
         rseq=place.rseq,
-        policy=standing.policy,
+        policy=standing.reading.policy,
         priority=standing.stat.priority,
         nice=standing.stat.nice,
-        io_priority=standing.io_priority,
-        affinity=tuple(sorted(standing.affinity)),
+        io_priority=standing.reading.io_priority,
+        affinity=standing.reading.affinity,
         timer_slack_ns=standing.timer_slack_ns,
         interrupted=standing.interrupted,
     )
@@ -49,8 +49,8 @@ def _first_thread(pid: int, standing: Standing) -> ThreadState:
         name=status.name,
         registers={
             "prstatus": arch.encode_registers(standing.settled),
-            "xstate": standing.xstate,
-            "xstate_layout": x86_64_xstate.encode_layout(processor.xstate_layout()),
+            "xstate": standing.place.reading.xstate,
+            "xstate_layout": extended.encode_layout(processor.xstate_layout()),
         },
         signal_mask=place.mask,
         pending=place.pending,
@@ -58,11 +58,11 @@ def _first_thread(pid: int, standing: Standing) -> ThreadState:
         robust_list=told.robust_list,
         clear_tid=told.clear_tid,
         rseq=place.rseq,
-        policy=description.policy(pid),
+        policy=place.reading.policy,
         priority=stat.priority,
         nice=stat.nice,
-        io_priority=abi.io_priority(pid),
-        affinity=description.affinity(pid),
+        io_priority=place.reading.io_priority,
+        affinity=place.reading.affinity,
         timer_slack_ns=told.timer_slack_ns,
         interrupted=standing.interrupted,
     )

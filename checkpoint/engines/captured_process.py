@@ -10,7 +10,7 @@ import operator
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
-from checkpoint.arch import x86_64_xstate
+from checkpoint.arch import extended
 from checkpoint.engine import ProtectOrder
 from checkpoint.engines import entering, waits
 from checkpoint.engines.capture_memory import MemoryCapture, RunningCopy, SharedPlaces, Taken
@@ -20,7 +20,7 @@ from checkpoint.engines.identities import Identities
 from checkpoint.engines.outputs import Outputs
 from checkpoint.engines.restart import Interruptions
 from checkpoint.engines.standing import Onlooker, Standing
-from checkpoint.errors import ProcessGoneError
+from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.threads import Threads
@@ -28,7 +28,18 @@ from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.tracking import NONE, NOT_CARRIED
 from checkpoint.linux.vm_flags import FlagsReader
 from checkpoint.model import Position, ProcessState, Resource, ThreadState, Vma
-from checkpoint.resources import Opened, deadlines, memory_locks, system_v_memory, unsupported
+from checkpoint.resources import (
+    Opened,
+    aio_rings,
+    deadlines,
+    gather,
+    memory_locks,
+    seccomp,
+    stops,
+    system_v_memory,
+    unsupported,
+    untouched,
+)
 
 NOBODY: SharedPlaces = frozenset()
 
@@ -43,10 +54,8 @@ class Look:
     @property
     def xstate_mask(self) -> int:
         """Which parts of the processor's state any thread uses."""
-        standing = self.standing
-        return functools.reduce(
-            operator.or_, map(x86_64_xstate.in_use, (standing.xstate, *(one.xstate for one in standing.others)))
-        )
+        readings = (self.standing.place.reading, *(one.reading for one in self.standing.others))
+        return functools.reduce(operator.or_, (extended.in_use(reading.xstate) for reading in readings))
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +146,10 @@ class CapturedProcess:
             self.memory.refresh()
             self._flags.refresh(self.memory.lines, anew=True)
             self.identities.vmas(self.memory.lines, self._flags.flags, NONE)
-        return self.memory.copy_running(base=base)
+        copied = self.memory.copy_running(base=base)
+        if base:  # which takes long: a thread may have confined itself since
+            self.onlooker.rights.prepare()
+        return copied
 
     # While it stands still
 
@@ -146,9 +158,17 @@ class CapturedProcess:
 
         Args:
             opened: see `Onlooker.ask`.
+
+        Raises:
+            CaptureError: it does not, in some way; it may at the next attempt.
         """
         place = self.onlooker.place()
+        is_awaited = self.memory.has_rings
+        if is_awaited:
+            aio_rings.await_requests(self.order.component, gather(self.pid) if opened is None else opened)
         taken = self.memory.take(copied, base=base)
+        if self.memory.has_rings and not is_awaited:
+            raise CaptureError(f"cannot capture {self.order.component}: it has just made a ring of asynchronous I/O; try again")
         return Look(self.onlooker.ask(place, outputs, opened), taken)
 
     # Afterwards
@@ -176,7 +196,13 @@ class CapturedProcess:
             self._flags.refresh(self.memory.lines)
             of_mappings = (unsupported.refuse_mapping(line, self._foreign_flags(line)) for line in look.taken.lines)
             of_process = unsupported.refuse_process(self.pid, look.standing.status, kin, files_kept=self.files_kept)
-            return (*of_process, *(reason for reason in of_mappings if reason), *system_v_memory.refuse(look.taken.lines))
+            of_rings = aio_rings.refuse(look.standing.opened) if self.memory.has_rings else ()
+            return (
+                *of_process,
+                *(reason for reason in of_mappings if reason),
+                *system_v_memory.refuse(look.taken.lines),
+                *of_rings,
+            )
         except ProcessGoneError:
             return ()  # the picture was taken before it ended
 
@@ -184,8 +210,12 @@ class CapturedProcess:
         """What it has open, by the names that it knows."""
         return tuple(map(self.identities.as_known, resources))
 
+    def stopped(self) -> tuple[Resource, ...]:
+        """That it is stopped, of the first process at the last look; who waits for it is somebody else."""
+        return stops.describe(0 if self.order.is_guarded else self.threads.leader.stopped_by, 0)
+
     def unopened(self, look: Look) -> tuple[Resource, ...]:
-        """What no descriptor stands for: locks on what it will map, System V shared memory, threads with rights of their own.
+        """What no descriptor stands for: locks on what it will map, System V shared memory, what its threads may.
 
         Raises:
             CaptureError: one of its threads has just changed its rights.
@@ -196,8 +226,23 @@ class CapturedProcess:
         return (
             *memory_locks.describe(of_program, ours),
             *system_v_memory.describe(look.taken.lines),
-            *self.onlooker.rights.describe(),
+            *untouched.describe(look.taken.lines, look.taken.untouched, look.standing.opened),
+            *self._limits(look.standing),
             *deadlines.describe(self.pid),
+        )
+
+    def _limits(self, standing: Standing) -> tuple[Resource, ...]:
+        """What its threads may, and what they are confined to.
+
+        Raises:
+            CaptureError: one of them has just changed that.
+        """
+        place, first = standing.place, standing.status.pids
+        confined = [other.tracee.pid for other in place.others if other.confinement]
+        threads = [(other.inner_tid, other.confinement) for other in place.others]
+        return (
+            *self.onlooker.rights.describe({*confined, self.pid}),
+            *seccomp.describe([(first[-1], place.confinement), *threads]),
         )
 
     def _foreign_flags(self, line: MapsLine) -> tuple[str, ...]:

@@ -23,19 +23,31 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Final, NoReturn
 
 from checkpoint import tree
 from checkpoint.engines import births
 from checkpoint.engines.capture_memory import RunningCopy, SharedPlaces
 from checkpoint.engines.captured_process import NOBODY, CapturedProcess, Look, Met
+from checkpoint.engines.lasting import lasting
 from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError, UnsupportedError
-from checkpoint.linux import abi, procfs
+from checkpoint.linux import abi, kinship, procfs
 from checkpoint.linux.kinship import Kinship
 from checkpoint.linux.procfs import Stat, Status
 from checkpoint.linux.threads import Threads
 from checkpoint.model import Member, Position, ProcessState, Resource, ThreadState, Vma, Zombie
-from checkpoint.resources import Held, Surroundings, elsewhere, gather, refused_threads, sharing, stops, streams, unsupported
+from checkpoint.resources import (
+    Held,
+    Surroundings,
+    elsewhere,
+    gather,
+    joint,
+    refused_threads,
+    sharing,
+    stops,
+    streams,
+    unsupported,
+)
 from checkpoint.resources import look as sorted_into_kinds
 
 ENDING_S: Final = 0.2
@@ -162,7 +174,8 @@ class SeenOthers:
     def reasons(self, first: Look) -> tuple[str, ...]:
         """Why the component cannot be captured because of them."""
         found = [reason for seen in self.processes for reason in seen.reasons]
-        found += births.refuse(first.standing.status, self.members(first), self.zombies(first))
+        status = first.standing.status
+        found += births.refuse(status, self.members(first), self.zombies(first), kinship.taken_pids(status.pids[0]))
         return tuple(dict.fromkeys(found))
 
 
@@ -217,7 +230,8 @@ class CapturedTree:
         status = procfs.status(pid)
         if status.state in "ZX" or _shares_memory(pid, status.ppid):
             return  # it has ended, or has still to execute its program (vfork), and our pages there are its parent's
-        self._require_enterable(pid, status)
+        if reasons := lasting(lambda: self._refusals(pid)):
+            self._refuse(reasons)
         try:
             process = CapturedProcess.entered(self._meet(pid), self._first.order, self._free_slot())
         except ProcessGoneError:
@@ -226,14 +240,17 @@ class CapturedTree:
             raise MovedError(str(error)) from error
         self._add(process)
 
-    def _require_enterable(self, pid: int, status: Status) -> None:
+    def _refusals(self, pid: int) -> tuple[str, ...]:
+        """Why one cannot be entered."""
+        status = procfs.status(pid)
         found = [
             *refused_threads.refuse_shared_memory(pid, status),
             *unsupported.refuse_entering(pid, status, files_kept=self._first.files_kept),
         ]
-        reasons = tuple(f"its process {pid} ({status.name}): {why}" for why in found)
-        if reasons:
-            raise UnsupportedError(f"cannot capture pid {self._first.pid}: {'; '.join(reasons)}", reasons)
+        return tuple(f"its process {pid} ({status.name}): {why}" for why in found)
+
+    def _refuse(self, reasons: tuple[str, ...]) -> NoReturn:
+        raise UnsupportedError(f"cannot capture pid {self._first.pid}: {'; '.join(reasons)}", reasons)
 
     def _meet(self, pid: int) -> Met:
         """A process that is not followed yet: the same as at an attempt that failed, for it may not be let go of yet.
@@ -260,7 +277,7 @@ class CapturedTree:
         slot = next(slot for slot in itertools.count(1) if slot not in taken)
         if slot >= tree.SLOT_LIMIT:
             reason = f"it has more than {tree.SLOT_LIMIT} processes, which is the limit"
-            raise UnsupportedError(f"cannot capture pid {self._first.pid}: {reason}", (reason,))
+            self._refuse((reason,))
         return slot
 
     def copy_running(self, *, base: bool) -> None:
@@ -354,14 +371,14 @@ class CapturedTree:
         outside = streams.of_first(first.standing.opened, surroundings)
         around = replace(surroundings, pipes={**outside, **surroundings.pipes}, is_first=False)
         told = NOBODY | self._first.memory.shared_places()
-        stands = bool(self._first.threads.leader.stopped_by)
+        is_held = self._first.order.is_guarded and bool(self._first.threads.leader.stopped_by)
         for pid, threads in self._standing.items():
             process = self._known.get(pid)
             try:
                 with _gone_if_ended(pid):
                     look, process = self._look_at(process, threads, seen, told, base=base)
                     told |= process.memory.shared_places()
-                    stopped_by = 0 if stands else threads.leader.stopped_by
+                    stopped_by = 0 if is_held else threads.leader.stopped_by
                     seen.taken.append((process, look))
                     tell = functools.partial(_told_of, process, look, seen, around, stopped_by)
                     if process.is_new:
@@ -391,7 +408,8 @@ class CapturedTree:
                 self._forget(pid)
         elif process is not None:
             self._forget(pid)
-        self._require_enterable(pid, procfs.status(pid))
+        if reasons := self._refusals(pid):
+            self._refuse(reasons)
         met = self._met.get(pid) or replace(Met.of(pid), threads=threads)
         process = CapturedProcess.entered_standing(met, self._first.order, self._free_slot())
         self._add(process)
@@ -444,6 +462,7 @@ def _end_of(pid: int) -> tuple[Status, Stat] | None:
 
     Raises:
         MovedError: it takes too long.
+        UnsupportedError: its first thread has ended, and others live on.
     """
     deadline = time.monotonic() + ENDING_S
     while True:
@@ -454,6 +473,9 @@ def _end_of(pid: int) -> tuple[Status, Stat] | None:
         if stat.state == "Z" and status.threads <= 1:
             return status, stat
         if time.monotonic() > deadline:
+            named = f"its process {pid} ({status.name})"
+            if reasons := tuple(f"{named}: {why}" for why in refused_threads.refuse_ended_first(status)):
+                raise UnsupportedError(f"cannot capture pid {pid}: {'; '.join(reasons)}", reasons)
             raise MovedError(f"process {pid} takes long to end; capture it again")
         time.sleep(0.0005)
 
@@ -474,9 +496,15 @@ def _told_of(process: CapturedProcess, look: Look, seen: SeenOthers, around: Sur
         threads=process.thread_states(look),
         vmas=process.mappings(look, is_kin=True),
         held=held,
-        unopened=(*process.unopened(look), *stops.describe(stopped_by, look.standing.stat.exit_code)),
+        unopened=(*process.unopened(look), *_joint(look, seen), *stops.describe(stopped_by, look.standing.stat.exit_code)),
         reasons=tuple(f"{named}: {reason}" for reason in reasons),
     )
+
+
+def _joint(look: Look, seen: SeenOthers) -> tuple[Resource, ...]:
+    """What one shares with its parent, which is one of them."""
+    status = look.standing.status
+    return joint.describe(status.pids[0], status.ppid) if status.ppid in seen.pids else ()
 
 
 def _of_namespaces(pid: int, seen: SeenOthers) -> Iterable[str]:

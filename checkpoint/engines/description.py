@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import os
 import socket
 
 from blake3 import blake3
 
 from checkpoint.engines.inquiry import Told
-from checkpoint.errors import ProbeError, ProcessGoneError
+from checkpoint.errors import ProbeError
 from checkpoint.linux import abi, processor, procfs
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import Stat, Status
@@ -54,23 +53,6 @@ def coredump_filter(pid: int) -> int:
         return -1
 
 
-def policy(pid: int) -> int:
-    """The scheduling policy with SCHED_RESET_ON_FORK, as sched_setscheduler(2) takes it."""
-    try:
-        return os.sched_getscheduler(pid)
-    except ProcessLookupError as error:
-        raise ProcessGoneError(f"pid {pid} ended while it was being described") from error
-
-
-def affinity(pid: int) -> tuple[int, ...]:
-    """The processors that it may run on."""
-    try:
-        return tuple(sorted(os.sched_getaffinity(pid)))
-    except ProcessLookupError as error:
-        raise ProcessGoneError(f"pid {pid} ended while it was being described") from error
-
-
-@functools.cache
 def this_machine() -> Machine:
     """Where we run; ``robot`` and ``xstate_mask`` are left to the capture."""
     about = os.uname()

@@ -5,14 +5,17 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from checkpoint.arch import x86_64 as arch
+from checkpoint.arch import cpu as arch
+from checkpoint.arch.calls import Registers
+from checkpoint.engines.confinements import Confinements
 from checkpoint.engines.restart import Interruptions, outside_critical_section
 from checkpoint.errors import CaptureError, UnsupportedError
-from checkpoint.linux import dirty, entry, procfs, remote
+from checkpoint.linux import confinement, dirty, entry, procfs, remote
+from checkpoint.linux.confinement import FILTERED
 from checkpoint.linux.digests import DigestTracker
 from checkpoint.linux.dirty import SoftDirtyTracker
 from checkpoint.linux.remote import BorrowedPages
@@ -21,7 +24,7 @@ from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.tracking import Tracker
 from checkpoint.linux.write_protection import PagemapTracker
 from checkpoint.model import Rseq
-from checkpoint.resources import refused_threads, sockets
+from checkpoint.resources import refused_threads, sockets, unkept
 
 LEAVE_TIMEOUT_S: Final = 0.5
 """How long a program may take to leave the code of a tracer that died in the middle: that waits 100 ms at most."""
@@ -70,18 +73,30 @@ def _try_to_enter(threads: Threads, interruptions: Interruptions, *, last: bool)
     Args:
         last: waiting has helped nothing: pages that somebody was in are left to the program.
     """
+    modes = confinement.modes(threads.pid)
     with stopped(threads):
-        return _enter_once(threads, interruptions, last=last)
+        return _enter_once(threads, interruptions, last=last, modes=modes)
 
 
-def _enter_once(threads: Threads, interruptions: Interruptions, *, last: bool) -> entry.Entered | None:
+def _enter_once(
+    threads: Threads, interruptions: Interruptions, *, last: bool, modes: Mapping[int, int] = confinement.NO_MODES
+) -> entry.Entered | None:
+    """Enter a process that stands still.
+
+    Args:
+        modes: of seccomp(2), by thread, as far as they are known.
+    """
     tracee = threads.leader
     if dispatching := [one.pid for one in (tracee, *threads.others) if one.dispatches_calls()]:
         reason = refused_threads.of_dispatching(dispatching[0])
         raise UnsupportedError(f"cannot enter pid {tracee.pid}: {reason}", (reason,))
-    require_answers(tracee.pid, procfs.read_bytes(tracee.pid, "status"))
+    confinements = Confinements(threads.pid, interruptions)
+    mode = confinement.mode_in(procfs.read_bytes(tracee.pid, "status"))
+    confinements.suspended(tracee, mode, (tracee.pid, 0))
+    for one in threads.others if mode or modes else ():
+        confinements.suspended(one, modes.get(one.pid, FILTERED if mode else 0), (one.pid, 0))
     mask = tracee.signal_mask()
-    decoded = where_it_stands(tracee, interruptions, tracee.rseq())
+    decoded = where_it_stands(tracee, tracee.registers(), tracee.rseq(), interruptions)
     lines = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
     left = entry.leftovers(tracee.memory, lines)
     others = [(other, arch.decode_registers(other.registers())) for other in threads.others]
@@ -106,15 +121,22 @@ def _enter_once(threads: Threads, interruptions: Interruptions, *, last: bool) -
     else:
         entered = entry.enter(tracee, lines, registers, mask)
     batch = remote.Batch(entered.pages.table)
+    questions = unkept.Questions(batch)
     for number in {entered.inside, *entry.left_open(tracee.pid)}:
         batch.add("close", number)
     try:
-        entered.pages.run(tracee, batch, registers, mask)
+        answers = entered.pages.run(tracee, batch, registers, mask)
+        _require_none((*unkept.refuse_ports(tracee), *questions.refuse(answers)), tracee.pid)
     except BaseException:
         if entered.faults is not None:
             os.close(entered.faults)
         raise
     return entered
+
+
+def _require_none(reasons: tuple[str, ...], pid: int) -> None:
+    if reasons:
+        raise UnsupportedError(f"cannot enter pid {pid}: {'; '.join(reasons)}", reasons)
 
 
 def _put_back(pid: int, borrowed: BorrowedPages) -> None:
@@ -127,26 +149,12 @@ def _put_back(pid: int, borrowed: BorrowedPages) -> None:
         sockets.set_peek_offset(looked, offset)
 
 
-def require_answers(pid: int, status: bytes) -> None:
-    """Look whether a process that stands still may be asked at all: the kernel kills who makes a call that its filter forbids.
-
-    Args:
-        status: its /proc/PID/status, now: it may have come under the filter since it was looked at.
-
-    Raises:
-        UnsupportedError: it may not.
-    """
-    if b"\nSeccomp:" in status and b"\nSeccomp:\t0\n" not in status:
-        reason = "it runs under a seccomp filter, which forbids what a capture asks of it: run it without the filter"
-        raise UnsupportedError(f"cannot capture pid {pid}: {reason}", (reason,))
-
-
-def where_it_stands(tracee: Tracee, interruptions: Interruptions, rseq: Rseq | None) -> arch.Registers:
+def where_it_stands(tracee: Tracee, registers: bytes, rseq: Rseq | None, interruptions: Interruptions) -> Registers:
     """The registers that the program is given back: as they are, but for what our stop alone has brought about."""
-    decoded = arch.decode_registers(tracee.registers())
+    decoded = arch.decode_registers(registers)
     if decoded[arch.CALL_NUMBER] >> 63:
         return outside_critical_section(decoded, tracee.memory, rseq.address) if rseq else decoded
-    return interruptions.of(tracee).waiting.undisturbed(decoded)
+    return interruptions.of(tracee).undisturbed(decoded)
 
 
 def _tracker_for(pid: int, entered: entry.Entered) -> tuple[Tracker, tuple[str, ...]]:

@@ -11,11 +11,13 @@ import time
 from typing import Final
 
 from checkpoint import program_files
-from checkpoint.contents import DIGEST_SIZE, path_in
+from checkpoint.contents import DIGEST_SIZE, digest_of_file, path_in
+from checkpoint.digests_of_files import DigestOf
 from checkpoint.engine import (
     COOPERATIVE,
     NOTED,
     CaptureOrder,
+    Copy,
     Finding,
     ProtectOrder,
     Report,
@@ -152,7 +154,7 @@ class CooperativeEngine:
         """See `checkpoint.engine.Engine.protect`."""
         return GuardedTask(pid, order)
 
-    def lacks(self, outline: Snapshot, options: RestoreOptions) -> tuple[str, ...]:
+    def lacks(self, outline: Snapshot, options: RestoreOptions, digest_of: DigestOf = digest_of_file) -> tuple[str, ...]:
         """See `checkpoint.engine.Engine.lacks`: the files that it is started again from, here or as they were brought."""
         files = program_of(outline)
         gone = [file.path for file in files if not os.path.lexists(file.path) and not _is_brought(options, file.digest)]
@@ -161,3 +163,8 @@ class CooperativeEngine:
     def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
         """Refused: see the class."""
         raise RestoreError(f"cannot restore {state.component} into pid {vessel_pid}: a {COOPERATIVE} program is started again")
+
+    def lay(self, vessel_pid: int, base: Snapshot, options: RestoreOptions) -> Copy:
+        """Refused: what waits for such a program is the program itself, started in advance."""
+        reason = "it keeps its state itself, and waits started"
+        raise UnsupportedError(f"{base.component} can have no ready copy: {reason}", (reason,))

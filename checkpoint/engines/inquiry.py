@@ -126,8 +126,13 @@ class Inquiry:
             thp_disabled=result[self._thp] == 1,
             securebits=max(result[self._securebits], 0),
             timer_slack_ns=max(result[self._slack], 0),
-            switches=self._switches.read(answers),
+            switches=(*self._switches.read(answers), *_huge_pages(result[self._thp])),
         )
+
+
+def _huge_pages(told: int) -> tuple[Switch, ...]:
+    """The switch of transparent huge pages, where more is said than that there are none (Linux 6.18)."""
+    return ((abi.PR_SET_THP_DISABLE, 1, told & ~1),) if told > 1 else ()
 
 
 def _action(number: int, words: tuple[int, ...]) -> SignalAction:

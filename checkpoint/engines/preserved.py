@@ -24,7 +24,7 @@ CAPABILITIES: Final = (
     ),
     by_rule(
         Area.PROCESS,
-        "keys and keyrings of the kernel (keyctl)",
+        "keys and keyrings of the kernel (keyctl); rules of Landlock, labels of AppArmor and SELinux",
         "they stay behind: the program has those of whoever restores it",
     ),
     by_rule(

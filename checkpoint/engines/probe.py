@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
 from checkpoint import portable
 from checkpoint.engine import KEPT, NO_TERMS, NOTED, REFUSED, Finding, Report, Streams, Terms
 from checkpoint.engines import births
+from checkpoint.engines.lasting import lasting
 from checkpoint.errors import CheckpointError, ProbeError, ProcessGoneError
 from checkpoint.linux import dirty, kinship, processor, procfs, vm_flags
 from checkpoint.linux.procfs import Status
@@ -21,6 +23,7 @@ from checkpoint.resources import (
     Opened,
     OpenFile,
     Surroundings,
+    aio_rings,
     gather,
     glance,
     kinds,
@@ -67,7 +70,7 @@ def _probe(pid: int, surroundings: Surroundings, files_kept: bool) -> Report:
     findings = (
         *_process_findings(pid, status, kin, files_kept),
         *_processor_findings(pid),
-        *_memory_findings(pid),
+        *_memory_findings(pid, opened[pid]),
         *looked[pid].findings,
         *kinds.findings_of_all([held for one in looked.values() for held in one.resources], standing=False),
         *_others_findings(opened, pid, looked),
@@ -147,37 +150,42 @@ def _looked(opened: sharing.OpenedByAll, first: int, surroundings: Surroundings)
 def _others_findings(opened: sharing.OpenedByAll, first: int, looked: Mapping[int, Held]) -> Iterator[Finding]:
     """What stands against the processes besides the first; one that ends meanwhile does not."""
     for pid, held in looked.items():
-        if pid == first:
-            continue
-        try:
-            status = procfs.status(pid)
-            reasons = [*held.reasons, *unsupported.refuse_process(pid, status, tuple(opened))]
-            smaps = procfs.read_text(pid, "smaps")
-            flags = vm_flags.parse(smaps)
-            lines = procfs.parse_maps(procfs.read_text(pid, "maps"))
-        except (CheckpointError, FileNotFoundError, ProcessLookupError):
-            continue
-        reasons += [why for line in lines if (why := unsupported.refuse_mapping(line, flags.get(line.start, ())))]
-        for reason in reasons:
-            yield Finding("process", f"pid {pid}", REFUSED, f"its process {pid} ({status.name}): {reason}")
-    for reason in _births_refused(first):
+        if pid != first:
+            for reason in (*_named(pid, held.reasons), *lasting(functools.partial(_against, pid, opened))):
+                yield Finding("process", f"pid {pid}", REFUSED, reason)
+    for reason in lasting(functools.partial(_births_refused, first)):
         yield Finding("process", "births", REFUSED, reason)
 
 
-def _births_refused(first: int) -> tuple[str, ...]:
-    """Why its processes could not be born again: what is said twice, for they come and go."""
-    reasons = _births_refused_now(first)
-    if not reasons:
+def _against(pid: int, opened: sharing.OpenedByAll) -> tuple[str, ...]:
+    """What stands against a process besides the first, but for what it has open."""
+    try:
+        reasons = list(unsupported.refuse_process(pid, procfs.status(pid), tuple(opened)))
+        flags = vm_flags.parse(procfs.read_text(pid, "smaps"))
+        lines = procfs.parse_maps(procfs.read_text(pid, "maps"))
+    except (CheckpointError, FileNotFoundError, ProcessLookupError):
         return ()
-    time.sleep(LOOK_PAUSE_S)
-    again = _births_refused_now(first)
-    return tuple(reason for reason in reasons if reason in again)
+    reasons += [why for line in lines if (why := unsupported.refuse_mapping(line, flags.get(line.start, ())))]
+    reasons += aio_rings.refuse(opened[pid]) if any(map(aio_rings.is_ring, lines)) else ()
+    return _named(pid, reasons)
 
 
-def _births_refused_now(first: int) -> tuple[str, ...]:
+def _named(pid: int, reasons: Iterable[str]) -> tuple[str, ...]:
+    """Reasons with whose they are; none of a process that has ended."""
+    with contextlib.suppress(CheckpointError):
+        name = procfs.status(pid).name
+        return tuple(f"its process {pid} ({name}): {reason}" for reason in reasons)
+    return ()
+
+
+def _births_refused(first: int) -> tuple[str, ...]:
+    """Why its processes could not be born again."""
     with contextlib.suppress(CheckpointError):
         everybody = list(map(procfs.status, (first, *kinship.component(first))))
-        return tuple(births.refuse_persons(everybody[0], births.persons(everybody)[1:]))
+        ended = [(one, why) for one in everybody[1:] for why in refused_threads.refuse_ended_first(one)]
+        if ended:
+            return tuple(f"its process {one.pids[0]} ({one.name}): {why}" for one, why in ended)
+        return tuple(births.refuse_persons(everybody[0], births.persons(everybody)[1:], kinship.taken_pids(first)))
     return ()
 
 
@@ -226,7 +234,7 @@ def _processor_findings(pid: int) -> Iterator[Finding]:
     yield Finding("process", "processor", KEPT, f"not started with failover run --portable: it may have chosen {needed}")
 
 
-def _memory_findings(pid: int) -> Iterator[Finding]:
+def _memory_findings(pid: int, opened: Sequence[OpenFile]) -> Iterator[Finding]:
     flags = vm_flags.parse(procfs.read_text(pid, "smaps"))
     lines = procfs.parse_maps(procfs.read_text(pid, "maps"))
     for line in lines:
@@ -235,6 +243,10 @@ def _memory_findings(pid: int) -> Iterator[Finding]:
             yield Finding("memory", f"VMA {line.start:x}-{line.end:x}", REFUSED, reason)
     for reason in system_v_memory.refuse(lines):
         yield Finding("memory", "System V shared memory", REFUSED, reason)
+    if any(map(aio_rings.is_ring, lines)):
+        yield Finding("memory", "asynchronous I/O", NOTED, aio_rings.NOTE)
+        for reason in aio_rings.refuse(opened):
+            yield Finding("memory", "asynchronous I/O", REFUSED, reason)
     for path, note in unsupported.note_mappings(line for line in lines if not system_v_memory.is_segment(line)):
         yield Finding("memory", path, NOTED, note)
 

@@ -5,8 +5,10 @@ Imported by the keeper alone, and at once: a keeper that waits in advance must n
 
 from __future__ import annotations
 
-from checkpoint.engine import PTRACE, ProtectOrder, Report, Restored, RestoreOptions, Session
-from checkpoint.engines import restore_checks
+from checkpoint.contents import digest_of_file
+from checkpoint.digests_of_files import DigestOf
+from checkpoint.engine import PTRACE, Copy, ProtectOrder, Report, Restored, RestoreOptions, Session
+from checkpoint.engines import ready_copy, restore_checks
 from checkpoint.engines.probe import probe
 from checkpoint.engines.ptrace_capture import PtraceSession
 from checkpoint.engines.ptrace_restore import restore
@@ -26,10 +28,14 @@ class PtraceEngine:
         """See ``checkpoint.engine.Engine.protect``."""
         return PtraceSession.open(pid, order)
 
-    def lacks(self, outline: Snapshot, options: RestoreOptions) -> tuple[str, ...]:
+    def lacks(self, outline: Snapshot, options: RestoreOptions, digest_of: DigestOf = digest_of_file) -> tuple[str, ...]:
         """See ``checkpoint.engine.Engine.lacks``."""
-        return restore_checks.lacks(outline, options)
+        return restore_checks.lacks(outline, options, digest_of)
 
     def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
         """See ``checkpoint.engine.Engine.restore``."""
         return restore(vessel_pid, state, options)
+
+    def lay(self, vessel_pid: int, base: Snapshot, options: RestoreOptions) -> Copy:
+        """See ``checkpoint.engine.Engine.lay``."""
+        return ready_copy.lay(vessel_pid, base, options)

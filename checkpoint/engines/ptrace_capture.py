@@ -23,7 +23,7 @@ import time
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from checkpoint import portable, tree
+from checkpoint import portable, room, tree
 from checkpoint.chain import position_of
 from checkpoint.engine import PTRACE, CaptureOrder, ProtectOrder
 from checkpoint.engines import description
@@ -201,6 +201,8 @@ class PtraceSession:
         while True:
             try:
                 self._tree.admit(held=self._held)
+                if base and (others := self._tree.processes()):
+                    self._refuse(room.refuse_capture((self.pid, *(process.pid for process in others))))
                 copied = self._first.copy_running(base=base)
                 self._tree.copy_running(base=base)
                 frozen = self._frozen_look(copied, base=base, hold=order.hold)
@@ -322,7 +324,12 @@ class PtraceSession:
         totals = first.standing.totals
         snapshot = replace(
             self._with_pages(self._outline(order, parent, frozen, parcel), with_parcel(taken, parcel, is_base=parent is None)),
-            resources=(*self._first.known(held.resources), *self._first.unopened(first), *parcel.resources),
+            resources=(
+                *self._first.known(held.resources),
+                *self._first.unopened(first),
+                *self._first.stopped(),
+                *parcel.resources,
+            ),
             output=self._outputs.pieces(self._output_since(parent), totals) if self._outputs else (),
         )
         snapshot = frozen.departing.added_to(snapshot)

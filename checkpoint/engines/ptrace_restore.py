@@ -23,19 +23,20 @@ import os
 import resource
 import signal
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from checkpoint import carried, epoch_variable, rights
-from checkpoint.arch import x86_64, x86_64_stub, x86_64_xstate
+from checkpoint import carried, epoch_variable, rights, room, tree
+from checkpoint.arch import cpu, extended, stubs
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import (
     restore_checks,
     restore_kinds,
     restore_memory,
     restore_process,
+    restore_stops,
     restore_threads,
     restore_vdso,
     switches,
@@ -48,17 +49,26 @@ from checkpoint.linux import abi, call_table, processor, procfs, vdso
 from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee
-from checkpoint.model import Credentials, Position, Snapshot, ThreadState, Vma
+from checkpoint.model import Credentials, PageRun, Position, Snapshot, ThreadState, Vma
+from checkpoint.pages import Words
 from checkpoint.resources import (
+    aio_rings,
     carried_connections,
     deadlines,
+    departed,
     files,
+    joint,
     laying,
     memory_locks,
     remembered,
+    seccomp,
+    stops,
     system_v_memory,
+    untouched,
 )
+from checkpoint.resources.aio_rings import Ring
 from checkpoint.resources.carried_connections import Arriving
+from checkpoint.resources.departed import Departed
 from checkpoint.resources.rebuild import deleted_directory, rebuild_all, rebuild_last
 from checkpoint.resources.rebuilding import number_of
 
@@ -71,6 +81,7 @@ AMX_TILES: Final = 18
 ARCH_REQ_XCOMP_PERM: Final = 0x1023
 """Source: Documentation/arch/x86/xstate.rst."""
 
+NOBODY_YET: Final = 0
 REFUGE_SIZE: Final = 1 << 20
 """Bytes beside the area where vdso and its data stay while their old and new places are cleared."""
 
@@ -113,6 +124,8 @@ def restore(vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restor
     """See ``checkpoint.engine.Engine.restore``."""
     if not state.is_base:
         raise RestoreError("cannot restore a delta by itself: fold its chain first")
+    if reasons := room.refuse_restore(state):
+        raise MismatchError(f"cannot restore {state.component} here: {'; '.join(reasons)}", reasons)
     program = carried.without(state)
     if program is not state:
         options = replace(options, accept_changed=(*options.accept_changed, *carried.every_path(state)))
@@ -183,8 +196,30 @@ class Estate:
     anonymous: Mapping[tuple[int, int], int]
 
 
+def options_for(state: Snapshot) -> int:
+    """Those with which a vessel is traced; whoever is born of it is traced with the same."""
+    confined = any(seccomp.is_confined(view.resources) for view in tree.views(state))
+    return OPTIONS | (abi.PTRACE_O_SUSPEND_SECCOMP if confined else 0)
+
+
+@dataclass(frozen=True, slots=True)
+class LaterTables:
+    """What comes after the pages: descriptors, marks, signals; what comes after the threads' birth; and each thread's own."""
+
+    state: CallTable
+    rights: CallTable
+    threads: list[CallTable]
+
+    @property
+    def all(self) -> tuple[CallTable, ...]:
+        return (self.state, self.rights, *self.threads)
+
+
 class ProcessRestore:
     """The restore of one process, from the seizing of its vessel to the program's own registers.
+
+    Attributes:
+        has_table_of_parent: it shares its table of descriptors with its parent, which fills it.
 
     Args:
         state: of this process alone.
@@ -201,13 +236,16 @@ class ProcessRestore:
         estate: Estate | None = None,
         legacy: Legacy = restore_memory.NOTHING,
     ) -> None:
-        self._state = state
+        self.has_table_of_parent = bool(joint.flags_of(state.resources) & joint.CLONE_FILES)
+        self._state = joint.without_descriptors(state) if self.has_table_of_parent else state
         self._legacy = legacy
         self._brought = brought
         self._executable: int | None = None
         self._options = options
         self._estate = estate
         self._thread = state.threads[0]
+        self._filters_of_all = seccomp.of_all(state.resources, [thread.tid for thread in state.threads])
+        self._untouched = untouched.of(state.resources)
         self._tracee = tracee
         self._others: list[tuple[Tracee, ThreadState]] = []
         self.notes: list[str] = []
@@ -215,6 +253,8 @@ class ProcessRestore:
         self._foreign: tuple[Vma, ...] = ()
         self._segments = system_v_memory.Segments()
         self._own_functions: tuple[vdso.Function, ...] = ()
+        self._rings: list[Ring | None] = []
+        self._ended: tuple[Departed, ...] = ()
 
     def end(self) -> None:
         """Kill what will be no program."""
@@ -231,9 +271,11 @@ class ProcessRestore:
     def prepare(self) -> None:
         """Seize a vessel that waits by itself."""
         tracee = self._tracee
-        tracee.seize(OPTIONS)
+        tracee.seize(options_for(self._state))
         tracee.freeze()
         tracee.set_signal_mask(abi.ALL_SIGNALS & ~(1 << (signal.SIGTRAP - 1)))
+        if stop := stops.stop_of(self._state.resources):
+            restore_stops.stop(tracee, stop[0])
 
     def build(self) -> None:
         """Everything but the registers."""
@@ -289,40 +331,107 @@ class ProcessRestore:
             )
 
     def _build_and_run(self, vessel: Vessel, mappings: tuple[procfs.MapsLine, ...]) -> None:
-        state, tracee = self._state, self._tracee
+        base = self._choose_place(mappings)
+        first = self._mappings_table(CallTable(base, descriptors=self._inherited()), vessel, mappings, base + AREA_SIZE)
+        opened = CallTable(base, descriptors=set(first.descriptors))
+        self._ended = departed.of(self._state.resources, self._state.process.working_directory)
+        for one in self._ended:
+            self._objects |= one.open(opened, NOBODY_YET)
+        later = self._later_tables(base, set(opened.descriptors), vessel)
+        self._rings = aio_rings.slots(aio_rings.rings_of(self._state.vmas, self._content_at))
+        made, moves = CallTable(base), CallTable(base, descriptors=set(first.descriptors))
+        aio_rings.make(made, self._rings)
+        aio_rings.move(moves, self._rings, [0] * len(self._rings))
+        self._lay_stub(base, mappings, self._size_of((first, made, moves, opened, *later.all)))
+        self._lay_out(first)
+        self._complete(later)
+
+    def _carried(self) -> Sequence[PageRun] | Words:
+        """Of which pages there is content: what they lie in must be writable until it is there."""
+        return self._state.runs
+
+    def _choose_place(self, mappings: tuple[procfs.MapsLine, ...]) -> int:
+        """Where the stub and its tables may lie; what the program shares with nobody by name is made."""
+        state = self._state
         taken = [(line.start, line.end) for line in mappings] + [(vma.start, vma.end) for vma in state.vmas]
         self._segments.make(state.resources)
         shared_size = sum(restore_memory.anonymous_sizes(state.vmas).values())
-        base = self._estate.base if self._estate else call_table.find_hole(taken, AREA_SIZE + REFUGE_SIZE + shared_size)
-        kernel_pages = restore_memory.kernel_pages(mappings)
-        first = self._mappings_table(CallTable(base, descriptors=self._inherited()), vessel, mappings, base + AREA_SIZE)
-        second = self._state_table(CallTable(base, descriptors=set(first.descriptors)), vessel)
+        return self._estate.base if self._estate else call_table.find_hole(taken, AREA_SIZE + REFUGE_SIZE + shared_size)
+
+    def _later_tables(self, base: int, descriptors: set[int], vessel: Vessel) -> LaterTables:
+        """Everything that comes after the pages.
+
+        Args:
+            descriptors: that are open by then.
+        """
+        second = self._state_table(CallTable(base, descriptors=descriptors), vessel)
         third = self._rights_table(CallTable(base, descriptors=set(second.descriptors)), vessel)
         tables = [self._thread_table(CallTable(base), thread, vessel) for thread in self._state.threads[1:]]
-        size = max(table.end for table in (first, second, third, *tables)) - base
+        return LaterTables(second, third, tables)
+
+    def _size_of(self, tables: Sequence[CallTable]) -> int:
+        size = max(table.end - table.base for table in tables)
         if size > AREA_SIZE:
             raise RestoreError(
-                f"cannot restore: its {len(state.vmas)} mappings need {size >> 20} MiB of calls; the limit is 64 MiB"
+                f"cannot restore: its {len(self._state.vmas)} mappings need {size >> 20} MiB of calls; the limit is 64 MiB"
             )
-        stub = Stub(tracee, base)
+        return size
+
+    def _lay_stub(self, base: int, mappings: tuple[procfs.MapsLine, ...], size: int) -> None:
+        self._stub = Stub(self._tracee, base)
+        image = restore_memory.kernel_pages(mappings)[-1]
         if self._estate is None:
-            stub.install(self._syscall_instruction(kernel_pages[-1].start, kernel_pages[-1].size), size)
+            self._stub.install(self._syscall_instruction(image.start, image.size), size)
         self._area_size = self._estate.size if self._estate else size
-        self.notes += stub.run(first)
+
+    def _lay_out(self, first: CallTable) -> None:
+        """The program's mappings and its pages."""
+        self.notes += self._stub.run(first)
         self._segments.attached()
         self.notes += self._segments.notes
-        restore_memory.fill(tracee.memory, state, self._legacy)
+        if self._rings:
+            self._make_rings(self._stub, self._rings, first.descriptors)
+        self._open_what_is_left(self._stub, self._ended, first.descriptors)
+        restore_memory.fill(self._tracee.memory, self._state, self._legacy, self._untouched)
+
+    def _complete(self, later: LaterTables) -> None:
+        """Everything but mappings and pages, which are there."""
+        tracee, state = self._tracee, self._state
         if self._own_functions:
             self._leave_old_vdso()
             tracee.memory.write_each(restore_vdso.jumps(state, self._vdso, self._own_functions))
         if self._options.epoch:
             _renew_token(tracee, state, self._options.epoch)
-        self.notes += stub.run(second)
-        self._start_threads(base, tables)
-        self.notes += stub.run(third)
-        self._stub = stub
+        self.notes += self._stub.run(later.state)
+        self._start_threads(self._stub.base, later.threads)
+        self.notes += self._stub.run(later.rights)
         _write_oom_score(tracee.pid, state.process.oom_score_adj, self.notes)
         _write_coredump_filter(tracee.pid, state.process.coredump_filter, self.notes)
+
+    def _make_rings(self, stub: Stub, rings: list[Ring | None], descriptors: set[int]) -> None:
+        """Have the kernel make rings of asynchronous I/O; it alone chooses where, so that a second table moves them."""
+        made, moves = (CallTable(stub.base, descriptors=set(descriptors)) for _ in range(2))
+        answers = aio_rings.make(made, rings)
+        stub.run(made)
+        aio_rings.move(moves, rings, [int.from_bytes(self._tracee.memory.read(answer, 8), "little") for answer in answers])
+        stub.run(moves)
+
+    def _open_what_is_left(self, stub: Stub, ended: Iterable[Departed], descriptors: Iterable[int]) -> None:
+        """Open what the program holds of processes that have ended: for each a child is born, and ended before it runs."""
+        opened = set(descriptors)
+        for one in ended:
+            child = restore_threads.spawn_any(self._tracee, self._start_registers, stub.base)
+            try:
+                number = procfs.status(child.pid).pids[-1]
+                table = CallTable(stub.base, descriptors=opened)
+                one.open(table, number)
+                stub.run(table)
+                opened = table.descriptors
+            finally:
+                restore_threads.end(child, ())
+            table = CallTable(stub.base)
+            departed.forget(table, number)
+            stub.run(table)
 
     def _inherited(self) -> set[int]:
         """Descriptors that the vessel has."""
@@ -352,12 +461,12 @@ class ProcessRestore:
         protect(abi.PROT_READ)
 
     def _mappings_table(self, table: CallTable, vessel: Vessel, mappings: tuple[procfs.MapsLine, ...], refuge: int) -> CallTable:
-        vmas, runs = self._state.vmas, self._state.runs
+        vmas, runs = self._state.vmas, self._carried()
         restore_process.raise_limits(table, vessel)
         brought = self._open_brought(table)  # with our rights, from a place of ours
         if self._options.own_eyes:
             restore_process.own_eyes(table, self._state.process, vessel)
-        restore_process.make_directories(table, restore_checks.missing_directories(self._state))
+        self._make_directories(table)
         if self._estate is not None:
             restore_process.begin_member(table)
         restore_memory.clear(table, mappings, self._legacy)
@@ -370,7 +479,7 @@ class ProcessRestore:
         sizes = {} if self._estate else restore_memory.anonymous_sizes(vmas)
         ours_alone = restore_memory.map_anonymous(table, sizes, refuge + REFUGE_SIZE)
         inherited = (self._estate.objects, self._estate.anonymous) if self._estate else ({}, ours_alone)
-        self._objects |= restore_memory.map_program(table, vmas, runs, brought, *inherited, self._legacy)
+        self._objects |= restore_memory.map_program(table, vmas, runs, brought, *inherited, self._legacy, self._untouched)
         self._objects |= inherited[0]
         for key, place in ours_alone.items():
             table.call("unmap shared memory, which is mapped elsewhere now", "munmap", place, sizes[key])
@@ -378,6 +487,10 @@ class ProcessRestore:
         for descriptor in brought.values():
             table.close(descriptor)
         return table
+
+    def _make_directories(self, table: CallTable) -> None:
+        """What leads to its working directory."""
+        restore_process.make_directories(table, restore_checks.missing_directories(self._state))
 
     def _open_brought(self, table: CallTable) -> dict[str, int]:
         """Open what was brought along: descriptors of what is run, by path; what is only read joins the nameless objects."""
@@ -394,26 +507,27 @@ class ProcessRestore:
 
     def _state_table(self, table: CallTable, vessel: Vessel) -> CallTable:
         process, thread = self._state.process, self._thread
-        restore_memory.settle(table, self._state.vmas, self._state.runs)
+        restore_memory.settle(table, self._state.vmas, self._carried())
         restore_process.memory_layout(
             table, process, with_executable=vessel.may_choose_executable, brought=self._executable
         )  # before the program's own descriptors take their numbers
-        self.notes += rebuild_all(
-            table,
-            self._state,
-            self._options,
-            vessel.inner_pid,
-            self._objects,
-            vessel.pid,
-            self._estate.descriptions if self._estate else None,
-        )
+        if self.has_table_of_parent:
+            for number in set(self._objects.values()) - self._inherited():
+                table.close(number)
+        else:
+            self._rebuild_descriptors(table, vessel)
         restore_process.signal_actions(table, process.signal_actions)
         restore_process.thread_marks(table, thread)
         restore_process.enter_directory(table, process.working_directory, deleted_directory(self._state))
         restore_process.surroundings(table, process)
         if set(self._state.machine.features) & set(processor.features()) >= AMX:
             table.attempt("", "arch_prctl", ARCH_REQ_XCOMP_PERM, AMX_TILES)  # it may have asked for them
+        seccomp.install(table, self._filters_of_all, process.credentials)  # all threads are born with them
         return table
+
+    def _rebuild_descriptors(self, table: CallTable, vessel: Vessel) -> None:
+        given = self._estate.descriptions if self._estate else None
+        self.notes += rebuild_all(table, self._state, self._options, vessel.inner_pid, self._objects, vessel.pid, given)
 
     def _rights_table(self, table: CallTable, vessel: Vessel) -> CallTable:
         """What comes after the birth of the threads, which takes a right."""
@@ -423,6 +537,7 @@ class ProcessRestore:
         restore_process.scheduling(table, thread, vessel)
         deadlines.rebuild(table, state.resources, thread.tid, bool(thread.policy & os.SCHED_RESET_ON_FORK))
         self.notes += restore_process.limits(table, process, vessel)
+        self._confine(table, thread, process.credentials)
         self.notes += restore_process.rights(table, process, vessel)
         restore_process.pending_signals(table, process, vessel.inner_pid)
         restore_process.pending_of_thread(table, process, thread, vessel.inner_pid, vessel.inner_pid)
@@ -440,10 +555,16 @@ class ProcessRestore:
         restore_process.thread_marks(table, thread)
         restore_process.scheduling(table, thread, vessel, f" for thread {thread.tid} ({thread.name})")
         deadlines.rebuild(table, self._state.resources, thread.tid, bool(thread.policy & os.SCHED_RESET_ON_FORK))
+        self._confine(table, thread, credentials)
         restore_process.rights(table, replace(process, credentials=credentials), vessel)
         restore_process.pending_of_thread(table, process, thread, vessel.inner_pid, thread.tid)
         switches.set_again(table, [switch for switch in process.switches if switch[0] in switches.OF_THREADS])
         return table
+
+    def _confine(self, table: CallTable, thread: ThreadState, credentials: Credentials) -> None:
+        """Before it gives up its rights; suspended until it is let go."""
+        found = seccomp.of_thread(self._state.resources, thread.tid)
+        seccomp.confine(table, found, len(self._filters_of_all), credentials)
 
     def _start_threads(self, base: int, tables: list[CallTable]) -> None:
         """Give birth to the other threads, and have each make the calls of its table."""
@@ -487,11 +608,11 @@ class ProcessRestore:
         """Give a thread its registers and mask; it stands in a stop that it can be let go from."""
         self._restore_rseq_section(thread)
         theirs, ours = restore_checks.xstate_layouts(self._state)
-        tracee.set_xstate(x86_64_xstate.fitted(thread.registers["xstate"], theirs, ours, self._own_xstate))
+        tracee.set_xstate(extended.fitted(thread.registers["xstate"], theirs, ours, self._own_xstate))
         tracee.interrupt()  # a signal that comes from now on finds the thread where the kernel decides about interrupted calls
         tracee.cont()
         tracee.wait(call_table.RUN_TIMEOUT_S)
-        tracee.set_registers(x86_64_stub.in_interrupted_call(thread.registers["prstatus"], thread.interrupted))
+        tracee.set_registers(stubs.in_interrupted_call(thread.registers["prstatus"], thread.interrupted))
         tracee.set_signal_mask(thread.signal_mask)
 
     def _restore_rseq_section(self, thread: ThreadState) -> None:
@@ -499,9 +620,13 @@ class ProcessRestore:
         rseq = thread.rseq
         if rseq is None:
             return
-        pointer = restore_memory.content_at(self._state, rseq.address + RSEQ_SECTION_OFFSET, 8)
+        pointer = self._content_at(rseq.address + RSEQ_SECTION_OFFSET, 8)
         if pointer is not None and any(pointer):
             self._tracee.memory.write(rseq.address + RSEQ_SECTION_OFFSET, pointer)
+
+    def _content_at(self, address: int, size: int) -> bytes | None:
+        """Bytes of the program's memory as it was captured; None where no page is carried."""
+        return restore_memory.content_at(self._state, address, size)
 
     def _execute_program(self) -> None:
         """Have the vessel execute the program's own file, so that /proc/PID/exe is right without a right to set it."""
@@ -516,11 +641,11 @@ class ProcessRestore:
         arguments = place + -(-len(content) // 16) * 16
         tracee.memory.write(place, content)
         tracee.memory.write(arguments, place.to_bytes(8, "little") + bytes(16))
-        call = (x86_64_stub.SYSTEM_CALLS["execve"], (place, arguments, arguments + 8))
-        tracee.set_registers(x86_64_stub.at_call(tracee.registers(), instruction, *call))
+        call = (stubs.SYSTEM_CALLS["execve"], (place, arguments, arguments + 8))
+        tracee.set_registers(stubs.at_call(tracee.registers(), instruction, *call))
         self._step()  # into the call
         if self._step().event != PTRACE_EVENT_EXEC:
-            reason = os.strerror(-x86_64_stub.call_result(tracee.registers()))
+            reason = os.strerror(-stubs.call_result(tracee.registers()))
             raise RestoreError(f"cannot execute {path} in the vessel: {reason}")
         self._step()  # out of the call, into a program that has not run yet
 
@@ -530,13 +655,13 @@ class ProcessRestore:
 
     def _syscall_instruction(self, start: int, size: int) -> int:
         image = self._tracee.memory.read(start, size)
-        offset = image.find(x86_64.SYSCALL)
+        offset = image.find(cpu.SYSCALL)
         if offset < 0:
             raise RestoreError("cannot restore: this kernel's vdso has no syscall instruction to leave by")
         return start + offset
 
     def _single(self, instruction: int, name: str, *arguments: int, by: Tracee | None = None) -> None:
-        number = x86_64_stub.SYSTEM_CALLS[name]
+        number = stubs.SYSTEM_CALLS[name]
         result = call_table.single_call(by or self._tracee, self._start_registers, instruction, number, *arguments)
         if result < 0:
             raise RestoreError(f"cannot {name} as the last step of a restore: {os.strerror(-result)}")

@@ -13,8 +13,9 @@ import ctypes
 import errno
 from collections.abc import Container
 
-from checkpoint.arch import x86_64 as arch
-from checkpoint.engines.waits import Waiting
+from checkpoint.arch import cpu as arch
+from checkpoint.arch.calls import Registers
+from checkpoint.engines.waits import Waiting, made_again
 from checkpoint.errors import CaptureError
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.tracee import Tracee
@@ -33,15 +34,26 @@ class Interruption:
 
     Attributes:
         waiting: of those calls that do not go on by themselves.
+        begins_anew: it may not call restart_syscall(2).
     """
 
     def __init__(self, memory: Memory, *, makes_again: bool = False) -> None:
         self.waiting = Waiting(memory, makes_again=makes_again)
+        self.begins_anew = False
         self._memory = memory
         self._place: Place = ()
         self._number = -1
 
-    def settled(self, registers: arch.Registers) -> tuple[arch.Registers, str]:
+    def undisturbed(self, registers: Registers) -> Registers:
+        """The registers that the live program gets back: see `Waiting.undisturbed`."""
+        registers = self.waiting.undisturbed(registers)
+        if not self.begins_anew or ctypes.c_int64(registers[arch.RESULT]).value != arch.RESTART_BLOCK:
+            return registers
+        number, registers = self._interrupted(registers, arch.call_number(registers))
+        known = arch.SYSCALL_NAMES.get(number) in arch.RESTART_BLOCK_USERS
+        return made_again({**registers, arch.CALL_NUMBER: number}, 0) if known else registers
+
+    def settled(self, registers: Registers) -> tuple[Registers, str]:
         """The registers that a snapshot goes on with, and the name of the call that is made again ("" if none)."""
         number = arch.call_number(registers)
         result = ctypes.c_int64(registers[arch.RESULT]).value
@@ -53,20 +65,25 @@ class Interruption:
             return self._from_restart_block(registers, number)
         return registers, ""
 
-    def _from_restart_block(self, registers: arch.Registers, number: int) -> tuple[arch.Registers, str]:
+    def _from_restart_block(self, registers: Registers, number: int) -> tuple[Registers, str]:
+        number, registers = self._interrupted(registers, number)
+        if arch.SYSCALL_NAMES.get(number) not in arch.RESTART_BLOCK_USERS:
+            ended = {**registers, arch.RESULT: -errno.EINTR, arch.CALL_NUMBER: arch.NO_CALL}
+            return ended, ""
+        return _again(registers, number)
+
+    def _interrupted(self, registers: Registers, number: int) -> tuple[int, Registers]:
+        """The call itself, and the registers with which it waits for what is left of its time."""
         place = tuple(registers[name] for name in (arch.INSTRUCTION_POINTER, arch.STACK_POINTER, *arch.ARGUMENTS))
         if number == arch.SYSCALLS["restart_syscall"]:
             number = self._number if place == self._place else self._read_from_code(registers[arch.INSTRUCTION_POINTER])
         self._place, self._number = place, number
         name = arch.SYSCALL_NAMES.get(number, "")
-        if name not in arch.RESTART_BLOCK_USERS:
-            ended = {**registers, arch.RESULT: -errno.EINTR, arch.CALL_NUMBER: arch.NO_CALL}
-            return ended, ""
         if name in arch.REMAINING_TIME:
             asked, remaining = (arch.ARGUMENTS[index] for index in arch.REMAINING_TIME[name])
             if registers[remaining]:
                 registers = {**registers, asked: registers[remaining]}
-        return _again(registers, number)
+        return number, registers
 
     def _read_from_code(self, instruction_pointer: int) -> int:
         try:
@@ -101,12 +118,12 @@ class Interruptions:
     def mend(self, tracee: Tracee) -> None:
         """Let a thread that stands still, and has not been given registers, go on as if it had not been stopped."""
         found = arch.decode_registers(tracee.registers())
-        mended = self.of(tracee).waiting.undisturbed(found)
+        mended = self.of(tracee).undisturbed(found)
         if mended != found:
             tracee.set_registers(arch.encode_registers(mended))
 
 
-def _again(registers: arch.Registers, number: int) -> tuple[arch.Registers, str]:
+def _again(registers: Registers, number: int) -> tuple[Registers, str]:
     again = {
         **registers,
         arch.RESULT: number,
@@ -116,7 +133,7 @@ def _again(registers: arch.Registers, number: int) -> tuple[arch.Registers, str]
     return again, arch.SYSCALL_NAMES.get(number, str(number))
 
 
-def outside_critical_section(registers: arch.Registers, memory: Memory, rseq_address: int) -> arch.Registers:
+def outside_critical_section(registers: Registers, memory: Memory, rseq_address: int) -> Registers:
     """The registers as the kernel itself would set them after a preemption inside a restartable sequence: at its abort point.
 
     Source: rseq(2); kernel/rseq.c, rseq_ip_fixup(): struct rseq holds the address of struct rseq_cs at offset 8.

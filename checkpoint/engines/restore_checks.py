@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Final
 
 from checkpoint import carried, portable, tree
-from checkpoint.arch import x86_64, x86_64_xstate
-from checkpoint.arch.x86_64_xstate import Layout
+from checkpoint.arch import cpu, extended
 from checkpoint.capability import Area, by_rule, refused
 from checkpoint.contents import DIGEST_SIZE, digest_of_file, path_in
+from checkpoint.digests_of_files import DigestOf
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import restore_kinds, restore_vdso
 from checkpoint.engines.description import this_machine
@@ -26,7 +26,7 @@ from checkpoint.engines.restore_memory import is_file_mapping, kernel_pages, mak
 from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux import abi, processor, procfs
 from checkpoint.model import FileIdentity, Resource, Snapshot
-from checkpoint.resources import attached_devices, rebuild, writers
+from checkpoint.resources import aio_rings, attached_devices, covered_files, rebuild, writers
 from checkpoint.resources.rebuilding import number_of
 
 CAPABILITIES: Final = (
@@ -129,19 +129,19 @@ def require(state: Snapshot, options: RestoreOptions, vessel_pid: int) -> tuple[
     return tuple(brought)
 
 
-def _compare(state: Snapshot, options: RestoreOptions) -> tuple[tuple[str, ...], Brought]:
+def _compare(state: Snapshot, options: RestoreOptions, digest_of: DigestOf = digest_of_file) -> tuple[tuple[str, ...], Brought]:
     """Everything in which this machine differs from what the snapshot needs, one sentence each; and what was brought for it."""
     architecture = os.uname().machine
-    if state.machine.architecture != architecture or architecture != x86_64.NAME:
+    if state.machine.architecture != architecture or architecture != cpu.NAME:
         reason = f"it was taken on {state.machine.architecture}, this machine is {architecture}: restore it on such a machine"
         return (reason,), Brought()
     run: dict[str, str] = {}
     opened: dict[str, str] = {}
-    of_files = (*_of_files(state, options, run), *_of_descriptors(state, options, opened))
+    of_files = (*_of_files(state, options, run, digest_of), *_of_descriptors(state, options, opened, digest_of))
     return (*_of_machine(state, options), *of_files), Brought(run, opened)
 
 
-def lacks(outline: Snapshot, options: RestoreOptions) -> tuple[str, ...]:
+def lacks(outline: Snapshot, options: RestoreOptions, digest_of: DigestOf) -> tuple[str, ...]:
     """What this machine lacks of what a program needs that still runs elsewhere, one sentence each.
 
     What it writes to may change until it comes: of that only whether it is there is looked at. Not asked are who else writes to
@@ -153,7 +153,7 @@ def lacks(outline: Snapshot, options: RestoreOptions) -> tuple[str, ...]:
     found: list[str] = []
     for view in tree.views(carried.without(outline)):
         expected = (*options.accept_changed, *carried.every_path(outline), *_in_flux(view))
-        found += _compare(view, replace(options, accept_changed=expected))[0]
+        found += _compare(view, replace(options, accept_changed=expected), digest_of)[0]
     return tuple(dict.fromkeys(found))
 
 
@@ -183,6 +183,7 @@ def _of_machine(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
         cure = "use one that has them, or start it with failover run --portable"
         yield f"this processor lacks {listed}, by which the program may have chosen its code: {cure}"
     yield from restore_kinds.refuse(state)
+    yield from aio_rings.mismatches(state.vmas)
     if any(vma.guards for vma in state.vmas) and not can_install_guards():
         yield f"it has guard pages of madvise(2), which our kernel ({here.kernel}) does not know: boot Linux 6.13 or later"
     if state.process.root_directory != "/":
@@ -206,19 +207,19 @@ def _of_threads(state: Snapshot) -> Iterator[str]:
         yield "its first thread is not told: capture it again"
     for thread in state.threads:
         registers = thread.registers
-        if len(registers.get("prstatus", b"")) != x86_64.REGISTERS_SIZE or not registers.get("xstate"):
+        if len(registers.get("prstatus", b"")) != cpu.REGISTERS_SIZE or not registers.get("xstate"):
             yield f"the registers of its thread {thread.tid} are not those of this processor: capture it again"
             continue
-        if names := ", ".join(x86_64_xstate.lacking(registers["xstate"], *xstate_layouts(state))):
+        if names := ", ".join(extended.lacking(registers["xstate"], *xstate_layouts(state))):
             cure = "use the same processor, or another checkpoint"
             yield f"its thread {thread.tid} is using {names}, which cannot be had here: {cure}"
 
 
-def xstate_layouts(state: Snapshot) -> tuple[Layout, Layout]:
+def xstate_layouts(state: Snapshot) -> tuple[extended.Layout, extended.Layout]:
     """Where the components of the threads' extended states lie there, and here; the same where nobody has told."""
     ours = processor.xstate_layout()
     told = state.threads[0].registers.get("xstate_layout", b"") if state.threads else b""
-    theirs = x86_64_xstate.decode_layout(told)
+    theirs = extended.decode_layout(told)
     return theirs or ours, ours or theirs
 
 
@@ -235,7 +236,7 @@ def can_install_guards() -> bool:
 # --- Files -----------------------------------------------------------------------------------------------------------
 
 
-def _of_files(state: Snapshot, options: RestoreOptions, brought: dict[str, str]) -> Iterator[str]:
+def _of_files(state: Snapshot, options: RestoreOptions, brought: dict[str, str], digest_of: DigestOf) -> Iterator[str]:
     """The executable and everything that is mapped: the program runs their bytes, so they must be the very same.
 
     Args:
@@ -246,21 +247,29 @@ def _of_files(state: Snapshot, options: RestoreOptions, brought: dict[str, str])
     for identity in {identity.path: identity for identity in (state.process.executable, *mapped)}.values():
         if identity.path in options.accept_changed or _is_made(state, identity.path):
             continue
-        reasons = tuple(_of_file(identity, is_written=identity.path in written))
-        content, damage = _content(options, identity.digest if reasons and identity.path not in written else b"")
+        reasons = tuple(_of_file(identity, digest_of, is_written=identity.path in written))
+        content, damage = _content(options, identity.digest if reasons and identity.path not in written else b"", digest_of)
         if content:
             brought[identity.path] = content
         else:
             yield from (reason + damage for reason in reasons)
 
 
-def _content(options: RestoreOptions, digest: bytes) -> tuple[str, str]:
+def of_mapped_files(
+    state: Snapshot, options: RestoreOptions, digest_of: DigestOf = digest_of_file
+) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Why its executable, or what it maps, cannot be had here; and the contents to open for what was brought along, by path."""
+    brought: dict[str, str] = {}
+    return tuple(_of_files(state, options, brought, digest_of)), brought
+
+
+def _content(options: RestoreOptions, digest: bytes, digest_of: DigestOf) -> tuple[str, str]:
     """The file that was brought with this digest, or "" and what is wrong with it ("" if there is none)."""
     if not options.contents or len(digest) != DIGEST_SIZE:
         return "", ""
     path = str(path_in(options.contents, digest))
     try:
-        if digest_of_file(path) == digest:
+        if digest_of(path) == digest:
             return path, ""
     except OSError:
         return "", ""
@@ -272,7 +281,7 @@ def _is_made(state: Snapshot, path: str) -> bool:
     return not os.path.lexists(path) and makes_shared_memory(state.vmas, path)
 
 
-def _of_file(identity: FileIdentity, *, is_written: bool) -> Iterator[str]:
+def _of_file(identity: FileIdentity, digest_of: DigestOf, *, is_written: bool) -> Iterator[str]:
     """Why a file is not the one that was mapped.
 
     Args:
@@ -290,13 +299,13 @@ def _of_file(identity: FileIdentity, *, is_written: bool) -> Iterator[str]:
         return
     if identity.size and about.st_size != identity.size:
         yield f"{path} is another file: {about.st_size} bytes here, {identity.size} there; {_FAR}"
-    elif identity.digest and digest_of_file(path) != identity.digest:
+    elif identity.digest and digest_of(path) != identity.digest:
         yield f"{path} is another file: as long, but its content differs; {_FAR}"
     elif not identity.digest and identity.build_id and build_id(path) != identity.build_id:
         yield f"{path} is another build of that file (its build id differs); {_FAR}"
 
 
-def _of_descriptors(state: Snapshot, options: RestoreOptions, brought: dict[str, str]) -> Iterator[str]:
+def _of_descriptors(state: Snapshot, options: RestoreOptions, brought: dict[str, str], digest_of: DigestOf) -> Iterator[str]:
     for held in state.resources:
         path = str(held.facts.get("path", ""))
         if held.kind not in rebuild.KINDS:
@@ -304,20 +313,22 @@ def _of_descriptors(state: Snapshot, options: RestoreOptions, brought: dict[str,
         elif held.kind == "files" and not held.facts.get("deleted") and path not in options.accept_changed:
             if _is_made(state, path):
                 continue
-            reasons = tuple(_of_open_file(held, path, state.machine.boot_id == this_machine().boot_id))
+            reasons = tuple(_of_open_file(held, path, state.machine.boot_id == this_machine().boot_id, digest_of))
             digest = held.facts.get("digest")
-            content, damage = _content(options, digest if reasons and isinstance(digest, bytes) else b"")
+            content, damage = _content(options, digest if reasons and isinstance(digest, bytes) else b"", digest_of)
             if content:
                 brought[path] = content
             else:
                 yield from (reason + damage for reason in reasons)
         elif held.kind == attached_devices.KIND:
             yield from attached_devices.mismatches(held, options.terms.devices)
+        elif held.kind == covered_files.KIND and options.own_eyes:
+            yield covered_files.refuse_user(held)
         elif held.kind in rebuild.NEEDED:
             yield from rebuild.NEEDED[held.kind](held)
 
 
-def _of_open_file(held: Resource, path: str, same_boot: bool) -> Iterator[str]:
+def _of_open_file(held: Resource, path: str, same_boot: bool, digest_of: DigestOf) -> Iterator[str]:
     """A file that was only read must be the same; one that was written at its end may have grown, and is cut back.
 
     Args:
@@ -341,7 +352,7 @@ def _of_open_file(held: Resource, path: str, same_boot: bool) -> Iterator[str]:
         yield f"{named} has {about.st_size} bytes here and {size} there; {_FAR}, or {shared}"
     elif same_file and about.st_mtime_ns != facts["mtime_ns"] and rebuild.is_written(held) and not grows:
         yield f"{named} was written to since the snapshot, and not only at its end; end the program with the capture, or {shared}"
-    elif digest and digest_of_file(path) != digest:
+    elif digest and digest_of(path) != digest:
         yield f"{named} has another content here; {_FAR}, or {shared}"
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Final
 
-from checkpoint.arch import x86_64_xstate
+from checkpoint.arch import extended
 from checkpoint.capability import Area, by_rule, preserved
 from checkpoint.linux import abi, processor
 from checkpoint.linux.call_table import CallTable
@@ -27,7 +27,7 @@ CAPABILITIES: Final = (
     preserved(
         Area.MEMORY,
         "advice: transparent huge pages, DONTFORK, WIPEONFORK, DONTDUMP, merging; droppable and sealed mappings",
-        "as it was; what is excluded from core dumps is carried all the same",
+        "as it was; what is excluded from core dumps is carried all the same, what is droppable begins empty",
     ),
     preserved(
         Area.MEMORY,
@@ -88,9 +88,9 @@ def keys_of(state: Snapshot) -> frozenset[int]:
     """The protection keys that the program has: they guard memory, or a thread has a right by them."""
     guarding = {key_in(vma.flags) for vma in state.vmas} - {0}
     told = state.threads[0].registers.get("xstate_layout", b"") if state.threads else b""
-    layout = x86_64_xstate.decode_layout(told) or processor.xstate_layout()
+    layout = extended.decode_layout(told) or processor.xstate_layout()
     for thread in state.threads:
-        rights = x86_64_xstate.key_rights(thread.registers.get("xstate", b""), layout)
+        rights = extended.key_rights(thread.registers.get("xstate", b""), layout)
         if rights is not None:
             guarding |= {key for key in range(FIRST_KEY, LAST_KEY + 1) if rights >> 2 * key & 3 != KEY_DENIES}
     return frozenset(guarding)

@@ -26,10 +26,10 @@ from checkpoint.linux import abi, vm_flags
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import MapsLine
-from checkpoint.linux.tracking import MEMORY_PLACE
+from checkpoint.linux.tracking import MEMORY_PLACE, NONE
 from checkpoint.model import PageRun, Snapshot, Vma, VmaKind
 from checkpoint.pages import Words
-from checkpoint.resources import memory_files, nameless, system_v_memory
+from checkpoint.resources import aio_rings, memory_files, nameless, system_v_memory
 
 OWNERS_ALONE: Final = 0o600
 MREMAP_MAYMOVE_FIXED: Final = 1 | 2
@@ -100,13 +100,14 @@ Object = tuple[int, int]
 def map_program(
     table: CallTable,
     vmas: Iterable[Vma],
-    runs: Sequence[PageRun],
+    runs: Sequence[PageRun] | Words,
     brought: Mapping[str, int],
     inherited: Mapping[Object, int] = MappingProxyType({}),
     anonymous: Mapping[Object, int] = MappingProxyType({}),
     legacy: Legacy = NOTHING,
+    untouched: Words = NONE,
 ) -> dict[Object, int]:
-    """Map everything that the program had, but for attached segments; what will be filled is writable for now.
+    """Map everything that the program had, but for attached segments and rings; what will be filled is writable for now.
 
     Answers with a descriptor of each shared object without a name, by (device, inode): open files may be of the same one.
 
@@ -115,25 +116,27 @@ def map_program(
         inherited: those that are there already: a descriptor of each, which is left as it is.
         anonymous: shared memory that is there already: where it is mapped whole.
         legacy: private memory that is there already.
+        untouched: pages of objects without a name that private mappings show as they are.
     """
     carried = Carried(runs)
     vmas = tuple(vmas)
-    mapped = [vma for vma in vmas if vma.kind not in KERNEL_KINDS and not system_v_memory.is_segment(vma)]
+    made_elsewhere = (system_v_memory.is_segment, aio_rings.is_ring)
+    mapped = [vma for vma in vmas if vma.kind not in KERNEL_KINDS and not any(is_one(vma) for is_one in made_elsewhere)]
     files = [vma for vma in mapped if is_file_mapping(vma)]
     for (path, writable), group in groupby(sorted(files, key=_file_order), key=_file_order):
         pieces = list(group)
         if path in brought and not writable:
             for vma in pieces:
-                _map(table, vma, _first_protection(vma, carried), brought[path])
+                _map(table, vma, first_protection(vma, carried), brought[path])
             continue
         if path.startswith(MEMORY_PLACE) and not os.path.lexists(path):
             descriptor = _make_shared_memory(table, pieces[0])
         else:
             descriptor = table.open(path, (os.O_RDWR if writable else os.O_RDONLY) | os.O_CLOEXEC)
         for vma in pieces:
-            _map(table, vma, _first_protection(vma, carried), descriptor)
+            _map(table, vma, first_protection(vma, carried), descriptor)
         table.close(descriptor)
-    objects = [vma for vma in mapped if is_object_mapping(vma)]
+    objects = [vma for vma in mapped if is_object_mapping(vma) or _shows_object(vma, untouched)]
     made = {
         key: make_object(table, list(group))
         for key, group in groupby(sorted(objects, key=object_of), key=object_of)
@@ -141,14 +144,15 @@ def map_program(
     }
     for vma in objects:
         key = object_of(vma)
-        _map(table, vma, _first_protection(vma, carried), inherited[key] if key in inherited else made[key])
+        _map(table, vma, first_protection(vma, carried), inherited[key] if key in inherited else made[key])
     for vma in mapped:
         if is_anonymous_object(vma) and object_of(vma) in anonymous:
             _map_again(table, vma, anonymous[object_of(vma)])
-    others = (vma for vma in mapped if not is_file_mapping(vma) and not is_object_mapping(vma))
+    there = {vma.start for vma in objects}
+    others = (vma for vma in mapped if not is_file_mapping(vma) and vma.start not in there)
     for piece in joined_shared(vma for vma in others if not (is_anonymous_object(vma) and object_of(vma) in anonymous)):
         for start, end in legacy.without_kept(piece):
-            _map(table, replace(piece, start=start, end=end), _first_protection(piece, carried), -1)
+            _map(table, replace(piece, start=start, end=end), first_protection(piece, carried), -1)
     return made
 
 
@@ -210,7 +214,13 @@ def makes_shared_memory(vmas: Iterable[Vma], path: str) -> bool:
 def is_object_mapping(vma: Vma) -> bool:
     """Whether it is a shared mapping of a memory file, or of a file that has no name any more."""
     is_named_nowhere = vma.kind is VmaKind.FILE and vma.file is not None and vma.file.deleted
-    return is_named_nowhere and vma.shared and not restore_kinds.is_huge(vma)
+    return is_named_nowhere and vma.shared and not restore_kinds.is_huge(vma) and not aio_rings.is_ring(vma)
+
+
+def _shows_object(vma: Vma, untouched: Words) -> bool:
+    """Whether it is a private mapping of one, in some pages of which the object itself is seen."""
+    is_nameless = vma.kind is VmaKind.FILE and vma.file is not None and vma.file.deleted and not vma.shared
+    return is_nameless and not restore_kinds.is_huge(vma) and len(pages.intersection(pages.extents([vma]), untouched)) > 0
 
 
 def object_of(vma: Vma) -> tuple[int, int]:
@@ -274,16 +284,18 @@ def _map(table: CallTable, vma: Vma, protection: int, descriptor: int) -> None:
     table.call(what, "mmap", *arguments, least=vma.start, most=vma.start)
 
 
-def _first_protection(vma: Vma, carried: Carried) -> int:
+def first_protection(vma: Vma, carried: Carried) -> int:
     return vma.protection | (abi.PROT_READ | abi.PROT_WRITE if carried.within(vma) else 0)
 
 
 class Carried:
     """Which mappings the snapshot carries pages for."""
 
-    def __init__(self, runs: Sequence[PageRun]) -> None:
-        self._starts: NDArray[np.uint64] = np.fromiter((run.start for run in runs), np.uint64, len(runs))
-        self._ends: NDArray[np.uint64] = np.fromiter((run.end for run in runs), np.uint64, len(runs))
+    def __init__(self, runs: Sequence[PageRun] | Words) -> None:
+        if not isinstance(runs, np.ndarray):
+            runs = np.array([(run.start, run.end) for run in runs], np.uint64).reshape(-1, 2)
+        self._starts: NDArray[np.uint64] = np.ascontiguousarray(runs[:, 0])
+        self._ends: NDArray[np.uint64] = np.ascontiguousarray(runs[:, 1])
 
     def within(self, vma: Vma) -> bool:
         """Whether a page of this mapping is carried."""
@@ -291,11 +303,15 @@ class Carried:
         return index < len(self._starts) and int(self._starts[index]) < vma.end
 
 
-def fill(memory: Memory, snapshot: Snapshot, legacy: Legacy = NOTHING) -> None:
-    """Write every page that the snapshot carries, but for those of the kernel's own mappings, and those that are there."""
+def fill(memory: Memory, snapshot: Snapshot, legacy: Legacy = NOTHING, untouched: Words = NONE) -> None:
+    """Write every page that the snapshot carries, but for those of the kernel's own mappings, and those that are there.
+
+    Droppable memory begins empty, as its program must expect at any time: seeds of random numbers lie there (vgetrandom), which
+    two lives must not have in common.
+    """
     contents, position = np.frombuffer(snapshot.contents, np.uint8), 0
-    mapped = pages.extents(vma for vma in snapshot.vmas if vma.kind not in KERNEL_KINDS)
-    mapped = pages.difference(mapped, legacy.there)
+    mapped = pages.extents(vma for vma in snapshot.vmas if vma.kind not in KERNEL_KINDS and vm_flags.DROPPABLE not in vma.flags)
+    mapped = pages.difference(pages.difference(mapped, legacy.there), untouched)
     for is_wanted, piece in _cut(snapshot.runs, mapped):
         ranges = piece.copy()
         ranges[:, 1] -= ranges[:, 0]
@@ -330,13 +346,13 @@ def content_at(state: Snapshot, address: int, size: int) -> bytes | None:
     return None
 
 
-def settle(table: CallTable, vmas: Iterable[Vma], runs: Sequence[PageRun]) -> None:
+def settle(table: CallTable, vmas: Iterable[Vma], runs: Sequence[PageRun] | Words) -> None:
     """Give every mapping its own protection, guards, advice, name and lock (a locked mapping takes no guards)."""
     carried = Carried(runs)
     for vma in vmas:
         if vma.kind in KERNEL_KINDS:
             continue
-        if vma.shared or _first_protection(vma, carried) != vma.protection:
+        if vma.shared or first_protection(vma, carried) != vma.protection:
             table.call(f"protect {vma.start:#x}", "mprotect", vma.start, vma.size, vma.protection)
         for guard in vma.guards:
             table.call(f"install a guard at {guard.start:#x}", "madvise", guard.start, guard.size, abi.MADV_GUARD_INSTALL)

@@ -21,7 +21,7 @@ from checkpoint.errors import RestoreError
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.call_table import AT_FDCWD, CallTable
 from checkpoint.model import Credentials, IntervalTimer, PosixTimer, ProcessState, SignalAction, ThreadState
-from checkpoint.resources import deadlines, nameless
+from checkpoint.resources import deadlines, kernel_files, nameless
 
 _NO_FILE: Final = 0xFFFFFFFF
 _MM_MAP: Final = struct.Struct("<12Q2I")
@@ -312,13 +312,15 @@ def make_directories(table: CallTable, directories: Iterable[str]) -> None:
 
 
 def enter_directory(table: CallTable, directory: str, opened: int | None) -> None:
-    """Make a directory the working one; one that is gone is made again, and goes again.
+    """Make a directory the working one; one that is gone is made again, and goes again; `departed` has entered one of /proc.
 
     Args:
         opened: a descriptor that the program has of it, if it is gone.
     """
     if opened is not None:
         table.call(f"enter the working directory {directory}", "fchdir", opened)
+    elif kernel_files.left_by_ended(directory):
+        return
     elif procfs.is_gone(directory):
         made = nameless.make_directory(table, directory.removesuffix(procfs.DELETED), DIRECTORY_MODE)
         table.call(f"enter the working directory {directory}", "fchdir", made)

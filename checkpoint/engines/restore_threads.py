@@ -17,7 +17,7 @@ import struct
 from collections.abc import Iterable
 from typing import Final
 
-from checkpoint.arch import x86_64, x86_64_stub
+from checkpoint.arch import cpu, stubs
 from checkpoint.errors import CheckpointError, ProcessGoneError, RestoreError
 from checkpoint.linux import abi, call_table
 from checkpoint.linux.tracee import Tracee
@@ -31,6 +31,7 @@ CLONE_SYSVSEM: Final = 0x40000
 FLAGS: Final = CLONE_VM | CLONE_FS | CLONE_FILES | CLONE_SIGHAND | CLONE_THREAD | CLONE_SYSVSEM
 """What pthread_create(3) shares; what it sets (thread-local storage, addresses for its id) comes with registers and table."""
 
+ANY_ID: Final = 0
 PTRACE_EVENT_FORK: Final = 1
 _ARGUMENTS: Final = struct.Struct("<10Q")
 """struct clone_args of linux/sched.h, as far as set_tid_size: the ids wanted are a list of their own."""
@@ -51,13 +52,21 @@ def spawn(leader: Tracee, registers: bytes, base: int, tid: int) -> Tracee:
     return thread
 
 
-def spawn_process(parent: Tracee, registers: bytes, base: int, pid: int, exit_signal: int) -> Tracee:
+def spawn_process(parent: Tracee, registers: bytes, base: int, pid: int, exit_signal: int, flags: int) -> Tracee:
     """Have a process give birth to one with the id ``pid``; it stands still at its first instruction. As `spawn`.
 
     Args:
         exit_signal: what the parent is sent when it ends.
+        flags: of clone(2): what both share.
     """
-    process = Tracee(_birth(parent, registers, base, (0, exit_signal, pid), f"process {pid}"))
+    process = Tracee(_birth(parent, registers, base, (flags, exit_signal, pid), f"process {pid}"))
+    process.wait(call_table.RUN_TIMEOUT_S)
+    return process
+
+
+def spawn_any(parent: Tracee, registers: bytes, base: int) -> Tracee:
+    """Have a process give birth to one with whatever id, of whose end it is told by no signal. As `spawn`."""
+    process = Tracee(_birth(parent, registers, base, (0, 0, ANY_ID), "stand-in for a process that has ended"))
     process.wait(call_table.RUN_TIMEOUT_S)
     return process
 
@@ -70,11 +79,12 @@ def _birth(parent: Tracee, registers: bytes, base: int, wanted: tuple[int, int, 
     """
     place = base + abi.PAGE_SIZE
     flags, exit_signal, tid = wanted
-    arguments = _ARGUMENTS.pack(flags, 0, 0, 0, exit_signal, 0, 0, 0, place + _ARGUMENTS.size, 1)
+    listed = (0, 0) if tid == ANY_ID else (place + _ARGUMENTS.size, 1)
+    arguments = _ARGUMENTS.pack(flags, 0, 0, 0, exit_signal, 0, 0, 0, *listed)
     parent.memory.write(place, arguments + struct.pack("<i", tid))
-    instruction = base + x86_64_stub.CALL_LOOP.index(x86_64.SYSCALL)
-    call = x86_64_stub.SYSTEM_CALLS["clone3"], (place, _ARGUMENTS.size)
-    parent.set_registers(x86_64_stub.at_call(registers, instruction, *call))
+    instruction = base + stubs.CALL_LOOP.index(cpu.SYSCALL)
+    call = stubs.SYSTEM_CALLS["clone3"], (place, _ARGUMENTS.size)
+    parent.set_registers(stubs.at_call(registers, instruction, *call))
     born = 0
     for _ in ("entry", "birth or exit"):
         parent.request("step", abi.PTRACE_SYSCALL)
@@ -83,7 +93,7 @@ def _birth(parent: Tracee, registers: bytes, base: int, wanted: tuple[int, int, 
             parent.request("step", abi.PTRACE_SYSCALL)
             parent.wait(call_table.RUN_TIMEOUT_S)
     if not born:
-        raise RestoreError(f"cannot restore its {what}: {_reason(-x86_64_stub.call_result(parent.registers()))}")
+        raise RestoreError(f"cannot restore its {what}: {_reason(-stubs.call_result(parent.registers()))}")
     return born
 
 

@@ -29,7 +29,7 @@ from itertools import groupby
 from typing import Final
 
 from checkpoint import pages, tree
-from checkpoint.arch import x86_64, x86_64_stub
+from checkpoint.arch import cpu, stubs
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import (
     births,
@@ -40,13 +40,13 @@ from checkpoint.engines import (
     restore_stops,
     restore_threads,
 )
-from checkpoint.engines.births import Birth, End, Join, NewSession, Step
+from checkpoint.engines.births import Birth, End, Join, NewSession, Reaper, Step
 from checkpoint.engines.forked_memory import Legacy
-from checkpoint.engines.ptrace_restore import OPTIONS, REFUGE_SIZE, Estate, ProcessRestore, look_at_vessel
+from checkpoint.engines.ptrace_restore import REFUGE_SIZE, Estate, ProcessRestore, look_at_vessel, options_for
 from checkpoint.engines.restore_checks import Brought
 from checkpoint.engines.restore_process import Vessel
 from checkpoint.errors import CheckpointError, MismatchError, ProcessGoneError, RestoreError
-from checkpoint.linux import abi, call_table, procfs
+from checkpoint.linux import abi, call_table, kinship, procfs
 from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Tracee
@@ -55,9 +55,7 @@ from checkpoint.resources import epolls, files, rebuild, shared, stops, streams,
 from checkpoint.resources.rebuilding import number_of
 
 PTRACE_O_TRACEFORK: Final = 2
-TREE_OPTIONS: Final = OPTIONS | PTRACE_O_TRACEFORK
 WALL: Final = 0x40000000
-NO_CORE: Final = struct.pack("<2Q", 0, 0)
 STOPPED_BY: Final = 0x7F
 """Bits of a wait status that hold the signal that ended a process; 0: it exited."""
 
@@ -106,25 +104,22 @@ class TreeRestore:
     def run(self) -> None:
         """All of it, up to the registers; everybody stands still."""
         first = self._first
-        first.seize(TREE_OPTIONS)
+        first.seize(options_for(self._state) | PTRACE_O_TRACEFORK)
         first.freeze()
         first.set_signal_mask(abi.ALL_SIGNALS & ~(1 << (signal.SIGTRAP - 1)))
         vessel = look_at_vessel(first.pid)
         self._require_rights(vessel)
         self._registers = first.registers()
         estate = self._make_estate(vessel)
-        self._instruction = estate.base + x86_64_stub.CALL_LOOP.index(x86_64.SYSCALL)
+        self._instruction = estate.base + stubs.CALL_LOOP.index(cpu.SYSCALL)
         self._take_terminal(self._state.process.pid)
-        is_apart = vessel.inner_pid != vessel.pid  # where nobody else has pids
-
-        def is_taken(pid: int) -> bool:
-            return not is_apart and os.path.exists(f"/proc/{pid}")
-
-        for step in births.steps_of(self._state, is_taken):
+        for step in births.steps_of(self._state, kinship.taken_pids(first.pid)):
             self._take(step, estate.base)
         self._set_foreground(estate.base)
         for zombie in self._state.zombies:
             self._end_as(zombie, estate.base)
+        if stop := stops.stop_of(self._state.resources):
+            restore_stops.stop(self._first, stop[0])
         for member in self._state.members:
             if stop := stops.stop_of(member.resources):
                 self._stop(member.process, *stop)
@@ -132,7 +127,7 @@ class TreeRestore:
             ProcessRestore(self._born[view.process.pid], view, self._options, brought, estate, legacy)
             for view, brought, legacy in zip(self._views, self._brought, self._legacies, strict=True)
         ]
-        for restoring in self._restoring:
+        for restoring in sorted(self._restoring, key=lambda one: not one.has_table_of_parent):  # which that fills last
             restoring.build()
         for restoring in self._restoring:
             restoring.become_program()
@@ -181,7 +176,7 @@ class TreeRestore:
         self._terminals = terminals.controlling({estate.descriptions[number]: held for number, held in resources.items()})
         stub = Stub(self._first, base)
         image = restore_memory.kernel_pages(mappings)[-1]
-        stub.install(image.start + self._first.memory.read(image.start, image.size).find(x86_64.SYSCALL), AREA_SIZE)
+        stub.install(image.start + self._first.memory.read(image.start, image.size).find(cpu.SYSCALL), AREA_SIZE)
         taken_by_vessel = pages.extents(PageRun(line.start, line.end) for line in mappings)
         inheritance = forked_memory.of(views, taken_by_vessel)
         self._legacies = inheritance.legacies
@@ -237,14 +232,17 @@ class TreeRestore:
 
     def _take(self, step: Step, base: int) -> None:
         match step:
-            case Birth(parent, pid, exit_signal):
+            case Birth(parent, pid, exit_signal, flags):
                 mother = self._born[parent]
-                self._born[pid] = restore_threads.spawn_process(mother, self._registers, base, pid, exit_signal)
+                self._born[pid] = restore_threads.spawn_process(mother, self._registers, base, pid, exit_signal, flags)
             case NewSession(pid):
                 self._call(pid, f"make session {pid}", "setsid")
                 self._take_terminal(pid)
             case Join(pid, group):
                 self._call(pid, f"have process {pid} join group {group}", "setpgid", 0, group)
+            case Reaper(pid, is_one):
+                what = f"have process {pid} be given orphans" if is_one else f"have process {pid} be given no more orphans"
+                self._call(pid, what, "prctl", abi.PR_SET_CHILD_SUBREAPER, int(is_one))
             case End(parent, pid):
                 self._exit(pid, 0)
                 self._call(parent, f"take note of the end of {pid}", "wait4", pid, 0, WALL, 0)
@@ -278,7 +276,7 @@ class TreeRestore:
         self._call(pid, "close a terminal", "close", slave)
 
     def _call(self, pid: int, what: str, name: str, *arguments: int) -> int:
-        number = x86_64_stub.SYSTEM_CALLS[name]
+        number = stubs.SYSTEM_CALLS[name]
         result = call_table.single_call(self._born[pid], self._registers, self._instruction, number, *arguments)
         if result < 0:
             raise RestoreError(f"cannot {what}: {os.strerror(-result)}")
@@ -286,8 +284,8 @@ class TreeRestore:
 
     def _exit(self, pid: int, status: int) -> None:
         tracee = self._born[pid]
-        number = x86_64_stub.SYSTEM_CALLS["exit_group"]
-        tracee.set_registers(x86_64_stub.at_call(self._registers, self._instruction, number, (status,)))
+        number = stubs.SYSTEM_CALLS["exit_group"]
+        tracee.set_registers(stubs.at_call(self._registers, self._instruction, number, (status,)))
         tracee.cont()
         _await_end(tracee)
 

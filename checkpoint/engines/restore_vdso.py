@@ -24,8 +24,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
-from checkpoint.arch import x86_64
-from checkpoint.arch import x86_64_stub as arch
+from checkpoint.arch import cpu
+from checkpoint.arch import stubs as arch
 from checkpoint.capability import Area, preserved
 from checkpoint.engines.description import this_machine
 from checkpoint.engines.restore_memory import KERNEL_KINDS, content_at, kernel_pages_of
@@ -120,12 +120,12 @@ def run_out(tracee: Tracee, registers: bytes, code: Vma, open_data: Callable[[],
     registers = arch.with_registers(registers)
     asked = opened = False
     for _ in range(STEP_LIMIT):
-        place = x86_64.decode_registers(registers)[x86_64.INSTRUCTION_POINTER]
+        place = cpu.decode_registers(registers)[cpu.INSTRUCTION_POINTER]
         if not code.start <= place < code.end:
             if opened and not asked:
                 break
             return registers
-        asked |= image.startswith(x86_64.SYSCALL, place - code.start)
+        asked |= image.startswith(cpu.SYSCALL, place - code.start)
         tracee.set_registers(registers)
         tracee.request("step", abi.PTRACE_SINGLESTEP)
         stop = tracee.wait()
@@ -144,7 +144,7 @@ def run_out(tracee: Tracee, registers: bytes, code: Vma, open_data: Callable[[],
 
 def stands_in(registers: bytes, image: Vma) -> bool:
     """Whether a thread is in the middle of an image."""
-    return image.start <= x86_64.decode_registers(registers)[x86_64.INSTRUCTION_POINTER] < image.end
+    return image.start <= cpu.decode_registers(registers)[cpu.INSTRUCTION_POINTER] < image.end
 
 
 def jumps(state: Snapshot, own: int, functions: Sequence[Function]) -> list[tuple[int, bytes]]:

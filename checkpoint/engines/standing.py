@@ -8,21 +8,26 @@ import os
 from dataclasses import dataclass
 from typing import Final
 
-from checkpoint.arch import x86_64 as arch
+from checkpoint.arch import cpu as arch
+from checkpoint.arch.calls import Registers
 from checkpoint.device_rules import DeviceRule
-from checkpoint.engines.entering import Entered, require_answers, where_it_stands
+from checkpoint.engines.confinements import Confinements
+from checkpoint.engines.entering import Entered, where_it_stands
 from checkpoint.engines.inquiry import Inquiry, Told, rearmed
 from checkpoint.engines.outputs import Outputs
 from checkpoint.engines.standing_threads import ThreadOnlooker, ThreadPlace, ThreadStanding
 from checkpoint.errors import CaptureError
-from checkpoint.linux import procfs
-from checkpoint.linux.descriptors import KeptTexts, lending
-from checkpoint.linux.procfs import Stat, Status
+from checkpoint.linux import confinement, procfs
+from checkpoint.linux.confinement import FREE, Confinement
+from checkpoint.linux.descriptors import lending
+from checkpoint.linux.procfs import KeptFiles, Stat, Status
+from checkpoint.linux.readings import Reading, Readings
 from checkpoint.linux.remote import Answers
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.timers import parse_timers
 from checkpoint.model import Rseq
-from checkpoint.resources import Opened, OpenFile, gather, with_contents
+from checkpoint.resources import Kept, Opened, OpenFile, gather, with_contents
+from checkpoint.resources.recollection import Recollection
 from checkpoint.resources.thread_rights import ThreadRights
 from checkpoint.stream_counts import Totals
 
@@ -38,14 +43,28 @@ class Place:
         special: signals with an action of their own, bit 0 is signal 1.
     """
 
-    registers: arch.Registers
-    mask: int
+    registers: Registers
+    reading: Reading
     special: int
-    pending: tuple[bytes, ...]
     shared_pending: tuple[bytes, ...]
-    rseq: Rseq | None
     status_text: bytes
     others: tuple[ThreadPlace, ...] = ()
+    confinement: Confinement = FREE
+
+    @property
+    def mask(self) -> int:
+        """The program's own."""
+        return self.reading.mask
+
+    @property
+    def pending(self) -> tuple[bytes, ...]:
+        """Signals sent to this very thread."""
+        return self.reading.pending
+
+    @property
+    def rseq(self) -> Rseq | None:
+        """Its registration for restartable sequences."""
+        return self.reading.rseq
 
     def every_pending(self) -> tuple[bytes, ...]:
         """Whatever is pending anywhere."""
@@ -64,10 +83,8 @@ class Standing:
 
     place: Place
     others: tuple[ThreadStanding, ...]
-    xstate: bytes
-    settled: arch.Registers
+    settled: Registers
     interrupted: str
-    stat_text: bytes
     inquiry: Inquiry
     answers: Answers
     waiting: tuple[bytes, ...]
@@ -87,7 +104,7 @@ class Standing:
     @functools.cached_property
     def stat(self) -> Stat:
         """Its /proc/PID/stat."""
-        return procfs.parse_stat(os.fsdecode(self.stat_text))
+        return procfs.parse_stat(os.fsdecode(self.place.reading.stat_text))
 
 
 class Onlooker:
@@ -101,8 +118,12 @@ class Onlooker:
         self._devices = devices
         self._tracee = threads.leader
         self._threads = threads
-        self._texts = KeptTexts(threads.pid)
-        self._others = ThreadOnlooker(threads, entered)
+        self._kept = Kept(threads.pid)
+        self._files = KeptFiles(threads.pid)
+        self._readings = Readings()
+        self._confinements = Confinements(threads.pid, entered.interruptions)
+        self._others = ThreadOnlooker(threads, entered, self._confinements)
+        self._recollection = Recollection()
         self.rights = ThreadRights(threads.pid)
         self._borrowed = entered.pages
         self._interruptions = entered.interruptions
@@ -111,15 +132,16 @@ class Onlooker:
 
     def gather(self) -> Opened:
         """What it has open; for an exact picture it stands still."""
-        return gather(self._tracee.pid, self._texts)
+        return gather(self._tracee.pid, self._kept)
 
     def _with_contents(self, opened: Opened) -> tuple[OpenFile, ...]:
         with lending(self._tracee.pid):
-            return with_contents(opened, self._borrowed.noted, self._devices)
+            return with_contents(opened, self._borrowed.noted, self._devices, self._recollection)
 
     def close(self) -> None:
         """Close what is kept open of it."""
-        self._texts.close()
+        self._kept.texts.close()
+        self._files.close()
         self._others.close()
 
     def is_entered(self) -> bool:
@@ -133,8 +155,10 @@ class Onlooker:
             self._questions(special)
             with contextlib.suppress(CaptureError):  # it runs: one of its threads has just closed something
                 with_contents(self.gather(), None, self._devices)
+            self._kept.texts.forget()
             if self._threads.is_one_of_many:  # what all of them have open is read for all of them, not by what stays open
-                self._texts.close()
+                self._kept.texts.close()
+        self._recollection.prepare()
         self._others.prepare()
         self.rights.prepare()
 
@@ -143,20 +167,22 @@ class Onlooker:
 
         Raises:
             CaptureError: it has not left the code of an earlier look yet.
-            UnsupportedError: it has come under a seccomp filter since.
+            UnsupportedError: it has come under a seccomp filter since, and we may do nothing about it.
         """
         tracee = self._tracee
-        status = procfs.read_bytes(tracee.pid, "status")
-        require_answers(tracee.pid, status)
-        special, waits_here, waits_shared = procfs.signal_sets(status)
-        pending = tracee.pending(shared=False) if waits_here else ()
+        status = self._files.read("status")
+        mode = confinement.mode_in(status)
+        confined = self._confinements.suspended(tracee, mode, (tracee.pid, 0))
+        reading, *of_others = self._readings.read(
+            [tracee, *self._threads.others], [self._files.descriptor("stat"), *self._others.stat_files()]
+        )
+        special, _, waits_shared = procfs.signal_sets(status)
         shared_pending = tracee.pending(shared=True) if waits_shared else ()
-        mask, rseq = tracee.signal_mask(), tracee.rseq()
-        registers = where_it_stands(tracee, self._interruptions, rseq)
+        registers = where_it_stands(tracee, reading.registers, reading.rseq, self._interruptions)
         if self._borrowed.holds(registers[arch.INSTRUCTION_POINTER]):
             raise CaptureError(f"pid {tracee.pid} still stands in code of an earlier look; capture it again in a moment")
-        others = self._others.places()
-        return Place(registers, mask, special, pending, shared_pending, rseq, status, others)
+        others = self._others.places(of_others, self.rights.modes, mode)
+        return Place(registers, reading, special, shared_pending, status, others, confined)
 
     def ask(self, place: Place, outputs: Outputs | None, opened: Opened | None = None) -> Standing:
         """Everything else. Its system calls are made inside the process: the memory has been taken before.
@@ -175,10 +201,8 @@ class Onlooker:
         return Standing(
             place=place,
             others=others,
-            xstate=tracee.xstate(),
             settled=settled,
             interrupted=interrupted,
-            stat_text=procfs.read_bytes(tracee.pid, "stat"),
             inquiry=inquiry,
             answers=answers,
             waiting=waiting,
@@ -187,7 +211,7 @@ class Onlooker:
         )
 
     def _questions(self, special: int) -> Inquiry:
-        timers = procfs.read_bytes(self._tracee.pid, "timers")
+        timers = self._files.read("timers")
         key = (special, timers)
         if self._inquiry is None or self._inquiry_key != key:
             lines = parse_timers(os.fsdecode(timers)) if timers else ()

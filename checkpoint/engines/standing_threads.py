@@ -10,23 +10,23 @@ import contextlib
 import functools
 import os
 import struct
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from checkpoint.arch import x86_64 as arch
-from checkpoint.engines import description
+from checkpoint.arch import cpu as arch
+from checkpoint.arch.calls import Registers
+from checkpoint.engines.confinements import Confinements, Life
 from checkpoint.engines.entering import Entered, where_it_stands
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import abi, procfs
-from checkpoint.linux.descriptors import TEXTS_KEPT
+from checkpoint.linux.confinement import FILTERED, FREE, Confinement
+from checkpoint.linux.kept_descriptors import TEXTS_KEPT
 from checkpoint.linux.procfs import Stat
+from checkpoint.linux.readings import NO_FILE, Reading
 from checkpoint.linux.remote import SMALL, Answers, Batch, Desk, Guest
 from checkpoint.linux.threads import Threads, thread_ids
 from checkpoint.linux.tracee import Tracee
 from checkpoint.model import Rseq
-
-Life = tuple[int, int]
-"""A thread for all its life: its id as we see it, and when it began."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,16 +36,31 @@ class ThreadPlace:
     Attributes:
         registers: that it is given back.
         inner_tid: its id as it sees it itself.
+        confinement: by seccomp(2); suspended as long as it stands.
     """
 
     tracee: Tracee
     life: Life
     inner_tid: int
     stat_text: bytes
-    registers: arch.Registers
-    mask: int
-    pending: tuple[bytes, ...]
-    rseq: Rseq | None
+    registers: Registers
+    reading: Reading
+    confinement: Confinement = FREE
+
+    @property
+    def mask(self) -> int:
+        """The program's own."""
+        return self.reading.mask
+
+    @property
+    def pending(self) -> tuple[bytes, ...]:
+        """Signals sent to this very thread."""
+        return self.reading.pending
+
+    @property
+    def rseq(self) -> Rseq | None:
+        """Its registration for restartable sequences."""
+        return self.reading.rseq
 
 
 @dataclass(frozen=True)
@@ -58,15 +73,15 @@ class ThreadStanding:
     """
 
     place: ThreadPlace
-    xstate: bytes
-    settled: arch.Registers
+    settled: Registers
     interrupted: str
-    robust_list: tuple[int, int]
-    policy: int
-    affinity: tuple[int, ...]
-    io_priority: int
     questions: ThreadQuestions
     answers: Answers
+
+    @property
+    def reading(self) -> Reading:
+        """What the kernel told of it."""
+        return self.place.reading
 
     @functools.cached_property
     def stat(self) -> Stat:
@@ -132,8 +147,10 @@ def _start_time(stat_text: bytes) -> int:
 class ThreadOnlooker:
     """Asks the threads of one process besides the first, again and again."""
 
-    def __init__(self, threads: Threads, entered: Entered) -> None:
+    def __init__(self, threads: Threads, entered: Entered, confinements: Confinements) -> None:
         self._threads = threads
+        self._confinements = confinements
+        self._modes: dict[Life, int] = {}
         self._borrowed = entered.pages
         self._questions = [ThreadQuestions(desk) for desk in entered.pages.desks]
         self._inner_tids: dict[Life, int] = {}
@@ -171,44 +188,54 @@ class ThreadOnlooker:
         return procfs.read_line(self._threads.pid, name)
 
     def _inner_tid(self, life: Life) -> int:
-        """Its id as it sees it itself.
-
-        Raises:
-            UnsupportedError: it cannot be asked anything.
-        """
+        """Its id as it sees it itself; whether it is confined since its birth is noted by the way."""
         tid = life[0]
         if life not in self._inner_tids:
             status = procfs.parse_status(procfs.read_text(self._threads.pid, f"task/{tid}/status"))
             if status.seccomp:
-                reason = f"its thread {tid} runs under a seccomp filter, which forbids what a capture asks of it"
-                raise UnsupportedError(f"cannot capture pid {self._threads.pid}: {reason}", (reason,))
+                self._modes[life] = status.seccomp
             self._inner_tids[life] = status.pids[-1]
         return self._inner_tids[life]
 
-    def places(self) -> tuple[ThreadPlace, ...]:
+    def stat_files(self) -> list[int]:
+        """Of those that stand still: what `Readings.read` is to read of them."""
+        return [self._stats.get(tracee.pid, NO_FILE) for tracee in self._threads.others]
+
+    def places(self, readings: Sequence[Reading], modes: Mapping[int, int], of_first: int) -> tuple[ThreadPlace, ...]:
         """Where they stand.
+
+        Args:
+            readings: what the kernel told of each.
+            modes: of seccomp(2), by thread, of those that were confined before the freeze.
+            of_first: that of the first thread, which may have given its filters to all.
 
         Raises:
             CaptureError: one has not left the code of an earlier look yet.
+            UnsupportedError: it is confined, and we may do nothing about it.
         """
-        found = tuple(self._place(tracee) for tracee in self._threads.others)
+        unknown = FILTERED if of_first else 0
+        told = zip(self._threads.others, readings, strict=True)
+        found = tuple(self._place(tracee, reading, modes.get(tracee.pid, unknown)) for tracee, reading in told)
         if len(self._inner_tids) > len(found):
             lives = {place.life for place in found}
             self._inner_tids = {life: tid for life, tid in self._inner_tids.items() if life in lives}
+            self._modes = {life: mode for life, mode in self._modes.items() if life in lives}
             tids = frozenset(tid for tid, _ in lives)
             self._interruptions.keep_only({self._threads.pid, *tids})
+            self._confinements.keep_only({(self._threads.pid, 0), *lives})
             self._keep_only(tids)
         return found
 
-    def _place(self, tracee: Tracee) -> ThreadPlace:
-        stat_text = self._stat_text(tracee.pid)
-        pending = tracee.pending(shared=False)
-        mask, rseq = tracee.signal_mask(), tracee.rseq()
-        registers = where_it_stands(tracee, self._interruptions, rseq)
+    def _place(self, tracee: Tracee, reading: Reading, mode: int) -> ThreadPlace:
+        stat_text = reading.stat_text or self._stat_text(tracee.pid)
+        life = tracee.pid, _start_time(stat_text)
+        inner_tid = self._inner_tid(life)
+        mode = self._modes.get(life, mode) or (FILTERED if reading.is_filtered else 0)
+        found = self._confinements.suspended(tracee, mode, life)
+        registers = where_it_stands(tracee, reading.registers, reading.rseq, self._interruptions)
         if self._borrowed.holds(registers[arch.INSTRUCTION_POINTER]):
             raise CaptureError(f"thread {tracee.pid} still stands in code of an earlier look; capture it again in a moment")
-        life = tracee.pid, _start_time(stat_text)
-        return ThreadPlace(tracee, life, self._inner_tid(life), stat_text, registers, mask, pending, rseq)
+        return ThreadPlace(tracee, life, inner_tid, stat_text, registers, reading, found)
 
     def ask(self, places: tuple[ThreadPlace, ...]) -> tuple[ThreadStanding, ...]:
         """Everything else."""
@@ -223,17 +250,11 @@ class ThreadOnlooker:
         )
 
     def _standing(self, place: ThreadPlace, questions: ThreadQuestions, answers: Answers) -> ThreadStanding:
-        tid = place.tracee.pid
         settled, interrupted = self._interruptions.of(place.tracee).settled(place.registers)
         return ThreadStanding(
             place=place,
-            xstate=place.tracee.xstate(),
             settled=settled,
             interrupted=interrupted,
-            robust_list=abi.robust_list(tid),
-            policy=description.policy(tid),
-            affinity=tuple(os.sched_getaffinity(tid)),
-            io_priority=abi.io_priority(tid),
             questions=questions,
             answers=answers,
         )

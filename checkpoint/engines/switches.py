@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from checkpoint.errors import RestoreError
+from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.remote import Answers, Batch
 
@@ -39,6 +40,7 @@ NAMES: Final = {
     PR_MCE_KILL: "what a broken page of memory does",
     PR_SET_SPECULATION_CTRL: "a limit on speculation",
     PR_SET_MEMORY_MERGE: "the merging of equal pages",
+    abi.PR_SET_THP_DISABLE: "where there are no transparent huge pages",
     MEMBARRIER: "a registration for memory barriers",
     PR_SET_MDWE: "that nothing written may become code",
 }

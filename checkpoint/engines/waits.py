@@ -38,7 +38,8 @@ import time
 from dataclasses import dataclass, replace
 from typing import Final
 
-from checkpoint.arch import x86_64 as arch
+from checkpoint.arch import cpu as arch
+from checkpoint.arch.calls import MILLISECONDS, SOCKET, Registers, Timeout
 from checkpoint.errors import CaptureError
 from checkpoint.linux import procfs
 from checkpoint.linux.descriptors import copy_of
@@ -98,7 +99,7 @@ class Waiting:
         self._makes_again = makes_again
         self._wait: Wait | None = None
 
-    def undisturbed(self, registers: arch.Registers) -> arch.Registers:
+    def undisturbed(self, registers: Registers) -> Registers:
         """The registers that the live program gets back: without what our stop alone has brought about."""
         before, self._wait = self._wait, None
         if ctypes.c_int64(registers[arch.RESULT]).value != -errno.EINTR:
@@ -117,12 +118,12 @@ class Waiting:
         decided, self._wait = decide(registers, before, asked_ns, timeout.at_end, time.monotonic_ns())
         return decided
 
-    def _asked_ns(self, registers: arch.Registers, timeout: arch.Timeout) -> int | None:
+    def _asked_ns(self, registers: Registers, timeout: Timeout) -> int | None:
         """How long the call was told to wait, negative for ever; None if that cannot be known."""
         argument = registers[arch.ARGUMENTS[timeout.argument]]
-        if timeout.form == arch.MILLISECONDS:
+        if timeout.form == MILLISECONDS:
             return ctypes.c_int32(argument & 0xFFFFFFFF).value * NS_PER_MS
-        if timeout.form == arch.SOCKET:
+        if timeout.form == SOCKET:
             return _socket_timeout_ns(self._memory.pid, ctypes.c_int32(argument & 0xFFFFFFFF).value, timeout.option)
         if not argument:
             return -1
@@ -143,9 +144,7 @@ def _socket_timeout_ns(pid: int, number: int, option: int) -> int | None:
     return int(seconds * NS_PER_S + rest_us * NS_PER_US) or None
 
 
-def decide(
-    registers: arch.Registers, before: Wait | None, asked_ns: int, at_end: int, now_ns: int
-) -> tuple[arch.Registers, Wait | None]:
+def decide(registers: Registers, before: Wait | None, asked_ns: int, at_end: int, now_ns: int) -> tuple[Registers, Wait | None]:
     """What becomes of a call with a timeout that a stop has ended: see the table above.
 
     Args:
@@ -167,7 +166,7 @@ def _fresh_mark() -> int:
     return 1 + secrets.randbelow(arch.MARK_LIMIT - 1)
 
 
-def made_again(registers: arch.Registers, mark: int) -> arch.Registers:
+def made_again(registers: Registers, mark: int) -> Registers:
     """Have the kernel make a call again as soon as the program runs, unless a signal handler comes first."""
     number = arch.marked(arch.call_number(registers), mark)
     return {**registers, arch.RESULT: arch.ERESTARTNOHAND, arch.CALL_NUMBER: number}

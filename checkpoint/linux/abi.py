@@ -34,6 +34,8 @@ PTRACE_LISTEN: Final = 0x4208
 PTRACE_PEEKSIGINFO: Final = 0x4209
 PTRACE_GETSIGMASK: Final = 0x420A
 PTRACE_SETSIGMASK: Final = 0x420B
+PTRACE_SECCOMP_GET_FILTER: Final = 0x420C
+PTRACE_SECCOMP_GET_METADATA: Final = 0x420D
 PTRACE_GET_RSEQ_CONFIGURATION: Final = 0x420F
 PTRACE_GET_SYSCALL_USER_DISPATCH_CONFIG: Final = 0x4211
 PTRACE_EVENT_CLONE: Final = 3
@@ -41,6 +43,7 @@ PTRACE_EVENT_STOP: Final = 128
 PTRACE_O_TRACECLONE: Final = 0x08
 PTRACE_O_TRACEEXEC: Final = 0x10
 PTRACE_O_EXITKILL: Final = 0x100000
+PTRACE_O_SUSPEND_SECCOMP: Final = 0x200000
 PTRACE_PEEKSIGINFO_SHARED: Final = 1
 WALL: Final = 0x40000000
 """__WALL of waitpid(2): also children that are not ours."""
@@ -51,6 +54,10 @@ ENDS: Final = (os.CLD_EXITED, os.CLD_KILLED, os.CLD_DUMPED)
 # linux/elf.h: names of register sets
 NT_PRSTATUS: Final = 1
 NT_X86_XSTATE: Final = 0x202
+
+# linux/filter.h
+SOCK_FILTER_SIZE: Final = 8
+"""Bytes of one instruction of a filter."""
 
 # asm-generic/siginfo.h, asm-generic/signal.h
 SIGINFO_SIZE: Final = 128
@@ -218,11 +225,6 @@ process_vm_writev.restype = ctypes.c_ssize_t
 ioctl = _libc.ioctl
 ioctl.argtypes = (ctypes.c_int, ctypes.c_ulong, ctypes.c_void_p)
 ioctl.restype = ctypes.c_int
-
-ioctl_held = ctypes.PyDLL(None, use_errno=True).ioctl
-"""As `ioctl`, but other threads of the interpreter wait: for a short call in the middle of what must not be late."""
-ioctl_held.argtypes = ioctl.argtypes
-ioctl_held.restype = ioctl.restype
 
 _syscall = _libc.syscall
 _syscall.restype = ctypes.c_long

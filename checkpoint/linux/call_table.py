@@ -14,7 +14,7 @@ import signal
 from dataclasses import dataclass, field
 from typing import Final
 
-from checkpoint.arch import x86_64_stub as arch
+from checkpoint.arch import stubs as arch
 from checkpoint.errors import RestoreError
 from checkpoint.linux import abi
 from checkpoint.linux.tracee import Tracee

@@ -13,17 +13,17 @@ from collections.abc import Sequence
 from ipaddress import ip_address
 from typing import Final
 
-from checkpoint.linux.unix_sockets import NETLINK_SOCK_DIAG, NLM_F_REQUEST, SOCK_DIAG_BY_FAMILY
+from checkpoint.linux import sock_diag
+from checkpoint.linux.sock_diag import HEADER, SOCK_DIAG_BY_FAMILY
 
 SOCK_DESTROY: Final = 21
 TIME_WAIT: Final = 6
-_HEADER: Final = struct.Struct("<IHHII")
 _REQUEST: Final = struct.Struct("<BBBxI")
 _ENDS: Final = struct.Struct(">HH16s16s")
 _REST: Final = struct.Struct("<III")
 """Interface and cookie of struct inet_diag_sockid: any."""
-_STATE_AT: Final = _HEADER.size + 1
-_INODE_AT: Final = _HEADER.size + 68
+_STATE_AT: Final = HEADER.size + 1
+_INODE_AT: Final = HEADER.size + 68
 """idiag_inode: 0 of a socket that nobody has open."""
 _ANY_STATE: Final = 0xFFFFFFFF
 _NO_COOKIE: Final = 0xFFFFFFFF
@@ -38,7 +38,7 @@ def remove(ends: Sequence[End]) -> None:
     A connection that lives is left alone.
     """
     for address, peer in (ends, ends[::-1]):
-        with contextlib.suppress(OSError), socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM, NETLINK_SOCK_DIAG) as asked:
+        with contextlib.suppress(OSError), sock_diag.opened() as asked:
             if _answer(asked, SOCK_DIAG_BY_FAMILY, address, peer)[_STATE_AT : _STATE_AT + 1] == bytes([TIME_WAIT]):
                 _answer(asked, SOCK_DESTROY, address, peer)
 
@@ -49,7 +49,7 @@ def remove_orphan(ends: Sequence[End]) -> None:
     The kernel may want to reset the peer's: the connection is silent.
     """
     address, peer = ends
-    with contextlib.suppress(OSError), socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM, NETLINK_SOCK_DIAG) as asked:
+    with contextlib.suppress(OSError), sock_diag.opened() as asked:
         told = _answer(asked, SOCK_DIAG_BY_FAMILY, address, peer)
         if told[_INODE_AT : _INODE_AT + 4] == bytes(4):
             _answer(asked, SOCK_DESTROY, address, peer)
@@ -62,10 +62,6 @@ def _answer(asked: socket.socket, order: int, address: End, peer: End) -> bytes:
     request = _REQUEST.pack(family, socket.IPPROTO_TCP, 0, _ANY_STATE)
     request += _ENDS.pack(address[1], peer[1], *(host.packed.ljust(16, b"\0") for host in hosts))
     request += _REST.pack(0, _NO_COOKIE, _NO_COOKIE)
-    flags = NLM_F_REQUEST | (NLM_F_ACK if order == SOCK_DESTROY else 0)
-    asked.send(_HEADER.pack(_HEADER.size + len(request), order, flags, 1, 0) + request)
+    asked.send(sock_diag.message(request, order, sock_diag.NLM_F_ACK if order == SOCK_DESTROY else 0))
     told = asked.recv(1 << 16)
-    return told if _HEADER.unpack_from(told)[1] == SOCK_DIAG_BY_FAMILY else b""
-
-
-NLM_F_ACK: Final = 4
+    return told if HEADER.unpack_from(told)[1] == SOCK_DIAG_BY_FAMILY else b""

@@ -7,18 +7,22 @@ import functools
 import os
 import re
 import socket
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
 
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import abi
+from checkpoint.linux.own_calls import FIRST_ARGUMENT, RESULT_TO, OwnCalls, row
 from checkpoint.linux.procfs import READ_SIZE, parse_fields
+
+if TYPE_CHECKING:
+    from checkpoint.linux.kept_descriptors import KeptTexts
 
 _HEAD: Final = re.compile(rb"pos:\s*(\d+)\nflags:\s*(\d+)\n(?:mnt_id:\s*(\d+)\nino:\s*(\d+)\n)?")
 
-TEXTS_KEPT: Final = 256
-"""Files of fdinfo that stay open for one process: we may have 1,024 descriptors ourselves (RLIMIT_NOFILE)."""
 BLOCK_SIZE: Final = 512
 """Bytes of what stat(2) counts as a block."""
 
@@ -67,48 +71,18 @@ class Descriptor:
         return os.fsdecode(self.told)
 
 
-class KeptTexts:
-    """The fdinfo files of one process, kept open from look to look: reading one again takes a third of opening it anew.
-
-    Such a file tells of whatever has its number when it is read. Source: seq_show() in fs/proc/fd.c.
-    """
-
-    def __init__(self, pid: int) -> None:
-        self.pid = pid
-        self._files: dict[int, int] = {}
-
-    def read(self, number: int, directory: int) -> bytes:
-        """What it tells of one descriptor now.
-
-        Args:
-            directory: /proc/PID/fdinfo.
-        """
-        file = self._files.get(number)
-        if file is not None:
-            told = os.pread(file, READ_SIZE, 0)
-            return told if len(told) < READ_SIZE else _read(str(number), directory)
-        if len(self._files) >= TEXTS_KEPT:
-            return _read(str(number), directory)
-        self._files[number] = os.open(str(number), os.O_RDONLY | os.O_CLOEXEC, dir_fd=directory)
-        return self.read(number, directory)
-
-    def keep_only(self, numbers: Collection[int]) -> None:
-        """Close those of descriptors that are gone."""
-        for number in [number for number in self._files if number not in numbers]:
-            os.close(self._files.pop(number))
-
-    def close(self) -> None:
-        """Close all; they are opened again when they are read."""
-        self.keep_only(())
-
-
 def descriptors(pid: int, kept: KeptTexts | None = None) -> tuple[Descriptor, ...]:
-    """Every open descriptor, in order of number."""
+    """Every open descriptor, in order of number.
+
+    Args:
+        kept: of a process that is looked at again and again.
+    """
     numbers = _numbers(pid)
-    if kept is not None:
-        kept.keep_only(frozenset(numbers))
     with _opened(pid, "fd") as links, _opened(pid, "fdinfo") as texts:
-        return tuple(found for number in numbers if (found := _descriptor(number, links, texts, kept)) is not None)
+        if kept is None:
+            return tuple(found for number in numbers if (found := _descriptor(number, links, texts)) is not None)
+        kept.ask(numbers)
+        return tuple(found for number in numbers if (found := kept.read(number, links, texts)) is not None)
 
 
 def descriptors_to(pid: int, target: str) -> tuple[Descriptor, ...]:
@@ -159,13 +133,38 @@ def _opened(pid: int, name: str) -> Iterator[int]:
         os.close(directory)
 
 
-def _descriptor(number: int, links: int, texts: int, kept: KeptTexts | None = None) -> Descriptor | None:
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """What must be asked, besides its fdinfo, to know that a descriptor is what it was.
+
+    Attributes:
+        link: where it leads.
+        about: its fstat(2).
+    """
+
+    link: bool
+    about: bool
+
+
+def head_of(told: bytes) -> re.Match[bytes] | None:
+    """What the first lines of fdinfo say: offset, flags, and of Linux 5.14 mnt_id and inode, which name an open file's file."""
+    return _HEAD.match(told)
+
+
+def _descriptor(number: int, links: int, texts: int) -> Descriptor | None:
     """One descriptor, by the directories fd and fdinfo of its process."""
+    found = standing_of(number, links, texts)
+    return found[0] if found else None
+
+
+def standing_of(number: int, links: int, texts: int) -> tuple[Descriptor, Standing] | None:
+    """The same, and what must be asked of it the next time."""
     name = str(number)
     try:
-        told = kept.read(number, texts) if kept is not None else _read(name, texts)
+        told = _read(name, texts)
         head = _HEAD.match(told)
         alike = _nameless().get(head[3]) if head else None
+        standing = Standing(link=alike is None or not alike.prefix, about=alike is None)
         if head is None or alike is None:
             target, about = os.readlink(name, dir_fd=links), os.stat(name, dir_fd=links)
             inode = about.st_ino
@@ -173,9 +172,13 @@ def _descriptor(number: int, links: int, texts: int, kept: KeptTexts | None = No
             inode, about = int(head[4]), alike.about
             target = alike.target(inode) or os.readlink(name, dir_fd=links)
             if not alike.prefix and inode != about.st_ino:  # one that has an inode of its own
-                about = os.stat(name, dir_fd=links)
+                about, standing = os.stat(name, dir_fd=links), Standing(link=True, about=True)
     except (FileNotFoundError, ProcessLookupError):
         return None
+    return _made(number, target, told, head, inode, about), standing
+
+
+def _made(number: int, target: str, told: bytes, head: re.Match[bytes] | None, inode: int, about: os.stat_result) -> Descriptor:
     return Descriptor(
         number=number,
         target=target,
@@ -263,6 +266,41 @@ def lending(pid: int) -> Iterator[None]:
             os.close(pidfd)
 
 
+def _lent(pid: int) -> int:
+    """The pidfd that is lent for a process."""
+    if _LENT[pid] == NOT_YET:
+        _LENT[pid] = os.pidfd_open(pid)
+    return _LENT[pid]
+
+
+@contextlib.contextmanager
+def copies_of(pid: int, numbers: Sequence[int]) -> Iterator[Sequence[int]]:
+    """Descriptors of ours for the same open files, for the body, in the same order; negative where one cannot be had."""
+    if pid not in _LENT:
+        with lending(pid), copies_of(pid, numbers) as copies:
+            yield copies
+        return
+    results = np.full(len(numbers), NOT_YET, dtype=np.int64)
+    try:
+        pidfd = _lent(pid)
+    except OSError:  # it has been killed, or we have no descriptor left
+        yield results.tolist()
+        return
+    taking = OwnCalls(len(numbers))
+    taking.entries[:] = row("pidfd_getfd", pidfd)
+    taking.entries[:, FIRST_ARGUMENT + 1] = numbers
+    taking.entries[:, RESULT_TO] = results.ctypes.data + 8 * np.arange(len(numbers))
+    taking.run()
+    try:
+        yield results.tolist()
+    finally:
+        ours = results[results >= 0]
+        closing = OwnCalls(len(ours))
+        closing.entries[:] = row("close")
+        closing.entries[:, FIRST_ARGUMENT] = ours
+        closing.run()
+
+
 @contextlib.contextmanager
 def copy_of(pid: int, number: int) -> Iterator[int]:
     """A descriptor of ours for the same open file, for the body.
@@ -270,14 +308,11 @@ def copy_of(pid: int, number: int) -> Iterator[int]:
     Raises:
         OSError: it was closed meanwhile, it is opened with O_PATH, or we may not.
     """
-    pidfd = _LENT.get(pid)
-    if pidfd is None:
+    if pid not in _LENT:
         with lending(pid), copy_of(pid, number) as descriptor:
             yield descriptor
         return
-    if pidfd == NOT_YET:
-        pidfd = _LENT[pid] = os.pidfd_open(pid)
-    descriptor = abi.pidfd_getfd(pidfd, number)
+    descriptor = abi.pidfd_getfd(_lent(pid), number)
     try:
         yield descriptor
     finally:

@@ -36,6 +36,11 @@ class DigestTracker:
         self._existence = existence(pid)
         self._known = PageMap.empty()
 
+    @property
+    def watched(self) -> Words:
+        """See `Tracker.watched`."""
+        return NONE
+
     def arm(self, lines: Sequence[MapsLine]) -> None:
         """See `Tracker.arm`: nothing is known, so that the first scan finds everything."""
         self._known = PageMap.empty()

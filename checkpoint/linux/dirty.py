@@ -37,6 +37,11 @@ class SoftDirtyTracker:
         self._pagemap = PagemapFile(pid)
         self._existed: Words = NONE
 
+    @property
+    def watched(self) -> Words:
+        """See `Tracker.watched`."""
+        return NONE
+
     def arm(self, lines: Sequence[MapsLine]) -> None:
         """See `Tracker.arm`."""
         self._clear()

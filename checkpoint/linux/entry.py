@@ -17,8 +17,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from checkpoint.arch import x86_64 as arch
-from checkpoint.arch.x86_64 import Call
+from checkpoint.arch import cpu as arch
+from checkpoint.arch.calls import Call, EntryCalls
 from checkpoint.errors import CaptureError
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.descriptors import Descriptor, descriptors_to
@@ -109,10 +109,10 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
     return Entered(pages, faults, inside, -inside if inside < 0 else 0)
 
 
-def _entry_calls(hole: int) -> arch.EntryCalls:
+def _entry_calls(hole: int) -> EntryCalls:
     fixed = abi.MAP_PRIVATE | abi.MAP_ANONYMOUS | abi.MAP_FIXED_NOREPLACE
     read_execute, read_write = abi.PROT_READ | abi.PROT_EXEC, abi.PROT_READ | abi.PROT_WRITE
-    return arch.EntryCalls(
+    return EntryCalls(
         code_pages=Call("mmap", (hole, CODE_SIZE, read_execute, fixed, -1, 0)),
         table_pages=Call("mmap", (hole + CODE_SIZE, TABLE_SIZE, read_write, fixed, -1, 0)),
         advice=Call("madvise", (hole, SIZE, abi.MADV_DONTFORK)),

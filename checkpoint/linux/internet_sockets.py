@@ -5,21 +5,11 @@ Source: sock_diag(7), linux/inet_diag.h; inet_sk_diag_fill() in net/ipv4/inet_di
 
 from __future__ import annotations
 
-import errno
-import socket
 import struct
 from typing import Final
 
-from checkpoint.linux.unix_sockets import (
-    NETLINK_SOCK_DIAG,
-    NLM_F_DUMP,
-    NLM_F_REQUEST,
-    SOCK_DIAG_BY_FAMILY,
-    answers,
-    attributes,
-)
+from checkpoint.linux import sock_diag
 
-_HEADER: Final = struct.Struct("<IHHII")
 _REQUEST: Final = struct.Struct("<BBBxI48x")
 """Family, protocol, extensions, states; any socket."""
 _ANSWER_SIZE: Final = 72
@@ -39,21 +29,11 @@ def shut_down(family: int, protocol: int) -> dict[int, int]:
     if (family, protocol) in _WITHOUT:
         return found
     try:
-        with socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM, NETLINK_SOCK_DIAG) as asked:
-            request = _REQUEST.pack(family, protocol, 0, _ANY_STATE)
-            size = _HEADER.size + len(request)
-            asked.send(_HEADER.pack(size, SOCK_DIAG_BY_FAMILY, NLM_F_REQUEST | NLM_F_DUMP, 1, 0) + request)
-            if _is_unknown(asked.recv(_HEADER.size + 4, socket.MSG_PEEK)):
-                _WITHOUT.add((family, protocol))
-            for answer in answers(asked):
-                if how := int.from_bytes(dict(attributes(answer[_ANSWER_SIZE:])).get(_SHUTDOWN, b""), "little"):
-                    found[int.from_bytes(answer[_INODE_AT : _INODE_AT + 4], "little")] = how
+        for answer in sock_diag.listed(_REQUEST.pack(family, protocol, 0, _ANY_STATE)):
+            if how := int.from_bytes(dict(sock_diag.attributes(answer[_ANSWER_SIZE:])).get(_SHUTDOWN, b""), "little"):
+                found[int.from_bytes(answer[_INODE_AT : _INODE_AT + 4], "little")] = how
+    except sock_diag.UnknownError:
+        _WITHOUT.add((family, protocol))
     except OSError:
         return {}
     return found
-
-
-def _is_unknown(answer: bytes) -> bool:
-    """Whether an answer begins with the end of a list, and that with the word that there is none."""
-    _, kind, *_ = _HEADER.unpack_from(answer)
-    return kind != SOCK_DIAG_BY_FAMILY and int.from_bytes(answer[_HEADER.size :], "little", signed=True) == -errno.ENOENT

@@ -2,21 +2,25 @@
 
 Who has lost its parent is given to the nearest ancestor that asks for such (a *reaper*). That of a component in PIDs of its own,
 or under a guard, has no other children. Elsewhere a *stray* is told from the children of others by its session or process group,
-where one of the component leads it, and no ancestor is in it: programs that somebody else has started together stay apart.
+where one of the component leads it, and no ancestor is in it: programs that somebody else has started together stay apart. Where
+the leader of its session has ended, too, it is told by a standard stream that it has from the first process, and no ancestor has.
 
-Source: proc_pid_task(5) (children), credentials(7), pid_namespaces(7); PR_SET_CHILD_SUBREAPER of prctl(2).
+Source: proc_pid_task(5) (children), credentials(7), pid_namespaces(7), kcmp(2); PR_SET_CHILD_SUBREAPER of prctl(2).
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Final
 
 from checkpoint.errors import CheckpointError
-from checkpoint.linux import procfs
+from checkpoint.linux import abi, procfs
 
+STREAMS: Final = (0, 1, 2)
+LEFT_BEHIND_MAX: Final = 4096
+"""Strangers of which it is remembered whether they belong to the component: there are new ones as long as a machine runs."""
 CHILDREN_SIZE: Final = 1 << 16
 NEARLY_A_PAGE: Final = 4000
 """Bytes: the kernel gives a list in pieces of a page at most, so what is shorter is the end.
@@ -77,6 +81,7 @@ class Kinship:
         self._of_first = Children(pid)
         self._of_reaper = Children(reaper)
         self._of_ancestors = () if reaper else tuple(map(Children, ancestors(pid)))
+        self._left_behind: dict[tuple[int, int], bool] = {}
         self._has_strays = False
 
     def has_others(self, tids: list[int]) -> bool:
@@ -107,7 +112,27 @@ class Kinship:
         ours = {self._pid, *found} - _circles(one.pid for one in self._of_ancestors)
         known = elders | set(found)
         theirs = ((one.pid, pid) for one in self._of_ancestors for pid in one.read([one.pid]) if pid not in known)
-        return [pid for ancestor, pid in theirs if _given_to(ancestor, pid) & ours]
+        return [pid for ancestor, pid in theirs if _given_to(ancestor, pid) & ours or self._is_left_behind(pid)]
+
+    def _is_left_behind(self, pid: int) -> bool:
+        """Whether a child of an ancestor is of a session whose leader has ended, and was born below the first process."""
+        with contextlib.suppress(ProcessLookupError, PermissionError, CheckpointError):
+            session = os.getsid(pid)
+            if session in _circles((self._pid, *(one.pid for one in self._of_ancestors))) or _exists(session):
+                return False
+            born = procfs.stat(pid).start_time
+            if (pid, born) not in self._left_behind:
+                if len(self._left_behind) >= LEFT_BEHIND_MAX:
+                    self._left_behind.clear()
+                streams = procfs.stat(self._pid).start_time <= born and self._streams_of_first()
+                self._left_behind[pid, born] = any(abi.kcmp(self._pid, pid, abi.KCMP_FILE, n, n) == 0 for n in streams or ())
+            return self._left_behind[pid, born]
+        return False
+
+    def _streams_of_first(self) -> list[int]:
+        """The standard streams of the first process that it has not from its ancestors."""
+        theirs = [(one.pid, number) for one in self._of_ancestors for number in _descriptors_of(one.pid)]
+        return [n for n in STREAMS if not any(abi.kcmp(self._pid, pid, abi.KCMP_FILE, n, number) == 0 for pid, number in theirs)]
 
     @staticmethod
     def _walk(waiting: list[int], known: Iterable[int]) -> Iterator[int]:
@@ -144,6 +169,13 @@ def ancestors(pid: int) -> list[int]:
     return found
 
 
+def _descriptors_of(pid: int) -> list[int]:
+    """The numbers of its descriptors; of one that has ended nothing."""
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        return list(map(int, os.listdir(f"/proc/{pid}/fd")))
+    return []
+
+
 def _circles(pids: Iterable[int]) -> set[int]:
     """The sessions and process groups of processes; of one that has ended nothing."""
     found: set[int] = set()
@@ -159,6 +191,13 @@ def _given_to(ancestor: int, pid: int) -> set[int]:
         session = os.getsid(pid)
         return {session} if session == os.getsid(ancestor) else _circles([pid])
     return set()
+
+
+def _exists(pid: int) -> bool:
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, 0)
+        return True
+    return False
 
 
 def reaper_of(pid: int, *, is_guarded: bool) -> int:
@@ -182,6 +221,12 @@ def _is_first_of_namespace(other: int, pid: int) -> bool:
 
 def _namespace(pid: int) -> str:
     return os.readlink(f"/proc/{pid}/ns/pid")
+
+
+def taken_pids(pid: int) -> Callable[[int], bool]:
+    """Whether a pid is somebody's where a process lives; of those that live apart from us nobody else is there."""
+    is_apart = len(procfs.status(pid).pids) > 1
+    return lambda number: not is_apart and os.path.exists(f"/proc/{number}")
 
 
 def others(pid: int, reaper: int) -> list[int]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from checkpoint import pages
 from checkpoint.errors import CheckpointError
-from checkpoint.linux import abi
+from checkpoint.linux import abi, own_calls
 from checkpoint.linux.pagetables import PageScanner
 from checkpoint.linux.tracking import NONE
 from checkpoint.linux.write_protection import enable_write_protection
@@ -153,7 +153,7 @@ class LiveMemory:
             return
         try:
             enable_write_protection(self._faults)
-            scanner = PageScanner(os.getpid(), abi.ioctl_held)
+            scanner = PageScanner(os.getpid(), own_calls.one_by_one)
             scanner.is_protected(0, abi.PAGE_SIZE)
         except (OSError, CheckpointError) as error:
             self._give_up(str(error))

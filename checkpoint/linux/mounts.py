@@ -20,8 +20,13 @@ USER_SPACE: Final = "fuse."
 
 def network_mount(pid: int, path: str) -> str:
     """The type of the network file system that a path lies on; "" if it lies on none, as far as can be told."""
-    kind = _type_at(_mounts(pid), path)
+    kind = type_of_mount(pid, path)
     return kind if kind in NETWORK_TYPES or kind.startswith(USER_SPACE) else ""
+
+
+def type_of_mount(pid: int, path: str) -> str:
+    """The type of the file system that a path lies on; "" if that cannot be told."""
+    return _type_at(_mounts(pid), path)
 
 
 def is_mount_point(path: str) -> bool:
@@ -38,12 +43,16 @@ def _type_at(mounts: list[tuple[str, str]], path: str) -> str:
 def _mounts(pid: int) -> list[tuple[str, str]]:
     """(mount point, type) of each mount, oldest first."""
     try:
-        lines = Path(f"/proc/{pid}/mountinfo").read_bytes().splitlines()
+        lines = Path(f"/proc/{pid}/mountinfo").read_bytes().split(b"\n")
     except OSError:
         return []
     found = []
-    for line in lines:
+    for line in filter(None, lines):
         before, _, after = line.partition(b" - ")
-        point = _ESCAPED.sub(lambda found: bytes((int(found[1], 8),)), before.split(b" ")[4])
-        found.append((os.fsdecode(point), os.fsdecode(after.split(b" ")[0])))
+        found.append((unescaped(before.split(b" ")[4]), os.fsdecode(after.split(b" ")[0])))
     return found
+
+
+def unescaped(point: bytes) -> str:
+    """A mount point as mountinfo tells it, as a path."""
+    return os.fsdecode(_ESCAPED.sub(lambda found: bytes((int(found[1], 8),)), point))

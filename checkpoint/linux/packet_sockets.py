@@ -11,16 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from checkpoint.linux.unix_sockets import (
-    NETLINK_SOCK_DIAG,
-    NLM_F_DUMP,
-    NLM_F_REQUEST,
-    SOCK_DIAG_BY_FAMILY,
-    answers,
-    attributes,
-)
+from checkpoint.linux import sock_diag
 
-_HEADER: Final = struct.Struct("<IHHII")
 _REQUEST: Final = struct.Struct("<BBHIIII")
 _ANSWER: Final = struct.Struct("<BBHI8x")
 _MEMBERSHIP: Final = struct.Struct("<IIHH32s")
@@ -65,17 +57,14 @@ def packet_sockets() -> Mapping[int, PacketSocket]:
         OSError: the kernel does not tell (CONFIG_PACKET_DIAG).
     """
     found = {}
-    with socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM, NETLINK_SOCK_DIAG) as asked:
-        request = _REQUEST.pack(socket.AF_PACKET, 0, 0, 0, _SHOW, 0xFFFFFFFF, 0xFFFFFFFF)
-        asked.send(_HEADER.pack(_HEADER.size + len(request), SOCK_DIAG_BY_FAMILY, NLM_F_REQUEST | NLM_F_DUMP, 1, 0) + request)
-        for answer in answers(asked):
-            told = dict(attributes(answer[_ANSWER.size :]))
-            packed = told.get(_MEMBERSHIPS, b"")
-            memberships = tuple(
-                Membership(interface, count, kind, address[:size])
-                for interface, count, kind, size, address in _MEMBERSHIP.iter_unpack(packed)
-            )
-            found[_ANSWER.unpack_from(answer)[3]] = PacketSocket(
-                memberships, {option: told[ring] for ring, option in _RINGS.items() if ring in told}
-            )
+    for answer in sock_diag.listed(_REQUEST.pack(socket.AF_PACKET, 0, 0, 0, _SHOW, 0xFFFFFFFF, 0xFFFFFFFF)):
+        told = dict(sock_diag.attributes(answer[_ANSWER.size :]))
+        packed = told.get(_MEMBERSHIPS, b"")
+        memberships = tuple(
+            Membership(interface, count, kind, address[:size])
+            for interface, count, kind, size, address in _MEMBERSHIP.iter_unpack(packed)
+        )
+        found[_ANSWER.unpack_from(answer)[3]] = PacketSocket(
+            memberships, {option: told[ring] for ring, option in _RINGS.items() if ring in told}
+        )
     return found

@@ -8,18 +8,21 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
-from collections.abc import Callable
 from typing import Final, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from checkpoint import pages
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import abi, procfs
+from checkpoint.linux.own_calls import ROW_SIZE, Loop, OwnCalls, row
 from checkpoint.linux.tracking import NONE
 from checkpoint.pages import Words
 
-REGION_COUNT: Final = 1 << 15
+BATCH: Final = 64
+"""Ranges that are asked about in one go."""
+REGION_COUNT: Final = 1 << 7
 """Regions that one scan call may answer with; more are asked for in the next call."""
 MARKER_RUN: Final = 64 * abi.PAGE_SIZE
 """Where nothing is swapped out, what looks so is a hole that we protected, or a page that the kernel moves just now: it moves 32
@@ -30,23 +33,62 @@ class MappingLostError(CaptureError):
     """A mapping is not write-protected any more."""
 
 
+class _Orders:
+    """PAGEMAP_SCAN on several ranges in one go.
+
+    Attributes:
+        starts, ends: of the ranges; to be filled in.
+        reached: how far each scan came.
+        counts: of the regions that each found; an error is a negative number.
+        regions: start, end and categories of each, by range.
+    """
+
+    def __init__(self, pagemap: int, loop: Loop | None) -> None:
+        self.counts = np.zeros(BATCH, dtype=np.int64)
+        self.regions = np.zeros((BATCH, REGION_COUNT, 3), dtype=np.uint64)
+        size = ctypes.sizeof(abi.PageScan)
+        self._words = np.zeros((BATCH, size // 8), dtype=np.uint64)
+        fields = [name for name, _ in abi.PageScan._fields_]
+        self._words[:, fields.index("size")] = size
+        self._words[:, fields.index("vec")] = self.regions.ctypes.data + np.arange(BATCH) * self.regions[0].nbytes
+        self._words[:, fields.index("vec_len")] = REGION_COUNT
+        self.starts, self.ends, self.reached = (self._words[:, fields.index(name)] for name in ("start", "end", "walk_end"))
+        self._flags = self._words[:, fields.index("flags")]
+        self._wanted = self._words[:, fields.index("max_pages") :]
+        place, answer = self._words.ctypes.data, self.counts.ctypes.data
+        self._calls = OwnCalls(
+            [row("ioctl", pagemap, abi.PAGEMAP_SCAN, place + index * size, to=answer + 8 * index) for index in range(BATCH)]
+        )
+        self._loop = loop
+
+    def want(self, flags: int, mask: int, told: int, *, inverted: int = 0, anyof: int = 0, limit: int = 0) -> None:
+        """What is asked from now on: see struct pm_scan_arg; no more than ``limit`` pages, 0: all."""
+        self._flags[:] = flags
+        self._wanted[:] = (limit, inverted, mask, anyof, told)
+
+    def ask(self, first: int, last: int) -> None:
+        """Make the scans of the ranges [first, last)."""
+        if self._loop is None:
+            self._calls.run(first, last)
+        else:
+            self._loop(self._calls.address + first * ROW_SIZE, self._calls.address + last * ROW_SIZE)
+
+
 class PageScanner:
     """PAGEMAP_SCAN on one process's pagemap.
 
     Args:
-        ioctl: makes the call; ``abi.ioctl_held`` keeps the interpreter meanwhile.
+        loop: makes the calls, see ``checkpoint.linux.own_calls``; None: as fast as may be.
 
     Raises:
         ProcessGoneError: it ended, or it became another program (exec).
         ProbeError: not permitted: it ended just now, or became another user's.
     """
 
-    def __init__(self, pid: int, ioctl: Callable[[int, int, int], int] = abi.ioctl) -> None:
+    def __init__(self, pid: int, loop: Loop | None = None) -> None:
         self._pid = pid
-        self._ioctl = ioctl
         self._pagemap = procfs.opened(pid, "pagemap")
-        self._regions = np.zeros((REGION_COUNT, 3), dtype=np.uint64)
-        self._order = abi.PageScan(size=ctypes.sizeof(abi.PageScan), vec=self._regions.ctypes.data, vec_len=REGION_COUNT)
+        self._orders = _Orders(self._pagemap, loop)
         self._guard = abi.PAGE_IS_GUARD if self._understands(abi.PAGE_IS_GUARD) else 0
 
     def close(self) -> None:
@@ -55,13 +97,26 @@ class PageScanner:
 
     def is_protected(self, start: int, end: int) -> bool:
         """Whether every mapping in a range is registered for asynchronous write protection."""
-        order = self._order
-        order.flags, order.start, order.end = abi.PM_SCAN_CHECK_WPASYNC, start, end
-        order.category_mask = order.category_inverted = abi.PAGE_IS_WPALLOWED
-        order.category_anyof_mask, order.return_mask = 0, abi.PAGE_IS_WPALLOWED
-        if abi.ioctl(self._pagemap, abi.PAGEMAP_SCAN, ctypes.addressof(order)) >= 0:
-            return True
-        return self._refused("check") != errno.EPERM
+        return not self.unprotected(np.array([[start, end]], dtype=np.uint64))
+
+    def unprotected(self, ranges: Words) -> list[tuple[int, int]]:
+        """Those ranges in which a mapping is not registered for asynchronous write protection."""
+        self._orders.want(abi.PM_SCAN_CHECK_WPASYNC, abi.PAGE_IS_WPALLOWED, abi.PAGE_IS_WPALLOWED, inverted=abi.PAGE_IS_WPALLOWED)
+        found = []
+        for first in range(0, len(ranges), BATCH):
+            counts = self._asked(ranges[first : first + BATCH])
+            for place in np.flatnonzero(counts < 0).tolist():
+                self._refused("check", -int(counts[place]))
+                start, end = ranges[first + place].tolist()
+                found.append((start, end))
+        return found
+
+    def _asked(self, ranges: Words) -> NDArray[np.int64]:
+        """Ask about one batch of ranges: the counts."""
+        orders, count = self._orders, len(ranges)
+        orders.starts[:count], orders.ends[:count] = ranges[:, 0], ranges[:, 1]
+        orders.ask(0, count)
+        return orders.counts[:count]
 
     def written(self, ranges: Words) -> Words:
         """Pages written since they were last protected, and holes that never were; all are protected again.
@@ -88,29 +143,22 @@ class PageScanner:
 
     def written_count(self, ranges: Words, limit: int) -> int:
         """How many pages `written` would find, counted no further than ``limit``; nothing is protected."""
-        self._ask_for_written(0)
         count = 0
-        try:
-            for start, end in ranges.tolist():
-                count += self._counted(start, end, limit - count)
-                if count >= limit:
-                    break
-        finally:
-            self._order.max_pages = 0
+        for start, end in ranges.tolist():
+            count += self._counted(start, end, limit - count)
+            if count >= limit:
+                break
         return count
 
     def _counted(self, start: int, end: int, limit: int) -> int:
-        order = self._order
-        order.start, order.end, order.max_pages = start, end, limit
-        regions = abi.ioctl(self._pagemap, abi.PAGEMAP_SCAN, ctypes.addressof(order))
+        self._orders.want(0, abi.PAGE_IS_WRITTEN, abi.PAGE_IS_WRITTEN, limit=limit)
+        regions = int(self._asked(np.array([[start, end]], dtype=np.uint64))[0])
         if regions < 0:
-            self._refused("count written")
-        return pages.total_size(self._regions[: max(regions, 0), :2]) // abi.PAGE_SIZE
+            self._refused("count written", -regions)
+        return pages.total_size(self._orders.regions[0, : max(regions, 0), :2]) // abi.PAGE_SIZE
 
     def _ask_for_written(self, flags: int) -> None:
-        order = self._order
-        order.flags, order.return_mask = flags, abi.PAGE_IS_WRITTEN
-        order.category_mask, order.category_inverted, order.category_anyof_mask = abi.PAGE_IS_WRITTEN, 0, 0
+        self._orders.want(flags, abi.PAGE_IS_WRITTEN, abi.PAGE_IS_WRITTEN)
 
     def existing(self, ranges: Words, *, own: bool = True) -> Words:
         """Pages present or swapped out, but guards, which look as if they were swapped out.
@@ -118,16 +166,13 @@ class PageScanner:
         Args:
             own: leave out unchanged pages of files and the shared page of zeros.
         """
-        order = self._order
         unwanted = (abi.PAGE_IS_FILE | abi.PAGE_IS_PFNZERO if own else abi.PAGE_IS_PFNZERO) | self._guard
-        order.flags = 0
-        order.category_mask = order.category_inverted = unwanted
-        order.category_anyof_mask = abi.PAGE_IS_PRESENT | abi.PAGE_IS_SWAPPED
-        order.return_mask = abi.PAGE_IS_PRESENT | abi.PAGE_IS_SWAPPED
+        wanted = abi.PAGE_IS_PRESENT | abi.PAGE_IS_SWAPPED
+        self._orders.want(0, unwanted, wanted, inverted=unwanted, anyof=wanted)
         found = self._collect(ranges)
-        absent = found[:, 2] & np.uint64(abi.PAGE_IS_PRESENT) == 0
-        if absent.any() and not procfs.swapped_size(self._pid):
-            found = found[~(absent & (found[:, 1] - found[:, 0] >= MARKER_RUN))]
+        marker = (found[:, 2] & np.uint64(abi.PAGE_IS_PRESENT) == 0) & (found[:, 1] - found[:, 0] >= MARKER_RUN)
+        if marker.any() and not procfs.swapped_size(self._pid):
+            found = found[~marker]
         return pages_joined(found[:, :2])
 
     def guards(self, ranges: Words) -> Words:
@@ -137,16 +182,12 @@ class PageScanner:
         """
         if not self._guard:
             return NONE
-        order = self._order
-        order.flags, order.category_mask, order.category_inverted, order.category_anyof_mask = 0, self._guard, 0, 0
-        order.return_mask = self._guard
+        self._orders.want(0, self._guard, self._guard)
         return pages_joined(self._collect(ranges)[:, :2])
 
     def _understands(self, category: int) -> bool:
-        order = self._order
-        order.flags = order.start = order.end = order.category_inverted = order.category_anyof_mask = 0
-        order.category_mask = order.return_mask = category
-        return int(abi.ioctl(self._pagemap, abi.PAGEMAP_SCAN, ctypes.addressof(order))) >= 0
+        self._orders.want(0, category, category)
+        return int(self._asked(np.zeros((1, 2), dtype=np.uint64))[0]) >= 0
 
     def _collect(self, ranges: Words, refused: list[list[int]] | None = None) -> Words:
         """Every region that the kernel tells of.
@@ -154,30 +195,48 @@ class PageScanner:
         Args:
             refused: takes the ranges that are not protected, instead of an error.
         """
-        order, found = self._order, []
-        place = ctypes.addressof(order)
-        for start, end in ranges.tolist():
-            order.end = end
-            while start < end:
-                order.start = start
-                count = self._ioctl(self._pagemap, abi.PAGEMAP_SCAN, place)
-                if count < 0:
-                    self._refused("scan")
-                    if refused is not None:
-                        refused.append([start, end])
-                        break
-                    raise MappingLostError(
-                        f"cannot find written pages of pid {self._pid}: a mapping lost its protection; capture it again"
-                    )
-                if count:
-                    found.append(self._regions[:count].copy())
-                start = int(order.walk_end)
+        found: list[Words] = []
+        for first in range(0, len(ranges), BATCH):
+            batch = ranges[first : first + BATCH]
+            counts = self._asked(batch)
+            told = counts != 0
+            told |= self._orders.reached[: len(batch)] < batch[:, 1]
+            places = np.flatnonzero(told).tolist()
+            if not self._is_whole(places):
+                for place in places:
+                    self._collect_one(place, found, refused)
+            elif places:
+                found.append(np.concatenate([self._orders.regions[place, : counts[place]] for place in places]))
         if not found:
             return np.empty((0, 3), dtype=np.uint64)
         return found[0] if len(found) == 1 else np.concatenate(found)
 
-    def _refused(self, what: str) -> int:
-        number = ctypes.get_errno()
+    def _is_whole(self, places: list[int]) -> bool:
+        """Whether nothing more is to be asked about these ranges."""
+        orders = self._orders
+        return all(orders.counts[place] > 0 and orders.reached[place] >= orders.ends[place] for place in places)
+
+    def _collect_one(self, place: int, found: list[Words], refused: list[list[int]] | None) -> None:
+        """What was found in one range of the batch; the rest of it is asked for."""
+        orders = self._orders
+        while True:
+            count, end = int(orders.counts[place]), int(orders.ends[place])
+            if count < 0:
+                self._refused("scan", -count)
+                if refused is None:
+                    raise MappingLostError(
+                        f"cannot find written pages of pid {self._pid}: a mapping lost its protection; capture it again"
+                    )
+                refused.append([int(orders.starts[place]), end])
+                return
+            if count:
+                found.append(orders.regions[place, :count].copy())
+            orders.starts[place] = orders.reached[place]
+            if orders.starts[place] >= end:
+                return
+            orders.ask(place, place + 1)
+
+    def _refused(self, what: str, number: int) -> int:
         if number == errno.ESRCH:
             raise ProcessGoneError(f"cannot {what} pages of pid {self._pid}: it has ended, or has become another program")
         if number != errno.EPERM:
@@ -197,6 +256,8 @@ def pages_joined(found: Words) -> Words:
         return found
     ends = np.maximum.accumulate(found[:, 1])
     apart = found[1:, 0] > ends[:-1]
+    if apart.all():
+        return found
     return np.stack((found[np.concatenate(([True], apart)), 0], ends[np.concatenate((apart, [True]))]), axis=1)
 
 

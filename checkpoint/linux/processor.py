@@ -13,12 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from checkpoint.arch import x86_64_xstate as arch
-from checkpoint.arch.x86_64_xstate import Layout
+from checkpoint.arch import extended as arch
 
 
 @functools.cache
-def xstate_layout() -> Layout:
+def xstate_layout() -> arch.Layout:
     """Where the components of a thread's extended state lie; () where there are none, or the system forbids code of our own."""
     if "xsave" not in features():
         return ()
@@ -28,7 +27,7 @@ def xstate_layout() -> Layout:
         return ()
 
 
-def _asked() -> Layout:
+def _asked() -> arch.Layout:
     """Put the instructions into a page that nobody can write, and run them.
 
     Raises:

@@ -66,10 +66,40 @@ def _explained(pid: int, name: str) -> Iterator[None]:
 
 
 def _read_whole(descriptor: int) -> bytes:
-    pieces = []
-    while piece := os.read(descriptor, READ_SIZE):
-        pieces.append(piece)
-    return b"".join(pieces)
+    found = piece = os.pread(descriptor, READ_SIZE, 0)
+    while piece:
+        piece = os.pread(descriptor, READ_SIZE, len(found))
+        found += piece
+    return found
+
+
+class KeptFiles:
+    """Files of one process that are read again and again, kept open: a third of what it takes to open one anew.
+
+    Of a process that has executed another program they tell as ever; not so its maps and pagemap.
+    """
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._files: dict[str, int] = {}
+
+    def descriptor(self, name: str) -> int:
+        """Of ``/proc/PID/name``. Raises as `read_bytes`."""
+        file = self._files.get(name)
+        if file is None:
+            file = self._files[name] = opened(self._pid, name)
+        return file
+
+    def read(self, name: str) -> bytes:
+        """Read ``/proc/PID/name`` whole. Raises as `read_bytes`."""
+        with _explained(self._pid, name):
+            return _read_whole(self.descriptor(name))
+
+    def close(self) -> None:
+        """Give the descriptors back."""
+        for file in self._files.values():
+            os.close(file)
+        self._files.clear()
 
 
 def read_line(pid: int, name: str) -> bytes:

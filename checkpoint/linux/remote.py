@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import os
 import struct
 import time
@@ -36,11 +37,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from checkpoint.arch import x86_64 as arch
-from checkpoint.arch.x86_64 import Call
-from checkpoint.errors import CaptureError
+from checkpoint.arch import cpu as arch
+from checkpoint.arch.calls import Call, Registers, TablePlaces
+from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import abi
 from checkpoint.linux.memory import Memory
+from checkpoint.linux.rounds import Round
 from checkpoint.linux.tracee import Tracee
 
 LARGE_DESK: Final = 4 * abi.PAGE_SIZE
@@ -67,6 +69,7 @@ _HEAD: Final = struct.Struct("<32sQQQQQQQQ")  # magic, state, done, serial, mask
 _HEAD_SIZE: Final = _HEAD.size + 8 * len(arch.CLOBBERED)
 _OUTPUT_ALIGNMENT: Final = 16
 _STATE_OFFSET: Final = 32
+_IDLE_WORD: Final = struct.pack("<Q", IDLE)
 _NOTE: Final = struct.Struct("<Ii")
 """At the end of the large desk's table: a descriptor and one more (0: there is no note), and a number."""
 
@@ -98,9 +101,9 @@ LARGE: Final = Plan(LARGE_DESK, CALL_LIMIT)
 SMALL: Final = Plan(SMALL_DESK, 4)
 
 
-def _places(table: int, plan: Plan) -> arch.TablePlaces:
+def _places(table: int, plan: Plan) -> TablePlaces:
     words = table + _STATE_OFFSET
-    return arch.TablePlaces(
+    return TablePlaces(
         state=words,
         ended=ENDED,
         done=words + 8,
@@ -176,12 +179,16 @@ class Guest:
     """
 
     tracee: Tracee
-    registers: arch.Registers
+    registers: Registers
     mask: int
 
 
 class Desk:
-    """A place in the borrowed pages at which one thread makes the calls of a batch."""
+    """A place in the borrowed pages at which one thread makes the calls of a batch.
+
+    Attributes:
+        is_known_idle: whoever was here last was led away by ourselves.
+    """
 
     def __init__(self, memory: Memory, code: int, table: int, plan: Plan) -> None:
         self.code = code
@@ -192,6 +199,7 @@ class Desk:
         self._places = _places(table, plan)
         self._code_key: tuple[Call, ...] | None = None
         self._serial = 0
+        self.is_known_idle = False
 
     def state(self) -> int:
         """`IDLE`, `ARMED`, `ENDED` or `ABANDONED`, as it stands in the table."""
@@ -201,7 +209,7 @@ class Desk:
         """Write it."""
         self._memory.write(self._places.state, struct.pack("<Q", state))
 
-    def armed(self, batch: Batch, registers: arch.Registers, mask: int) -> bytes:
+    def armed(self, batch: Batch, registers: Registers, mask: int) -> bytes:
         """Step 1: lay the code; the head of the table, to be laid, too: what a thread needs that goes on by itself."""
         key = tuple(batch.calls)
         if key != self._code_key:
@@ -210,17 +218,11 @@ class Desk:
             self._memory.poke(self.code, code)
             self._code_key = key
         self._serial += 1
+        self.is_known_idle = False
         resume = resumed(registers)
         return _HEAD.pack(
             MAGIC, ARMED, 0, self._serial, mask, 0, arch.ENTRY_TIMEOUT_NS, 0, resume[arch.INSTRUCTION_POINTER]
         ) + struct.pack(f"<{len(arch.CLOBBERED)}Q", *(resume[name] for name in arch.CLOBBERED))
-
-    def start(self, guest: Guest) -> None:
-        """Steps 2 to 4: have a thread make the calls."""
-        there = {**guest.registers, arch.INSTRUCTION_POINTER: self.code, arch.CALL_NUMBER: arch.NO_CALL}
-        guest.tracee.set_registers(arch.encode_registers(there))
-        guest.tracee.set_signal_mask(abi.ALL_SIGNALS)
-        guest.tracee.cont()
 
     def is_done(self, table: bytes) -> bool:
         """Whether the calls have been made, by the table's bytes."""
@@ -249,7 +251,12 @@ class BorrowedPages:
         self._note = self.table + LARGE_DESK - _NOTE.size
         self._large = Desk(memory, address, self.table, LARGE)
         offsets = range(LARGE_DESK, CODE_SIZE, SMALL_DESK)
+        self._of_large = Round(1)
         self.desks = tuple(Desk(memory, address + offset, self.table + offset, SMALL) for offset in offsets)
+
+    @functools.cached_property
+    def _of_small(self) -> Round:
+        return Round(DESK_COUNT)
 
     @property
     def end(self) -> int:
@@ -325,17 +332,20 @@ class BorrowedPages:
         self._require_free([desk for desk, _, _ in places])
         heads = [(desk.table, desk.armed(batch, guest.registers, guest.mask)) for desk, batch, guest in places]
         self._memory.write_each(heads)
-        started: list[tuple[Desk, Guest]] = []
+        tracees = [guest.tracee for guest in guests]
+        sent = self._of_small if desks is self.desks else self._of_large
+        registers, masks = [guest.registers for guest in guests], [guest.mask for guest in guests]
         try:
-            for desk, _, guest in places:
-                started.append((desk, guest))
-                desk.start(guest)
+            if not sent.start(tracees, [desk.code for desk, _, _ in places], registers, masks):
+                raise ProcessGoneError(f"pid {self._memory.pid} ended while it was being looked at")
             tables = _tables_when_done(self._memory, [desk for desk, _, _ in places], batches[0].end)
         finally:
-            self._take_back(started, [desk for desk, _, _ in places[len(started) :]])
+            self._take_back(sent, [(desk, guest) for desk, _, guest in places])
         return [desk.answers(table, batch) for (desk, batch, _), table in zip(places, tables, strict=True)]
 
     def _require_free(self, desks: Sequence[Desk]) -> None:
+        if all(desk.is_known_idle for desk in desks):
+            return
         size = desks[0].size
         raw = self._memory.read(desks[0].table, (len(desks) - 1) * size + _HEAD_SIZE)
         for place in range(len(desks)):
@@ -344,33 +354,48 @@ class BorrowedPages:
                     f"pid {self._memory.pid} still has to return to code of an earlier look; capture it again in a moment"
                 )
 
-    def _take_back(self, places: Sequence[tuple[Desk, Guest]], untouched: Sequence[Desk]) -> None:
+    def _take_back(self, sent: Round, places: Sequence[tuple[Desk, Guest]]) -> None:
         """As `give_back`, for many: nobody waits for another one's stop, and one that is gone spoils nothing for the others.
-
-        Args:
-            untouched: desks that nobody came to.
 
         Raises:
             ProcessGoneError, CaptureError: of the first of those that could not be given back.
         """
         failures: list[CaptureError] = []
-        moving: list[Tracee] = []
-        for _, guest in places:
+        tracees = [guest.tracee for _, guest in places]
+        asked = sent.ask_to_stop()
+        if asked is None:
+            given = self._take_back_singly(places, failures)
+        elif all(stand := sent.await_stops(tracees, asked)) and sent.give_back(self.holds):
+            given = [desk for desk, _ in places]
+        else:
+            moving = [was and not stands for was, stands in zip(asked, stand, strict=True)]
+            given = self._set_back_singly(places, moving, failures)
+        with _collected(failures):
+            self._memory.write_each([(desk.table + _STATE_OFFSET, _IDLE_WORD) for desk in given])
+            for desk in given:
+                desk.is_known_idle = True
+        if failures:
+            raise failures[0]
+
+    def _take_back_singly(self, places: Sequence[tuple[Desk, Guest]], failures: list[CaptureError]) -> list[Desk]:
+        """Stop them, and set them back: the desks of those with whom that worked."""
+        moving = [False] * len(places)
+        for index, (_, guest) in enumerate(places):
             with _collected(failures):
-                if guest.tracee.ask_to_stop() is None:
-                    moving.append(guest.tracee)
-        given = list(untouched)
-        for desk, guest in places:
+                moving[index] = guest.tracee.ask_to_stop() is None
+        return self._set_back_singly(places, moving, failures)
+
+    def _set_back_singly(
+        self, places: Sequence[tuple[Desk, Guest]], moving: Sequence[bool], failures: list[CaptureError]
+    ) -> list[Desk]:
+        given = []
+        for (desk, guest), moves in zip(places, moving, strict=True):
             with _collected(failures):
-                if guest.tracee in moving:
+                if moves:
                     guest.tracee.await_stop()
                 set_back(guest.tracee, arch.encode_registers(guest.registers), guest.mask, self.holds)
                 given.append(desk)
-        idle = struct.pack("<Q", IDLE)
-        with _collected(failures):
-            self._memory.write_each([(desk.table + _STATE_OFFSET, idle) for desk in given])
-        if failures:
-            raise failures[0]
+        return given
 
 
 @contextlib.contextmanager
@@ -405,13 +430,13 @@ def _tables_when_done(memory: Memory, desks: Sequence[Desk], end: int) -> list[b
         os.sched_yield()
 
 
-def give_back(tracee: Tracee, registers: bytes, mask: int, is_ours: Callable[[int], bool]) -> arch.Registers:
+def give_back(tracee: Tracee, registers: bytes, mask: int, is_ours: Callable[[int], bool]) -> Registers:
     """Stop the thread in our code, and set it where the program stood. Answers with what it had there; raises as `set_back`."""
     tracee.freeze()
     return set_back(tracee, registers, mask, is_ours)
 
 
-def set_back(tracee: Tracee, registers: bytes, mask: int, is_ours: Callable[[int], bool]) -> arch.Registers:
+def set_back(tracee: Tracee, registers: bytes, mask: int, is_ours: Callable[[int], bool]) -> Registers:
     """Set a thread that stands in our code where the program stood. Mask first: see step 5. Answers with what it had there.
 
     Args:
@@ -422,6 +447,7 @@ def set_back(tracee: Tracee, registers: bytes, mask: int, is_ours: Callable[[int
     """
     found = arch.decode_registers(tracee.registers())
     if not is_ours(found[arch.INSTRUCTION_POINTER]):
+        tracee.is_as_found = True  # whatever it stands in now it has come to by itself
         raise CaptureError(
             f"pid {tracee.pid} has run on while it was looked at: the machine left us no processor for "
             f"{arch.ENTRY_TIMEOUT_NS // 1_000_000} ms; capture it again"
@@ -431,7 +457,7 @@ def set_back(tracee: Tracee, registers: bytes, mask: int, is_ours: Callable[[int
     return found
 
 
-def resumed(registers: arch.Registers) -> arch.Registers:
+def resumed(registers: Registers) -> Registers:
     """The registers with which the live program can go on without the kernel's help: an interrupted call is made again."""
     result = ctypes.c_int64(registers[arch.RESULT]).value
     number = ctypes.c_int64(registers[arch.CALL_NUMBER]).value

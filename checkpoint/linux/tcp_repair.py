@@ -57,7 +57,6 @@ PIECE_SIZE: Final = 1 << 15
 """Bytes that are laid into a queue at once: the kernel wants memory in one piece for each."""
 _ROOM: Final = 4
 """How much more memory than bytes a queue may take that is filled in such pieces."""
-_INFO_SIZE: Final = 8
 _WITH_TIMESTAMPS: Final = 1
 _WITH_SACK: Final = 2
 _WITH_SCALE: Final = 4

@@ -86,7 +86,7 @@ class Tracee:
     """One thread of another process, from `seize` to `detach`.
 
     Attributes:
-        is_as_found: nobody has set its registers since it was seized.
+        is_as_found: it stands where the program has come to by itself: nobody has set its registers since.
         stopped_by: the signal that had stopped its process when it stopped for us last (SIGSTOP, job control); 0: it ran.
 
     Args:
@@ -205,7 +205,7 @@ class Tracee:
             except ChildProcessError as error:
                 raise ProcessGoneError(f"pid {self.pid} ended while it was being looked at") from error
             if pid:
-                return self._stop_of(status)
+                return self.stop_of(status)
             waited = time.perf_counter() - began
             if waited > timeout_s:
                 raise no_stop(self.pid, timeout_s)
@@ -243,9 +243,14 @@ class Tracee:
             pid, status = os.waitpid(self.pid, abi.WALL | os.WNOHANG)
         except ChildProcessError as error:
             raise ProcessGoneError(f"pid {self.pid} ended while it was being looked at") from error
-        return self._stop_of(status) if pid else None
+        return self.stop_of(status) if pid else None
 
-    def _stop_of(self, status: int) -> Stop:
+    def stop_of(self, status: int) -> Stop:
+        """The stop that a wait status of it tells of.
+
+        Raises:
+            ProcessGoneError: it tells of its end.
+        """
         if not os.WIFSTOPPED(status):
             raise ProcessGoneError(f"pid {self.pid} ended while it was being looked at")
         stop = Stop(event=status >> 16, signal=os.WSTOPSIG(status))
@@ -275,6 +280,14 @@ class Tracee:
     def xstate(self) -> bytes:
         """Read the FPU and vector registers in XSAVE's own form (NT_X86_XSTATE)."""
         return self._getregset("read vector registers of", abi.NT_X86_XSTATE, self._xstate)
+
+    def register_set(self, kind: int) -> bytes:
+        """Read another register set.
+
+        Raises:
+            CaptureError: it has none of this kind.
+        """
+        return self._getregset("read registers of", kind, self._xstate)
 
     def set_xstate(self, content: bytes) -> None:
         """Write the FPU and vector registers."""
@@ -323,9 +336,40 @@ class Tracee:
             )
             raw = ctypes.string_at(buffer, count * abi.SIGINFO_SIZE)
             found += [raw[i * abi.SIGINFO_SIZE : (i + 1) * abi.SIGINFO_SIZE] for i in range(count)]
-            if count < PEEK_COUNT:
+            if not count:  # fewer than were asked for need not be all: the kernel breaks off when a signal waits for us
                 return tuple(found)
         raise CaptureError(f"pid {self.pid} has more than {PENDING_LIMIT} signals queued; capture it when it has taken them")
+
+    # Seccomp
+
+    def suspend_filters(self) -> None:
+        """Have no seccomp filter, nor strict mode, judge its calls until it is let go: that ends by itself then."""
+        self.request("suspend the seccomp filters of", abi.PTRACE_SETOPTIONS, 0, abi.PTRACE_O_SUSPEND_SECCOMP)
+
+    def filter_at(self, number: int) -> tuple[bytes, int] | None:
+        """One of its seccomp filters: instructions (struct sock_filter), and flags as far as the kernel tells them.
+
+        Args:
+            number: 0 is the oldest.
+
+        Returns:
+            None where it has no such one.
+
+        Raises:
+            CaptureError: EMEDIUMTYPE: the kernel has only its translation.
+        """
+        try:
+            count = int(_ptrace(abi.PTRACE_SECCOMP_GET_FILTER, self.pid, number, 0))
+        except PtraceError as error:
+            if error.errno in (errno.ENOENT, errno.EINVAL):
+                return None
+            raise self._failure("read a seccomp filter of", error.errno or 0) from error
+        content = ctypes.create_string_buffer(count * abi.SOCK_FILTER_SIZE)
+        self.request("read a seccomp filter of", abi.PTRACE_SECCOMP_GET_FILTER, number, ctypes.addressof(content))
+        about = (ctypes.c_uint64 * 2)(number, 0)
+        with contextlib.suppress(PtraceError):  # Linux 4.16 tells
+            _ptrace(abi.PTRACE_SECCOMP_GET_METADATA, self.pid, ctypes.sizeof(about), ctypes.addressof(about))
+        return content.raw, int(about[1])
 
     def dispatches_calls(self) -> bool:
         """Whether its system calls may end in a signal handler of its own (PR_SET_SYSCALL_USER_DISPATCH)."""

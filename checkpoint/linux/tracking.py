@@ -12,6 +12,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
+from checkpoint import scratch
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.pages import Words
@@ -46,6 +47,11 @@ class Tracker(Protocol):
     name: str
     sees_every_write: bool
     scans_running: bool
+
+    @property
+    def watched(self) -> Words:
+        """Where the next scan names every page whose entry in the page tables has changed, guards included."""
+        ...
 
     def arm(self, lines: Sequence[MapsLine]) -> None:
         """Begin to follow: whatever is written from now on is in the next scan. The process may run."""
@@ -100,7 +106,7 @@ def is_shared(line: MapsLine) -> bool:
     one that restores could not write to it.
     """
     from_its_file = line.has_file and not line.protection & abi.PROT_WRITE and not line.name.endswith(procfs.DELETED)
-    return line.shared and line.name not in NOT_CARRIED and not from_its_file
+    return line.shared and line.name not in NOT_CARRIED and line.name != scratch.MAPPED and not from_its_file
 
 
 MEMORY_PLACE: Final = "/dev/shm/"

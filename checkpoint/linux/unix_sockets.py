@@ -9,21 +9,14 @@ import contextlib
 import fcntl
 import socket
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
-NETLINK_SOCK_DIAG: Final = 4
-SOCK_DIAG_BY_FAMILY: Final = 20
-NLM_F_REQUEST: Final = 1
-NLM_F_DUMP: Final = 0x300
-ROOM: Final = 1 << 18
-"""Bytes of one part of a list; the kernel fills 32 KiB at most."""
+from checkpoint.linux import sock_diag
+
 SIOCUNIXFILE: Final = 0x89E0
-_HEADER: Final = struct.Struct("<IHHII")
 _REQUEST: Final = struct.Struct("<BBHIIIII")
 _ANSWER: Final = struct.Struct("<BBBxIII")
-_ATTRIBUTE: Final = struct.Struct("<HH")
 _SHOW: Final = 1 | 4 | 8 | 16
 """Name, peer, who waits to be accepted, lengths."""
 _NO_COOKIE: Final = 0xFFFFFFFF
@@ -58,33 +51,31 @@ class UnixSocket:
     shutdown: int
 
 
-def unix_socket(inode: int) -> UnixSocket | None:
-    """What a unix socket of our network namespace is; None where the kernel does not tell."""
-    with contextlib.suppress(OSError), socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM, NETLINK_SOCK_DIAG) as asked:
-        request = _REQUEST.pack(socket.AF_UNIX, 0, 0, _ANY_STATE, inode, _SHOW, _NO_COOKIE, _NO_COOKIE)
-        asked.send(_HEADER.pack(_HEADER.size + len(request), SOCK_DIAG_BY_FAMILY, NLM_F_REQUEST, 1, 0) + request)
-        return _parsed(asked.recv(1 << 16))
-    return None
+def answer_about(inode: int) -> bytes:
+    """What the kernel says of one unix socket of our network namespace, for `parsed`; b"" where it does not tell."""
+    with contextlib.suppress(OSError), sock_diag.opened() as asked:
+        asked.send(sock_diag.message(_REQUEST.pack(socket.AF_UNIX, 0, 0, _ANY_STATE, inode, _SHOW, _NO_COOKIE, _NO_COOKIE)))
+        packed = asked.recv(1 << 16)
+        size, kind, *_ = sock_diag.HEADER.unpack_from(packed)
+        if kind == sock_diag.SOCK_DIAG_BY_FAMILY:
+            return packed[sock_diag.HEADER.size : size]
+    return b""
 
 
-def answers(asked: socket.socket) -> Iterator[bytes]:
-    """Every message of a list that was asked for, without its header."""
-    while True:
-        packed = asked.recv(ROOM)
-        while packed:
-            size, kind, *_ = _HEADER.unpack_from(packed)
-            if kind != SOCK_DIAG_BY_FAMILY:  # the list's end, or an error
-                return
-            yield packed[_HEADER.size : size]
-            packed = packed[-(-size // 4) * 4 :]
+def answers() -> dict[int, bytes]:
+    """The same of all of them, by inode number; none where the kernel does not tell."""
+    request = _REQUEST.pack(socket.AF_UNIX, 0, 0, _ANY_STATE, 0, _SHOW, _NO_COOKIE, _NO_COOKIE)
+    with contextlib.suppress(OSError):
+        return {_ANSWER.unpack_from(answer)[3]: answer for answer in sock_diag.listed(request)}
+    return {}
 
 
-def _parsed(answer: bytes) -> UnixSocket | None:
-    size, kind, *_ = _HEADER.unpack_from(answer)
-    if kind != SOCK_DIAG_BY_FAMILY:
+def parsed(answer: bytes) -> UnixSocket | None:
+    """What an answer says; None for none."""
+    if not answer:
         return None
-    _, socket_type, state, _, _, _ = _ANSWER.unpack_from(answer, _HEADER.size)
-    found = dict(attributes(answer[_HEADER.size + _ANSWER.size : size]))
+    _, socket_type, state, _, _, _ = _ANSWER.unpack_from(answer)
+    found = dict(sock_diag.attributes(answer[_ANSWER.size :]))
     lengths = struct.unpack("<II", found[_LENGTHS]) if _LENGTHS in found else (0, 0)
     return UnixSocket(
         type=socket_type,
@@ -95,17 +86,6 @@ def _parsed(answer: bytes) -> UnixSocket | None:
         clients=tuple(number for (number,) in struct.iter_unpack("<I", found.get(_WAITING, b""))),
         shutdown=int.from_bytes(found.get(_SHUTDOWN, b""), "little"),
     )
-
-
-def attributes(packed: bytes) -> Iterator[tuple[int, bytes]]:
-    """The attributes of an answer: their number and content. Source: netlink(7), rtnetlink(7)."""
-    place = 0
-    while place + _ATTRIBUTE.size <= len(packed):
-        size, kind = _ATTRIBUTE.unpack_from(packed, place)
-        if size < _ATTRIBUTE.size:
-            return
-        yield kind, packed[place + _ATTRIBUTE.size : place + size]
-        place += -(-size // 4) * 4
 
 
 def bound_file(looked: socket.socket) -> int | None:

@@ -34,7 +34,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NoReturn
 
-from checkpoint.arch import x86_64_stub as stub
+from checkpoint.arch import stubs
 from checkpoint.errors import ProbeError, ProcessGoneError, RestoreError
 from checkpoint.linux import namespaces, procfs
 from checkpoint.linux.brought import BroughtFile, User, show
@@ -44,7 +44,7 @@ from checkpoint.model import Clocks
 _MFD_CLOEXEC_EXEC: Final = 0x1 | 0x10
 _MFD_CLOEXEC: Final = 0x1
 _WATCHED: Final = 3
-"""The descriptor that the first process's program watches; see ``x86_64_stub.WATCH``."""
+"""The descriptor that the first process's program watches; see ``stubs.WATCH``."""
 
 _REPORT_LIMIT: Final = 65536
 """Bytes of all reports of one birth; a few hundred are usual."""
@@ -58,7 +58,7 @@ class Birth:
         inner_pid: the PID it is to see as its own; 0: any. When it cannot be had, a note says so.
         isolate: give it PIDs, mounts and /proc of its own.
         clocks: the reading its monotonic and boot time are to go on from; None: this machine's clocks are right for it.
-        elapsed_ns: time since that reading.
+        elapsed_ns: time since that reading, as it was at ``counted_ns`` on CLOCK_BOOTTIME; 0: as it is now.
         stdio: our descriptors that become its 0, 1 and 2; all others are closed.
         own_session: make it the leader of a session, with standard input as its terminal if that is one.
         die_with_parent: SIGKILL it when the calling thread ends.
@@ -75,6 +75,7 @@ class Birth:
     die_with_parent: bool = True
     inheritance: Inheritance | None = None
     brought: tuple[BroughtFile, ...] = ()
+    counted_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +207,8 @@ def _attend(lines: _Lines, birth: Birth, become: Callable[[], NoReturn], keep_ri
     entered = namespaces.enter(pids=birth.isolate, clocks=birth.clocks is not None)
     notes = list(entered.notes)
     if entered.clocks and birth.clocks is not None:
-        namespaces.set_clocks(birth.clocks, birth.elapsed_ns)
+        since_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - birth.counted_ns if birth.counted_ns else 0
+        namespaces.set_clocks(birth.clocks, birth.elapsed_ns + since_ns)
     watch_read, watch_write = os.pipe()
     ready_read, ready_write = os.pipe()
     if entered.pids:
@@ -280,7 +282,7 @@ def _become_first_process(lines: _Lines, watch_read: int, ready_write: int, own_
     os.chdir("/")
     os.close(lines.descriptor)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # orphans that come to us are reaped by the kernel
-    code = fcntl.fcntl(_executable(stub.WATCH), fcntl.F_DUPFD_CLOEXEC, _WATCHED + 1)
+    code = fcntl.fcntl(_executable(stubs.WATCH), fcntl.F_DUPFD_CLOEXEC, _WATCHED + 1)
     os.dup2(pidfd, _WATCHED)
     namespaces.close_others_on_exec(_WATCHED + 1)
     os.execve(code, ["failover-init"], {})
@@ -339,7 +341,7 @@ def _forget_signals() -> None:
 
 
 def _become_vessel() -> NoReturn:
-    os.execve(_executable(stub.WAIT), ["failover-vessel"], {})
+    os.execve(_executable(stubs.WAIT), ["failover-vessel"], {})
 
 
 def _executable(code: bytes) -> int:
@@ -350,7 +352,7 @@ def _executable(code: bytes) -> int:
         if error.errno != errno.EINVAL:  # before Linux 6.3 there is no MFD_EXEC, and no need for it
             raise
         descriptor = os.memfd_create("failover", _MFD_CLOEXEC)
-    os.write(descriptor, stub.program(code))
+    os.write(descriptor, stubs.program(code))
     return descriptor
 
 

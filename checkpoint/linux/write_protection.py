@@ -65,12 +65,18 @@ class PagemapTracker:
         self._scanner = PageScanner(pid)
         self._armed: Words = NONE
         self._tracked: Words = NONE
-        self._spans: list[tuple[int, int]] = []
+        self._spans: Words = NONE
         self._open: Words = NONE
         self._doubtful: Words = NONE
         self._files: Words = NONE
         self._owned: Words = NONE
+        self._around_owned: tuple[Words, Words] = (NONE, NONE)
         self._stubborn: set[tuple[int, int]] = set()
+
+    @property
+    def watched(self) -> Words:
+        """See `Tracker.watched`."""
+        return self._armed
 
     def arm(self, lines: Sequence[MapsLine]) -> None:
         """See `Tracker.arm`. A mapping that goes or comes meanwhile is found fresh by the scan."""
@@ -121,12 +127,7 @@ class PagemapTracker:
     def _found(self, lines: Sequence[MapsLine], *, changed: bool, is_running: bool) -> Scan:
         if changed:
             self._learn(lines)
-        fresh = [
-            line
-            for start, end in self._spans
-            if not self._scanner.is_protected(start, end)
-            for line in self._lost(lines, start, end)
-        ]
+        fresh = [line for start, end in self._scanner.unprotected(self._spans) for line in self._lost(lines, start, end)]
         cleared, copied = extents_of(fresh), NONE
         if fresh:
             self._armed = pages.difference(self._armed, cleared)
@@ -179,7 +180,8 @@ class PagemapTracker:
         self._open = pages.difference(self._tracked, self._armed)
         self._doubtful = pages.intersection(self._doubtful, self._tracked)
         self._files = extents_of([line for line in followed if line.has_file])
-        self._spans = [(int(start), int(end)) for start, end in extents_of(lines).tolist()]
+        self._owned = pages.intersection(self._owned, self._files)
+        self._spans = extents_of(lines)
 
     def _lost(self, lines: Sequence[MapsLine], start: int, end: int) -> list[MapsLine]:
         inside = (line for line in lines if start <= line.start and line.end <= end)
@@ -239,11 +241,22 @@ class PagemapTracker:
         is_doubtful = (written[:, 1] - written[:, 0]) > LONG_RUN
         if len(self._files):
             is_doubtful |= touching(written, self._files)
-        doubtful = pages.union(written[is_doubtful], self._owned)
-        real = self._scanner.existing(surroundings_of(doubtful))
+        doubtful = written[is_doubtful]
+        doubtful = self._owned if pages.covers(self._owned, doubtful) else pages.union(doubtful, self._owned)
+        real = self._scanner.existing(self._surroundings_of(doubtful))
+        if doubtful is self._owned and not len(copied) and pages.covers(real, doubtful):
+            return written, NONE
         empty = pages.difference(doubtful, real)
         self._owned = pages.intersection(pages.union(real, copied), self._files)
         return pages.union(pages.difference(written, empty), copied), empty
+
+    def _surroundings_of(self, doubtful: Words) -> Words:
+        """Those of the private copies are the same from scan to scan."""
+        if doubtful is not self._owned:
+            return surroundings_of(doubtful)
+        if self._around_owned[0] is not doubtful:
+            self._around_owned = doubtful, surroundings_of(doubtful)
+        return self._around_owned[1]
 
 
 def surroundings_of(extents: Words) -> Words:

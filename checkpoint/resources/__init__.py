@@ -16,11 +16,15 @@ from typing import TYPE_CHECKING, Final
 from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import KEPT, REFUSED, Finding
 from checkpoint.errors import CaptureError
-from checkpoint.linux import abi, entry
-from checkpoint.linux.descriptors import Descriptor, KeptTexts, descriptors
+from checkpoint.linux import entry
+from checkpoint.linux.descriptors import Descriptor, descriptors
+from checkpoint.linux.kept_descriptors import KeptTexts
 from checkpoint.model import Fact, Resource
+from checkpoint.resources.grouping import Grouping
+from checkpoint.resources.listings import Listings
 
 if TYPE_CHECKING:
+    from checkpoint.resources.recollection import Recollection
     from checkpoint.resources.sockets import Noted
     from checkpoint.resources.travelling import Lent
 
@@ -128,16 +132,30 @@ def pipes_of(outputs: Sequence[int]) -> dict[str, int]:
     }
 
 
-Group = tuple[int, str]
-"""A multicast group: interface and address."""
+@dataclass(frozen=True, slots=True)
+class Recalled:
+    """What a socket answers as it did at the last look.
+
+    Attributes:
+        settings: facts that follow from what the program has set.
+        whole: the open file with all that was observed, where everything is as it was.
+    """
+
+    settings: Mapping[str, Fact]
+    whole: OpenFile | None = None
 
 
 class Opened(tuple[OpenFile, ...]):
     """All open files of a process, one entry for those that share one; and what is asked once for many of them."""
 
     @functools.cached_property
-    def groups(self) -> dict[int, tuple[Group, ...]]:
-        """Multicast groups of the machine by family, as far as they were asked for."""
+    def listings(self) -> Listings:
+        """What is read once for all of them."""
+        return Listings()
+
+    @functools.cached_property
+    def recalled(self) -> dict[int, Recalled]:
+        """Of sockets that are, in part at least, as they were at the last look, by their descriptors."""
         return {}
 
     @functools.cached_property
@@ -146,69 +164,57 @@ class Opened(tuple[OpenFile, ...]):
         return []
 
     @functools.cached_property
-    def shut_down(self) -> dict[tuple[int, int], Mapping[int, int]]:
-        """Sockets for datagrams that were shut down, by family and protocol, as far as they were asked for."""
-        return {}
-
-    @functools.cached_property
     def inodes(self) -> frozenset[int]:
         """Their numbers."""
         return frozenset(one.first.inode for one in self)
 
 
-def gather(pid: int, kept: KeptTexts | None = None) -> Opened:
+class Kept:
+    """What is kept of a process that is looked at again and again, so that only what has changed is read anew."""
+
+    def __init__(self, pid: int) -> None:
+        self.texts = KeptTexts(pid)
+        self.grouping = Grouping(pid)
+        self._groups: tuple[tuple[Descriptor, ...], ...] = ()
+        self._opened: tuple[OpenFile, ...] = ()
+
+    def opened(self, groups: tuple[tuple[Descriptor, ...], ...], pid: int) -> tuple[OpenFile, ...]:
+        """The open files; the very same where they have not changed."""
+        if groups is not self._groups:
+            self._groups, self._opened = groups, _opened_of(groups, pid)
+        return self._opened
+
+
+def gather(pid: int, kept: Kept | None = None) -> Opened:
     """Read every descriptor, and which of them share an open file. For an exact picture the process stands still.
 
     Args:
         kept: of a process that is looked at again and again.
     """
-    groups: list[list[Descriptor]] = []
-    alike: dict[tuple[int | bytes, ...], list[list[Descriptor]]] = {}
-    for one in descriptors(pid, kept):
-        if entry.is_left_open(one):  # ours, and closed when it is entered
-            continue
-        identity = (one.device, one.inode, one.offset, one.flags & ~os.O_CLOEXEC, _own_number(one))
-        candidates = alike.setdefault(identity, [])
-        place, is_known = _place_among(pid, candidates, one)
-        if is_known:
-            candidates[place].append(one)
-        else:
-            groups.append([one])
-            candidates.insert(place, groups[-1])
+    found = descriptors(pid, kept.texts if kept else None)
+    if any(map(entry.is_left_open, found)):  # ours, and closed when it is entered
+        found = tuple(one for one in found if not entry.is_left_open(one))
+    groups = (kept.grouping if kept else Grouping(pid)).of(found)
+    return Opened(kept.opened(groups, pid) if kept else _opened_of(groups, pid))
+
+
+def _opened_of(groups: Sequence[tuple[Descriptor, ...]], pid: int) -> tuple[OpenFile, ...]:
     ends = {(group[0].target, group[0].flags & os.O_ACCMODE) for group in groups}
     other = {os.O_RDONLY: os.O_WRONLY, os.O_WRONLY: os.O_RDONLY}
-    return Opened(
-        OpenFile(pid, tuple(group), both_ends=(group[0].target, other.get(group[0].flags & os.O_ACCMODE)) in ends)
-        for group in groups
+    return tuple(
+        OpenFile(pid, group, both_ends=(group[0].target, other.get(group[0].flags & os.O_ACCMODE)) in ends) for group in groups
     )
 
 
-def _own_number(one: Descriptor) -> bytes:
-    """What tells an eventfd from all others; b"" for other kinds, and on kernels before 4.20. Source: fs/eventfd.c."""
-    return one.told.partition(b"eventfd-id:")[2].partition(b"\n")[0]
-
-
-def _place_among(pid: int, ordered: Sequence[Sequence[Descriptor]], one: Descriptor) -> tuple[int, bool]:
-    """Where a descriptor belongs among open files in the kernel's own order, and whether it is one of them.
-
-    The order makes it few questions: a program may have thousands of timerfds, which are all alike. Source: kcmp(2), KCMP_FILE.
-    """
-    low, high = 0, len(ordered)
-    while low < high:
-        middle = (low + high) // 2
-        order = abi.kcmp(pid, pid, abi.KCMP_FILE, one.number, ordered[middle][0].number)
-        if order == 0:
-            return middle, True
-        low, high = (low, middle) if order == 1 else (middle + 1, high)
-    return low, False
-
-
-def with_contents(opened: Opened, noted: Noted | None, rules: tuple[DeviceRule, ...] = ()) -> tuple[OpenFile, ...]:
+def with_contents(
+    opened: Opened, noted: Noted | None, rules: tuple[DeviceRule, ...] = (), recollection: Recollection | None = None
+) -> tuple[OpenFile, ...]:
     """Add the content of every deleted file and of every pipe that is kept, and what else must be asked while it stands still.
 
     Args:
         noted: see `checkpoint.resources.sockets.queue_of`; None for a process that runs.
         rules: of devices; others are not asked.
+        recollection: of a process that is looked at again and again.
 
     Raises:
         CaptureError: one of them cannot be looked into.
@@ -216,8 +222,11 @@ def with_contents(opened: Opened, noted: Noted | None, rules: tuple[DeviceRule, 
     from checkpoint.resources import attached_devices, files, kinds, pipes
 
     found = []
-    for held in _with_travelling(opened, noted):
-        if held.is_echo or held.observed:
+    empty = recollection.empty_pipes(opened) if recollection and not rules else {}
+    for held in _with_travelling(opened, noted, recollection):
+        if held.first.number in empty and held.lent is None:
+            held = empty[held.first.number]
+        elif held.is_echo or held.observed:
             pass
         elif rules and attached_devices.is_ruled(held.first, rules):
             held = replace(held, observed=attached_devices.observe(held, opened))
@@ -227,18 +236,19 @@ def with_contents(opened: Opened, noted: Noted | None, rules: tuple[DeviceRule, 
             held = replace(held, observed=files.observe_deleted(held, opened))
         elif pipes.is_pipe(held.first) and (held.both_ends or (_may_be_half(held) and pipes.is_half(held))):
             capacity, pieces = pipes.look_into(held)
-            packets: list[Fact] = [len(piece) for piece in pieces]
-            content = b"".join(pieces)
-            held = replace(held, both_ends=True, capacity=capacity, content=content, observed={"packets": packets})
+            held = pipes.with_content(held, capacity, pieces)
         found.append(held)
     return tuple(found)
 
 
-def _with_travelling(opened: Opened, noted: Noted | None) -> list[OpenFile]:
+def _with_travelling(opened: Opened, noted: Noted | None, recollection: Recollection | None = None) -> list[OpenFile]:
     """All of them, sockets looked into, and what was found on its way in these."""
     from checkpoint.resources import travelling
 
+    answers = recollection.recall(opened) if recollection else {}
     found = [_looked_into(held, opened, noted) for held in opened]
+    if recollection:
+        recollection.remember(found, answers, opened)
     for held in opened.travelling:  # which grows meanwhile
         found.append(_looked_into(held, opened, noted and travelling.unnoted))
     is_hidden = travelling.may_hide(found, noted)
@@ -250,8 +260,9 @@ def _with_travelling(opened: Opened, noted: Noted | None) -> list[OpenFile]:
     def completed(held: OpenFile) -> OpenFile:
         if held.first.target in whole or (is_hidden and held.first.target.startswith("pipe:")):
             return replace(held, both_ends=True)
-        peer = held.observed.get("peer")
-        return replace(held, observed={**held.observed, "peer_is_ours": True}) if peer and (is_hidden or peer in inodes) else held
+        peer = held.observed.get("peer")  # the number of a unix socket; of another kind an address
+        is_ours = isinstance(peer, int) and bool(peer) and (is_hidden or peer in inodes)
+        return replace(held, observed={**held.observed, "peer_is_ours": True}) if is_ours else held
 
     return list(map(completed, found))
 
@@ -260,6 +271,9 @@ def _looked_into(held: OpenFile, opened: Opened, noted: Noted | None) -> OpenFil
     """A socket as it is observed; as it was where it cannot be, of which whoever asks next is told."""
     from checkpoint.resources import kinds, sockets
 
+    recalled = opened.recalled.get(held.first.number)
+    if recalled and recalled.whole is not None and held.lent is None:
+        return recalled.whole
     if not held.is_echo and sockets.is_socket(held.first):
         with contextlib.suppress(CaptureError):
             return replace(held, observed=kinds.observe_socket(held, opened, noted=noted))

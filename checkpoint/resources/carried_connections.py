@@ -114,7 +114,8 @@ def depart(opened: Iterable[OpenFile]) -> Departing:
 
 def _with_others(opened: Iterable[OpenFile]) -> Iterator[OpenFile]:
     """Connections that live, and whose other end is not the program's, too."""
-    living = [(one, _connection(one.observed)) for one in opened if tcp_connections.is_carriable(one.observed)]
+    own = (one for one in opened if one.lent is None)  # of another the program has no descriptor that could be given to it
+    living = [(one, _connection(one.observed)) for one in own if tcp_connections.is_carriable(one.observed)]
     ends = {(between.peer, between.ours) for _, between in living}
     for one, between in living:
         if (between.ours, between.peer) not in ends:
@@ -187,8 +188,10 @@ class Arriving:
         notes: what is to be done for them.
     """
 
-    def __init__(self, arrivals: Iterable[_Arrival] = ()) -> None:
+    def __init__(self, arrivals: Iterable[_Arrival] = (), ended: Iterable[Connection] = ()) -> None:
+        """Of those that it takes up, and of those that have ended: this machine resets them, also where it was to be silent."""
         self._arrivals = tuple(arrivals)
+        self._ended = tuple(ended)
         self.notes = tuple(_missing(one) for one in self._arrivals if not internet_sockets.is_ours(_ends(one.resource)[0]))
         self._made: list[tuple[socket.socket, _Arrival, int]] = []
 
@@ -229,6 +232,8 @@ class Arriving:
                 made.close()
         except OSError as error:
             raise RestoreError(f"cannot let TCP connections go on: {error.strerror}") from error
+        with contextlib.suppress(OSError):  # then nobody could have silenced them either
+            silence.lift(self._ended)
 
 
 def _missing(one: _Arrival) -> str:
@@ -249,8 +254,11 @@ def arriving(state: Snapshot, *, wanted: bool) -> tuple[Arriving, Snapshot]:
     """
     lost: dict[int, str] = {}
     arrivals = []
+    ended = []
     for process, resources in enumerate((state.resources, *(member.resources for member in state.members))):
         for held in resources:
+            if held.kind == KIND and not wanted and tcp_connections.is_carriable(held.facts):
+                ended.append(_connection(held.facts))
             if held.kind == KIND and TAKEN in held.facts:
                 one = _Arrival(process, held, _connection(held.facts), _kept(held))
                 if reason := _hindrance(one) if wanted else "it goes on from an older state":
@@ -263,7 +271,7 @@ def arriving(state: Snapshot, *, wanted: bool) -> tuple[Arriving, Snapshot]:
             return held
         return replace(held, facts={**{name: fact for name, fact in held.facts.items() if name != TAKEN}, LEFT: reason})
 
-    return Arriving(arrivals), _changed(state, without) if lost else state
+    return Arriving(arrivals, ended), _changed(state, without) if lost else state
 
 
 def _changed(state: Snapshot, change: Callable[[Resource], Resource]) -> Snapshot:

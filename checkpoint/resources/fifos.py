@@ -191,4 +191,7 @@ def _nameless(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
 def _make(table: CallTable, path: str, mode: int) -> None:
     place = table.place_path(path)
     table.attempt("", "mknodat", _AT_FDCWD, place, stat.S_IFIFO | mode & 0o7777, 0)  # two descriptors of it make it once
-    table.attempt("", "fchmodat", _AT_FDCWD, place, mode & 0o7777)
+    made = table.open(path, nameless.O_PATH | os.O_NOFOLLOW)
+    itself = table.place_path(f"/proc/self/fd/{made}")  # its name may be another's by now
+    table.attempt("", "fchmodat", _AT_FDCWD, itself, mode & 0o7777)
+    table.close(made)

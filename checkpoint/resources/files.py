@@ -199,10 +199,10 @@ def _is_or_was_found(held: OpenFile) -> bool:
     Two looks may fall between a deletion and the making of another file of the same name, which often gets the same inode, as a
     database's journals do: a file that is where it was and has no name has one at the next look.
     """
-    return any(_is_found(held) or _has_just_lost_its_name(held) for _ in range(LOOKS))
+    return any(is_found(held) or _has_just_lost_its_name(held) for _ in range(LOOKS))
 
 
-def _is_found(held: OpenFile) -> bool:
+def is_found(held: OpenFile) -> bool:
     """Whether its path leads to it, as the process sees paths."""
     try:
         about = os.stat(f"/proc/{held.pid}/root{held.first.target}", follow_symlinks=not held.first.flags & O_PATH)
@@ -245,7 +245,8 @@ def observe_deleted(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, 
     Raises:
         CaptureError: it cannot be read.
     """
-    first = next(one for one in opened if (one.first.device, one.first.inode) == (held.first.device, held.first.inode))
+    same = (held.first.device, held.first.inode)
+    first = next((one for one in opened if (one.first.device, one.first.inode) == same), held)
     if locks.has_lease(held):
         return {}  # to read it would break that
     return {"content": _content_of(held) if first is held else [], "attributes": _attributes_of(held)}

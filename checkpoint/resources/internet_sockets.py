@@ -26,11 +26,10 @@ from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.engine import NOTED, Finding
-from checkpoint.linux import internet_sockets as inet_diag
-from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import Group, Opened, OpenFile, Surroundings, elsewhere, sockets
+from checkpoint.resources import Opened, OpenFile, Surroundings, elsewhere, sockets
+from checkpoint.resources.listings import Group, Listings
 from checkpoint.resources.rebuilding import number_of
 from checkpoint.resources.unix_makers import Disguise
 
@@ -100,7 +99,7 @@ def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: socket
     Raises:
         OSError: it cannot be looked into.
     """
-    facts = sockets.general_facts(held.first, looked)
+    facts = sockets.general_facts(held, looked, opened)
     state, waiting, backlog = CLOSED, 0, 0
     if looked.proto == socket.IPPROTO_TCP:
         state, *_, waiting, backlog = _TCP_INFO.unpack(looked.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size))
@@ -110,12 +109,12 @@ def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: socket
     return facts | {
         "state": state,
         "address": _bound(looked.getsockname()),
-        "peer": _peer(held, looked),
+        "peer": _peer(held, looked, opened.listings),
         "backlog": backlog if state == LISTENING else 0,
         "waiting": waiting if state == LISTENING else 0,
         "queue": list(queue.messages),
         "sources": [list(source) for source in queue.sources if isinstance(source, tuple)],
-        "groups": list(_groups(looked, _machine_groups(held.pid, opened, looked.family))) if is_datagram else [],
+        "groups": list(_groups(looked, opened.listings.groups(held.pid, looked.family))) if is_datagram else [],
         "shutdown": _shutdown(held, looked, opened) if is_datagram else 0,
         "failed": may_queue and bool(sockets.readiness(looked) & select.POLLERR),
         "lost": is_datagram and not may_queue and bool(sockets.readiness(looked)),
@@ -124,13 +123,12 @@ def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: socket
 
 def _shutdown(held: OpenFile, looked: socket.socket, opened: Opened) -> int:
     """What of a socket for datagrams was shut down; only poll(2) tells of one that is bound to no port, and not that it sends."""
-    key = int(looked.family), looked.proto
-    if key not in opened.shut_down:
-        opened.shut_down[key] = inet_diag.shut_down(*key) if looked.proto in DATAGRAMS else {}
     poll = select.poll()
     poll.register(looked, select.POLLRDHUP)
     seen = dict(poll.poll(0)).get(looked.fileno(), 0)
-    told = opened.shut_down[key].get(held.first.inode, 0)
+    is_listed = looked.proto in DATAGRAMS and looked.getsockname()[1]
+    listed = opened.listings.shut_down(int(looked.family), looked.proto) if is_listed else {}
+    told = listed.get(held.first.inode, 0)
     return told | (SHUT_DOWN_WHOLE if seen & select.POLLHUP else bool(seen & select.POLLRDHUP))
 
 
@@ -143,7 +141,7 @@ def in_words(address: Sequence[Fact]) -> str:
     return f"{address[0]!s} port {address[1]!s}"
 
 
-def _peer(held: OpenFile, looked: socket.socket) -> list[Fact]:
+def _peer(held: OpenFile, looked: socket.socket, listings: Listings) -> list[Fact]:
     """Whom it is, or was, connected with."""
     with contextlib.suppress(OSError):
         return list(looked.getpeername())
@@ -152,19 +150,8 @@ def _peer(held: OpenFile, looked: socket.socket) -> list[Fact]:
             size = 28 if looked.family == socket.AF_INET6 else 16
             return _unpacked(looked.getsockopt(socket.SOL_SOCKET, SO_PEERNAME, size))
     elif looked.type == socket.SOCK_RAW or looked.proto in PINGS:  # no port, and so no peer for getpeername(2)
-        return listed_peer(held, looked.family, "raw" if looked.type == socket.SOCK_RAW else "icmp")
-    return []
-
-
-def listed_peer(held: OpenFile, family: int, table: str) -> list[Fact]:
-    """Whom a socket is connected with, as /proc lists it; empty for none. Source: proc_pid_net(5)."""
-    for line in procfs.read_text(held.pid, f"net/{table}{'6' if family == socket.AF_INET6 else ''}").splitlines()[1:]:
-        words = line.split()
-        if int(words[9]) == held.first.inode:
-            host, _, port = words[2].partition(":")
-            packed = b"".join(bytes.fromhex(host[place : place + 8])[::-1] for place in range(0, len(host), 8))
-            if any(packed):
-                return [socket.inet_ntop(family, packed), int(port, 16), *([0, 0] if family == socket.AF_INET6 else [])]
+        table = "raw" if looked.type == socket.SOCK_RAW else "icmp"
+        return listings.peer(held.pid, table, looked.family, held.first.inode)
     return []
 
 
@@ -190,29 +177,6 @@ def _groups(looked: socket.socket, known: Sequence[Group]) -> Iterator[list[Fact
             count = _FILTER.unpack_from(packed)[3]
             with contextlib.suppress(OSError):  # the interface has just gone
                 yield [socket.if_indextoname(interface), group, bytes(packed[: _FILTER.size + ADDRESS_SIZE * count])]
-
-
-def _machine_groups(pid: int, opened: Opened, family: int) -> tuple[Group, ...]:
-    """All groups that anybody on this machine has joined: asked once for all sockets."""
-    if family not in opened.groups:
-        opened.groups[family] = tuple(_listed_groups(pid, family))
-    return opened.groups[family]
-
-
-def _listed_groups(pid: int, family: int) -> Iterator[Group]:
-    """Source: proc_pid_net(5)."""
-    if family == socket.AF_INET6:
-        for line in procfs.read_text(pid, "net/igmp6").splitlines():
-            words = line.split()
-            yield int(words[0]), socket.inet_ntop(socket.AF_INET6, bytes.fromhex(words[2]))
-        return
-    interface = 0
-    for line in procfs.read_text(pid, "net/igmp").splitlines()[1:]:
-        words = line.split()
-        if not line.startswith("\t"):
-            interface = int(words[0])
-        else:
-            yield interface, socket.inet_ntoa(bytes.fromhex(words[0])[::-1])
 
 
 def sockaddr(address: Sequence[Fact]) -> bytes:

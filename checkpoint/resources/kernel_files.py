@@ -4,7 +4,7 @@ What is read from them is what the kernel says then. Whatever acts on the machin
 files of other processes.
 
 Facts: ``descriptors``; ``path``, with ``{pid}`` in place of the process's own number, and numbers of others as the program knows
-them; ``flags`` of open(2); ``offset``.
+them; ``flags`` of open(2); ``offset``; of a process that has ended ``ended`` (see `departed`), and ``{ended}`` for its number.
 
 Source: proc(5), sysfs(5).
 """
@@ -21,7 +21,7 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.descriptors import Descriptor
-from checkpoint.model import Resource
+from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile, Surroundings
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
@@ -31,7 +31,7 @@ CAPABILITIES: Final = (
     preserved(
         Area.FILES,
         "files of /proc and /sys that are read",
-        "opened again where they stood; those of the program itself lead to itself again",
+        "opened again where they stood; those of the program itself lead to itself again, those of what has ended to nobody",
     ),
     refused(
         Area.FILES,
@@ -41,7 +41,7 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.FILES,
-        "files of /proc of single threads and of other programs",
+        "files of /proc of single threads and of other programs that live",
         "let the program close them after reading",
         "of one of its threads: let the program close it",
         "a view of another process",
@@ -64,12 +64,15 @@ PLACES: Final = ("/proc", "/sys")
 UNREADABLE: Final = ("/proc/kmsg", "/sys/kernel/debug", "/sys/kernel/tracing", "/sys/fs/bpf", "/proc/sys/fs/binfmt_misc")
 """What is used up by being read, or is no view at all."""
 OWN: Final = "/proc/{pid}"
+ENDED: Final = "/proc/{ended}"
 O_PATH: Final = 0o10000000
 
 INIT: Final = 1
 """Every machine has one, and every PID namespace."""
 
 _OF_A_PROCESS: Final = re.compile(r"/proc/(\d+)(/.*)?")
+_OF_ITS_OWN: Final = re.compile(r"/(fd|fdinfo|map_files|task|ns)/(?!\{)")
+"""Files of a process that another one may not have."""
 _OF_A_THREAD: Final = re.compile(r"/task/\d+")
 
 
@@ -84,15 +87,30 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
     if not is_kernels(held.first):
         return None
     flags, path = held.first.flags & ~os.O_CLOEXEC, _path_of(held)
-    return Resource(KIND, held.name, {"descriptors": held.numbers, "path": path, "flags": flags, "offset": held.first.offset})
+    facts: dict[str, Fact] = {"descriptors": held.numbers, "path": path, "flags": flags, "offset": held.first.offset}
+    if path.startswith(ENDED) and (match := _OF_A_PROCESS.match(held.first.target)):
+        facts["ended"] = int(match[1])
+    return Resource(KIND, held.name, facts)
 
 
 def _path_of(held: OpenFile) -> str:
-    """Its path, with ``{pid}`` for the program's own number."""
-    match = _OF_A_PROCESS.fullmatch(held.first.target)
-    if match is None or int(match[1]) != procfs.status(held.pid).pids[-1]:
-        return held.first.target
-    return OWN + (match[2] or "").replace(f"/task/{match[1]}", "/task/{pid}")
+    """Its path, with ``{pid}`` for the program's own number, ``{ended}`` for that of a process that has ended."""
+    target = held.first.target
+    match = _OF_A_PROCESS.fullmatch(target.removesuffix(procfs.DELETED))
+    if match is None:
+        return target
+    if _has_ended(held, match[1]):
+        return ENDED + (match[2] or "").replace(f"/task/{match[1]}", "/task/{ended}")
+    if int(match[1]) != procfs.status(held.pid).pids[-1]:
+        return target
+    return OWN + target.removeprefix(f"/proc/{match[1]}").replace(f"/task/{match[1]}", "/task/{pid}")
+
+
+def _has_ended(held: OpenFile, number: str) -> bool:
+    """Whether a process of whom it has a file is no more: others may have got its number, but the file's name is gone then."""
+    place = f"/proc/{held.pid}/root/proc"
+    is_named = not held.first.target.endswith(procfs.DELETED) and os.path.exists(f"{place}/{number}")
+    return not is_named and os.path.exists(f"{place}/self")
 
 
 def _known_numbers(held: OpenFile) -> Iterator[int]:
@@ -105,26 +123,49 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     if not is_kernels(held.first):
         return None
     path, what = _path_of(held), f"{held.name} is {held.first.target}"
-    if path.endswith(procfs.DELETED) or any(f"{path}/".startswith(f"{place}/") for place in UNREADABLE):
+    is_lost = path.endswith(procfs.DELETED) and not path.startswith(ENDED)
+    if is_lost or any(f"{path}/".startswith(f"{place}/") for place in UNREADABLE):
         return f"{what}, a part of this machine's kernel that cannot be opened again as it was: let the program close it"
+    if path.startswith(ENDED) and not held.description and not _OF_ITS_OWN.search(path) and _is_only_read(held):
+        return None
     if path.startswith(OWN):
         return f"{what}, of one of its threads: let the program close it" if _OF_A_THREAD.search(path) else None
-    if (match := _OF_A_PROCESS.fullmatch(path)) and int(match[1]) not in (INIT, *_known_numbers(held)):
+    match = _OF_A_PROCESS.fullmatch(path)
+    if path.startswith(ENDED) or (match and int(match[1]) not in (INIT, *_known_numbers(held))):
         return f"{what}, a view of another process: let the program close it after reading"
-    if held.first.flags & os.O_ACCMODE != os.O_RDONLY and not held.first.flags & O_PATH:
+    if not _is_only_read(held):
         return f"{what}, open for writing, by which it acts on this machine's kernel: let the program open it only to write"
     return None
+
+
+def left_by_ended(directory: str) -> str:
+    """A directory in /proc of a process that has ended, with ``{ended}`` for its number; "" if a path is none."""
+    match = _OF_A_PROCESS.fullmatch(directory.removesuffix(procfs.DELETED))
+    if match is None or not directory.endswith(procfs.DELETED) or _OF_ITS_OWN.search(f"{match[2] or ''}/"):
+        return ""
+    return ENDED + (match[2] or "")
+
+
+def of_ended(path: str, pid: int) -> str:
+    """The same of a process that lives."""
+    return path.replace(ENDED, f"/proc/{pid}").replace("{ended}", str(pid))
+
+
+def _is_only_read(held: OpenFile) -> bool:
+    return held.first.flags & os.O_ACCMODE == os.O_RDONLY or bool(held.first.flags & O_PATH)
 
 
 def mismatches(held: Resource) -> Iterator[str]:
     """Why it is not here."""
     path = str(held.facts["path"])
-    if not (path.startswith(OWN) or _OF_A_PROCESS.fullmatch(path) or os.path.exists(path)):
+    if not (path.startswith((OWN, ENDED)) or _OF_A_PROCESS.fullmatch(path) or os.path.exists(path)):
         yield f"{path}, open as {held.name}, is not offered by this kernel: boot the same one, or attach what it shows"
 
 
 def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     """Open it again."""
+    if held.facts.get("ended"):
+        return rebuilding.ended(table, held)
     path = str(held.facts["path"]).replace("{pid}", str(rebuilding.inner_pid))
     flags, offset = number_of(held.facts["flags"]), number_of(held.facts["offset"])
     made = table.open(path, flags)

@@ -16,6 +16,7 @@ from checkpoint.resources import (
     OpenFile,
     Surroundings,
     attached_devices,
+    covered_files,
     devices,
     epolls,
     eventfds,
@@ -24,6 +25,7 @@ from checkpoint.resources import (
     internet_sockets,
     kernel_files,
     memory_files,
+    namespace_files,
     netlink_sockets,
     packet_sockets,
     pidfds,
@@ -64,6 +66,7 @@ ASKED: Final[tuple[Kind, ...]] = (
     shared,
     kernel_files,
     memory_files,
+    covered_files,
     files,
     devices,
     pipes,
@@ -72,6 +75,7 @@ ASKED: Final[tuple[Kind, ...]] = (
     timerfds,
     signalfds,
     pidfds,
+    namespace_files,
     epolls,
     watches,
     unix_sockets,
@@ -120,9 +124,9 @@ def observe_socket(held: OpenFile, opened: Opened, *, noted: sockets.Noted | Non
             if looked.family == socket.AF_UNIX:
                 return unix_sockets.observe(held, looked, opened, noted)
             if looked.family == socket.AF_NETLINK:
-                return netlink_sockets.observe(held, looked)
+                return netlink_sockets.observe(held, looked, opened)
             if packet_sockets.is_mine(looked):
-                return packet_sockets.observe(held, looked)
+                return packet_sockets.observe(held, looked, opened)
             if internet_sockets.is_kept(looked.family, looked.type, looked.proto):
                 return _observe_internet_socket(held, looked, opened, noted)
     except OSError as error:
@@ -136,7 +140,9 @@ def _observe_internet_socket(
     facts = internet_sockets.observe(held, looked, opened, noted)
     if looked.proto == socket.IPPROTO_TCP and facts["state"] == internet_sockets.CLOSED:
         facts["ends"] = tcp_connections.ends_of(looked)
-    return facts | tcp_connections.observe(held, looked, facts) if tcp_connections.is_connection(facts) else facts
+    return (
+        facts | tcp_connections.observe(held, looked, facts, opened.listings) if tcp_connections.is_connection(facts) else facts
+    )
 
 
 def findings_of_all(resources: Sequence[Resource], *, standing: bool) -> tuple[Finding, ...]:

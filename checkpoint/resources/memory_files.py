@@ -18,6 +18,7 @@ import stat
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
+from checkpoint import scratch
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError
 from checkpoint.linux import procfs
@@ -32,6 +33,7 @@ KIND: Final = "memory_files"
 
 CAPABILITIES: Final = (
     preserved(Area.FILES, "memory files (memfd)", "with name, content, size and seals, up to 16 MiB"),
+    preserved(Area.MEMORY, "scratch memory", "a memory file called failover-scratch: mapped again, filled with zeros"),
     refused(
         Area.FILES,
         "memory files over 16 MiB, of huge pages, or sealed against writing and mapped; shared memory that is opened and mapped",
@@ -70,14 +72,15 @@ def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
     Raises:
         CaptureError: it cannot be looked into.
     """
-    first = next(one for one in opened if _key(one.first) == _key(held.first))
+    first = next((one for one in opened if _key(one.first) == _key(held.first)), held)  # one on its way may be open nowhere
     try:
         with copy_of(held.pid, held.first.number) as descriptor:
             about, seals = os.fstat(descriptor), fcntl.fcntl(descriptor, F_GET_SEALS)
-        content = _content(held) if first is held and about.st_blocks * 512 <= CONTENT_LIMIT else []
+        stored = 0 if held.first.target == scratch.MAPPED else about.st_blocks * 512
+        content = _content(held) if first is held and 0 < stored <= CONTENT_LIMIT else []
     except OSError as error:
         raise CaptureError(f"cannot look into the memory file {held.name} of pid {held.pid}: {error.strerror}") from error
-    return {"seals": seals, "content": content, "stored": about.st_blocks * 512, "huge": about.st_blksize >= HUGE}
+    return {"seals": seals, "content": content, "stored": stored, "huge": about.st_blksize >= HUGE}
 
 
 def _key(one: Descriptor) -> tuple[int, int]:

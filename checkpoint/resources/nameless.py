@@ -45,8 +45,8 @@ def make_node(table: CallTable, path: str, mode: int, rdev: int = 0) -> int:
     name = _name_for(path)
     place = table.place_path(name)
     table.call(f"make {name}", "mknodat", AT_FDCWD, place, mode, _encoded(rdev))
-    table.call(f"set the mode of {name}", "fchmodat", AT_FDCWD, place, stat.S_IMODE(mode))  # the umask took from it
-    made = table.open(name, O_PATH)
+    made = table.open(name, O_PATH | os.O_NOFOLLOW)
+    set_mode(table, made, f"the mode of {name}", mode)
     table.call(f"unlink {name}", "unlinkat", AT_FDCWD, place, 0)
     return made
 
@@ -56,8 +56,8 @@ def make_directory(table: CallTable, path: str, mode: int) -> int:
     name = _name_for(path)
     place = table.place_path(name)
     table.call(f"make the directory {name}", "mkdirat", AT_FDCWD, place, stat.S_IMODE(mode))
-    table.call(f"set the mode of {name}", "fchmodat", AT_FDCWD, place, stat.S_IMODE(mode))
-    made = table.open(name, O_PATH | os.O_DIRECTORY)
+    made = table.open(name, O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW)
+    set_mode(table, made, f"the mode of {name}", mode)
     table.call(f"remove the directory {name}", "unlinkat", AT_FDCWD, place, AT_REMOVEDIR)
     return made
 
@@ -70,6 +70,11 @@ def make_link(table: CallTable, path: str, target: str) -> int:
     made = table.open(name, O_PATH | os.O_NOFOLLOW)
     table.call(f"unlink {name}", "unlinkat", AT_FDCWD, place, 0)
     return made
+
+
+def set_mode(table: CallTable, made: int, what: str, mode: int) -> None:
+    """Give what a descriptor leads to (O_PATH) its mode, from which the umask took: by name it could be another's by now."""
+    table.call(f"set {what}", "fchmodat", AT_FDCWD, table.place_path(f"/proc/self/fd/{made}"), stat.S_IMODE(mode))
 
 
 def _name_for(path: str) -> str:

@@ -20,10 +20,10 @@ from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.engine import NOTED, Finding
-from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings, elsewhere, sockets
+from checkpoint.resources import Opened, OpenFile, Surroundings, elsewhere, sockets
+from checkpoint.resources.listings import Listings
 from checkpoint.resources.rebuilding import number_of
 from checkpoint.resources.unix_makers import Disguise
 
@@ -61,23 +61,22 @@ LIST_MEMBERSHIPS: Final = 9
 GROUPS_SIZE: Final = 512
 """Bytes of the longest list of groups, one bit each."""
 _DUMP_COLUMN: Final = 6
-_INODE_COLUMN: Final = 9
 _ADDRESS: Final = struct.Struct("<HHII")
 """struct sockaddr_nl."""
 
 
-def observe(held: OpenFile, looked: socket.socket) -> dict[str, Fact]:
+def observe(held: OpenFile, looked: socket.socket, opened: Opened) -> dict[str, Fact]:
     """Its number, its groups, and whether something is under way.
 
     Raises:
         OSError: it cannot be looked into.
     """
     port, _ = looked.getsockname()
-    return sockets.general_facts(held.first, looked) | {
+    return sockets.general_facts(held, looked, opened) | {
         "port": port,
         "groups": list(_groups(looked)),
         "peer": _peer(looked),
-        "busy": _is_busy(held, looked),
+        "busy": _is_busy(held, looked, opened.listings),
     }
 
 
@@ -92,14 +91,12 @@ def _peer(looked: socket.socket) -> list[Fact]:
     return [port, groups] if port or groups else []
 
 
-def _is_busy(held: OpenFile, looked: socket.socket) -> bool:
+def _is_busy(held: OpenFile, looked: socket.socket, listings: Listings) -> bool:
     """Whether a message or an error waits, or the rest of a list is still to come. Source: proc_pid_net(5)."""
-    poll = select.poll()
-    poll.register(looked, select.POLLIN)
-    if poll.poll(0):
+    if sockets.readiness(looked) & (select.POLLIN | select.POLLERR | select.POLLHUP):
         return True
-    lines = (line.split() for line in procfs.read_text(held.pid, "net/netlink").splitlines()[1:])
-    return any(words[_INODE_COLUMN] == str(held.first.inode) and words[_DUMP_COLUMN] != "0" for words in lines)
+    words = listings.line(held.pid, "netlink", held.first.inode)
+    return bool(words) and words[_DUMP_COLUMN] != "0"
 
 
 def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:

@@ -23,9 +23,8 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.engine import NOTED, Finding
 from checkpoint.errors import CaptureError
 from checkpoint.linux.call_table import CallTable
-from checkpoint.linux.packet_sockets import packet_sockets
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings, elsewhere, sockets
+from checkpoint.resources import Opened, OpenFile, Surroundings, elsewhere, sockets
 from checkpoint.resources.rebuilding import number_of
 from checkpoint.resources.unix_makers import Disguise
 
@@ -60,24 +59,24 @@ _REQUEST: Final = struct.Struct("<iHH8s")
 """struct packet_mreq."""
 
 
-def observe(held: OpenFile, looked: socket.socket) -> dict[str, Fact]:
+def observe(held: OpenFile, looked: socket.socket, opened: Opened) -> dict[str, Fact]:
     """Where it is bound, and what else it hears.
 
     Raises:
         OSError: it cannot be looked into.
         CaptureError: the kernel does not tell.
     """
-    told = packet_sockets().get(held.first.inode)
+    told = opened.listings.packet_sockets().get(held.first.inode)
     if told is None:
         raise CaptureError(f"cannot ask the kernel about the packet socket {held.name} (sock_diag): load af_packet_diag")
     interface, ether_type, *_ = looked.getsockname()
-    return sockets.general_facts(held.first, looked) | {
+    return sockets.general_facts(held, looked, opened) | {
         "interface": interface,
         "ether_type": ether_type,
         "memberships": [[_name_of(one.interface), one.type, one.address] for one in told.memberships for _ in range(one.count)],
         "rings": [[option, packed] for option, packed in told.rings.items()],
         "fanout": looked.getsockopt(SOL_PACKET, FANOUT),
-        "lost": _has_frames(looked),
+        "lost": bool(sockets.readiness(looked) & ~select.POLLPRI),
     }
 
 
@@ -85,12 +84,6 @@ def _name_of(index: int) -> str:
     with contextlib.suppress(OSError):  # it has gone
         return socket.if_indextoname(index)
     return ""
-
-
-def _has_frames(looked: socket.socket) -> bool:
-    poll = select.poll()
-    poll.register(looked, select.POLLIN)
-    return bool(poll.poll(0))
 
 
 def is_mine(looked: socket.socket) -> bool:

@@ -21,13 +21,17 @@ import select
 import stat
 import termios
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
+
+import numpy as np
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError
 from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.descriptors import Descriptor, copy_of
+from checkpoint.linux.own_calls import FIRST_ARGUMENT, RESULT_TO, OwnCalls, row
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile, Surroundings, elsewhere
 from checkpoint.resources.rebuilding import number_of
@@ -124,6 +128,26 @@ def look_into(held: OpenFile) -> tuple[int, list[bytes]]:
         raise CaptureError(
             f"cannot look into the pipe {held.name} of pid {held.pid}: {error.strerror}; capture it again"
         ) from error
+
+
+def with_content(held: OpenFile, capacity: int, pieces: Sequence[bytes]) -> OpenFile:
+    """The same, with what was seen of it."""
+    packets: list[Fact] = [len(piece) for piece in pieces]
+    return replace(held, both_ends=True, capacity=capacity, content=b"".join(pieces), observed={"packets": packets})
+
+
+def capacities_of_empty(ends: Sequence[int]) -> list[int]:
+    """The capacity of each pipe in which nothing waits, by an end of it that we have; 0 of another one, and of what is none."""
+    waiting, capacities = np.full(len(ends), -1, dtype=np.int32), np.zeros(len(ends), dtype=np.int64)
+    table = OwnCalls(2 * len(ends))
+    table.entries[: len(ends)] = row("ioctl", 0, termios.FIONREAD)
+    table.entries[: len(ends), FIRST_ARGUMENT + 2] = waiting.ctypes.data + 4 * np.arange(len(ends))
+    table.entries[len(ends) :] = row("fcntl", 0, F_GETPIPE_SZ)
+    table.entries[len(ends) :, RESULT_TO] = capacities.ctypes.data + 8 * np.arange(len(ends))
+    table.entries[:, FIRST_ARGUMENT] = np.tile(np.array(ends, dtype=np.int64), 2).view(np.uint64)
+    table.run()
+    found: list[int] = np.where((waiting == 0) & (capacities > 0), capacities, 0).tolist()
+    return found
 
 
 def packets_in(pipe: int, capacity: int) -> list[bytes]:

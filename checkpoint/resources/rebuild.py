@@ -29,6 +29,7 @@ from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource, Snapshot
 from checkpoint.resources import (
     attached_devices,
+    covered_files,
     deadlines,
     devices,
     epolls,
@@ -36,15 +37,18 @@ from checkpoint.resources import (
     fifos,
     files,
     internet_sockets,
+    joint,
     kernel_files,
     locks,
     memory_files,
     memory_locks,
     nameless,
+    namespace_files,
     netlink_sockets,
     packet_sockets,
     pidfds,
     pipes,
+    seccomp,
     shared,
     signalfds,
     signalling,
@@ -56,6 +60,7 @@ from checkpoint.resources import (
     timerfds,
     unix_names,
     unix_sockets,
+    untouched,
     watches,
 )
 from checkpoint.resources.rebuilding import Rebuilding, number_of
@@ -81,12 +86,14 @@ MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
     timerfds.KIND: timerfds.rebuild,
     signalfds.KIND: signalfds.rebuild,
     pidfds.KIND: pidfds.rebuild,
+    namespace_files.KIND: namespace_files.rebuild,
     epolls.KIND: epolls.rebuild,
     watches.KIND: watches.rebuild,
     devices.KIND: devices.rebuild,
     fifos.KIND: fifos.rebuild,
     kernel_files.KIND: kernel_files.rebuild,
     memory_files.KIND: memory_files.rebuild,
+    covered_files.KIND: covered_files.rebuild,
     attached_devices.KIND: attached_devices.rebuild,
 }
 """Kinds that are made anew: each adds its calls and answers with a descriptor."""
@@ -95,15 +102,26 @@ NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
     watches.KIND: watches.mismatches,
     unix_sockets.KIND: unix_names.mismatches,
     kernel_files.KIND: kernel_files.mismatches,
+    covered_files.KIND: covered_files.mismatches,
     internet_sockets.KIND: internet_sockets.mismatches,
     packet_sockets.KIND: packet_sockets.mismatches,
     system_v_memory.KIND: system_v_memory.mismatches,
+    seccomp.KIND: seccomp.mismatches,
 }
 """Kinds that need something of this machine: why it does not have that, one sentence each."""
 OF_KERNEL: Final = {netlink_sockets.KIND: netlink_sockets.prepare, packet_sockets.KIND: packet_sockets.prepare}
 """Sockets that lead to the kernel or an interface alone."""
 SOCKETS: Final = (unix_sockets.KIND, tcp_connections.KIND, internet_sockets.KIND, *OF_KERNEL)
-NOT_OPEN: Final = (memory_locks.KIND, system_v_memory.KIND, rights.KIND, deadlines.KIND, stops.KIND)
+NOT_OPEN: Final = (
+    memory_locks.KIND,
+    system_v_memory.KIND,
+    rights.KIND,
+    deadlines.KIND,
+    stops.KIND,
+    seccomp.KIND,
+    joint.KIND,
+    untouched.KIND,
+)
 """Kinds of what no descriptor stands for."""
 KINDS: Final = (files.KIND, streams.KIND, shared.KIND, pipes.KIND, terminals.KIND, *NOT_OPEN, *MADE, *SOCKETS)
 

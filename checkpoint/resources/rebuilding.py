@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 from dataclasses import dataclass, field
+from typing import Final
 
 from checkpoint.engine import RestoreOptions
 from checkpoint.errors import RestoreError
 from checkpoint.linux.call_table import CallTable
-from checkpoint.model import Clocks, Fact
+from checkpoint.model import Clocks, Fact, Resource
+
+NO_DEVICE: Final = -1
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +39,22 @@ class Rebuilding:
         table.close(made)
         self.objects[key] = number
 
+    def ended(self, table: CallTable, held: Resource) -> int:
+        """A descriptor of what the program holds of a process that has ended: `resources.departed` has made it."""
+        made = self.objects[ended_place(held)]
+        return table.obtain(f"open {held.name} again", "fcntl", made, fcntl.F_DUPFD, 0)
+
     @property
     def elapsed_ns(self) -> int:
         """How long ago the capture was."""
         return self.options.elapsed_ns
+
+
+def ended_place(held: Resource) -> tuple[int, int]:
+    """Where among the objects something is that the program holds of a process that has ended; no device has that number."""
+    descriptors = held.facts["descriptors"]
+    assert isinstance(descriptors, list) and isinstance(descriptors[0], list)
+    return NO_DEVICE, number_of(descriptors[0][0])
 
 
 def number_of(fact: Fact) -> int:

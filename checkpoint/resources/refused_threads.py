@@ -14,10 +14,11 @@ from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import ProbeError, ProcessGoneError
-from checkpoint.linux import abi, procfs
+from checkpoint.linux import abi, confinement, procfs
 from checkpoint.linux.procfs import Status
 from checkpoint.linux.threads import thread_ids
 from checkpoint.linux.timers import parse_timers
+from checkpoint.resources import seccomp
 
 CAPABILITIES: Final = (
     preserved(
@@ -34,9 +35,8 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.THREADS,
-        "a thread with a seccomp filter, namespaces, open files, directory or personality of its own (unshare)",
+        "a thread with namespaces, open files, directory or personality of its own (unshare)",
         "let all threads share these",
-        "runs under a seccomp filter",
         "has its own {} (unshare)",
         "open files",
         "working directory and root",
@@ -58,7 +58,7 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.PROCESS,
-        "a process that shares memory, open files or directory with its parent (vfork, clone(2))",
+        "a process that shares its memory with its parent (vfork, clone(2))",
         "it is kept as soon as it has executed a program",
         "it shares its {} with its parent",
     ),
@@ -80,15 +80,13 @@ def refuse(pid: int, status: Status, kin: Collection[int] = ()) -> Iterator[str]
         kin: all processes of its component, if there are several.
     """
     yield from refuse_shared_memory(pid, status)
-    if status.ppid in kin:
-        yield from _refuse_shared(pid, status.ppid, _SHARED)
     if status.threads == 1:
         return
     if status.threads > THREAD_LIMIT:
         yield f"it has {status.threads} threads; the limit is {THREAD_LIMIT}: let it start fewer"
         return
     if status.state in "ZX":
-        yield f"its first thread has ended while {status.threads - 1} others live, which is not kept yet: let it wait for them"
+        yield from refuse_ended_first(status)
         return
     first = _Shared.of(pid, pid)
     for tid in thread_ids(pid):
@@ -99,6 +97,12 @@ def refuse(pid: int, status: Status, kin: Collection[int] = ()) -> Iterator[str]
                 continue  # this one has ended
     if any(timer.clock == CLOCK_THREAD_CPUTIME for timer in parse_timers(procfs.read_text(pid, "timers"))):
         yield "it has a timer that counts the processor time of one of its threads, and nobody tells which: use another clock"
+
+
+def refuse_ended_first(status: Status) -> Iterator[str]:
+    """Why a process whose first thread has ended cannot be captured; nothing stands against one that has ended as a whole."""
+    if status.state in "ZX" and status.threads > 1:
+        yield f"its first thread has ended while {status.threads - 1} others live, which is not kept yet: let it wait for them"
 
 
 def refuse_shared_memory(pid: int, status: Status) -> Iterator[str]:
@@ -164,8 +168,8 @@ def _unlike(pid: int, tid: int, shared: _Shared, first: _Shared, own: list[str])
     named = f"its thread {tid} ({status.name})"
     if shared.tracer:
         yield f"{named} is traced by pid {shared.tracer}: end that debugger"
-    elif shared.seccomp:
-        yield f"{named} runs under a seccomp filter, which forbids what a capture asks of it: run it without the filter"
+    elif shared.seccomp and (why := confinement.why_not()):
+        yield seccomp.not_ours(why, named)
     for what in own:
         yield f"{named} has its own {what} (unshare), which is not kept yet"
     pairs = zip(_NAMESPACES, shared.namespaces, first.namespaces, strict=True)

@@ -33,7 +33,7 @@ from checkpoint.capability import Area, refused
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.descriptors import Descriptor, copy_of
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile
+from checkpoint.resources import Opened, OpenFile
 from checkpoint.resources.rebuilding import number_of
 
 CAPABILITIES: Final = (
@@ -97,6 +97,9 @@ _PACKET: Final = (8, 9, 10, 12, 14, 15, 17, 19, 20, 23)
 """PACKET_AUXDATA, ORIGDEV, VERSION, RESERVE, LOSS, VNET_HDR, TIMESTAMP, TX_HAS_OFF, QDISC_BYPASS, IGNORE_OUTGOING."""
 _OF_FAMILY: Final = {socket.AF_NETLINK: (270, _NETLINK), socket.AF_PACKET: (263, _PACKET)}
 """SOL_NETLINK and SOL_PACKET."""
+
+_JUST_NOW: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOBUFS)
+"""Why no socket can be made, which says nothing of the next time."""
 
 _getsockopt = ctypes.CDLL(None, use_errno=True).getsockopt
 
@@ -166,12 +169,15 @@ def looked_into(pid: int, number: int) -> Iterator[socket.socket]:
             lent.detach()
 
 
-def general_facts(one: Descriptor, looked: socket.socket) -> dict[str, Fact]:
+def general_facts(held: OpenFile, looked: socket.socket, opened: Opened) -> dict[str, Fact]:
     """Family, kind and options."""
+    recalled = opened.recalled.get(held.first.number)
+    if recalled and held.lent is None:
+        return dict(recalled.settings)
     form = Form(looked.family, looked.type, looked.proto)
     about = os.fstat(looked.fileno())  # what a descriptor is told to be is what all sockets have in common
     facts: dict[str, Fact] = {
-        "socket": one.inode,
+        "socket": held.first.inode,
         "family": int(form.family),
         "type": int(form.type),
         "protocol": form.protocol,
@@ -224,9 +230,18 @@ def _options(looked: socket.socket, form: Form) -> Iterator[list[Fact]]:
             yield [level, number, value]
 
 
+def fresh_options(form: Form) -> Mapping[tuple[int, int], bytes]:
+    """By level and number, what such a socket answers that was just made."""
+    return _fresh_options(form)
+
+
 @lru_cache(maxsize=32)
 def _fresh_options(form: Form) -> Mapping[tuple[int, int], bytes]:
-    """Options of a socket that was just made, as far as it has them."""
+    """Options of a socket that was just made, as far as it has them; none of one that we may not make.
+
+    Raises:
+        OSError: it cannot be made just now.
+    """
     levels = [(socket.SOL_SOCKET, (*_GENERAL, *_BUFFERS))]
     if form.family in _OF_FAMILY:
         levels.append(_OF_FAMILY[socket.AddressFamily(form.family)])
@@ -238,7 +253,9 @@ def _fresh_options(form: Form) -> Mapping[tuple[int, int], bytes]:
     is_ping = form.type == socket.SOCK_DGRAM and form.protocol in (socket.IPPROTO_ICMP, socket.IPPROTO_ICMPV6)
     try:
         fresh = socket.socket(form.family, form.type, 0 if is_ping else form.protocol)  # which group of users may, we may not
-    except OSError:
+    except OSError as error:
+        if error.errno in _JUST_NOW:  # or it would seem for ever to have no options
+            raise
         return {}
     with fresh:
         found = {(level, number): _option(fresh, level, number) for level, numbers in levels for number in numbers}

@@ -33,11 +33,12 @@ from typing import Final
 
 from checkpoint.capability import Area, by_rule, preserved, refused
 from checkpoint.engine import NOTED, REFUSED, Finding
-from checkpoint.linux import connection_remains, procfs, tcp_repair
+from checkpoint.linux import connection_remains, tcp_repair
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile, Surroundings, elsewhere, internet_sockets, sockets
 from checkpoint.resources.internet_sockets import CLOSED, LISTENING, in_words, size_of, sockaddr
+from checkpoint.resources.listings import Listings
 from checkpoint.resources.rebuilding import number_of
 
 KIND: Final = "tcp_connections"
@@ -81,6 +82,9 @@ MAY_MOVE: Final = "may_move"
 LEFT: Final = "left"
 """Why one is not taken along that was to be."""
 
+ON_ITS_WAY: Final = "it was on its way in a unix socket: received, it is taken along"
+"""Of one that a message carries (SCM_RIGHTS), and that the program has no descriptor of."""
+
 READ_ENDED: Final = 1
 FAILED: Final = 2
 
@@ -96,7 +100,7 @@ _RESET_AT_CLOSE: Final = struct.pack("<ii", 1, 0)
 _ROOM: Final = 1 << 16
 
 
-def observe(held: OpenFile, looked: socket.socket, facts: Mapping[str, Fact]) -> dict[str, Fact]:
+def observe(held: OpenFile, looked: socket.socket, facts: Mapping[str, Fact], listings: Listings) -> dict[str, Fact]:
     """What else must be known of a TCP socket that is neither fresh nor listens.
 
     Args:
@@ -106,7 +110,9 @@ def observe(held: OpenFile, looked: socket.socket, facts: Mapping[str, Fact]) ->
         OSError: it cannot be looked into.
     """
     told = looked.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO_SIZE)
-    peer = _asked_for(held, looked.family) if facts["state"] == SYN_SENT else facts["peer"]
+    peer = facts["peer"]
+    if facts["state"] == SYN_SENT:  # which getpeername(2) does not tell yet
+        peer = listings.peer(held.pid, "tcp", looked.family, held.first.inode)
     is_local = _is_local(facts["address"], peer)
     unread = (
         int.from_bytes(fcntl.ioctl(looked.fileno(), termios.FIONREAD, bytes(4)), "little") if facts["state"] != SYN_SENT else 0
@@ -122,17 +128,6 @@ def observe(held: OpenFile, looked: socket.socket, facts: Mapping[str, Fact]) ->
         "received": _RECEIVED.unpack_from(told, _RECEIVED_AT)[0],
         "unsent": int.from_bytes(told[_UNSENT_AT : _UNSENT_AT + 4], "little"),
     }
-
-
-def _asked_for(held: OpenFile, family: int) -> list[Fact]:
-    """Whom a connection is being asked for, which getpeername(2) does not tell yet. Source: proc_pid_net(5)."""
-    for line in procfs.read_text(held.pid, "net/tcp6" if family == socket.AF_INET6 else "net/tcp").splitlines()[1:]:
-        words = line.split()
-        if int(words[9]) == held.first.inode:
-            host, _, port = words[2].partition(":")
-            packed = b"".join(bytes.fromhex(host[place : place + 8])[::-1] for place in range(0, len(host), 8))
-            return [socket.inet_ntop(family, packed), int(port, 16), *([0, 0] if family == socket.AF_INET6 else [])]
-    return []
 
 
 def ends_of(looked: socket.socket) -> int:
@@ -173,7 +168,7 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
         return None
     facts: dict[str, Fact] = {"descriptors": held.numbers, "flags": held.first.flags & ~os.O_CLOEXEC, **held.observed}
     if surroundings.connections and is_carriable(held.observed):
-        facts[MAY_MOVE] = True
+        facts |= {MAY_MOVE: True} if held.lent is None else {LEFT: ON_ITS_WAY}
     return Resource(KIND, held.name, facts)
 
 

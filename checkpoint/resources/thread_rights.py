@@ -1,7 +1,7 @@
 """Rights of threads that are not the first one's: the kernel has user, groups and capabilities for each thread.
 
 They are read before and after a program stands still, never meanwhile: they cost its freeze nothing, and what has not changed in
-between was the same then.
+between was the same then. So is whether a thread is confined by seccomp(2), which each may be by itself.
 
 Facts: ``descriptors`` (none); ``threads``: a list of [tid, uids, gids, groups, capabilities, no_new_privs] as Credentials of the
 model have them; what the first one's securebits are, theirs are.
@@ -11,7 +11,8 @@ Source: credentials(7); nptl(7) on why programs seldom do that.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from typing import Final
 
 from checkpoint.capability import Area, preserved
@@ -34,47 +35,76 @@ Odd = Mapping[int, tuple[int, Credentials]]
 """By thread id, as we see it: its id as it sees it itself, and its rights."""
 
 
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One look at all threads of a process.
+
+    Attributes:
+        odd: the rights of those that may not what the first one may, or more.
+        modes: of seccomp(2), of those that have one.
+    """
+
+    odd: Odd = field(default_factory=dict)
+    modes: Mapping[int, int] = field(default_factory=dict)
+
+
 class ThreadRights:
     """What the threads of one process may, as far as it is not what the first one may."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
-        self._seen: Odd = {}
+        self._before = Seen()
+
+    @property
+    def modes(self) -> Mapping[int, int]:
+        """Of seccomp(2), by thread id as we see it, before the freeze; of those that are confined."""
+        return self._before.modes
 
     def prepare(self) -> None:
         """Look before the freeze."""
-        self._seen = _odd(self._pid)
+        self._before = _seen(self._pid)
 
-    def describe(self) -> tuple[Resource, ...]:
+    def describe(self, confined: Collection[int]) -> tuple[Resource, ...]:
         """What was so before and after it.
+
+        Args:
+            confined: threads that were known to be confined while they stood still.
 
         Raises:
             CaptureError: one of them has just changed.
         """
-        now = _odd(self._pid) if self._seen or thread_count(self._pid) > 1 else {}
-        alive = frozenset(thread_ids(self._pid)) if self._seen or now else frozenset()
-        for tid in (now.keys() | self._seen.keys()) & alive:
-            if now.get(tid) != self._seen.get(tid):
+        before, now = self._before, _seen(self._pid)
+        if now == before == Seen():
+            return ()
+        alive = frozenset(thread_ids(self._pid))
+        for tid in (now.odd.keys() | before.odd.keys()) & alive:
+            if now.odd.get(tid) != before.odd.get(tid):
                 raise CaptureError(f"thread {tid} of pid {self._pid} is just changing its rights; capture it again")
-        if not self._seen:
+        if fresh := (now.modes.keys() - before.modes.keys() - set(confined)) & alive:
+            raise CaptureError(f"thread {min(fresh)} of pid {self._pid} has just come under a seccomp filter; capture it again")
+        if not before.odd:
             return ()
         return (
-            Resource(KIND, "rights of threads", {"descriptors": [], "threads": [_told(*one) for one in self._seen.values()]}),
+            Resource(KIND, "rights of threads", {"descriptors": [], "threads": [_told(*one) for one in before.odd.values()]}),
         )
 
 
-def _odd(pid: int) -> Odd:
+def _seen(pid: int) -> Seen:
     if thread_count(pid) == 1:
-        return {}
-    first, found = _credentials(procfs.status(pid)), {}
+        return Seen()
+    first = _credentials(procfs.status(pid))
+    odd: dict[int, tuple[int, Credentials]] = {}
+    modes: dict[int, int] = {}
     for tid in thread_ids(pid):
         try:
             status = procfs.parse_status(procfs.read_text(pid, f"task/{tid}/status"))
         except (ProcessGoneError, ProbeError):
             continue  # it has ended
         if _credentials(status) != first:
-            found[tid] = status.pids[-1], _credentials(status)
-    return found
+            odd[tid] = status.pids[-1], _credentials(status)
+        if status.seccomp:
+            modes[tid] = status.seccomp
+    return Seen(odd, modes)
 
 
 def _credentials(status: Status) -> Credentials:

@@ -73,14 +73,15 @@ class Disguise:
 
     @contextlib.contextmanager
     def as_maker(self, table: CallTable, one: Resource) -> Iterator[None]:
-        """Make calls for the body as who made a socket."""
+        """Make calls for the body as who made a socket; as the program's user where nobody knows, never as ourselves."""
         maker = one.facts.get("maker")
         if isinstance(maker, list) and maker:
             lost = f"{one.name} tells another user as its peer (SO_PEERCRED): it was uid {maker[1]!r}, gid {maker[2]!r}"
             with self._as(table, number_of(maker[1]), number_of(maker[2]), lost):
                 yield
         else:
-            yield
+            with self.as_program(table):
+                yield
 
     @contextlib.contextmanager
     def as_program(self, table: CallTable) -> Iterator[None]:
@@ -90,13 +91,14 @@ class Disguise:
 
     @contextlib.contextmanager
     def as_owner(self, table: CallTable, one: Resource) -> Iterator[None]:
-        """Make calls for the body as whom a socket belongs to."""
+        """Make calls for the body as whom a socket belongs to; as the program's user where nobody knows."""
         owner = one.facts.get("user")
         if isinstance(owner, list) and owner:
             with self._as(table, number_of(owner[0]), number_of(owner[1]), ""):
                 yield
         else:
-            yield
+            with self.as_program(table):
+                yield
 
     def notes(self, held: Iterable[Resource]) -> tuple[str, ...]:
         """Which sockets tell another process than before."""

@@ -20,14 +20,14 @@ import fcntl
 import os
 import socket
 import termios
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.engine import REFUSED, Finding
 from checkpoint.errors import CaptureError
-from checkpoint.linux.unix_sockets import ESTABLISHED, UnixSocket, unix_socket
+from checkpoint.linux.unix_sockets import ESTABLISHED, UnixSocket, parsed
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import Opened, OpenFile, Surroundings, elsewhere, sockets, travelling, unix_makers, unix_names
 from checkpoint.resources.rebuilding import number_of
@@ -84,10 +84,10 @@ def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: socket
         OSError: it cannot be looked into.
         CaptureError: the kernel does not tell.
     """
-    told = unix_socket(held.first.inode)
-    if told is None:
+    answer = opened.listings.unix_answer(held.first.inode)
+    if (told := parsed(answer)) is None:
         raise CaptureError(f"cannot ask the kernel about the unix socket {held.name} (sock_diag): load the module unix_diag")
-    facts = sockets.general_facts(held.first, looked)
+    facts = sockets.general_facts(held, looked, opened)
     has_queue = told.state == ESTABLISHED or told.type == socket.SOCK_DGRAM
     identify = partial(travelling.number_of, opened)
     queue = sockets.queue_of(looked, held.first.number, noted, identify) if has_queue else sockets.NOTHING
@@ -99,7 +99,7 @@ def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: socket
             "state": told.state,
             "name": told.name,
             "peer": told.peer,
-            "peer_is_ours": told.peer in opened.inodes or told.peer in held.kin.sockets,
+            "peer_is_ours": _is_ours(told.peer, held, opened),
             "peer_name": _peer_name(looked),
             "backlog": told.backlog,
             "shutdown": told.shutdown,
@@ -112,6 +112,25 @@ def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: socket
             "sources": list(map(_packed_name, queue.sources)) if told.type == socket.SOCK_DGRAM and any(queue.sources) else [],
         }
     )
+
+
+def again(held: OpenFile, facts: Mapping[str, Fact], opened: Opened) -> Mapping[str, Fact]:
+    """Facts of a socket that answers as before, and of what they say of others: its peer, and the file that is its name.
+
+    Raises:
+        OSError: it was closed meanwhile.
+    """
+    found: dict[str, Fact] = {**facts, "peer_is_ours": _is_ours(number_of(facts["peer"]), held, opened)}
+    name = facts["name"]
+    assert isinstance(name, bytes)
+    if name and name[:1] != b"\0":
+        with sockets.looked_into(held.pid, held.first.number) as looked:
+            found |= unix_names.observe(held, looked, name)
+    return found if found != facts else facts
+
+
+def _is_ours(peer: int, held: OpenFile, opened: Opened) -> bool:
+    return peer in opened.inodes or peer in held.kin.sockets
 
 
 def _waits(told: UnixSocket) -> bool:

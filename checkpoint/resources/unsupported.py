@@ -15,20 +15,18 @@ from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import ProbeError, ProcessGoneError
-from checkpoint.linux import procfs, vm_flags
+from checkpoint.linux import confinement, procfs, vm_flags
 from checkpoint.linux.procfs import MapsLine, Status
 from checkpoint.linux.tracking import is_orphan
 from checkpoint.model import Resource
-from checkpoint.resources import OpenFile, Surroundings, refused_threads, shared_objects, sockets
+from checkpoint.resources import OpenFile, Surroundings, kernel_files, refused_threads, seccomp, shared_objects, sockets
 
 KIND: Final = "unsupported"
 
 CAPABILITIES: Final = (
     refused(Area.PIPES, "io_uring", "poll(2) or epoll on what is kept", "an io_uring", "the rings of an io_uring"),
     refused(Area.PIPES, "fanotify", "use inotify, which is kept", "a fanotify group"),
-    refused(Area.PIPES, "asynchronous I/O (io_setup)", "use threads", "a ring of asynchronous I/O (aio)"),
     refused(Area.PIPES, "perf events", "run it without", "a perf event", "the buffer of a perf event"),
-    refused(Area.PIPES, "namespaces that are held open", "let the program close them", "a namespace ({})"),
     refused(
         Area.PIPES,
         "open files of any other kind (BPF …)",
@@ -69,7 +67,7 @@ CAPABILITIES: Final = (
     preserved(
         Area.MEMORY,
         "mapped files that were replaced or deleted since the program started",
-        "the old ones are carried, compared at every checkpoint, up to 64 MiB each",
+        "the old ones are carried, compared at every checkpoint, up to 64 MiB each; what is written to one still shows in them",
         "KiB of the old one are carried",
     ),
     refused(
@@ -78,12 +76,6 @@ CAPABILITIES: Final = (
         "restart the program, then protect it",
         "replaced since the program started",
         "and larger than",
-    ),
-    refused(
-        Area.PROCESS,
-        "a seccomp filter",
-        "run it without: a capture asks system calls of it that the filter forbids",
-        "it runs under a seccomp filter",
     ),
     refused(Area.PROCESS, "programs of 32 bits", "use a 64-bit build", "it is a program of 32 bits"),
     refused(Area.PROCESS, "a program without the kernel’s vdso", "do not unmap it", "it has no vdso"),
@@ -95,7 +87,7 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.PROCESS,
-        "a working directory of /proc or /sys that is gone, a root directory of its own (chroot)",
+        "a working directory of /sys that is gone, a root directory of its own (chroot)",
         "change the directory; run it without the chroot",
         "its working directory",
         "its root directory is",
@@ -137,7 +129,6 @@ _MAPPINGS: Final = (
     (re.compile(r"anon_inode:\[io_uring\]"), "the rings of an io_uring"),
     (re.compile(r"anon_inode:\[perf_event\]"), "the buffer of a perf event"),
     (re.compile(r"socket:"), "the rings of a packet socket"),
-    (re.compile(r"/\[aio\]"), "a ring of asynchronous I/O (aio)"),
     (re.compile(r"/secretmem"), "secret memory"),
     (re.compile(r"/dev/(?!zero|shm/|hugepages/)"), "memory of a device"),
 )
@@ -188,8 +179,6 @@ def _called(held: OpenFile) -> str:
     match = re.fullmatch(r"anon_inode:\[?([a-z_-]+)\]?", target)
     if match:
         return ANONYMOUS_INODES.get(match[1], f"an open {match[1]}")
-    if re.match(r"[a-z_]+:\[\d+\]", target):
-        return f"a namespace ({target})"
     return f"{target}, of a kind that we do not know"
 
 
@@ -313,8 +302,8 @@ def refuse_entering(pid: int, status: Status, *, files_kept: bool = False) -> It
     """Why a process cannot even be asked."""
     if status.tracer not in (0, os.getpid()):
         yield f"it is traced by pid {status.tracer}: end that debugger"
-    if status.seccomp:
-        yield "it runs under a seccomp filter, which forbids what a capture asks of it: run it without the filter"
+    if status.seccomp and (why := confinement.why_not()):
+        yield seccomp.not_ours(why)
     yield from _refuse_image(pid, files_kept)
     yield from _refuse_memory(pid)
 
@@ -337,7 +326,8 @@ def _refuse_memory(pid: int) -> Iterator[str]:
 
 def _refuse_places(pid: int) -> Iterator[str]:
     directory = procfs.read_link(pid, "cwd")
-    if procfs.is_gone(directory) and directory.startswith(KERNEL_PLACES):
+    is_kernels = directory.startswith(KERNEL_PLACES) and not kernel_files.left_by_ended(directory)
+    if procfs.is_gone(directory) and is_kernels:
         yield f"its working directory {directory} is gone: let it change to another one"
     root = procfs.read_link(pid, "root")
     if root != "/":

@@ -8,10 +8,12 @@ import platform
 import resource
 import shutil
 import subprocess
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+from checkpoint.arch import SUPPORTED
 from checkpoint.channel import Capture, Captured, Protect, Protected, Release, Released
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import vessel
@@ -20,8 +22,6 @@ from failover.cli import render
 from failover.cli.agent import connect
 from failover.cli.keeper import Keeper
 from failover.errors import FailoverError
-
-SUPPORTED = ("x86_64",)
 
 STAND_IN = ("sleep", "60")
 """An ordinary program, to be looked into and ended."""
@@ -66,10 +66,15 @@ def _standing_by(arguments: argparse.Namespace) -> list[Offer]:
     except FailoverError:
         return []
     held = [one for one in status["components"] if one["role"] == "standby" and one["lacks"] is not None]
-    lacking = [(one["name"], lack) for one in held for lack in one["lacks"]]
+    lacking = [(one, lack) for one in held for lack in one["lacks"]]
     if lacking:
-        return [Offer("lesser", name, f"could not go on here: {lack}") for name, lack in lacking]
+        return [Offer("lesser", one["name"], _what_is_lacking(one, lack)) for one, lack in lacking]
     return [Offer("good", "standing by", f"nothing is lacking of what {one['name']} needs") for one in held]
+
+
+def _what_is_lacking(component: Mapping[str, Any], lack: str) -> str:
+    brought = component.get("prepared_first")
+    return f"its hook before_resume is to bring what is lacking now: {lack}" if brought else f"could not go on here: {lack}"
 
 
 def _architecture() -> Offer:

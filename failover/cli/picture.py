@@ -131,7 +131,9 @@ def _component_row(component: Mapping[str, Any], branch: str) -> Row:
 def _standby(component: Mapping[str, Any]) -> str:
     """Who goes on with it; whether its program waits there already, where one can."""
     standby, warm = component.get("standby"), component.get("warm")
-    return "none" if not standby else str(standby) if warm is None else f"{standby}, {'warm' if warm else 'cold'}"
+    if not standby or warm is None:
+        return f"{standby or 'none'}{', ready' if component.get('ready') else ''}"
+    return f"{standby}, {'warm' if warm else 'cold'}"
 
 
 def _state(component: Mapping[str, Any]) -> str:
@@ -243,7 +245,7 @@ def is_healthy(status: Mapping[str, Any]) -> bool:
     living = [sight(component) for component in status["components"] if component.get("state") not in OVER_STATES]
     unwell = any(one.get("state") in BAD_STATES or not one.get("standby") or is_unprotected(one) for one in living)
     unwell |= any(
-        seen.get("cold") or seen.get("unstored") or seen.get("lacks")
+        seen.get("cold") or seen.get("unstored") or (seen.get("lacks") and not seen.get("prepared_first"))
         for one in status["components"]
         for seen in (one, *(one.get("elsewhere") or {}).values())
     )

@@ -64,18 +64,23 @@ peers: [{name, role, state, last_heard_ms, hears_us, load, beats_lost, links, la
     lane: connected | connecting | refused | down
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
-    freeze_us_max, snapshot_size, dirty_bytes, snapshots, restores, crashes, outage_ms, exit_status, promise,
-    promise_differs, kept, unstored, lacks, owner, reasons,
-    output, output_waiting, notes, elsewhere, warm, cold}]
+    freeze_us_max, snapshot_size, dirty_bytes, xor_hit_rate, snapshots, restores, crashes, outage_ms, exit_status, promise,
+    promise_differs, kept, unstored, lacks, prepared_first, owner, reasons,
+    output, output_waiting, notes, elsewhere, warm, cold, ready, ready_copy}]
+    snapshot_size, dirty_bytes: of the newest one: bytes on the wire, and of pages; xor_hit_rate: which part of what the
+        deltas of this life carried was in the cache of last contents (xor_cache of agent.toml); None before the first one
     output: immediate | committed (--output); output_waiting: bytes that wait until another robot holds them
     warm: its program waits at its standby, started in advance; None where nothing could: it is restored from its memory
     cold: why it does not wait at this robot, where it should and something went wrong; "" otherwise
+    ready: of any other program: a stopped process holds the newest checkpoint's memory at its standby
+    ready_copy: {ready, wanted, size, position: {generation, sequence}, why}: of that process, at this robot, where it stands by:
+        bytes of memory that it takes, or why there is none; wanted: ready_copy of agent.toml; None elsewhere
     owner: uid of the user who may give orders about it and read its output, besides root
     promise: what holds for it; promise_differs: from the team's, by what was chosen for it, or because a server stands by
     kept: {checkpoints, older, size, newest_age_s, oldest_age_s} of this robot's store: positions to which the team may go back,
         whole ones besides that are kept for people, bytes of all; None where it has nothing
     lacks: what this robot, a standby, would need to go on with it and has not: a device, a file, a feature; by
-        sentence, None where nobody has looked
+        sentence, None where nobody has looked; prepared_first: a hook gets it ready before, and may bring that
     unstored: why the last snapshot that came to this robot was not stored there; "" otherwise
     role: primary | standby | none; protection: none | protected | degraded | stopped
     state: starting | running | frozen | held | restoring | ended | degraded | failed | released

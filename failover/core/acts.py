@@ -191,7 +191,9 @@ class LetGo:
 
 @dataclass(frozen=True, slots=True)
 class Warm:
-    """Start the program in advance: it waits before its first step, under no epoch and no lease, until Restore uses it. → Warmed.
+    """Have the program wait before its next step, under no epoch and no lease, until Restore uses it. → Warmed.
+
+    One that keeps its state is started in advance; of any other a stopped process holds the newest checkpoint's memory.
 
     One that waits already is replaced. Whatever becomes of it, it is tried again until `Cool`; Start, Restore and Stop end it
     where they do not use it.
@@ -208,6 +210,15 @@ class Cool:
 
     component: str
     epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class Inquire:
+    """Ask robot ``to`` what it lacks of what the component needs to go on there. → Inquired, unless the robot cannot be asked."""
+
+    component: str
+    epoch: int
+    to: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,6 +288,7 @@ Act = (
     | LetGo
     | Warm
     | Cool
+    | Inquire
     | Prune
     | Drop
     | ReportExit

@@ -101,7 +101,7 @@ def _prefer(component: Component, turn: Turn, command: Prefer) -> None:
         _elsewhere(component, turn, command.request, "prefer a robot for")
     else:
         component.spec = replace(component.spec, rules=replace(component.spec.rules, prefer=command.robot))
-        component.retry_ns = turn.now_ns
+        component.return_ns, component.unfit = turn.now_ns, ()
         turn.order(acts.Answer(command.request, True, f"{component.name} prefers {command.robot or 'to stay where it is'}"))
 
 

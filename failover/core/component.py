@@ -152,6 +152,7 @@ class Component:
         keeps_state: on a standby: to go on from the newest snapshot is to start the program again.
         waiting: on a standby: the program that was ordered to wait, under ``waiting_epoch``; it is ready (``warm``) or, after
             something went wrong, ``cold`` says what.
+        return_ns: on a primary: when the preferred robot is asked whether it could go on there; ``unfit``: what it lacks.
     """
 
     name: str
@@ -194,6 +195,8 @@ class Component:
     waiting_epoch: int = 0
     warm: bool = False
     cold: str = ""
+    return_ns: int = 0
+    unfit: tuple[str, ...] = ()
     stored_ns: int = -1
     resumed_ns: int = -1
     resumed_age_ns: int = -1

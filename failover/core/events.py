@@ -187,6 +187,16 @@ class Warmed:
 
 
 @dataclass(frozen=True, slots=True)
+class Inquired:
+    """What robot ``to`` said that it lacks of what the component needs to go on there: nothing, or a sentence for each."""
+
+    component: str
+    epoch: int
+    to: str
+    lacks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class Exited:
     """The program ended by itself.
 
@@ -297,6 +307,7 @@ Event = (
     | ActFailed
     | Stopped
     | Warmed
+    | Inquired
     | Exited
     | Noticed
     | Command

@@ -14,6 +14,7 @@ from failover.core import (
     election,
     endings,
     handover,
+    homecoming,
     lease,
     majority,
     promise,
@@ -34,6 +35,7 @@ from failover.core.events import (
     Exited,
     Failback,
     Handover,
+    Inquired,
     NothingToCapture,
     Noticed,
     Prefer,
@@ -71,9 +73,6 @@ REST_NS = MS
 
 LIVES_MAX = 1 << 40
 """A peer that speaks of so many lives of this robot is not believed."""
-
-FAILBACK_PAUSE = 10
-"""Of ``retry_ms``: how long a component stays before it goes back to the robot that is preferred, and between two tries."""
 
 
 class Node:
@@ -331,6 +330,8 @@ def _tell(component: Component, turn: Turn, event: Event) -> None:
             endings.exited(component, turn, event)
         case Warmed():
             warmth.warmed(component, turn, event)
+        case Inquired():
+            homecoming.inquired(component, turn, event)
         case Stopped():
             if component.state is State.STOPPING:
                 component.move(Cause.CLEARED)
@@ -349,7 +350,7 @@ def _runs(component: Component, turn: Turn, event: Started | Restored) -> None:
     component.move(Cause.RUNS)
     component.resumption = Resumption.RESTARTED  # of what comes next, if that is here
     component.due_ns = turn.now_ns
-    component.retry_ns = turn.now_ns + FAILBACK_PAUSE * turn.config.retry_ms * MS
+    component.return_ns = turn.now_ns + homecoming.PAUSE * turn.config.retry_ms * MS
     turn.say(component, f"{how} at {turn.me}, epoch {component.epoch}")
     if component.request:
         turn.order(acts.Answer(component.request, True, f"{component.name} runs at {turn.me}"))
@@ -392,15 +393,5 @@ def _review_held(component: Component, turn: Turn) -> None:
         replication.choose_standby(component, turn)
         replication.capture(component, turn)
         archive.advance(component, turn)
-        _fail_back(component, turn)
+        homecoming.review(component, turn)
     handover.advance(component, turn)
-
-
-def _fail_back(component: Component, turn: Turn) -> None:
-    """Go to the robot that the operator prefers, once it keeps up and some time has passed."""
-    prefer = component.rules.prefer
-    if prefer in ("", turn.me) or prefer != component.standby or turn.now_ns < component.retry_ns:
-        return
-    if component.acked is not None and component.flight is None and turn.alive(prefer):
-        component.retry_ns = turn.now_ns + FAILBACK_PAUSE * turn.config.retry_ms * MS
-        handover.begin(component, turn, prefer, 0)

@@ -201,10 +201,15 @@ class ComponentSpec:
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """What was started in advance: another command line, or another owner, is another program."""
+    """What was started in advance: another command line, or another owner, is another program.
+
+    Attributes:
+        keeps_state: it is the program, started; else its memory. One that is captured from outside may come to keep its state.
+    """
 
     launch: Launch
     owner: int
+    keeps_state: bool
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from failover.core import promise
+from failover.core import homecoming, promise
 from failover.core.component import Component, Turn
 from failover.core.types import MS, ComponentView, Protection, State, StatusView
 from failover.core.warmth import is_warm
@@ -101,6 +101,8 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
         notes.append(f"snapshots do not arrive: {component.undelivered}; {_age(component, turn)}")
     if component.holding and component.resumed_age_ns >= STALE_NS:
         notes.append(f"it went on at {turn.me} from a checkpoint that was {component.resumed_age_ns / NS_PER_S:.1f} s old")
+    if staying := homecoming.note(component):
+        notes.append(staying)
     if component.unstored and component.state is State.STANDBY:
         notes.append(f"a snapshot was not stored at {turn.me}: {component.unstored}")
     if component.unprotected:

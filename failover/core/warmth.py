@@ -1,7 +1,8 @@
-"""A standby's program, started in advance: it has done everything before its first step and waits, so a takeover is one message.
+"""What waits at a standby, so that a takeover is one message: made in advance, it has done everything before its first step.
 
-Only a program that keeps its state itself can wait so; one that is captured from outside is restored from its memory, and there
-is nothing to start. One program waits a component, at the robot that its primary has entrusted, and nowhere else.
+Of a program that keeps its state itself that is the program, started; of one that is captured from outside it is a stopped
+process with the newest checkpoint's memory (the ready copy). Which of the two, and whether it can be had, is the robot's affair.
+One waits a component, at the robot that its primary has entrusted, and nowhere else.
 
 Invariants: nothing waits at a robot that runs the component, or to which its primary ships nothing; what waits is what a takeover
 would start.
@@ -22,12 +23,13 @@ def review(component: Component, turn: Turn) -> None:
         return
     if component.holding:  # the order to run it has used what waited, or ended it
         _forget(component)
+        component.stored_ns = -1
         return
     spec = _wanted(component)
     if spec is None and component.waiting is not None:
         turn.order(acts.Cool(component.name, component.epoch))
         _forget(component)
-    elif spec is not None and (waiting := Waiting(spec.launch, spec.owner)) != component.waiting:
+    elif spec is not None and (waiting := _waiting(component, spec)) != component.waiting:
         _forget(component)
         component.waiting, component.waiting_epoch = waiting, component.epoch
         turn.order(acts.Warm(component.name, component.epoch, spec))
@@ -56,7 +58,12 @@ def is_warm(component: Component, turn: Turn) -> bool:
 def _wanted(component: Component) -> ComponentSpec | None:
     """What should wait here: None where nothing would be started here, or by nobody's leave."""
     stands_by = component.state is State.STANDBY and component.trusted and not component.waits
-    return component.spec if stands_by and component.keeps_state and component.newest is not None else None
+    is_known = component.keeps_state or component.stored_ns >= 0  # of what ran here itself nobody has said whether it does
+    return component.spec if stands_by and component.newest is not None and is_known else None
+
+
+def _waiting(component: Component, spec: ComponentSpec) -> Waiting:
+    return Waiting(spec.launch, spec.owner, component.keeps_state)
 
 
 def _forget(component: Component) -> None:

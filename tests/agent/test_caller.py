@@ -19,11 +19,11 @@ from agent import caller
 from agent.births import check_rights
 from agent.caller import NOBODY, caller_of, check_right, inheritance_for, may, owner_of
 from agent.errors import RefusedError
-from checkpoint.errors import MismatchError
+from checkpoint.errors import FormatError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.linux.vessel import Birth, spawn_program
-from checkpoint.model import Credentials, Member, Resource, Snapshot
-from checkpoint.rights import KIND
+from checkpoint.model import Credentials, Fact, Member, Resource, Snapshot
+from checkpoint.rights import CONFINED, KIND
 from tests.samples.make import sample, tree_sample
 
 SOMEBODY = 7001
@@ -174,6 +174,47 @@ def test_a_snapshot_comes_back_with_the_rights_of_its_owner_or_not_at_all(found:
         else:
             with pytest.raises(MismatchError, match="other rights than those of its owner"):
                 check_rights("/lab/r1/mapper", outline, owner, groups)
+
+
+def confined(found: Credentials, threads: list[Fact]) -> Snapshot:
+    outline = running_as(found)
+    return replace(outline, resources=(Resource(CONFINED, "", {"descriptors": [], "filters": [], "threads": threads}),))
+
+
+@as_root
+def test_a_filter_under_which_rights_could_be_gained_is_roots_alone() -> None:
+    bound, free = replace(credentials(SOMEBODY), no_new_privs=True), credentials(SOMEBODY)
+    tid = running_as(free).threads[0].tid
+    check_rights("/lab/r1/mapper", confined(bound, [[tid, False, [0]]]), SOMEBODY, None)
+    check_rights("/lab/r1/mapper", confined(free, [[tid, True, []]]), SOMEBODY, None)
+    check_rights("/lab/r1/mapper", confined(free, [[tid, False, [0]]]), 0, None)
+    with pytest.raises(MismatchError, match="no_new_privs is off"):
+        check_rights("/lab/r1/mapper", confined(free, [[tid, False, [0]]]), SOMEBODY, None)
+
+
+@as_root
+@pytest.mark.parametrize(
+    ("kind", "threads"),
+    [
+        (KIND, 7),
+        (KIND, [7]),
+        (KIND, [[7, [0], [0], [], [0]]]),
+        (KIND, [[7, [0], [0], [], [0], True]]),
+        (KIND, [[7, ["0"] * 4, [0] * 4, [], [0] * 5, True]]),
+        (CONFINED, None),
+        (CONFINED, [7]),
+        (CONFINED, [[7, False, 0]]),
+    ],
+)
+def test_rights_that_are_told_in_another_way_are_no_mistake_of_ours(kind: str, threads: Fact) -> None:
+    outline = running_as(credentials(SOMEBODY))
+    told = replace(
+        outline,
+        threads=(replace(outline.threads[0], tid=7),),
+        resources=(Resource(kind, "", {"descriptors": [], "threads": threads}),),
+    )
+    with pytest.raises(FormatError, match="in a way that this version does not know"):
+        check_rights("/lab/r1/mapper", told, SOMEBODY, None)
 
 
 @as_root

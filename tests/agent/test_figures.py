@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from agent.figures import Commits
+from agent.component import Captured
+from agent.figures import Commits, Figures
+from checkpoint.model import Position
 
 MS = 10**6
 SECOND = 10**9
@@ -37,3 +39,12 @@ def test_a_capture_that_finds_nothing_new_changes_nothing() -> None:
     before = commits.newest_ns
     commits.note(200, before)
     assert (commits.usual_ns, commits.newest_ns) == (10 * MS, before)
+
+
+def test_the_hit_rate_of_the_cache_counts_deltas_alone() -> None:
+    figures, base, delta = Figures(), Position(1, 1, bytes(16)), Position(1, 2, bytes(16))
+    figures.captured(Captured(base, None, -1, 900, 500, 8192, ()))
+    assert figures.xor_hit_rate is None
+    figures.captured(Captured(delta, base, -1, 300, 500, 8192, (), known_bytes=4096))
+    figures.captured(Captured(delta, base, -1, 100, 500, 8192, (), known_bytes=8192))
+    assert figures.xor_hit_rate == 0.75

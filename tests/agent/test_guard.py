@@ -260,6 +260,19 @@ def test_a_vessel_ends_with_its_keeper_as_long_as_nobody_committed_to_it(guard: 
         assert exited.status == signal.SIGKILL and any("not finished" in note for note in exited.notes)
 
 
+def test_of_a_vessel_that_ended_before_its_agent_did_nothing_is_left_to_be_found(guard: GuardProcess) -> None:
+    agent = guard.agent()
+    keeper = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    pidfd = os.pidfd_open(keeper.pid)
+    agent.ask(vessel(guard), (pidfd,))
+    os.close(pidfd)
+    keeper.communicate()
+    assert agent.event(Exited).status == signal.SIGKILL
+    agent.close()
+    assert guard.ended() == 0
+    assert not guard.path.exists()
+
+
 # The lease
 
 

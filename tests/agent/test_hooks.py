@@ -1,12 +1,29 @@
-"""A hook that is a signal: what names none is refused, whatever else Python knows by that name."""
+"""Hooks by themselves: which signal one names, and what is left of one that takes too long."""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import os
 import signal
+import sys
+import time
+import tracemalloc
+from pathlib import Path
 
 import pytest
 
-from agent.hooks import signal_in
+from agent.hooks import STARTED, Hook, Hooks, Occasion, signal_in
+
+PATIENCE_S = 30.0
+STUBBORN = """
+import os, sys, time
+if not (child := os.fork()):
+    os.setpgid(0, 0)
+    open(sys.argv[1], "w").write(str(os.getpid()))
+time.sleep(1000)
+"""
+"""Its child is in a process group of its own."""
 
 
 def test_a_signal_is_found_by_its_name() -> None:
@@ -18,3 +35,38 @@ def test_a_signal_is_found_by_its_name() -> None:
 def test_what_names_none_that_a_program_can_handle_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match="names no signal"):
         signal_in((f"signal:{name}",))
+
+
+def test_of_a_hook_that_takes_too_long_nothing_is_left_in_whichever_process_group(tmp_path: Path) -> None:
+    note = tmp_path / "child"
+    hook = Hook((sys.executable, "-S", "-c", STUBBORN, str(note)), 2.0)
+    outcome = asyncio.run(Hooks().run("before_start", hook, Occasion("/lab/x", "robot1", 1, 64, STARTED)))
+    child = int(note.read_text())
+    try:
+        assert "took longer than 2 s and was ended" in outcome.failure
+        deadline = time.monotonic() + PATIENCE_S
+        while is_alive(child):
+            assert time.monotonic() < deadline, "its child lives on"
+            time.sleep(0.01)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(child, signal.SIGKILL)
+
+
+def test_of_a_hook_that_says_very_much_only_the_last_is_kept() -> None:
+    says = "import sys\nfor _ in range(64):\n    sys.stdout.write('x' * 2**20)\nprint(); print('done')"
+    tracemalloc.start()
+    try:
+        hook = Hook((sys.executable, "-S", "-c", says), PATIENCE_S)
+        outcome = asyncio.run(Hooks().run("before_start", hook, Occasion("/lab/x", "robot1", 1, 64, STARTED)))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert (outcome.failure, outcome.last_line) == ("", "done")
+    assert peak < 16 << 20
+
+
+def is_alive(pid: int) -> bool:
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    return False

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agent import guard_messages
+from agent import guard_messages, lacks
 from agent.arguments import ProtectArguments, RunArguments, StopArguments, arguments_of
 from agent.errands import Errands
 from agent.errors import RefusedError
@@ -193,6 +193,21 @@ def test_an_answer_that_is_none_is_a_refusal(content: bytes) -> None:
         ends.errands.done("robot1", ErrandDone(sent.number, content))
         with pytest.raises(RefusedError, match="answered stop in a way not understood"):
             await asked
+
+    asyncio.run(body())
+
+
+@pytest.mark.parametrize(("lacking", "told"), [(None, ()), (5, ()), ("a", ()), ([], ()), (["a disk", 5], ("a disk", "5"))])
+def test_what_a_peer_says_that_it_lacks_is_sentences_or_nothing(lacking: Any, told: tuple[str, ...]) -> None:
+    async def body() -> None:
+        ends = Ends()
+        asked = asyncio.ensure_future(lacks.asked_of(ends.errands, "robot1", "/lab/mapper"))
+        while not ends.said:
+            await asyncio.sleep(0)
+        sent = ends.said[0]
+        assert isinstance(sent, Errand)
+        ends.errands.done("robot1", ErrandDone(sent.number, msgspec.msgpack.encode({"lacks": lacking})))
+        assert await asked == told
 
     asyncio.run(body())
 

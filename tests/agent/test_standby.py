@@ -255,6 +255,31 @@ def test_what_waits_ends_when_it_is_wanted_no_longer(tmp_path: Path, end: Callab
     live(tmp_path, story)
 
 
+def test_what_is_being_ended_ends_whole_when_nothing_is_wanted_any_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    began, allowed = asyncio.Event(), asyncio.Event()
+    undo = Component.undo
+
+    async def undone(component: Component) -> None:
+        began.set()
+        await allowed.wait()
+        await undo(component)
+
+    async def story(places: Places) -> None:
+        monkeypatch.setattr(Component, "undo", undone)
+        waiting = Waiting(places)
+        waiting.warm(program(STEPS))
+        await waiting.ready()
+        assert waiting.standby._ready is not None
+        os.kill(waiting.standby._ready.pid, signal.SIGKILL)
+        await began.wait()
+        waiting.standby.cool()
+        allowed.set()
+        await waiting.standby.close()
+        await until(lambda: not guard_sockets(places), "the guard to end")
+
+    live(tmp_path, story)
+
+
 def test_what_waits_ends_with_its_agent(tmp_path: Path) -> None:
     async def story(places: Places) -> None:
         component = await births.start_to_wait(NAME, program(STEPS), places, 0)

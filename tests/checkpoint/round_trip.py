@@ -298,3 +298,8 @@ def _stdio(directory: Path) -> Iterator[tuple[int, int, int]]:
     finally:
         for descriptor in (null, *streams):
             os.close(descriptor)
+
+
+def calls_of(pid: int) -> set[str]:
+    """The numbers of the system calls that its threads stand in."""
+    return {(task / "syscall").read_text().split()[0] for task in Path(f"/proc/{pid}/task").iterdir()}

@@ -1,6 +1,7 @@
 """Two ends of a TCP connection, each a process of its own, which say to each other what a test can check byte for byte.
 
     python3 talkers.py caller HOST PORT OWN [ends]     connects from an address of its own; the program that is captured
+    python3 talkers.py caller HOST PORT OWN posts      sends its end to itself in a message, and takes it out at the end
     python3 talkers.py called HOST PORT OWN [ends]     listens; its peer, which knows of nothing
 
 Both send until nothing more is taken, while neither reads, and say "ready". Once the file ``go`` is there each reads all that the
@@ -81,6 +82,22 @@ def talk(end: socket.socket, *, ends: bool) -> str:
     return "ok" if body == said(len(body)) else "other bytes than were said"
 
 
+def posted(end: socket.socket) -> str:
+    """What becomes of an end that is on its way in a message while the program is captured."""
+    box, letter = socket.socketpair()
+    fill(end)
+    socket.send_fds(letter, [b"."], [end.fileno()])
+    end.close()
+    print("ready", flush=True)
+    while not os.path.exists("go"):
+        time.sleep(0.01)
+    _, (number,), _, _ = socket.recv_fds(box, 1, 1)
+    try:
+        return f"{len(heard(socket.socket(fileno=number)))} bytes"
+    except OSError as error:
+        return f"{error.strerror} ({error.errno})"
+
+
 def main(part: str, host: str, port: str, own: str, *how: str) -> None:
     """Be one of the two."""
     if part == "called":
@@ -90,7 +107,7 @@ def main(part: str, host: str, port: str, own: str, *how: str) -> None:
         end, _ = listener.accept()
     else:
         end = socket.create_connection((host, int(port)), source_address=(own, 0))
-    print(talk(end, ends="ends" in how), flush=True)
+    print(posted(end) if "posts" in how else talk(end, ends="ends" in how), flush=True)
 
 
 if __name__ == "__main__":

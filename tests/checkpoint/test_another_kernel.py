@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint.arch import x86_64
+from checkpoint.arch import cpu
 from checkpoint.engines.restore_memory import content_at
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import procfs, vdso
@@ -98,7 +98,7 @@ def captured_where(program: Program, *, inside: bool) -> Snapshot:
         for _ in range(ATTEMPTS):
             snapshot = captured_at_last(session, CaptureOrder())
             image = image_of(snapshot)
-            place = x86_64.decode_registers(snapshot.threads[0].registers["prstatus"])["rip"]
+            place = cpu.decode_registers(snapshot.threads[0].registers["prstatus"])["rip"]
             if (image.start <= place < image.end) is inside:
                 return snapshot
     raise AssertionError(f"not met {'inside' if inside else 'outside'} the vdso in {ATTEMPTS} captures")
@@ -144,9 +144,9 @@ def test_a_thread_that_would_take_zeros_for_the_time_is_said_so(compiled: Compil
         snapshot = captured(tracee)
     (offset,) = (function.offset for function in functions_of(snapshot) if function.name == "__vdso_time")
     (thread,) = snapshot.threads
-    registers = x86_64.decode_registers(thread.registers["prstatus"])
-    registers |= {"rip": image_of(snapshot).start + offset, "rdi": 0, "orig_rax": x86_64.NO_CALL}
-    inside = replace(thread, registers={**thread.registers, "prstatus": x86_64.encode_registers(registers)}, interrupted="")
+    registers = cpu.decode_registers(thread.registers["prstatus"])
+    registers |= {"rip": image_of(snapshot).start + offset, "rdi": 0, "orig_rax": cpu.NO_CALL}
+    inside = replace(thread, registers={**thread.registers, "prstatus": cpu.encode_registers(registers)}, interrupted="")
     before = children()
     with pytest.raises(CheckpointError, match="reading a clock"):
         restored(of_another_kernel(replace(snapshot, threads=(inside,))), tmp_path).kill()
@@ -201,10 +201,10 @@ def test_a_thread_comes_out_of_an_old_image_by_a_system_call(image: bytes, compi
         snapshot = with_image(outside_the_image(tracee), image)
     (offset,) = (function.offset for function in functions_of(snapshot) if function.name == "__vdso_clock_gettime")
     (thread,) = snapshot.threads
-    registers = x86_64.decode_registers(thread.registers["prstatus"])
+    registers = cpu.decode_registers(thread.registers["prstatus"])
     stack = registers["rsp"] - 1024 & ~15
     registers |= {"rip": image_of(snapshot).start + offset, "rsp": stack, "rdi": time.CLOCK_MONOTONIC, "rsi": reading}
-    state = {**thread.registers, "prstatus": x86_64.encode_registers(registers | {"orig_rax": x86_64.NO_CALL})}
+    state = {**thread.registers, "prstatus": cpu.encode_registers(registers | {"orig_rax": cpu.NO_CALL})}
     snapshot = written_over(snapshot, stack, landed.to_bytes(8, "little"))
     snapshot = replace(snapshot, threads=(replace(thread, registers=state, interrupted=""),))
     with ended(restored(snapshot, tmp_path)) as tracee:

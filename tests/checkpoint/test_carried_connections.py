@@ -145,11 +145,11 @@ def laid(made: Machines) -> Iterator[Machines]:
             subprocess.run(["ip", "netns", "del", made.name(machine)], capture_output=True, check=False)
 
 
-def conversation(machines: Machines, ending: str = "") -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
+def conversation(machines: Machines, ending: str = "", *how: str) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
     """A program and its peer, which have filled their connection in both directions, but for the one that ends."""
     called = machines.start("peer", "called", *(["ends"] if ending == "called" else []))
     until(lambda: machines.said("called") == ["listens"], "the peer to listen")
-    caller = machines.start("one", "caller", *(["ends"] if ending == "caller" else []))
+    caller = machines.start("one", "caller", *how, *(["ends"] if ending == "caller" else []))
     until(lambda: machines.said("caller") == ["ready"] and machines.said("called")[-1:] == ["ready"], "both ends to be full")
     return caller, called
 
@@ -292,5 +292,25 @@ def test_it_is_reset_where_who_restores_wants_it_so(machines_4: Machines) -> Non
     pid, notes = restored(machines_4, "one", file, "--connections", "reset")
     assert "is reset (it goes on from an older state)" in notes
     called.kill()
+    finish(machines_4, pid, called)
+    assert machines_4.said("caller")[-1] == "Connection reset by peer (104)"
+
+
+def test_one_that_is_reset_where_it_was_silent_is_reset_at_its_peer_too(machines_4: Machines) -> None:
+    """As after a crash that brings a program back onto the machine that it had left."""
+    caller, called = conversation(machines_4)
+    file = captured(machines_4, caller.pid, "--connections", "carry")
+    caller.wait()
+    pid, _ = restored(machines_4, "one", file, "--connections", "reset")
+    finish(machines_4, pid, called)
+    assert machines_4.said("called")[-1] in ("Connection reset by peer (104)", "Broken pipe (32)")
+
+
+def test_one_that_is_on_its_way_in_a_message_is_reset_and_that_is_said(machines_4: Machines) -> None:
+    caller, called = conversation(machines_4, "", "posts")
+    file = captured(machines_4, caller.pid, "--connections", "carry")
+    caller.wait()
+    pid, notes = restored(machines_4, "one", file)
+    assert "is reset (it was on its way in a unix socket: received, it is taken along)" in notes, notes
     finish(machines_4, pid, called)
     assert machines_4.said("caller")[-1] == "Connection reset by peer (104)"

@@ -11,13 +11,16 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from checkpoint.engine import ProtectOrder
-from checkpoint.errors import CheckpointError, UnsupportedError
+from checkpoint.engine import ProtectOrder, RestoreOptions
+from checkpoint.engines import restore_checks
+from checkpoint.errors import CheckpointError, MismatchError, UnsupportedError
+from checkpoint.linux import procfs
+from checkpoint.resources import aio_rings, covered_files
 from tests.checkpoint.round_trip import (
     ENGINE,
     captured_and_killed,
@@ -35,7 +38,8 @@ Compiled = Callable[..., Path]
 
 CASES = {
     "event_descriptors": (
-        "eventfd_counter eventfd_semaphore eventfd_full eventfd_many pidfd_self "
+        "eventfd_counter eventfd_semaphore eventfd_full eventfd_many pidfd_self namespaces ended_processes "
+        "ended_directory "
         "timer_relative timer_absolute_monotonic timer_absolute_realtime timer_absolute_boottime timer_periodic timer_unread "
         "timer_disarmed signalfd_waiting "
         "epoll_simple epoll_ready epoll_nested epoll_once epoll_edge epoll_exclusive epoll_renumbered epoll_waiting"
@@ -55,6 +59,7 @@ CASES = {
         "ghost_left ghost_directory name_taken_again waiting_stream waiting_packets named_senders named_pair makers travelling"
     ),
     "kernel_sockets": "netlink raw light_datagrams packets",
+    "aio": "aio_events aio_around",
     "internet_sockets": "udp_shut_down foreign_address rare_options closed_connection_4 closed_connection_6",
 }
 
@@ -65,6 +70,67 @@ def test_what_a_program_has_open_is_as_it_was_after_three_restores(
 ) -> None:
     tracee = start_tracee(compiled(program, "-O2"), tmp_path, case)
     expect_three_lives(tracee, tmp_path)
+
+
+def test_direct_requests_of_which_nobody_can_tell_that_they_are_done_are_refused(
+    compiled: Compiled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ended(start_tracee(compiled("aio", "-O2"), tmp_path, "aio_direct")) as tracee:
+        monkeypatch.setattr(aio_rings, "COUNTED", "/nowhere/{}:{}/inflight")
+        with pytest.raises(UnsupportedError, match="direct I/O"):
+            ENGINE.protect(tracee.pid, ProtectOrder("/test/direct"))
+        monkeypatch.undo()
+        ENGINE.protect(tracee.pid, ProtectOrder("/test/direct")).close()
+
+
+def test_a_namespace_in_which_the_program_does_not_live_is_refused(tmp_path: Path) -> None:
+    leaves = "import ctypes, os, time; f = os.open('/proc/self/ns/uts', 0); ctypes.CDLL(None).unshare(0x4000000)\n"
+    with ended(start([sys.executable, "-c", leaves + "print('ready', flush=True); time.sleep(600)"], tmp_path)) as program:
+        program.wait_for_line("ready")
+        with pytest.raises(UnsupportedError, match="a namespace in which the program does not live"):
+            ENGINE.protect(program.pid, ProtectOrder("/test/elsewhere"))
+
+
+@contextlib.contextmanager
+def covered(place: Path) -> Iterator[None]:
+    """Mount something over a directory, for the body."""
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "covers", place], check=True)
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", place], check=True)
+
+
+def test_files_that_a_mount_covers_are_as_they_were_after_three_restores(compiled: Compiled, tmp_path: Path) -> None:
+    tracee = start_tracee(compiled("path_descriptors", "-O2"), tmp_path, "covered")
+    with covered(tmp_path / "place"):
+        expect_three_lives(tracee, tmp_path)
+
+
+def test_a_file_that_a_mount_covers_is_not_opened_for_an_ordinary_user(compiled: Compiled, tmp_path: Path) -> None:
+    tracee = start_tracee(compiled("path_descriptors", "-O2"), tmp_path, "covered")
+    with covered(tmp_path / "place"), ended(tracee):
+        snapshot = captured_and_killed(tracee)
+        with pytest.raises(MismatchError, match="which a mount covers, is opened again for root alone"):
+            restore_checks.require(snapshot, RestoreOptions(own_eyes=True), os.getpid())
+
+
+@pytest.mark.parametrize("name", ["ä ö", "a\\b", "line\nbreak", "next\x85 line\u2028", os.fsdecode(b"\xff\x0c\r")])
+def test_a_mount_point_is_read_whatever_its_name(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = b"".join(b"\\%03o" % byte if byte in b" \t\n\\" else bytes((byte,)) for byte in os.fsencode(f"/mnt/{name}"))
+    lines = b"22 1 8:1 / / rw - ext4 x rw\n23 22 0:5 / " + told + b" rw - tmpfs x rw\n"
+    monkeypatch.setattr(procfs, "read_bytes", lambda *_: lines)
+    assert covered_files._mount_point(1, "23") == f"/mnt/{name}"
+    assert covered_files._mount_point(1, "") == covered_files._mount_point(1, "7") == ""
+
+
+def test_a_file_that_a_mount_covers_and_that_has_changed_stops_the_restore(compiled: Compiled, tmp_path: Path) -> None:
+    tracee = start_tracee(compiled("path_descriptors", "-O2"), tmp_path, "covered")
+    with covered(tmp_path / "place"), ended(tracee):
+        snapshot = captured_and_killed(tracee)
+    (tmp_path / "place" / "file").write_text("short")
+    with covered(tmp_path / "place"), pytest.raises(CheckpointError, match="which a mount covers, has another content"):
+        restored(snapshot, tmp_path)
 
 
 def test_a_named_pipe_is_made_where_it_is_missing(compiled: Compiled, tmp_path: Path) -> None:

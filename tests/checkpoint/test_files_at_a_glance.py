@@ -24,7 +24,7 @@ def test_a_file_that_gets_its_name_back_between_two_looks_is_not_refused(tmp_pat
     with path.open("wb"):
         (held,) = (one for one in gather(os.getpid()) if one.first.target == str(path))
         path.rename(away)
-        really_is_found = files._is_found
+        really_is_found = files.is_found
 
         def is_found_and_comes_back(held: OpenFile) -> bool:
             found = really_is_found(held)
@@ -32,7 +32,7 @@ def test_a_file_that_gets_its_name_back_between_two_looks_is_not_refused(tmp_pat
                 away.rename(path)
             return found
 
-        monkeypatch.setattr(files, "_is_found", is_found_and_comes_back)
+        monkeypatch.setattr(files, "is_found", is_found_and_comes_back)
         assert files.refuse(held, Surroundings()) is None
 
 

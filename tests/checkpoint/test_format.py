@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from checkpoint import format, layout
+from checkpoint import format, layout, validity
 from checkpoint.errors import FormatError
 from checkpoint.model import OutputPiece, PageRun, Resource, Snapshot
 from tests.checkpoint.snapshots import PAGE, START, family, history, page, snapshot, vma
@@ -173,7 +173,7 @@ def test_a_family_that_does_not_hold_together_is_not_written(words: str) -> None
 
 FUZZ = """
 import random, sys
-from checkpoint import format, layout
+from checkpoint import format, layout, validity
 from checkpoint.errors import FormatError
 sample = open(sys.argv[1], "rb").read()
 dice = random.Random(int(sys.argv[2]))
@@ -246,3 +246,14 @@ class FullSink:
 def test_a_file_that_takes_nothing_more_is_an_error_and_no_endless_loop() -> None:
     with pytest.raises(OSError, match="takes nothing more"):
         format.encode(history(1)[0], FullSink())
+
+
+def test_a_file_that_expands_to_more_than_the_limit_is_refused_before_a_page_is_copied(monkeypatch: pytest.MonkeyPatch) -> None:
+    (base,) = family(1)
+    size = len(base.contents) + sum(copy.size for copy in base.copies)
+    encoded = format.encode_bytes(base)
+    monkeypatch.setattr(validity, "MAX_CONTENTS_SIZE", size)
+    assert format.decode(encoded).copies
+    monkeypatch.setattr(validity, "MAX_CONTENTS_SIZE", size - PAGE)
+    with pytest.raises(FormatError, match=f"copies: {size} bytes with what they are of, above the limit of {size - PAGE}"):
+        format.decode(encoded)

@@ -11,7 +11,15 @@ import msgspec
 import pytest
 
 from checkpoint import format, layout, model, state
-from tests.samples.make import SAMPLE, TREE_SAMPLE, sample, tree_sample
+from tests.samples.make import (
+    DIFFERENCES_SAMPLE,
+    SAMPLE,
+    SAMPLES,
+    TREE_DIFFERENCES_SAMPLE,
+    TREE_SAMPLE,
+    sample,
+    tree_sample,
+)
 
 DOCUMENT = (Path(layout.__file__).parent / "FORMAT.md").read_text()
 MAPS = {
@@ -92,3 +100,11 @@ def test_the_sample_file_is_still_read() -> None:
 def test_the_sample_file_of_several_processes_is_still_read() -> None:
     assert TREE_SAMPLE.read_bytes()[8] == layout.TREE_VERSION
     assert format.decode(TREE_SAMPLE) == tree_sample()
+
+
+@pytest.mark.parametrize("path", [DIFFERENCES_SAMPLE, TREE_DIFFERENCES_SAMPLE])
+def test_the_sample_files_with_differences_are_still_read(path: Path) -> None:
+    assert path.name == f"version-{path.read_bytes()[8]}.snapshot"
+    decoded = format.decode(path)
+    assert decoded == SAMPLES[path]()
+    assert decoded.differences

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from checkpoint import channel
-from checkpoint.arch import x86_64
+from checkpoint.arch import cpu
 from checkpoint.channel import Channel, ChannelError, Reply
 from checkpoint.engine import CaptureOrder
 from checkpoint.errors import CaptureError
@@ -26,7 +26,17 @@ from checkpoint.linux import entry, remote
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.remote import Desk
 from checkpoint.linux.vessel import Birth, Born, spawn_vessel
-from tests.checkpoint.round_trip import PATIENCE_S, Program, captured_at_last, ended, expect_ok, protected, start, start_tracee
+from tests.checkpoint.round_trip import (
+    PATIENCE_S,
+    Program,
+    calls_of,
+    captured_at_last,
+    ended,
+    expect_ok,
+    protected,
+    start,
+    start_tracee,
+)
 
 KILLS = int(os.environ.get("FAILOVER_KILLS", "20"))
 
@@ -192,16 +202,11 @@ def test_a_keeper_that_is_late_with_its_first_entry_does_no_harm_either(worker: 
     expect_undisturbed(worker)
 
 
-def calls_of(pid: int) -> set[str]:
-    """The numbers of the system calls that its threads stand in."""
-    return {(task / "syscall").read_text().split()[0] for task in Path(f"/proc/{pid}/task").iterdir()}
-
-
 @pytest.mark.compiler
 def test_a_keeper_that_is_late_sends_none_of_many_threads_back(
     compiled: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wait_in_time, waiting = remote._tables_when_done, str(x86_64.SYSCALLS["rt_sigtimedwait"])
+    wait_in_time, waiting = remote._tables_when_done, str(cpu.SYSCALLS["rt_sigtimedwait"])
 
     def wait_too_long(memory: Memory, desks: Sequence[Desk], end: int) -> list[bytes]:
         tables = wait_in_time(memory, desks, end)

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import operator
 import os
 import select
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from checkpoint.linux import descriptors
-from checkpoint.linux.descriptors import TEXTS_KEPT, Descriptor, KeptTexts
+from checkpoint.linux.descriptors import Descriptor
+from checkpoint.linux.kept_descriptors import TEXTS_KEPT, KeptTexts
+from checkpoint.resources import Kept, OpenFile, gather, grouping, with_contents
+from checkpoint.resources.recollection import Recollection
 
 
 @contextlib.contextmanager
@@ -49,6 +56,17 @@ def test_a_number_that_leads_elsewhere_by_now_is_told_anew() -> None:
         os.close(writer)
 
 
+def test_a_path_that_is_too_long_to_be_kept_is_told_as_it_is_by_now(tmp_path: Path) -> None:
+    place = tmp_path / "before"
+    long = place.joinpath(*["directory" * 20] * 3)
+    long.mkdir(parents=True)
+    with kept() as texts, open(long / "file", "wb") as file:
+        for _ in range(LOOKS_UNTIL_KNOWN):
+            told(file.fileno(), texts)
+        place.rename(tmp_path / "after")
+        assert told(file.fileno(), texts).target == os.readlink(f"/proc/self/fd/{file.fileno()}")
+
+
 def test_what_is_not_asked_of_sockets_and_pipes_is_what_the_kernel_would_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     with contextlib.ExitStack() as stack:
         ours = [*os.pipe(), os.eventfd(3), os.memfd_create("x"), os.pidfd_open(os.getpid()), os.open("/", os.O_PATH)]
@@ -70,8 +88,120 @@ def test_no_more_files_stay_open_than_are_worth_it_and_none_in_the_end() -> None
             for _ in range(2):
                 found = {one.number: one for one in descriptors.descriptors(os.getpid(), texts)}
                 assert [int(found[number].fields["eventfd-count"], 16) for number in many] == list(range(len(many)))
-            assert len(os.listdir("/proc/self/fd")) <= len(before) + len(many) + TEXTS_KEPT
+            assert len(os.listdir("/proc/self/fd")) <= len(before) + len(many) + TEXTS_KEPT + 1  # and the directory
     finally:
         for number in many:
             os.close(number)
     assert sorted(os.listdir("/proc/self/fd")) == before
+
+
+HOLDER = """
+import fcntl, os, select, sys
+path = sys.argv[1]
+open(path, "wb").write(b"content")
+file, like = (os.open(path, os.O_RDWR) for _ in range(2))
+twin = os.dup(file)
+counter, other_counter = os.eventfd(3), os.eventfd(3)
+reader, writer = os.pipe()
+epoll, other_epoll = select.epoll(), select.epoll()
+many = [os.eventfd(value) for value in range(20)]
+print("ready", flush=True)
+for line in sys.stdin:
+    exec(line)
+    print("done", flush=True)
+"""
+"""Open files, some of them alike, and two descriptors of one; does what it is told."""
+
+
+class Holder:
+    """Another process, which is looked at again and again."""
+
+    def __init__(self, path: Path) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", HOLDER, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        self.pid = self._process.pid
+        self._kept, self._recollection = Kept(self.pid), Recollection()
+        self._await("ready")
+
+    def _await(self, word: str) -> None:
+        assert self._process.stdout is not None
+        assert self._process.stdout.readline() == f"{word}\n"
+
+    def tell(self, statement: str) -> None:
+        """Have it do something."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(statement + "\n")
+        self._process.stdin.flush()
+        self._await("done")
+
+    def look(self) -> tuple[OpenFile, ...]:
+        """What is said of it by who has looked before."""
+        return with_contents(gather(self.pid, self._kept), None, (), self._recollection)
+
+    def look_anew(self) -> tuple[OpenFile, ...]:
+        """What is said of it by who sees it for the first time."""
+        return with_contents(gather(self.pid), None)
+
+    def end(self) -> None:
+        """End it."""
+        self._process.kill()
+        self._process.communicate()
+        self._kept.texts.close()
+
+
+@pytest.fixture
+def holder(tmp_path: Path) -> Iterator[Holder]:
+    one = Holder(tmp_path / "file")
+    yield one
+    one.end()
+
+
+LOOKS_UNTIL_KNOWN = 3
+
+CHANGES = {
+    "an offset": "os.lseek(like, 3, os.SEEK_SET)",
+    "an offset of two": "os.lseek(twin, 3, os.SEEK_SET)",
+    "a flag": "os.set_blocking(reader, False)",
+    "close-on-exec": "os.set_inheritable(counter, True)",
+    "a size": "os.write(file, b'more than there was')",
+    "a name": "os.rename(path, path + '.other')",
+    "that it was deleted": "os.unlink(path)",
+    "a mode": "os.chmod(path, 0o600)",
+    "a count": "os.eventfd_write(counter, 4)",
+    "a twin that leads elsewhere": "os.dup2(like, twin)",
+    "two that are one now": "os.dup2(file, like)",
+    "counters that are one now": "os.dup2(counter, other_counter)",
+    "epolls that are one now": "os.dup2(epoll.fileno(), other_epoll.fileno())",
+    "an epoll that is a counter now": "os.dup2(counter, other_epoll.fileno())",
+    "a file that is a pipe now": "os.dup2(reader, like)",
+    "another file under the same number": "os.close(like); assert os.open('/dev/null', os.O_RDWR) == like",
+    "what waits in a pipe": "os.write(writer, b'content')",
+    "the capacity of a pipe": "fcntl.fcntl(writer, 1031, 4096)",
+    "what an epoll watches": "epoll.register(reader, select.EPOLLIN)",
+    "one more": "os.eventfd(0)",
+    "one less": "os.close(many[3])",
+    "others instead": "[os.close(one) for one in (many[7], many[0], many[-1])]; os.eventfd(77), os.eventfd(78), os.pipe()",
+}
+
+
+@pytest.mark.root
+@pytest.mark.parametrize("change", CHANGES)
+def test_whatever_changes_is_seen(change: str, holder: Holder) -> None:
+    for _ in range(LOOKS_UNTIL_KNOWN):
+        before = holder.look()
+    again = holder.look()
+    assert all(map(operator.is_, (held.descriptors for held in before), (held.descriptors for held in again))), "known by now"
+    holder.tell(CHANGES[change])
+    for _ in range(LOOKS_UNTIL_KNOWN):
+        after = holder.look()
+        assert after != before
+        assert after == holder.look_anew()
+
+
+@pytest.mark.root
+def test_what_is_known_is_not_compared_one_by_one(holder: Holder, monkeypatch: pytest.MonkeyPatch) -> None:
+    for _ in range(LOOKS_UNTIL_KNOWN):
+        holder.look()
+    monkeypatch.setattr(grouping, "_place_among", None)
+    assert holder.look()

@@ -27,6 +27,7 @@ from tests.checkpoint.round_trip import (
     captured_at_last,
     ended,
     expect_ok,
+    expect_three_lives,
     protected,
     restored,
     start,
@@ -73,6 +74,13 @@ def test_memory_of_a_special_kind_comes_back_as_it_was(kind: str, compiled: Comp
         with ended(tracee):
             tracee.tell()
             expect_ok(tracee)
+
+
+@pytest.mark.parametrize("kind", ["memfd", "deleted"])
+def test_a_file_without_a_name_shows_in_what_is_mapped_of_it_and_was_not_written(
+    kind: str, compiled: Compiled, tmp_path: Path
+) -> None:
+    expect_three_lives(start_tracee(compiled("private_of_nameless", "-O2"), tmp_path, kind), tmp_path)
 
 
 @pytest.mark.parametrize("kind", ["huge", "huge_shared"])

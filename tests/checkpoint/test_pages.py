@@ -30,6 +30,8 @@ def test_sets_of_pages_are_sets(left: frozenset[int], right: frozenset[int]) -> 
     assert as_numbers(pages.union(ours, theirs)) == left | right
     assert as_numbers(pages.intersection(ours, theirs)) == left & right
     assert as_numbers(pages.difference(ours, theirs)) == left - right
+    assert pages.covers(ours, theirs) == (right <= left)
+    assert pages.covers(pages.union(ours, theirs), theirs)
     assert pages.total_size(ours) == len(left) * PAGE
     addresses = pages.addresses_of(ours, PAGE)
     assert np.array_equal(pages.extents_of_addresses(addresses, PAGE), ours)

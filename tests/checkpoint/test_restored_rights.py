@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import stat
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from checkpoint.arch.x86_64_stub import SYSTEM_CALLS
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import netlink_sockets, rebuild, unix_names
+from checkpoint.resources import fifos, nameless, netlink_sockets, rebuild, unix_names
 from checkpoint.resources.unix_makers import Disguise
 from tests.checkpoint.snapshots import process
 
@@ -67,6 +68,44 @@ def test_a_deleted_file_gets_no_attribute_that_takes_more_than_its_user_may() ->
     given = [call for call in table.calls if call.number == SYSTEM_CALLS["setxattr"]]
     assert len(given) == 1
     assert b"user.colour" in table.content and b"security." not in table.content
+
+
+def disguise(uid: int) -> Disguise:
+    """A vessel of root's that will be a program of this user's."""
+    vessel = replace(procfs.status(os.getpid()), uids=(0, 0, 0, 0), gids=(0, 0, 0, 0))
+    program = process()
+    credentials = replace(program.credentials, uids=(uid,) * 4, gids=(uid,) * 4)
+    return Disguise(vessel, replace(program, credentials=credentials), True, 1)
+
+
+@pytest.mark.parametrize("facts", [{}, {"maker": [], "user": []}, {"maker": [7, 1000, 1000], "user": [1000, 1000]}])
+def test_nothing_is_made_as_root_for_somebody_else(facts: dict[str, Fact]) -> None:
+    for as_whom in (disguise(1000).as_maker, disguise(1000).as_owner):
+        table = CallTable(0x10000)
+        with as_whom(table, Resource("unix_sockets", "fd 3", facts)):
+            before = [(call.number, call.arguments[:2]) for call in table.calls]
+        assert (SYSTEM_CALLS["setresuid"], (1000, 1000)) in before
+
+
+def by_node(table: CallTable, path: str) -> None:
+    nameless.make_node(table, path, stat.S_IFIFO | 0o640)
+
+
+def by_directory(table: CallTable, path: str) -> None:
+    nameless.make_directory(table, path, 0o750)
+
+
+def by_named_pipe(table: CallTable, path: str) -> None:
+    fifos._make(table, path, 0o640)
+
+
+@pytest.mark.parametrize("make", [by_node, by_directory, by_named_pipe])
+def test_the_mode_is_given_to_what_was_made_and_not_to_its_name(make: Callable[[CallTable, str], None], tmp_path: Path) -> None:
+    table = CallTable(0x10000)
+    make(table, str(tmp_path / "made"))
+    (given,) = (call for call in table.calls if call.number == SYSTEM_CALLS["fchmodat"])
+    offset = given.arguments[1] - (table.place(b"") - len(table.content))
+    assert bytes(table.content)[offset:].startswith(b"/proc/self/fd/")
 
 
 @pytest.mark.parametrize(("owner", "expected"), [(1000, ["setresgid", "setresuid", "socket"]), (0, ["socket"])])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 from collections.abc import Callable
@@ -10,9 +11,10 @@ from pathlib import Path
 import pytest
 
 from checkpoint.engine import RestoreOptions
-from checkpoint.linux import internet_sockets
+from checkpoint.linux import internet_sockets, procfs
 from checkpoint.linux.vessel import Birth, discard, spawn_vessel
 from checkpoint.model import Snapshot
+from checkpoint.resources import gather, with_contents
 from tests.checkpoint.round_trip import ENGINE, Program, captured_and_killed, ended, expect_ok, start_tracee
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
@@ -57,3 +59,28 @@ def test_a_list_that_the_kernel_does_not_have_is_asked_for_once() -> None:
     for _ in range(2):
         assert internet_sockets.shut_down(*unassigned) == {}
         assert unassigned in internet_sockets._WITHOUT
+
+
+def test_the_kernels_lists_are_read_once_however_many_sockets_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[str] = []
+
+    def counted(pid: int, name: str) -> str:
+        read.append(name)
+        return read_text(pid, name)
+
+    read_text = procfs.read_text
+    monkeypatch.setattr(procfs, "read_text", counted)
+    with contextlib.ExitStack() as stack:
+        ours = [
+            stack.enter_context(socket.socket(*form))
+            for form in ((socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_ICMP), (socket.AF_NETLINK, socket.SOCK_RAW, 0))
+            for _ in range(5)
+        ]
+        for one in ours[:5]:
+            one.connect(("127.0.0.1", 0))
+        seen = with_contents(gather(os.getpid()), None)
+        facts = {held.first.number: held.observed for held in seen}
+        assert all(facts[one.fileno()]["peer"] == ["127.0.0.1", 0] for one in ours[:5])
+        assert all(facts[one.fileno()]["port"] == 0 for one in ours[5:])
+    assert read.count("net/raw") == 1
+    assert read.count("net/netlink") == 1

@@ -186,7 +186,7 @@ def test_a_dropped_component_leaves_no_page_table(tmp_path: Path) -> None:
     with opened(tmp_path / "store") as store:
         put(store, base)
         store.drop(COMPONENT)
-        assert not store._proved
+        assert not store._proofs._proved
         with pytest.raises(ChainError, match="ask for a base"):
             put(store, delta)
 

@@ -11,7 +11,17 @@ from pathlib import Path
 import pytest
 
 from checkpoint.errors import UnsupportedError
-from tests.checkpoint.round_trip import ENGINE, captured, captured_and_killed, ended, expect_ok, restored, start, start_tracee
+from tests.checkpoint.round_trip import (
+    ENGINE,
+    captured,
+    captured_and_killed,
+    ended,
+    expect_ok,
+    expect_three_lives,
+    restored,
+    start,
+    start_tracee,
+)
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
@@ -57,28 +67,14 @@ def _answer(accepted: socket.socket) -> None:
 
 @pytest.mark.parametrize("case", WITH_ITSELF)
 def test_a_connection_of_a_program_with_itself_comes_back(case: str, compiled: Compiled, tmp_path: Path) -> None:
-    three_lives(compiled("tcp_connections", "-O2"), tmp_path, case)
+    expect_three_lives(start_tracee(compiled("tcp_connections", "-O2"), tmp_path, case), tmp_path)
 
 
 @pytest.mark.parametrize("case", WITH_OTHERS)
 def test_a_connection_with_somebody_else_ends_as_if_he_had_crashed(
     case: str, peer: int, compiled: Compiled, tmp_path: Path
 ) -> None:
-    three_lives(compiled("tcp_connections", "-O2"), tmp_path, case, str(peer))
-
-
-def three_lives(program: Path, directory: Path, *arguments: str) -> None:
-    """Capture, kill and restore three times, then let the tracee look."""
-    tracee = start_tracee(program, directory, *arguments)
-    for _ in range(ROUNDS):
-        with ended(tracee):
-            captured(tracee)
-            snapshot = captured_and_killed(tracee)
-        tracee = restored(snapshot, directory)
-    with ended(tracee):
-        captured(tracee)
-        tracee.tell()
-        expect_ok(tracee)
+    expect_three_lives(start_tracee(compiled("tcp_connections", "-O2"), tmp_path, case, str(peer)), tmp_path)
 
 
 def test_a_connection_that_was_asked_for_is_asked_for_anew(compiled: Compiled, tmp_path: Path) -> None:

@@ -11,8 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from checkpoint import room
 from checkpoint.engine import CaptureOrder
-from checkpoint.linux import kinship
+from checkpoint.errors import UnsupportedError
+from checkpoint.linux import kinship, procfs
 from tests.checkpoint.round_trip import (
     Program,
     captured_at_last,
@@ -58,9 +60,9 @@ def is_ready():
 """
 
 
-def goes_through_three_lives(program: str, directory: Path) -> None:
+def goes_through_three_lives(program: str, directory: Path, *arguments: str) -> None:
     """It says what differs afterwards."""
-    begun = start([sys.executable, "-c", PREAMBLE + program], directory, isolate=True)
+    begun = start([sys.executable, "-c", PREAMBLE + program, *arguments], directory, isolate=True)
 
     def is_ready(one: Program) -> bool:
         return "ready\n" in one.output
@@ -101,6 +103,32 @@ def test_stopped_children_stay_so_and_their_parent_is_told_once(tmp_path: Path) 
     goes_through_three_lives(STOPPED, tmp_path)
 
 
+ALL_STOPPED = """
+child = born(wait_for_go) if sys.argv[1:] == ["parent"] else 0
+is_ready()
+if child:
+    expect_child(child)
+print("ok", flush=True)
+"""
+
+
+def state_of(program: Program) -> str:
+    return procfs.stat(program.pid).state
+
+
+@pytest.mark.parametrize("kind", ["alone", "parent"])
+def test_a_program_that_is_stopped_stays_so(kind: str, tmp_path: Path) -> None:
+    program = start([sys.executable, "-c", PREAMBLE + ALL_STOPPED, kind], tmp_path, isolate=True)
+    program.wait_for_line("ready")
+    os.kill(program.pid, signal.SIGSTOP)
+    last, _ = three_lives(program, lambda program: state_of(program) == "T")
+    with ended(last):
+        last.wait_until(lambda: state_of(last) == "T", "that it is stopped")
+        last.tell()
+        os.kill(last.pid, signal.SIGCONT)
+        expect_ok(last)
+
+
 NAMELESS = """
 import fcntl
 deleted = os.open("deleted", os.O_RDWR | os.O_CREAT)
@@ -135,6 +163,33 @@ expect("seals", fcntl.fcntl(sealed, fcntl.F_GET_SEALS), fcntl.F_SEAL_WRITE | fcn
 expect("the offset", os.lseek(deleted, 0, os.SEEK_CUR), 5000)
 print("ok", flush=True)
 """
+
+
+ON_THEIR_WAY = """
+import socket
+ours, theirs = socket.socketpair()
+memory = os.memfd_create("memory")
+os.write(memory, b"memory")
+deleted = os.open("deleted", os.O_RDWR | os.O_CREAT)
+os.write(deleted, b"deleted")
+os.unlink("deleted")
+socket.send_fds(ours, [b"x"], [memory, deleted])
+os.close(memory)
+os.close(deleted)
+is_ready()
+_, came, _, _ = socket.recv_fds(theirs, 10, 4)
+expect("what came", [os.pread(one, 10, 0) for one in came], [b"memory", b"deleted"])
+print("ok", flush=True)
+"""
+
+
+def test_files_without_a_name_that_are_on_their_way_and_open_nowhere_arrive(tmp_path: Path) -> None:
+    program = start([sys.executable, "-c", PREAMBLE + ON_THEIR_WAY], tmp_path, isolate=True)
+    program.wait_for_line("ready")
+    last, _ = three_lives(program, lambda program: True)
+    with ended(last):
+        last.tell()
+        expect_ok(last)
 
 
 def test_a_file_without_a_name_that_two_processes_have_opened_is_one_file(tmp_path: Path) -> None:
@@ -300,6 +355,49 @@ def test_processes_that_have_lost_their_parent_are_told_by_their_session(tmp_pat
         expect_ok(again)
     for pid in strays:
         os.waitpid(pid, 0)
+
+
+LEFT_BEHIND = """
+import ctypes
+if sys.argv[1:] == ["asks"]:
+    ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER
+read_end, write_end = os.pipe()
+
+def lead():
+    os.setsid()
+    born(live_alone)
+
+def live_alone():
+    mine = os.getsid(0)
+    while os.getppid() == mine:
+        time.sleep(0.01)
+    os.write(write_end, b".")
+    wait_for_go()
+    expect("its session", os.getsid(0), mine)
+    return 21
+
+os.waitpid(born(lead), 0)
+os.read(read_end, 1)
+is_ready()
+if sys.argv[1:] == ["asks"]:
+    expect("the end of an orphan", os.waitstatus_to_exitcode(os.waitpid(-1, 0)[1]), 21)
+print("ok", flush=True)
+"""
+"""The leader of a session has ended, and somebody of it lives on."""
+
+
+def test_an_orphan_of_a_session_that_has_lost_its_leader_is_again_its_foster_parent_s(tmp_path: Path) -> None:
+    goes_through_three_lives(LEFT_BEHIND, tmp_path, "asks")
+
+
+def test_an_orphan_of_a_session_that_has_lost_its_leader_is_told_by_its_standard_streams(tmp_path: Path) -> None:
+    with ended(start([sys.executable, "-c", PREAMBLE + LEFT_BEHIND], tmp_path)) as program:
+        program.wait_for_line("ready")
+        (stray,) = set(kinship.component(program.pid)) - {program.pid}
+        assert stray not in kinship.descendants(program.pid)
+        program.tell()
+        expect_ok(program)
+        os.waitpid(stray, 0)
 
 
 FORKED = """
@@ -553,5 +651,35 @@ def test_a_child_whose_first_delta_was_lost_is_whole_in_the_next(tmp_path: Path)
         program.kill()
     program = restored(chain, tmp_path)
     with ended(program):
+        program.tell()
+        expect_ok(program)
+
+
+CROWD = """
+held = bytearray(os.urandom(1 << 20) * 8)
+child = born(lambda: wait_for_go() or 0 if sum(held[:1 << 20]) else 1)
+is_ready()
+expect_child(child)
+print("ok", flush=True)
+"""
+
+
+def test_a_family_for_which_there_is_no_room_is_refused_by_name_and_runs_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = start([sys.executable, "-S", "-c", PREAMBLE + CROWD], tmp_path)
+    with ended(program):
+        program.wait_for_line("ready")
+        with protected(program) as session:
+            with monkeypatch.context() as little:
+                little.setattr(room, "free", lambda: 16 * MIB)
+                with pytest.raises(UnsupportedError, match=r"its processes hold 0\.0 GB together, and copying them takes"):
+                    session.capture(CaptureOrder())
+            snapshot = captured_at_last(session, CaptureOrder())
+        with monkeypatch.context() as little:
+            little.setattr(room, "free", lambda: 16 * MIB)
+            (reason,) = room.refuse_restore(snapshot)
+            assert "its processes hold 0.0 GB where each has its own" in reason
+        assert room.refuse_restore(snapshot) == ()
         program.tell()
         expect_ok(program)

@@ -8,18 +8,24 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
 
-from checkpoint.arch import x86_64 as arch
+from checkpoint.arch import cpu as arch
+from checkpoint.arch.calls import Registers
 from checkpoint.engine import CaptureOrder
 from checkpoint.engines import waits
 from checkpoint.engines.waits import Wait, decide
+from checkpoint.errors import CaptureError
+from checkpoint.linux import remote
+from checkpoint.linux.memory import Memory
+from checkpoint.linux.remote import Desk
 from tests.checkpoint.round_trip import (
     PATIENCE_S,
     Program,
+    calls_of,
     captured_and_killed,
     captured_at_last,
     ended,
@@ -152,13 +158,40 @@ def test_a_wait_that_a_keeper_had_made_again_ends_by_itself_when_that_is_killed(
         expect_all_ok(programs)
 
 
+@pytest.mark.compiler
+@pytest.mark.root
+@pytest.mark.parametrize("kind", ["epoll", "thread"])
+def test_a_wait_that_went_on_while_its_keeper_was_late_does_not_end_with_eintr(
+    compiled: Compiled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """The program has run on by itself, into the same call: it is stopped there once more."""
+    wait_in_time = remote._tables_when_done
+
+    def wait_too_long(memory: Memory, desks: Sequence[Desk], end: int) -> list[bytes]:
+        tables = wait_in_time(memory, desks, end)
+        program.wait_until(lambda: waiting_in in calls_of(program.pid), "the wait to be made again")
+        return tables
+
+    waiting_in = str(arch.SYSCALLS["epoll_wait"])
+    with waiting(compiled, tmp_path, (kind,)) as programs:
+        (program,) = programs
+        with protected(program) as session:
+            program.wait_until(lambda: waiting_in in calls_of(program.pid), "the wait")
+            monkeypatch.setattr(remote, "_tables_when_done", wait_too_long)
+            with pytest.raises(CaptureError, match="has run on while it was looked at"):
+                session.capture(CaptureOrder(base=True, generation=1, sequence=1))
+            monkeypatch.undo()
+        program.wait_until(lambda: has_done_enough(program), "its waits")
+        expect_all_ok(programs)
+
+
 # --- The table of rules ------------------------------------------------------------------------------------------------
 
 ASKED_NS = 1_000
 BEGAN_NS = 50_000
 
 
-def stopped(mark: int = 0, **changed: int) -> arch.Registers:
+def stopped(mark: int = 0, **changed: int) -> Registers:
     """Registers of a thread that a stop has found in an epoll_wait."""
     registers = dict.fromkeys(arch.REGISTER_NAMES, 7)
     return {
@@ -169,19 +202,19 @@ def stopped(mark: int = 0, **changed: int) -> arch.Registers:
     }
 
 
-def decided(registers: arch.Registers, before: Wait | None, now_ns: int) -> tuple[arch.Registers, Wait | None]:
+def decided(registers: Registers, before: Wait | None, now_ns: int) -> tuple[Registers, Wait | None]:
     """The rules, for an epoll_wait of `ASKED_NS`."""
     return decide(registers, before, ASKED_NS, 0, now_ns)
 
 
-def first_seen() -> tuple[arch.Registers, Wait]:
+def first_seen() -> tuple[Registers, Wait]:
     """A call that is met by a capture for the first time."""
     again, wait = decided(stopped(), None, BEGAN_NS)
     assert wait is not None and wait.deadline_ns == BEGAN_NS + ASKED_NS
     return again, wait
 
 
-def is_made_again(registers: arch.Registers, mark: int) -> bool:
+def is_made_again(registers: Registers, mark: int) -> bool:
     """Whether the kernel makes the call again, with this mark."""
     return registers == {**stopped(mark), arch.RESULT: arch.ERESTARTNOHAND}
 
@@ -204,7 +237,7 @@ def test_a_marked_call_keeps_its_mark_until_its_time_is_over_and_times_out_then(
 
 
 @pytest.mark.parametrize("found", [stopped(), stopped(mark=12345), stopped(rip=8)], ids=["unmarked", "another mark", "elsewhere"])
-def test_a_call_without_our_mark_begins_anew_whatever_the_time(found: arch.Registers) -> None:
+def test_a_call_without_our_mark_begins_anew_whatever_the_time(found: Registers) -> None:
     _, wait = first_seen()
     registers, fresh = decided(found, wait, wait.deadline_ns + 1)
     assert fresh is not None and fresh.deadline_ns == wait.deadline_ns + 1 + ASKED_NS

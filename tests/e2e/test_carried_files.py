@@ -129,7 +129,7 @@ def test_a_program_with_a_log_of_its_own_goes_there_and_comes_back(tmp_path: Pat
         (disk(first) / "ledger").mkdir()
         (disk(second) / "ledger").mkdir()
         (disk(second) / "ledger" / "his").write_text("stood here before")
-        run_carrying(first, "count", [str(folder)], sys.executable, str(LEDGER), str(folder), "1500")
+        run_carrying(first, "count", [str(folder)], sys.executable, str(LEDGER), str(folder), "4000")
         until_protected(first)
         for robot, other in ((first, second), (second, first)):
             until_more(robot, dice.randrange(10, 60))
@@ -142,7 +142,7 @@ def test_a_program_with_a_log_of_its_own_goes_there_and_comes_back(tmp_path: Pat
         ended = result(second, "count")
         lines = output(second, "count").decode().split()
         assert ended["exit_status"] == 0, lines[-3:]
-        assert lines == [*map(str, range(1, 1501)), "ok"]
+        assert lines == [*map(str, range(1, 4001)), "ok"]
 
 
 KEEPS_STATE = """

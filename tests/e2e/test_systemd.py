@@ -155,6 +155,9 @@ HOOKED = """
 hooks.before_start = ["/bin/sh", "-c", "grep CapEff /proc/self/status >/run/hooked; echo $FAILOVER_WHY >>/run/hooked"]
 [components."/lab/robot1/unhooked"]
 hooks.before_start = ["/bin/false"]
+[components."/lab/robot1/stubborn"]
+hooks.before_start = ["/bin/sh", "-c", "trap '' TERM; (while :; do sleep 1; done) & while :; do sleep 1; done"]
+hooks.limit_s = 1
 """
 
 
@@ -168,5 +171,8 @@ def test_a_hook_is_not_shut_in_as_the_service_is_and_its_failure_is_told(machine
     assert int(capabilities.split()[1], 16) and why == "started"
     started(machine, "unhooked")
     assert any("before_start (/bin/false) failed" in note for note in component(machine, "unhooked")["notes"])
-    for name in ("hooked", "unhooked"):
+    started(machine, "stubborn")
+    assert machine.run("systemctl", "list-units", "failover-hook-*", "--no-legend", "--plain").stdout == "", "nothing outlives it"
+    assert any("failed" in note for note in component(machine, "stubborn")["notes"])
+    for name in ("hooked", "unhooked", "stubborn"):
         machine.run("failover", "stop", name)

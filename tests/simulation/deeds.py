@@ -17,6 +17,7 @@ from failover.core.events import (
     CaptureFailed,
     Event,
     Exited,
+    Inquired,
     Restored,
     ShipEnded,
     Started,
@@ -37,6 +38,10 @@ REFUSES = 1 << 8
 
 WARM_FAILS = 0.2
 """Of the programs that are started in advance."""
+
+LACKING = 0.3
+"""Of the times that a robot is asked whether a component could go on there."""
+LACK = ("the device /dev/ttyUSB0 is missing here",)
 
 
 class Deeds:
@@ -68,6 +73,8 @@ class Deeds:
                 self._guard(robot, act)
             case acts.Warm() | acts.Cool():
                 self._warm(robot, act)
+            case acts.Inquire():
+                self._inquire(robot, act)
             case acts.Answer():
                 self._world.note(f"{robot.name} answers: {'; '.join((act.sentence, *act.risks))}")
 
@@ -110,6 +117,19 @@ class Deeds:
 
         fails = self._world.random.random() < WARM_FAILS
         self._world.after(self._world.soon(20, 200) * robot.slow, lambda: done(not fails))
+
+    def _inquire(self, robot: Robot, act: acts.Inquire) -> None:
+        """Another robot looks what it lacks, which nobody hears of if nothing gets through."""
+        life = robot.life
+        now_and_then = LACK if self._world.random.random() < LACKING else ()
+
+        def done() -> None:
+            asked = self._world.robots[act.to].lacks
+            lacks = now_and_then if asked is None else asked
+            if robot.life == life and self._world.passes(robot.name, act.to) and self._world.passes(act.to, robot.name):
+                self._world.feed(robot, Inquired(act.component, act.epoch, act.to, lacks))
+
+        self._world.after(self._world.soon(20, 300) * robot.slow, done)
 
     def _whole_program(self, robot: Robot, act: acts.Start | acts.Restore | acts.Stop) -> None:
         name, life = act.component, robot.life

@@ -8,7 +8,7 @@ from checkpoint.model import Position
 from failover.core import acts
 from failover.core.messages import ORDERED, Beat
 from failover.core.types import ENDED, Ballot, ComponentView, OnLoss, State, WhenAlone
-from tests.simulation.robots import KEEPS_STATE, NewDisk, ballot_of
+from tests.simulation.robots import NewDisk, ballot_of
 from tests.simulation.world import World
 
 
@@ -200,7 +200,7 @@ def seen_at(world: World, robot: str, component: str) -> ComponentView:
 
 def _waits_at_a_standby(world: World, component: str) -> bool:
     specs = (record.spec for robot in world.robots.values() for record in ballot_of(robot).records if record.name == component)
-    return any(spec is not None and spec.launch.engine == KEEPS_STATE and spec.rules.on_loss is OnLoss.TAKEOVER for spec in specs)
+    return any(spec is not None and spec.rules.on_loss is OnLoss.TAKEOVER for spec in specs)
 
 
 def _views(world: World, robot: str) -> tuple[ComponentView, ...]:

@@ -175,7 +175,7 @@ def waits_for_ever() -> Any:
 
 def waits_where_it_may_not_run() -> Any:
     """A program waits also where it was told to be held only, or where somebody else is entrusted."""
-    return patch.object(warmth, "_wanted", lambda component: component.spec if component.keeps_state else None)
+    return patch.object(warmth, "_wanted", lambda component: component.spec)
 
 
 # Mistakes in the rule ``majority``

@@ -66,7 +66,11 @@ class Program:
 
 @dataclass(slots=True)
 class Robot:
-    """One robot: a clock, a disk, programs, and (while its agent lives) the rules."""
+    """One robot: a clock, a disk, programs, and (while its agent lives) the rules.
+
+    Attributes:
+        lacks: what it says that it lacks when it is asked; None: something now and then.
+    """
 
     name: str
     config: Config
@@ -91,6 +95,7 @@ class Robot:
     slow: float = 1
     broken_store: bool = False
     refuses: bool = False
+    lacks: tuple[str, ...] | None = ()
     pending: Ballot | None = None
     told: list[Decision] = field(default_factory=list)
     writing: list[tuple[str, Position]] = field(default_factory=list)

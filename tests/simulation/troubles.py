@@ -197,4 +197,6 @@ class Trouble:
             self._world.after(after_ms * MS, lambda order=order: self._world.command(self._other, order))
 
     def _prefer(self) -> None:
+        """It is to run elsewhere from now on, where something is lacking now and then."""
+        self._world.robots[self._other].lacks = None
         self._world.command(self._name, Prefer(self._world.request(), self._spec.name, self._other))

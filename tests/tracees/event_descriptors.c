@@ -80,6 +80,75 @@ static void pidfd_self(void) {
     EXPECT(before.st_ino == after.st_ino, "it stands for somebody else");
 }
 
+/* Children that have ended and were waited for: two pidfds of one, one of another; files of /proc of a third. */
+static void ended_processes(void) {
+    pid_t children[3];
+    int files[3], status;
+    char path[40], text[64];
+    for (int index = 0; index < 3; index++)
+        if (!(children[index] = fork())) {
+            pause();
+            _exit(0);
+        }
+    for (int index = 0; index < 3; index++)
+        if ((files[index] = syscall(SYS_pidfd_open, children[index / 2], index == 1 ? O_NONBLOCK : 0)) < 0) cannot("open a pidfd");
+    snprintf(path, sizeof path, "/proc/%d", children[2]);
+    int folder = open(path, O_RDONLY | O_DIRECTORY | O_CLOEXEC), about = openat(folder, "status", O_RDONLY);
+    if (about < 0) cannot("open %s/status", path);
+    for (int index = 0; index < 3; index++)
+        if (kill(children[index], SIGKILL) || waitpid(children[index], &status, 0) != children[index]) cannot("end a child");
+    signal(SIGCHLD, hear);
+    wait_here();
+    struct stat first, second, other;
+    fstat(files[0], &first), fstat(files[1], &second), fstat(files[2], &other);
+    EXPECT(first.st_ino == second.st_ino && first.st_ino != other.st_ino, "they stand for others");
+    for (int index = 0; index < 3; index++) {
+        EXPECT(is_ready(files[index]), "pidfd %d says that somebody lives", index);
+        EXPECT(syscall(SYS_pidfd_send_signal, files[index], 0, NULL, 0) == -1 && errno == ESRCH, "somebody takes a signal");
+        EXPECT_EQUAL("flags", !!(fcntl(files[index], F_GETFL) & O_NONBLOCK), index == 1);
+    }
+    EXPECT(read(about, text, sizeof text) == -1 && errno == ESRCH, "its status is told: %s", strerror(errno));
+    EXPECT(openat(folder, "status", O_RDONLY) == -1 && fcntl(folder, F_GETFD) == FD_CLOEXEC, "its folder is another one");
+    EXPECT(waitpid(-1, &status, __WALL) == -1 && errno == ECHILD && !told, "there is a child");
+}
+
+/* It works in the directory of a process that has ended. */
+static void ended_directory(void) {
+    int here = open(".", O_RDONLY | O_DIRECTORY), status;
+    char path[40];
+    pid_t child = fork();
+    if (child == 0) {
+        pause();
+        _exit(0);
+    }
+    snprintf(path, sizeof path, "/proc/%d", child);
+    if (chdir(path) || kill(child, SIGKILL) || waitpid(child, &status, 0) != child) cannot("leave");
+    ready();
+    while (faccessat(here, go, F_OK, 0)) usleep(2000);
+    EXPECT(getcwd(path, sizeof path) == NULL && errno == ENOENT, "it works in %s", path);
+    EXPECT(open("status", O_RDONLY) == -1 && (errno == ENOENT || errno == ESRCH), "somebody lives there: %s", strerror(errno));
+    EXPECT(waitpid(-1, &status, __WALL) == -1 && errno == ECHILD, "there is a child");
+}
+
+/* Namespaces of its own; the process may live in others afterwards, of the same kinds. */
+static void namespaces(void) {
+    static const char *const kinds[] = {"net", "pid", "time", "user", "mnt"};
+    int files[5];
+    for (int index = 0; index < 5; index++) {
+        char path[40];
+        snprintf(path, sizeof path, "/proc/self/ns/%s", kinds[index]);
+        if ((files[index] = open(path, O_RDONLY | (index ? O_CLOEXEC : 0))) < 0) cannot("open %s", path);
+    }
+    wait_here();
+    for (int index = 0; index < 5; index++) {
+        char path[40];
+        struct stat own, found = {0};
+        snprintf(path, sizeof path, "/proc/self/ns/%s", kinds[index]);
+        EXPECT(!stat(path, &own) && !fstat(files[index], &found) && own.st_ino == found.st_ino, "%s is another one", path);
+        EXPECT_EQUAL("mark", fcntl(files[index], F_GETFD), index ? FD_CLOEXEC : 0);
+    }
+}
+
 /* timerfd */
 
 static void timer_relative(void) {
@@ -303,6 +372,9 @@ int main(int count, char **arguments) {
                  {"eventfd_semaphore", eventfd_semaphore},
                  {"eventfd_full", eventfd_full},
                  {"eventfd_many", eventfd_many}, {"pidfd_self", pidfd_self},
+                 {"ended_processes", ended_processes},
+                 {"ended_directory", ended_directory},
+                 {"namespaces", namespaces},
                  {"timer_relative", timer_relative},
                  {"timer_absolute_monotonic", timer_absolute_monotonic},
                  {"timer_absolute_realtime", timer_absolute_realtime},

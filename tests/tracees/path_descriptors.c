@@ -182,6 +182,22 @@ static void pipe_reopened(void) {
     EXPECT_EQUAL("what waited", count, 0);
 }
 
+/* A file and a directory over which somebody mounts another file system as soon as we are ready. */
+static void covered(void) {
+    char found[8] = "";
+    struct stat about;
+    mkdir("place", 0700);
+    int file = open("place/file", O_RDWR | O_CREAT | O_APPEND, 0600), folder = open("place", O_RDONLY | O_DIRECTORY | O_CLOEXEC);
+    if (write(file, "content", 7) != 7 || lseek(file, 3, SEEK_SET) != 3) cannot("write");
+    wait_here();
+    EXPECT(read(file, found, 7) == 4 && !strcmp(found, "tent"), "it reads '%s'", found);
+    EXPECT(write(file, "more", 4) == 4 && !fstat(file, &about) && about.st_size == 11, "its size is %ld", (long)about.st_size);
+    EXPECT(fstatat(folder, "file", &about, 0) == 0 && about.st_size == 11, "its directory is another one");
+    EXPECT_EQUAL("mark", fcntl(folder, F_GETFD), FD_CLOEXEC);
+    EXPECT_EQUAL("flags", fcntl(file, F_GETFL) & O_APPEND, O_APPEND);
+    EXPECT(access("place/file", F_OK) == -1, "it is not covered");
+}
+
 static void path_only(void) {
     mkfifo("pipe", 0600), touch("file"), mkdir("some", 0700);
     if (symlink("nowhere", "link")) cannot("make a link");
@@ -294,7 +310,8 @@ int main(int count, char **arguments) {
     } cases[] = {{"inotify_directories", inotify_directories}, {"inotify_gaps", inotify_gaps}, {"fifo_both", fifo_both},
                  {"fifo_reader", fifo_reader}, {"fifo_gone", fifo_gone},
                  {"leases", leases}, {"pipe_of_packets", pipe_of_packets}, {"fifo_signals", fifo_signals}, {"fifo_deleted", fifo_deleted}, {"inotify_deleted", inotify_deleted},
-                 {"pipe_reopened", pipe_reopened}, {"path_only", path_only}, {"kernel_files", kernel_files}, {"file_locks", file_locks}};
+                 {"pipe_reopened", pipe_reopened}, {"covered", covered},
+                 {"path_only", path_only}, {"kernel_files", kernel_files}, {"file_locks", file_locks}};
     go = arguments[1];
     for (size_t index = 0; index < sizeof cases / sizeof *cases; index++)
         if (count > 2 && !strcmp(arguments[2], cases[index].name)) {

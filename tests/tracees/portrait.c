@@ -160,6 +160,7 @@ static void tune(const char *what) {
     if (!strcmp(what, "parent_death_signal")) prctl(PR_SET_PDEATHSIG, SIGUSR2);
     if (!strcmp(what, "subreaper")) prctl(PR_SET_CHILD_SUBREAPER, 1);
     if (!strcmp(what, "huge_pages_off")) prctl(PR_SET_THP_DISABLE, 1, 0, 0, 0);
+    if (!strcmp(what, "huge_pages_advised") && prctl(PR_SET_THP_DISABLE, 1, 2, 0, 0)) cannot("have huge pages where advised");
     if (!strcmp(what, "timer_slack")) prctl(PR_SET_TIMERSLACK, 1234567);
     if (!strcmp(what, "affinity") && sched_setaffinity(0, sizeof one, &one)) cannot("bind to a processor");
     if (!strcmp(what, "batch") && sched_setscheduler(0, SCHED_BATCH, &(struct sched_param){0})) cannot("batch");

@@ -4,17 +4,17 @@
  */
 #include "tracee.h"
 
-#include <linux/aio_abi.h>
 #include <linux/bpf.h>
 #include <linux/filter.h>
+#include <asm/ldt.h>
 #include <linux/io_uring.h>
 #include <linux/perf_event.h>
-#include <linux/seccomp.h>
 #include <linux/userfaultfd.h>
 #include <mqueue.h>
 #include <pthread.h>
 #include <sys/fanotify.h>
 #include <sys/file.h>
+#include <sys/io.h>
 #include <sys/ioctl.h>
 #include <sys/pidfd.h>
 #include <sys/prctl.h>
@@ -113,11 +113,23 @@ static void take_zombie_child(void) {
     waitid(P_PID, child, &about, WEXITED | WNOWAIT);
 }
 
-static void take_shared_files_child(void) {
-    child = syscall(SYS_clone, CLONE_FILES | SIGCHLD, 0, 0, 0, 0);
-    if (child) return;
-    while (!is_told(go)) usleep(2000);
-    _exit(0);
+static char state_of(pid_t pid) {
+    char path[64], content[256] = "";
+    snprintf(path, sizeof path, "/proc/%d/stat", pid);
+    int file = open(path, O_RDONLY);
+    if (file < 0 || read(file, content, sizeof content - 1) < 0) cannot("look at a child");
+    close(file);
+    return strrchr(content, ')')[2];
+}
+
+static void take_child_without_first_thread(void) {
+    pthread_t thread;
+    child = fork();
+    if (child == 0) {
+        if (pthread_create(&thread, NULL, nap_along, NULL)) _exit(1);
+        syscall(SYS_exit, 0);
+    }
+    while (state_of(child) != 'Z') usleep(1000);
 }
 
 static void take_pipe(void) {
@@ -196,11 +208,6 @@ static void take_io_uring_mapped(void) {
     close(ring);
 }
 
-static void take_aio(void) {
-    aio_context_t context = 0;
-    if (syscall(SYS_io_setup, 4, &context)) cannot("set up asynchronous i/o");
-}
-
 static void take_userfaultfd(void) {
     struct uffdio_api api = {.api = UFFD_API};
     keep(syscall(SYS_userfaultfd, O_CLOEXEC), "userfaultfd");
@@ -214,22 +221,17 @@ static void take_userfaultfd_registered(void) {
     if (ioctl(opened, UFFDIO_REGISTER, &range)) cannot("register memory");
 }
 
-static void take_seccomp(void) {
-    struct sock_filter allow[] = {BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW)};
-    struct sock_fprog program = {1, allow};
-    prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0);
-    if (prctl(PR_SET_SECCOMP, SECCOMP_MODE_FILTER, &program)) cannot("install a filter");
+static void take_segments(void) {
+    struct user_desc segment = {.entry_number = 1, .limit = 0xfffff, .seg_32bit = 1, .limit_in_pages = 1, .useable = 1};
+    if (syscall(SYS_modify_ldt, 1, &segment, sizeof segment)) cannot("make a segment");
 }
 
-static int install_filter(void) {
-    struct sock_filter allow[] = {BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW)};
-    struct sock_fprog program = {1, allow};
-    return prctl(PR_SET_SECCOMP, SECCOMP_MODE_FILTER, &program);
+static void take_ports(void) {
+    if (ioperm(0x80, 1, 1)) cannot("use an I/O port");
 }
 
-static void take_thread_seccomp(void) {
-    prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0);
-    take_unlike_thread(install_filter);
+static void take_flusher(void) {
+    if (prctl(PR_SET_IO_FLUSHER, 1, 0, 0, 0)) cannot("write back for a file system");
 }
 
 static void take_lease_deleted(void) {
@@ -279,7 +281,24 @@ static void take_perf_event(void) {
 }
 
 static void take_pidfd_other(void) { keep(pidfd_open(1, 0), "a pidfd"); }
-static void take_namespace(void) { keep(open("/proc/self/ns/net", O_RDONLY), "a namespace"); }
+/* One of a child, which has left ours. */
+static void take_namespace(void) {
+    int ends[2];
+    char path[40], word;
+    if (pipe(ends)) cannot("make a pipe");
+    pid_t child = fork();
+    if (child == 0) {
+        if (unshare(CLONE_NEWUTS) || write(ends[1], "x", 1) != 1) _exit(1);
+        pause();
+    }
+    close(ends[1]);
+    if (read(ends[0], &word, 1) != 1) cannot("make a namespace");
+    close(ends[0]);
+    snprintf(path, sizeof path, "/proc/%d/ns/uts", child);
+    keep(open(path, O_RDONLY), "a namespace");
+    kill(child, SIGKILL), waitpid(child, NULL, 0);
+}
+
 static void take_proc_file(void) { keep(open("/proc/2/status", O_RDONLY), "a file of /proc"); }
 static void take_kernel_switch(void) { keep(open("/proc/sys/kernel/hostname", O_RDWR), "a switch of the kernel"); }
 
@@ -365,13 +384,12 @@ static const struct kind {
              {"thread_directory", take_thread_directory},
              {"thread_namespace", take_thread_namespace},
              {"namespace_of_children", take_namespace_of_children},
-             {"thread_seccomp", take_thread_seccomp},
              {"dead_leader", take_dead_leader},
              {"child_in_the_same_memory", take_child_in_the_same_memory},
              {"child_of_thread", take_child_of_thread},
              {"child", take_child},
              {"zombie_child", take_zombie_child},
-             {"shared_files_child", take_shared_files_child},
+             {"child_without_first_thread", take_child_without_first_thread},
              {"traced_child", take_traced_child},
              {"pipe", take_pipe},
              {"unix_rights", take_unix_rights},
@@ -385,11 +403,12 @@ static const struct kind {
              {"fanotify", take_fanotify},
              {"io_uring", take_io_uring},
              {"io_uring_mapped", take_io_uring_mapped},
-             {"aio", take_aio},
              {"userfaultfd", take_userfaultfd},
              {"userfaultfd_registered", take_userfaultfd_registered},
-             {"seccomp", take_seccomp},
-              {"lease_deleted", take_lease_deleted},
+              {"segments", take_segments},
+             {"ports", take_ports},
+             {"flusher", take_flusher},
+             {"lease_deleted", take_lease_deleted},
              {"kernel_log", take_kernel_log},
              {"tun", take_tun},
              {"fuse", take_fuse},

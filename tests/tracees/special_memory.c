@@ -132,6 +132,7 @@ static int droppable(void) {
     wait_for_go(go);
     flags_at(place, CODES, after);
     EXPECT(!strcmp(before, after), "flags are%s, were%s", after, before);
+    expect_zero("droppable memory in its next life", place, 4 * PAGE);
     return finish();
 }
 

@@ -62,8 +62,14 @@ def test_a_program_waits_as_soon_as_its_standby_holds_a_state_of_it(standby: Sta
     assert standby.stores() == standby.hears() == []
 
 
-def test_a_program_that_is_restored_from_its_memory_does_not_wait(standby: Standby) -> None:
-    assert standby.stores(keeps_state=False) == []
+def test_the_memory_of_a_program_that_keeps_no_state_waits_as_well(standby: Standby) -> None:
+    assert standby.stores(keeps_state=False) == [acts.Warm(NAME, 1, SPEC)]
+
+
+def test_a_program_that_comes_to_keep_its_state_is_started_in_place_of_its_memory(standby: Standby) -> None:
+    standby.stores(keeps_state=False)
+    assert standby.stores(keeps_state=True) == [acts.Warm(NAME, 1, SPEC)]
+    assert standby.stores(keeps_state=True) == []
 
 
 def test_a_program_does_not_wait_where_it_is_only_held_for_its_own_robot(standby: Standby) -> None:

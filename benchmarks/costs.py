@@ -1,0 +1,193 @@
+"""What protection takes: of the program's work at 1, 10 and 50 snapshots a second, of processor, network and memory."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+from benchmarks import interference
+from benchmarks.figures import OURS, Figure, Findings
+from benchmarks.interference import NAME, ON_LOOPBACK, UNPROTECTED, WINDOW_S
+from benchmarks.running import Running, running
+from failover.cli.demo.robots import RobotMachine, Stage
+
+RATES: Final = (1, 10, 50)
+"""Snapshots a second."""
+QUICK_RATES: Final = (10,)
+RESIDENT_MB: Final = 100
+DIRTY_KB: Final = 200
+"""Written each 50 ms: 4 MB/s."""
+TURNS: Final = 4
+
+CELLS: Final = 60_000
+CHANGES: Final = 300
+"""Of the map's cells, and how many are replaced each 50 ms."""
+SNAPSHOTS: Final = 40
+QUICK_SNAPSHOTS: Final = 8
+WHOLE: Final = "failover, without differences"
+IDLE_S: Final = 10.0
+QUICK_IDLE_S: Final = 3.0
+
+TICKS_A_SECOND: Final = os.sysconf("SC_CLK_TCK")
+PARTS: Final = {"agent.main": "heart", "agent.lanes": "lanes", "agent.guard": "guard", "checkpoint keeper": "keeper"}
+"""By what stands in their command line."""
+
+
+def costs(quick: bool, directory: Path) -> Findings:
+    """All of it, on robots of their own each."""
+    figures: list[Figure] = []
+    for number in QUICK_RATES if quick else RATES:
+        figures += _of_work(number, 1 if quick else TURNS, directory / f"work-{number}")
+    for who, settings in ((OURS, ""), (WHOLE, 'xor_cache = ""\n')):
+        figures.append(_on_the_wire(who, settings, QUICK_SNAPSHOTS if quick else SNAPSHOTS, directory / f"wire-{len(settings)}"))
+    figures += _idle(QUICK_IDLE_S if quick else IDLE_S, directory / "idle")
+    return Findings(
+        "What protection takes",
+        f"The work of a Python program with {RESIDENT_MB} MB resident that writes 4 MB/s, protected and released in turns, "
+        f"{WINDOW_S} s each, by snapshots a second, on a machine that plays both robots; processor time of the processes of the "
+        f"robot that runs it. Bytes of a delta's file, which is what travels, per byte of its pages: of a Python program with "
+        f"{CELLS:,} objects in a dictionary, {CHANGES} of them replaced each 50 ms. What an agent takes that protects nothing "
+        "(beats each 20 ms; guard and keeper wait in advance for the first program).",
+        tuple(figures),
+    )
+
+
+def _of_work(number: int, turns: int, directory: Path) -> list[Figure]:
+    """At so many snapshots a second."""
+    directory.mkdir()
+    settings = f"snapshot_period_ms = {1000 // number}\n"
+    case = f"{number} snapshots a second"
+    protected: list[float] = []
+    released: list[float] = []
+    made: list[float] = []
+    taken: dict[str, list[float]] = {}
+    with (
+        Stage(directory / "robots", ON_LOOPBACK, settings) as stage,
+        running("working", RESIDENT_MB, DIRTY_KB, directory=directory) as program,
+    ):
+        stage.directory.mkdir()
+        stage.start()
+        for _ in range(turns):
+            released.append(interference.rate(program))
+            work, snapshots, shares = _protected(stage.robots[0], program)
+            protected.append(work)
+            made.append(snapshots)
+            for part, share in shares.items():
+                taken.setdefault(part, []).append(share)
+    return [
+        Figure("work done a second", case, "steps", tuple(protected)),
+        Figure("work done a second", case, "steps", tuple(released), UNPROTECTED),
+        Figure("snapshots made a second", case, "", tuple(made)),
+        *(Figure(f"processor time of the {part}", case, "% of a core", tuple(values)) for part, values in taken.items()),
+    ]
+
+
+def _protected(robot: RobotMachine, program: Running) -> tuple[float, float, dict[str, float]]:
+    """Steps and snapshots a second, and percents of a core by part, while it is protected."""
+    with robot.control() as link:
+        link.ask("protect", pid=program.pid, name=NAME)
+    interference.until_protected(robot)
+    parts = _parts(robot)
+    began, snapshots, before = time.monotonic(), _snapshots(robot), _processor_s(parts)
+    work = interference.rate(program)
+    after, more, span = _processor_s(parts), _snapshots(robot) - snapshots, time.monotonic() - began
+    with robot.control() as link:
+        link.ask("release", name=NAME)
+    return work, more / span, {part: (after[part] - before[part]) / span * 100 for part in after}
+
+
+def _snapshots(robot: RobotMachine) -> int:
+    return sum(int(one["snapshots"]) for one in robot.status()["components"] if one["name"] == NAME)
+
+
+def _on_the_wire(who: str, settings: str, count: int, directory: Path) -> Figure:
+    """Of so many deltas in a row what their files take, by byte of their pages."""
+    directory.mkdir()
+    seen: dict[int, float] = {}
+    with (
+        Stage(directory / "robots", ON_LOOPBACK, settings) as stage,
+        running("heap", CELLS, CHANGES, directory=directory) as program,
+    ):
+        stage.directory.mkdir()
+        stage.start()
+        primary = stage.robots[0]
+        with primary.control() as link:
+            link.ask("protect", pid=program.pid, name=NAME)
+        interference.until_protected(primary)
+
+        def note(one: dict[str, object]) -> bool:
+            sequence, size, pages = one["sequence"], one["snapshot_size"], one["dirty_bytes"]
+            assert isinstance(sequence, int)
+            assert isinstance(size, int)
+            assert isinstance(pages, int)
+            seen[sequence] = size / max(pages, 1)
+            return len(seen) >= count
+
+        interference.until(primary, note)
+    return Figure("bytes on the wire per byte written", "a Python heap", "", tuple(seen.values()), who)
+
+
+def _idle(span_s: float, directory: Path) -> list[Figure]:
+    """Memory (PSS) and processor time of an agent that protects nothing."""
+    directory.mkdir()
+    with Stage(directory / "robots", ON_LOOPBACK) as stage:
+        stage.directory.mkdir()
+        stage.start()
+        time.sleep(span_s / 5)  # what it prepares is ready
+        parts = _parts(stage.robots[0])
+        before = _processor_s(parts)
+        time.sleep(span_s)
+        after = _processor_s(parts)
+        memory = {part: sum(map(_pss_mb, pids)) for part, pids in parts.items()}
+    of_agent = [part for part in parts if part in ("heart", "lanes")]
+    return [
+        Figure("memory of an idle agent", "heart and lanes", "MB", (sum(memory[part] for part in of_agent),)),
+        *(Figure("memory of an idle agent", part, "MB", (size,)) for part, size in memory.items()),
+        Figure(
+            "processor time of an idle agent",
+            "heart and lanes",
+            "% of a core",
+            (sum(after[part] - before[part] for part in of_agent) / span_s * 100,),
+        ),
+    ]
+
+
+def _parts(robot: RobotMachine) -> dict[str, list[int]]:
+    """The processes of an agent, by what they are."""
+    found: dict[str, list[int]] = {}
+    for pid in _descendants(robot.status()["pid"]):
+        command = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+        for sign, part in PARTS.items():
+            if sign in command:
+                found.setdefault(part, []).append(pid)
+    return found
+
+
+def _descendants(pid: int) -> list[int]:
+    """A process, its children, and theirs."""
+    found = [pid]
+    for one in found:
+        for task in Path(f"/proc/{one}/task").iterdir():
+            found += map(int, (task / "children").read_text().split())
+    return found
+
+
+def _processor_s(parts: dict[str, list[int]]) -> dict[str, float]:
+    """Seconds of processor time that each part has used."""
+    return {part: sum(map(_used_s, pids)) for part, pids in parts.items()}
+
+
+def _used_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS_A_SECOND
+
+
+def _pss_mb(pid: int) -> float:
+    return _kb("Pss:", Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()) / 1000
+
+
+def _kb(name: str, lines: Iterable[str]) -> int:
+    return next(int(line.split()[1]) for line in lines if line.startswith(name))

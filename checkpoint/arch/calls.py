@@ -1,0 +1,78 @@
+"""What every processor's file speaks of: registers by name, calls to be made inside a tracee, calls that a stop ends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+Registers = dict[str, int]
+"""General registers by name, unsigned."""
+
+MILLISECONDS: Final = "ms"
+TIMESPEC: Final = "timespec"
+SOCKET: Final = "socket"
+
+
+@dataclass(frozen=True, slots=True)
+class Timeout:
+    """How long a call waits.
+
+    Attributes:
+        argument: index of the argument that tells; of a `SOCKET`, of its descriptor.
+        form: `MILLISECONDS` (an int, negative for ever), `TIMESPEC` (address of one, 0 for ever), or `SOCKET`.
+        at_end: what the call returns when that time is over.
+        option: of a `SOCKET`: SO_RCVTIMEO or SO_SNDTIMEO.
+    """
+
+    argument: int
+    form: str
+    at_end: int
+    option: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """One system call to be made inside the tracee; its result goes to the next word of the table's results."""
+
+    name: str
+    arguments: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Unkept:
+    """A question to a process about something that no restore can give it.
+
+    Attributes:
+        usual: what one without it answers; one whose kernel does not know it answers with an error.
+        what: it has then.
+    """
+
+    call: Call
+    usual: int
+    what: str
+
+
+@dataclass(frozen=True, slots=True)
+class TablePlaces:
+    """Addresses inside the borrowed table that the code reads and writes."""
+
+    state: int
+    ended: int
+    done: int
+    serial: int
+    mask: int
+    timeout: int
+    empty_set: int
+    resume: int
+    registers: int
+    results: int
+
+
+@dataclass(frozen=True, slots=True)
+class EntryCalls:
+    """What the first entry does, in this order: map the code pages, map the table pages, advise, open a userfaultfd."""
+
+    code_pages: Call
+    table_pages: Call
+    advice: Call
+    faults: Call

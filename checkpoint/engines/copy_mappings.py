@@ -1,0 +1,170 @@
+"""What a delta changes in the mappings and pages of a ready copy, and the calls that do it.
+
+A page that a state does not hold is as its mapping is made: zeros, or what the file has. So whatever a delta takes away is
+dropped (madvise), and what it maps otherwise is mapped afresh. Mappings count as the same where the same thing lies at the
+same place; protection and advice may differ, they are set at the end.
+
+Sources: madvise(2), mmap(2).
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from checkpoint import pages
+from checkpoint.engines import restore_memory
+from checkpoint.engines.restore_memory import KERNEL_KINDS, Carried, first_protection, is_file_mapping
+from checkpoint.errors import RestoreError
+from checkpoint.linux.call_table import CallTable
+from checkpoint.linux.memory import Memory
+from checkpoint.model import Snapshot, Vma
+from checkpoint.pages import Words
+
+MADV_DONTNEED: Final = 4
+MADV_REMOVE: Final = 9
+NO_PAGES: Final[Words] = np.empty((0, 2), np.uint64)
+
+Backing = tuple[object, ...]
+"""What a mapping is of, and how it lies there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """From one position to the next.
+
+    Attributes:
+        gone: mapped no longer.
+        fresh: to be mapped.
+        dropped, removed: pages of private and of shared mappings that stay, to be as they were when they were mapped.
+        protections: (start, end, protection) that other parts need while pages are written.
+        carried: pages that the new state holds.
+        rescued_pages: those that must outlive that they are mapped afresh.
+    """
+
+    gone: Words
+    fresh: tuple[Vma, ...]
+    dropped: Words
+    removed: Words
+    protections: tuple[tuple[int, int, int], ...]
+    carried: Words
+    rescued_pages: Words
+
+    @classmethod
+    def between(cls, before: Sequence[Vma], held: Words, delta: Snapshot) -> Change:
+        """What leads from mappings, and the pages held in them, to a delta's.
+
+        Raises:
+            RestoreError: shared memory has grown in its place.
+        """
+        old, new = _ours(before), _ours(delta.vmas)
+        runs, cleared = pages.extents(delta.runs), pages.extents(delta.cleared)
+        carried = pages.union(pages.difference(pages.intersection(held, pages.extents(delta.vmas)), cleared), runs)
+        gone, fresh_set = _moved(old, new)
+        fresh = tuple(piece for vma in new for piece in _pieces(vma, fresh_set)) if len(fresh_set) else ()
+        emptied = pages.intersection(pages.intersection(cleared, held), _extents(new))
+        lost = pages.difference(pages.difference(emptied, fresh_set), runs)
+        shared = _extents(vma for vma in new if vma.shared)
+        rescued = pages.difference(pages.difference(pages.intersection(held, fresh_set), cleared), runs)
+        return cls(
+            gone,
+            fresh,
+            pages.difference(lost, shared),
+            pages.intersection(lost, shared),
+            tuple(_protections(old, Carried(held), new, Carried(carried), fresh_set)),
+            carried,
+            rescued,
+        )
+
+    def fresh_files(self) -> list[Vma]:
+        """Of what is to be mapped, what is mapped from files that have names."""
+        return [vma for vma in self.fresh if is_file_mapping(vma)]
+
+    def add_calls(self, table: CallTable, brought: Mapping[str, int]) -> None:
+        """Add everything but the writing of pages.
+
+        Args:
+            brought: descriptors of what is mapped in place of this machine's files, by path.
+        """
+        for start, end in self.gone.tolist():
+            table.call(f"unmap {start:#x} of the copy", "munmap", start, end - start)
+        restore_memory.map_program(table, self.fresh, self.carried, brought)
+        for advice, extents in ((MADV_DONTNEED, self.dropped), (MADV_REMOVE, self.removed)):
+            for start, end in extents.tolist():
+                table.call(f"empty {(end - start) >> 10} KiB at {start:#x}", "madvise", start, end - start, advice)
+        for start, end, protection in self.protections:
+            table.call(f"protect {start:#x}", "mprotect", start, end - start, protection)
+
+    def rescued(self, memory: Memory) -> list[tuple[Words, bytearray]]:
+        """What the pages hold that must outlive this change."""
+        return [(self.rescued_pages, memory.read_pages(self.rescued_pages))] if len(self.rescued_pages) else []
+
+
+def _ours(vmas: Iterable[Vma]) -> list[Vma]:
+    """Those that a restore maps, in address order."""
+    return sorted((vma for vma in vmas if vma.kind not in KERNEL_KINDS), key=lambda vma: vma.start)
+
+
+def _extents(vmas: Iterable[Vma]) -> Words:
+    return pages.extents(vmas)
+
+
+def backing(vma: Vma) -> Backing:
+    """What it is of, the same for all parts that could be one mapping."""
+    marks = "gd" in vma.flags, "nr" in vma.flags
+    if is_file_mapping(vma):
+        assert vma.file is not None
+        return vma.file.path, vma.file.device, vma.file.inode, vma.start - vma.offset, *marks
+    return vma.shared, vma.start - vma.offset if vma.shared else 0, *marks
+
+
+def _moved(old: Sequence[Vma], new: Sequence[Vma]) -> tuple[Words, Words]:
+    """What is mapped no longer, or as something else; and what is mapped afresh."""
+    before, after = _by_backing(old), _by_backing(new)
+    kept = NO_PAGES
+    for key, extents in after.items():
+        if key not in before or np.array_equal(before[key], extents):
+            kept = pages.union(kept, extents) if key in before else kept
+            continue
+        same = pages.intersection(before[key], extents)
+        if key[0] is True and len(same) and len(pages.difference(extents, before[key])):
+            raise RestoreError("the ready copy must be laid again: its shared memory has grown in its place")
+        kept = pages.union(kept, same)
+    return pages.difference(_extents(old), kept), pages.difference(_extents(new), kept)
+
+
+def _by_backing(vmas: Iterable[Vma]) -> dict[Backing, Words]:
+    groups: dict[Backing, list[Vma]] = {}
+    for vma in vmas:
+        groups.setdefault(backing(vma), []).append(vma)
+    return {key: _extents(group) for key, group in groups.items()}
+
+
+def _pieces(vma: Vma, wanted: Words) -> list[Vma]:
+    """The parts of a mapping that lie in a set."""
+    parts = pages.intersection(_extents([vma]), wanted).tolist()
+    return [replace(vma, start=start, end=end, offset=vma.offset + start - vma.start) for start, end in parts]
+
+
+def _protections(
+    old: Sequence[Vma], held: Carried, new: Sequence[Vma], carried: Carried, fresh: Words
+) -> Iterable[tuple[int, int, int]]:
+    """Where what stays mapped needs another protection than it has, and what is mapped as a part needs that of its whole."""
+    starts = [vma.start for vma in old]
+    had = [first_protection(vma, held) for vma in old]
+    for vma in new:
+        wanted = first_protection(vma, carried)
+        for piece in _pieces(vma, fresh) if len(fresh) else ():
+            if first_protection(piece, carried) != wanted:
+                yield piece.start, piece.end, wanted
+        index = max(bisect_right(starts, vma.start) - 1, 0)
+        while index < len(old) and old[index].start < vma.end:
+            start, end = max(old[index].start, vma.start), min(old[index].end, vma.end)
+            if start < end and had[index] != wanted:
+                part = np.array([[start, end]], np.uint64)
+                yield from ((first, last, wanted) for first, last in pages.difference(part, fresh).tolist())
+            index += 1

@@ -1,0 +1,189 @@
+"""Files and directories whose path leads elsewhere by now, for something was mounted over it: opened again by their handle.
+
+That is the same file of the same file system, so such a program stays on its machine.
+
+Facts: ``descriptors``; ``path``, by which it was opened; ``mounted``: where its file system is mounted; ``handle``: struct
+file_handle; ``flags`` of open(2); ``offset`` and ``size`` in bytes, ``mode``, ``inode`` and ``mtime_ns`` at the capture.
+
+Source: name_to_handle_at(2), open_by_handle_at(2), which takes CAP_DAC_READ_SEARCH; proc_pid_mountinfo(5).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import stat
+from collections.abc import Iterator
+from typing import Final
+
+from checkpoint.capability import Area, by_rule, refused
+from checkpoint.errors import ProcessGoneError
+from checkpoint.linux import mounts, procfs
+from checkpoint.linux.call_table import CallTable
+from checkpoint.model import Resource
+from checkpoint.resources import OpenFile, Surroundings, files, writers
+from checkpoint.resources.rebuilding import Rebuilding, number_of
+
+KIND: Final = "covered_files"
+
+CAPABILITIES: Final = (
+    by_rule(
+        Area.FILES,
+        "files over whose path something was mounted",
+        "as others, on the same machine, for root; where their file system has handles",
+    ),
+    refused(
+        Area.THERE,
+        "a file that a mount covers, on another machine, or changed meanwhile",
+        "run it where it was captured",
+        "{} is not on this machine: restore it where it was captured",
+        "{} has another content by now",
+        "{} is opened again for root alone",
+        "{} is held open for writing by pid {}: end that first",
+    ),
+)
+
+AT_FDCWD: Final = -100
+AT_SYMLINK_FOLLOW: Final = 0x400
+HANDLE_SIZE: Final = 128
+"""MAX_HANDLE_SZ of linux/fcntl.h."""
+O_PATH: Final = 0o10000000
+REOPENED: Final = (
+    os.O_ACCMODE | os.O_APPEND | os.O_NONBLOCK | os.O_DSYNC | os.O_SYNC | os.O_DIRECT | os.O_NOATIME | os.O_DIRECTORY
+)
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
+    """What must be known to open it again."""
+    first, found = held.first, None
+    with contextlib.suppress(ProcessGoneError, OSError):  # it has ended since it was stopped, or in a look at a running one
+        found = _found(held) if _may_be(held) else None
+    if found is None:
+        return None
+    return Resource(
+        KIND,
+        held.name,
+        {
+            "descriptors": held.numbers,
+            "path": first.target,
+            "mounted": found[0],
+            "handle": found[1],
+            "flags": first.flags & ~os.O_CLOEXEC,
+            "offset": first.offset,
+            "size": first.size,
+            "mode": first.mode,
+            "inode": first.inode,
+            "mtime_ns": first.mtime_ns,
+        },
+    )
+
+
+def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
+    """Nothing is refused here: what has no handle is a file as others are, which no path leads to."""
+    return None
+
+
+def _may_be(held: OpenFile) -> bool:
+    first = held.first
+    is_kind = stat.S_ISREG(first.mode) or stat.S_ISDIR(first.mode)
+    if not is_kind or first.flags & O_PATH or not first.links or not first.target.startswith("/"):
+        return False
+    return not files.is_deleted(first) and not files.is_found(held)
+
+
+def _found(held: OpenFile) -> tuple[str, bytes] | None:
+    """Where its file system is mounted, and its handle, by which it is really found."""
+    mounted = _mount_point(held.pid, held.first.text.partition("mnt_id:")[2].split("\n")[0].strip())
+    handle = (ctypes.c_char * (8 + HANDLE_SIZE)).from_buffer_copy(HANDLE_SIZE.to_bytes(4, "little") + bytes(4 + HANDLE_SIZE))
+    path, mount = f"/proc/{held.pid}/fd/{held.first.number}".encode(), ctypes.c_int()
+    if not mounted or _libc.name_to_handle_at(AT_FDCWD, path, handle, ctypes.byref(mount), AT_SYMLINK_FOLLOW):
+        return None
+    size = int.from_bytes(handle.raw[:4], "little")
+    told = handle.raw[: 8 + size]
+    with _opened(f"/proc/{held.pid}/root{mounted}", told) as place:
+        if place and os.stat(place).st_ino == held.first.inode and os.readlink(place) == held.first.target:
+            return mounted, told
+    return None
+
+
+def _mount_point(pid: int, number: str) -> str:
+    """Where the mount with a number of mountinfo lies; "" where the process has none such."""
+    for line in procfs.read_bytes(pid, "mountinfo").split(b"\n"):
+        words = line.split(b" ")
+        if words[0] == number.encode() and len(words) > 4:
+            return mounts.unescaped(words[4])
+    return ""
+
+
+@contextlib.contextmanager
+def _opened(mounted: str, handle: bytes) -> Iterator[str]:
+    """A path of ours that leads to what a handle stands for, for the body; "" where it does not stand for anything."""
+    found = -1
+    try:
+        mount = os.open(mounted, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            found = _libc.open_by_handle_at(mount, handle, O_PATH | os.O_CLOEXEC)
+        finally:
+            os.close(mount)
+    except OSError:  # it is not mounted here
+        found = -1
+    try:
+        yield f"/proc/self/fd/{found}" if found >= 0 else ""
+    finally:
+        if found >= 0:
+            os.close(found)
+
+
+def refuse_user(held: Resource) -> str:
+    """Why it is not for a program that opens its files with the rights of an ordinary user."""
+    what = f"{held.facts['path']!s}, open as {held.name}, which a mount covers,"
+    return f"{what} is opened again for root alone: let the program open it by a path that leads there"
+
+
+def mismatches(held: Resource) -> Iterator[str]:
+    """Why it is not here as it was; one that was written at its end may have grown, and is cut back."""
+    facts, handle = held.facts, held.facts["handle"]
+    assert isinstance(handle, bytes)
+    what = f"{facts['path']!s}, open as {held.name}, which a mount covers,"
+    with _opened(str(facts["mounted"]), handle) as place:
+        about = os.stat(place) if place else None
+        if about is None or about.st_ino != facts["inode"] or stat.S_IFMT(about.st_mode) != stat.S_IFMT(number_of(facts["mode"])):
+            yield f"{what} is not on this machine: restore it where it was captured"
+        elif stat.S_ISREG(about.st_mode) and _differs(held, about):
+            yield f"{what} has another content by now: end the program with the capture"
+        elif stat.S_ISREG(about.st_mode) and _is_written(held) and (pid := writers.writer_of(place, writers.family(os.getpid()))):
+            yield f"{what} is held open for writing by pid {pid}: end that first"
+
+
+def _is_written(held: Resource) -> bool:
+    return number_of(held.facts["flags"]) & os.O_ACCMODE != os.O_RDONLY
+
+
+def _grows(held: Resource) -> bool:
+    is_at_its_end = held.facts["offset"] == held.facts["size"] or bool(number_of(held.facts["flags"]) & os.O_APPEND)
+    return _is_written(held) and is_at_its_end
+
+
+def _differs(held: Resource, about: os.stat_result) -> bool:
+    if _grows(held):
+        return about.st_size < number_of(held.facts["size"])
+    return (about.st_size, about.st_mtime_ns) != (held.facts["size"], held.facts["mtime_ns"])
+
+
+def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
+    """Open it by its handle."""
+    facts, handle = held.facts, held.facts["handle"]
+    assert isinstance(handle, bytes)
+    mount = table.open(str(facts["mounted"]), os.O_RDONLY | os.O_DIRECTORY)
+    what, flags = f"open {facts['path']!s} by its handle", number_of(facts["flags"]) & REOPENED
+    made = table.obtain(what, "open_by_handle_at", mount, table.place(handle), flags)
+    table.close(mount)
+    if _grows(held):
+        size = number_of(facts["size"])
+        table.call(f"cut {facts['path']!s} back to {size} bytes", "ftruncate", made, size)
+    if offset := number_of(facts["offset"]):
+        table.call(f"set the offset of {held.name}", "lseek", made, offset, os.SEEK_SET, least=offset, most=offset)
+    return made

@@ -1,0 +1,57 @@
+"""What a process has in common with its parent beyond what a fork leaves: its table of descriptors, its directories and umask.
+
+So clone(2) with CLONE_FILES or CLONE_FS makes it. Such a process is born so again; its table is filled by its parent.
+
+Facts: ``descriptors`` (none); ``flags`` of clone(2) by which it was born.
+
+Source: clone(2), kcmp(2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Final
+
+from checkpoint.capability import Area, preserved
+from checkpoint.errors import ProcessGoneError
+from checkpoint.linux import abi
+from checkpoint.model import Resource, Snapshot
+from checkpoint.resources.rebuilding import number_of
+
+KIND: Final = "joint"
+CLONE_FS: Final = 0x200
+CLONE_FILES: Final = 0x400
+CAPABILITIES: Final = (
+    preserved(
+        Area.PROCESS,
+        "processes that share their table of descriptors, or directories and umask, with their parent (clone(2))",
+        "they share them again; record locks of such a table are those of the parent",
+    ),
+)
+_KINDS: Final = ((abi.KCMP_FILES, CLONE_FILES), (abi.KCMP_FS, CLONE_FS))
+
+
+def describe(pid: int, parent: int) -> tuple[Resource, ...]:
+    """What a process shares with its parent, which is of the same component.
+
+    Raises:
+        ProcessGoneError: one of them has ended.
+    """
+    flags = 0
+    for kind, flag in _KINDS:
+        order = abi.kcmp(pid, parent, kind)
+        if order is not None and order < 0:
+            raise ProcessGoneError(f"process {pid} or its parent {parent} has ended")
+        flags |= flag if order == 0 else 0
+    return (Resource(KIND, "shared with its parent", {"descriptors": [], "flags": flags}),) if flags else ()
+
+
+def flags_of(resources: Iterable[Resource]) -> int:
+    """Of clone(2), for who has these."""
+    return next((number_of(held.facts["flags"]) for held in resources if held.kind == KIND), 0)
+
+
+def without_descriptors(view: Snapshot) -> Snapshot:
+    """A process whose table of descriptors is filled by its parent."""
+    return replace(view, resources=tuple(held for held in view.resources if not held.facts["descriptors"]))

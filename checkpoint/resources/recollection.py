@@ -1,0 +1,218 @@
+"""Sockets that are as they were at the last look: all are asked everything again, and looked into where they answer otherwise.
+
+To look into a socket takes much longer than to ask it: the answers are many, and have to be understood. So all questions are
+asked by one table of calls (`checkpoint.linux.socket_questions`), and where the answers are those of last time, byte by byte, so
+is what they mean. Nothing is taken for granted because of a number, which may have been given to another socket.
+
+What waits in a socket is not asked that way, so one in which something waits is always looked into.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+from checkpoint.linux import socket_questions
+from checkpoint.linux.descriptors import copies_of, copy_of
+from checkpoint.linux.socket_questions import Asking, Subject, events
+from checkpoint.model import Fact
+from checkpoint.resources import Opened, OpenFile, Recalled, internet_sockets, pipes, sockets, tcp_connections, unix_sockets
+from checkpoint.resources.listings import Group
+from checkpoint.resources.rebuilding import number_of
+
+COPIES_MAX: Final = 128
+"""Sockets that are asked at a time: we may have 1,024 descriptors ourselves (RLIMIT_NOFILE)."""
+OF_SETTINGS: Final = ("socket", "family", "type", "protocol", "user", "options", "filter", "filter_locked")
+"""Facts that follow from what a program has set."""
+
+
+@dataclass(slots=True)
+class _Known:
+    """One socket as it was at the last look.
+
+    Attributes:
+        asking: None until the program runs again.
+        groups: multicast groups of the machine that it was asked about.
+        settings, state: what it answered; ``state`` None where that says nothing of the next time.
+        listed: what the kernel's lists say of it.
+        facts: what that means.
+        seen: the open file, and the same with all that was observed.
+    """
+
+    inode: int
+    facts: Mapping[str, Fact]
+    groups: tuple[Group, ...]
+    asking: Asking | None = None
+    settings: bytes | None = None
+    state: bytes | None = None
+    listed: object = None
+    seen: tuple[OpenFile, OpenFile] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    settings: bytes
+    state: bytes
+    listed: object
+
+
+class Recollection:
+    """What is known of the sockets of one process that is looked at again and again."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, _Known] = {}
+        self._pipes: dict[int, OpenFile] = {}
+        self._askings: dict[Subject, Asking] = {}
+
+    def prepare(self) -> None:
+        """Do what need not be done while the program stands still."""
+        wanted: dict[Subject, Asking] = {}
+        for known in self._known.values():
+            if known.asking is None:
+                try:
+                    subject = _subject(known.facts, known.groups)
+                except OSError:  # we have no descriptor left: it is looked into, and that says why not
+                    continue
+                known.asking = wanted.get(subject) or self._askings.get(subject) or Asking(subject)
+            wanted[known.asking.subject] = known.asking
+        self._askings = wanted  # a machine may have other multicast groups every minute
+
+    def recall(self, opened: Opened) -> dict[int, _Answer]:
+        """Ask every socket that was there last time; ``opened`` is told what is as it was. The process stands still.
+
+        Returns:
+            What those answered that have something new to say, for `remember`.
+        """
+        held = [one for one in opened if sockets.is_socket(one.first) and not one.is_echo]
+        asked = [(one, known) for one in held if (known := self._asked_of(one, opened)) is not None]
+        changed: dict[int, _Answer] = {}
+        for first in range(0, len(asked), COPIES_MAX):
+            some = asked[first : first + COPIES_MAX]
+            with copies_of(some[0][0].pid, [one.first.number for one, _ in some]) as copies:
+                for (one, known), copy in zip(some, copies, strict=True):
+                    if copy >= 0 and (answer := _recalled(one, known, copy, opened)) is not None:
+                        changed[one.first.number] = answer
+        numbers = {one.first.number for one in held}
+        self._known = {number: known for number, known in self._known.items() if number in numbers}
+        return changed
+
+    def empty_pipes(self, opened: Iterable[OpenFile]) -> dict[int, OpenFile]:
+        """Pipes in which nothing waits, with all that must be known of them, by their first descriptors."""
+        asked = [one for one in opened if one.both_ends and not one.is_echo and one.lent is None and pipes.is_pipe(one.first)]
+        known = {}
+        for first in range(0, len(asked), COPIES_MAX):
+            some = asked[first : first + COPIES_MAX]
+            with copies_of(some[0].pid, [one.first.number for one in some]) as copies:
+                for one, capacity in zip(some, pipes.capacities_of_empty(copies), strict=True):
+                    if capacity:
+                        known[one.first.number] = self._as_it_was(one, capacity)
+        self._pipes = known
+        return known
+
+    def _as_it_was(self, one: OpenFile, capacity: int) -> OpenFile:
+        before = self._pipes.get(one.first.number)
+        if before is not None and before.descriptors is one.descriptors and before.capacity == capacity and before.kin is one.kin:
+            return before
+        return pipes.with_content(one, capacity, [])
+
+    def _asked_of(self, one: OpenFile, opened: Opened) -> _Known | None:
+        known = self._known.get(one.first.number)
+        if known is None or known.asking is None or known.inode != one.first.inode:
+            return None
+        return known if known.groups == _groups_of(one, known.facts, opened) else None
+
+    def remember(self, looked_at: Iterable[OpenFile], answers: Mapping[int, _Answer], opened: Opened) -> None:
+        """Keep what a socket was found to be together with what it had answered; the process still stands."""
+        for one in looked_at:
+            recalled = opened.recalled.get(one.first.number)
+            if one.lent or not one.observed or (recalled and recalled.whole is not None):
+                continue
+            known, answer = self._known.get(one.first.number), answers.get(one.first.number)
+            if known is None or known.asking is None or known.inode != one.first.inode or answer is None:
+                if "family" in one.observed:
+                    groups = _groups_of(one, one.observed, opened)
+                    self._known[one.first.number] = _Known(one.first.inode, one.observed, groups)
+                continue
+            known.facts, known.listed = one.observed, answer.listed
+            known.settings = None if "filter" in one.observed else answer.settings  # of which the length alone was asked
+            known.state = answer.state if _is_quiet(one.observed) and _answers_again(one, known.asking, answer) else None
+
+
+def _recalled(one: OpenFile, known: _Known, copy: int, opened: Opened) -> _Answer | None:
+    """Ask one; what it answers, unless that is known."""
+    assert known.asking is not None
+    known.asking.ask(copy)
+    settings, state = known.asking.settings, known.asking.state
+    listed = _listed(one, known.facts, opened)
+    if settings != known.settings:
+        return _Answer(settings, state, listed)
+    if state != known.state or listed != known.listed or _may_hold_something(state, known.facts):
+        opened.recalled[one.first.number] = Recalled({name: known.facts[name] for name in OF_SETTINGS if name in known.facts})
+        return _Answer(settings, state, listed)
+    facts = known.facts
+    if facts["family"] == socket.AF_UNIX:
+        try:
+            facts = unix_sockets.again(one, facts, opened)
+        except OSError:  # whoever looks into it says why
+            return _Answer(settings, state, listed)
+    if known.seen is None or known.seen[0] is not one or facts is not known.seen[1].observed:
+        known.seen = one, replace(one, observed=facts)
+    opened.recalled[one.first.number] = Recalled(facts, known.seen[1])
+    return None
+
+
+def _subject(facts: Mapping[str, Fact], groups: Sequence[Group]) -> Subject:
+    form = sockets.Form(*(number_of(facts[name]) for name in ("family", "type", "protocol")))
+    packed = tuple((interface, internet_sockets.sockaddr([group, 0, 0, 0])) for interface, group in groups)
+    options = socket_questions.sized(sockets.fresh_options(form))
+    return Subject(form.family, form.type, form.protocol, options, packed)
+
+
+def _groups_of(one: OpenFile, facts: Mapping[str, Fact], opened: Opened) -> tuple[Group, ...]:
+    """Multicast groups that it may be in."""
+    if facts["family"] not in internet_sockets.FAMILIES or facts["type"] == socket.SOCK_STREAM:
+        return ()
+    return opened.listings.groups(one.pid, number_of(facts["family"]))
+
+
+def _listed(one: OpenFile, facts: Mapping[str, Fact], opened: Opened) -> object:
+    """What only the kernel's lists say of a socket."""
+    if facts["family"] == socket.AF_UNIX:
+        return opened.listings.unix_answer(one.first.inode)
+    if facts["protocol"] in internet_sockets.DATAGRAMS and facts.get("address"):
+        return opened.listings.shut_down(number_of(facts["family"]), number_of(facts["protocol"])).get(one.first.inode, 0)
+    return 0
+
+
+def _may_hold_something(state: bytes, facts: Mapping[str, Fact]) -> bool:
+    """Whether something may wait in it: what poll(2) says of one that was shut down it says of one with content, too."""
+    seen = events(state)
+    if seen & (select.POLLPRI | select.POLLERR):
+        return True
+    return bool(seen & select.POLLIN) and not (seen & select.POLLRDHUP and facts["type"] == socket.SOCK_STREAM)
+
+
+def _is_quiet(facts: Mapping[str, Fact]) -> bool:
+    """Whether a socket is of a kind whose every fact follows from its answers, as long as nothing waits in it."""
+    if any(facts.get(name) for name in ("queue", "urgent", "too_long", "failed", "lost", "groups", "unread", "waiting")):
+        return False
+    if facts["family"] == socket.AF_UNIX:
+        return facts["not_accepted"] == unix_sockets.NOT_WAITING
+    if facts["family"] not in internet_sockets.FAMILIES or facts["type"] == socket.SOCK_RAW:
+        return False
+    if facts["protocol"] == socket.IPPROTO_TCP:
+        return facts["state"] != tcp_connections.SYN_SENT
+    return facts["protocol"] in internet_sockets.DATAGRAMS
+
+
+def _answers_again(one: OpenFile, asking: Asking, answer: _Answer) -> bool:
+    """Whether nothing has come from outside since it was asked: then what was found since goes with what it had answered."""
+    try:
+        with copy_of(one.pid, one.first.number) as copy:
+            asking.ask(copy)
+    except OSError:
+        return False
+    return bool((asking.settings, asking.state) == (answer.settings, answer.state))

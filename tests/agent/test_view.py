@@ -1,0 +1,47 @@
+"""What status says of one component."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from agent.charge import Charge
+from agent.config import ComponentConfig, HooksConfig
+from agent.records import Records
+from agent.surroundings import Surroundings
+from agent.view import told_lacks
+from failover.cli.picture import is_healthy
+from failover.core.types import ComponentView, Protection, State
+
+NAME = "/lab/x"
+LACK = "/srv/maps/area.db cannot be used (No such file or directory)"
+VIEW = ComponentView(NAME, State.STANDBY, 1, "robot1", "robot2", Protection.NONE, -1, 0, (), "")
+
+
+@pytest.mark.parametrize(
+    ("hooks", "sentence"),
+    [
+        (HooksConfig(), f"robot2 could not go on with it: {LACK}"),
+        (HooksConfig(before_resume=("/bin/mount-maps",)), f"robot2 lacks now, and its hook before_resume is to bring: {LACK}"),
+    ],
+)
+def test_what_a_hook_perhaps_brings_is_lacking_now_and_no_refusal(hooks: HooksConfig, sentence: str, tmp_path: Path) -> None:
+    async def told() -> list[str]:
+        none = cast(Any, None)
+        around = Surroundings(none, none, Records(tmp_path), none, none, none, lambda _: ComponentConfig(hooks=hooks))
+        charge = Charge(NAME, around)
+        charge.figures.lacks = (LACK,)
+        return told_lacks(VIEW, charge, "robot2")
+
+    assert asyncio.run(told()) == [sentence]
+
+
+@pytest.mark.parametrize("prepared_first", [False, True])
+def test_a_standby_that_a_hook_gets_ready_is_no_reason_for_alarm(prepared_first: bool) -> None:
+    component = {"primary": "robot1", "state": "running", "standby": "robot2", "protection": "protected", "lacks": None}
+    there = {**component, "lacks": [LACK], "prepared_first": prepared_first}
+    status = {"peers": [], "components": [{**component, "elsewhere": {"robot2": there}}]}
+    assert is_healthy(status) is prepared_first

@@ -1,0 +1,53 @@
+"""Two robots: the standby holds the newest checkpoint's memory ready in a stopped process, and a takeover lets that one go."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from tests.e2e import robots
+from tests.e2e.robots import RobotMachine
+from tests.e2e.test_takeover import numbers, start_counting
+
+READY = '[components."/demo/robot1/count"]\nready_copy = true\n'
+
+
+def copy_at(robot: RobotMachine) -> dict[str, Any]:
+    """What its status says of the ready copy."""
+    return robots.component(robot, "count").get("ready_copy") or {}
+
+
+def until_ready(standby: RobotMachine) -> dict[str, Any]:
+    robots.until(lambda: copy_at(standby).get("ready"), "a ready copy")
+    return copy_at(standby)
+
+
+def count_goes_on(robot: RobotMachine) -> None:
+    robots.until(lambda: robots.component(robot, "count").get("role") == "primary", f"{robot.name} to take over")
+    before = len(numbers(robots.output(robot, "count")))
+    robots.until(lambda: len(numbers(robots.output(robot, "count"))) > before + 20, "the count to go on")
+    counted = numbers(robots.output(robot, "count"))
+    assert counted == list(range(len(counted)))
+
+
+def test_a_takeover_lets_the_ready_copy_go(tmp_path: Path) -> None:
+    with robots.two_robots(tmp_path, READY) as (first, second):
+        start_counting(first, 1_000_000)
+        shown = until_ready(second)
+        assert shown["size"] > 1_000_000, "an interpreter has some megabytes"
+        robots.until(lambda: copy_at(second)["position"] != shown["position"], "the copy to be brought on")
+        robots.until(lambda: "robot2, ready" in robots.failover(first, "status").stdout, "the primary to know")
+        assert "ready copy at robot2" in robots.failover(second, "status").stdout
+        first.cut_power()
+        count_goes_on(second)
+        assert "taking the ready copy" in robots.failover(second, "why", "count").stdout
+
+
+def test_without_the_option_the_checkpoints_alone_are_kept_and_a_takeover_uses_them(tmp_path: Path) -> None:
+    with robots.two_robots(tmp_path) as (first, second):
+        start_counting(first, 1_000_000)
+        robots.until(lambda: robots.checkpoints(second, "count") >= 5, "checkpoints at robot2")
+        assert not copy_at(second)["ready"]
+        assert "ready_copy = false" in copy_at(second)["why"]
+        first.cut_power()
+        count_goes_on(second)

@@ -1,0 +1,66 @@
+"""A component returns by itself to the robot that is preferred, as soon as that one lacks nothing of what it needs."""
+
+from __future__ import annotations
+
+from failover.core.events import Prefer
+from failover.core.types import MS, ComponentSpec, Launch
+from tests.simulation.deeds import LACK
+from tests.simulation.invariants import seen_at
+from tests.simulation.teams import pair
+from tests.simulation.world import World
+
+PART = "/team/part"
+LONG_MS = 40_000
+
+
+def at_robot1(lacks: tuple[str, ...]) -> World:
+    """It runs at robot1, protected by robot2, which is preferred from now on and lacks this."""
+    world = World(1, pair((ComponentSpec(PART, launch=Launch(("part",))),)))
+    world.robots["robot2"].lacks = lacks
+    for name in world.robots:
+        world.power_on(name)
+    world.run(2_000 * MS)
+    assert world.acting(PART) == ["robot1"] and seen_at(world, "robot1", PART).standby == "robot2"
+    world.command("robot1", Prefer(world.request(), PART, "robot2"))
+    return world
+
+
+def later(world: World, ms: int) -> list[str]:
+    world.run(world.now_ns + ms * MS)
+    return world.acting(PART)
+
+
+def notes(world: World) -> str:
+    return " ".join(seen_at(world, "robot1", PART).notes)
+
+
+def test_it_goes_to_a_robot_that_lacks_nothing() -> None:
+    world = at_robot1(lacks=())
+    assert later(world, 1_000) == ["robot2"]
+
+
+def test_it_waits_while_the_robot_lacks_something_and_status_says_what() -> None:
+    world = at_robot1(LACK)
+    assert later(world, LONG_MS) == ["robot1"]
+    assert f"its return to robot2 waits, which could not go on with it: {LACK[0]}" in notes(world)
+    told = [one.sentence for one in world.robots["robot1"].told]
+    assert sum("it does not return to robot2" in sentence for sentence in told) == 1
+    assert not any("handover" in sentence or "hand it over" in sentence for sentence in told), "it was never held still for that"
+    world.robots["robot2"].lacks = ()
+    assert later(world, LONG_MS) == ["robot2"]
+    assert "waits" not in notes(world)
+
+
+def test_what_its_operator_says_meanwhile_counts() -> None:
+    world = at_robot1(LACK)
+    assert later(world, 1_000) == ["robot1"] and "its return to robot2 waits" in notes(world)
+    world.command("robot1", Prefer(world.request(), PART, ""))
+    world.robots["robot2"].lacks = ()
+    assert later(world, LONG_MS) == ["robot1"] and "waits" not in notes(world)
+
+
+def test_what_one_robot_lacked_is_not_said_of_the_one_that_is_preferred_then() -> None:
+    world = at_robot1(LACK)
+    assert later(world, 1_000) == ["robot1"] and "its return to robot2 waits" in notes(world)
+    world.command("robot1", Prefer(world.request(), PART, "robot2"))
+    assert "waits" not in notes(world), "it is asked anew"
