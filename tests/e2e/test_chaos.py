@@ -28,7 +28,7 @@ ROOT: Final = Path(__file__).parents[2]
 @pytest.mark.slow
 @pytest.mark.command("tc")
 @pytest.mark.skipif(not robots.has_cable(), reason="needs network namespaces: cables must be laid and pulled")
-@pytest.mark.timeout(300 + 60 * FAULTS)
+@pytest.mark.timeout(600 + 90 * FAULTS)
 def test_whatever_fails_no_two_copies_act_and_nothing_acknowledged_is_lost_and_everything_goes_on(tmp_path: Path) -> None:
     evidence = Path(os.environ.get("FAILOVER_EVIDENCE", tmp_path / "chaos"))
     command = [sys.executable, "-m", "tests.chaos", "--faults", str(FAULTS), "--seed", SEED, "--directory", str(evidence)]
