@@ -27,7 +27,7 @@ from checkpoint.linux import procfs
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.task_channel import TAKEN_OVER
 from tests.agent.guards import PATIENCE_S
-from tests.agent.test_component import Captures, live, output, piece_of, until
+from tests.agent.test_component import Captures, at_last, live, output, piece_of, until
 
 NAME: Final = "/test/robot1/one"
 BEGIN = """
@@ -106,7 +106,7 @@ async def again(places: Places, captures: Captures, script: str) -> Component:
 
 
 async def held(component: Component) -> Captured:
-    return await component.capture(base=True, generation=1, sequence=99, epoch=3, hold=True)
+    return await at_last(lambda: component.capture(base=True, generation=1, sequence=99, epoch=3, hold=True))
 
 
 def test_a_snapshot_carries_the_output_as_it_stood_at_the_commit_and_freezes_nobody(tmp_path: Path) -> None:
@@ -181,7 +181,7 @@ def test_a_commit_is_safe_for_its_program_when_it_was_acknowledged_and_not_befor
         async with gone_afterwards(await started(places, WAITS)) as component:
             await until(lambda: output(component) == b"committed\n", "the commit")
             await until(lambda: component.keeps, "the agent to hear of its commit")
-            captured = await component.capture(base=True, generation=1, sequence=1, epoch=3)
+            captured = await at_last(lambda: component.capture(base=True, generation=1, sequence=1, epoch=3))
             os.close(captured.snapshot)
             assert output(component) == b"committed\n"
             await component.acknowledge(captured.position)

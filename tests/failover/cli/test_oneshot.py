@@ -39,9 +39,11 @@ for number in range(1, {LINES} + 1):
     print(number, digest.hexdigest(), flush=True)
     if not os.path.exists("hurry"):
         time.sleep(0.05)
+    while number == {LINES // 2} and not os.path.exists("hurry"):
+        time.sleep(0.05)
 sys.exit(7)
 """
-"""Takes its time, however busy the machine is, until the test has done with it what it wants to do."""
+"""Takes its time, and waits half way, however long a busy machine takes, until the test has done with it what it wants to do."""
 
 CHAOS = 'scale=50\nx=0.4\nfor(i=1;i<=500;i++){for(j=0;j<4000;j++)x=3.99*x*(1-x);print i," ",x,"\\n"}\nquit\n'
 
