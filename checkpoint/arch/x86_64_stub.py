@@ -212,6 +212,7 @@ SYSTEM_CALLS: Final = {
     "timerfd_settime": 286,
     "umask": 95,
     "unlinkat": 263,
+    "unshare": 272,
     "utimensat": 280,
     "wait4": 61,
     "waitid": 247,

@@ -149,6 +149,7 @@ class CapturedProcess:
         copied = self.memory.copy_running(base=base)
         if base:  # which takes long: a thread may have confined itself since
             self.onlooker.rights.prepare()
+            self.onlooker.tables.prepare()
         return copied
 
     # While it stands still
@@ -229,6 +230,7 @@ class CapturedProcess:
             *untouched.describe(look.taken.lines, look.taken.untouched, look.standing.opened),
             *self._limits(look.standing),
             *deadlines.describe(self.pid),
+            *self.onlooker.tables.describe(),
         )
 
     def _limits(self, standing: Standing) -> tuple[Resource, ...]:

@@ -64,12 +64,13 @@ from checkpoint.resources import (
     seccomp,
     stops,
     system_v_memory,
+    thread_tables,
     untouched,
 )
 from checkpoint.resources.aio_rings import Ring
 from checkpoint.resources.carried_connections import Arriving
 from checkpoint.resources.departed import Departed
-from checkpoint.resources.rebuild import deleted_directory, rebuild_all, rebuild_last
+from checkpoint.resources.rebuild import deleted_directory, open_here, rebuild_all, rebuild_last
 from checkpoint.resources.rebuilding import number_of
 
 PTRACE_O_TRACESYSGOOD: Final = 1
@@ -555,6 +556,8 @@ class ProcessRestore:
         restore_process.thread_marks(table, thread)
         restore_process.scheduling(table, thread, vessel, f" for thread {thread.tid} ({thread.name})")
         deadlines.rebuild(table, self._state.resources, thread.tid, bool(thread.policy & os.SCHED_RESET_ON_FORK))
+        thread_tables.enter(table, self._state.resources, thread.tid)
+        thread_tables.part(table, self._state.resources, thread.tid, open_here(self._state))
         self._confine(table, thread, credentials)
         restore_process.rights(table, replace(process, credentials=credentials), vessel)
         restore_process.pending_of_thread(table, process, thread, vessel.inner_pid, thread.tid)

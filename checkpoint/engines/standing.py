@@ -29,6 +29,7 @@ from checkpoint.model import Rseq
 from checkpoint.resources import Kept, Opened, OpenFile, gather, with_contents
 from checkpoint.resources.recollection import Recollection
 from checkpoint.resources.thread_rights import ThreadRights
+from checkpoint.resources.thread_tables import ThreadTables
 from checkpoint.stream_counts import Totals
 
 NOTHING_WRITTEN: Final[Totals] = (0, 0)
@@ -112,6 +113,7 @@ class Onlooker:
 
     Attributes:
         rights: of threads that may what the first may not, or the other way round.
+        tables: what threads have for themselves.
     """
 
     def __init__(self, threads: Threads, entered: Entered, devices: tuple[DeviceRule, ...]) -> None:
@@ -125,6 +127,7 @@ class Onlooker:
         self._others = ThreadOnlooker(threads, entered, self._confinements)
         self._recollection = Recollection()
         self.rights = ThreadRights(threads.pid)
+        self.tables = ThreadTables(threads.pid)
         self._borrowed = entered.pages
         self._interruptions = entered.interruptions
         self._inquiry: Inquiry | None = None
@@ -161,6 +164,7 @@ class Onlooker:
         self._recollection.prepare()
         self._others.prepare()
         self.rights.prepare()
+        self.tables.prepare()
 
     def place(self) -> Place:
         """Where it stands, before anything else is asked.
@@ -191,6 +195,7 @@ class Onlooker:
             opened: what it has open, if that is known already.
         """
         tracee = self._tracee
+        self.tables.look()
         inquiry = self._questions(place.special)
         answers = self._borrowed.run(tracee, inquiry.batch, arch.encode_registers(place.registers), place.mask)
         others = self._others.ask(place.others)

@@ -77,7 +77,7 @@ def descriptors(pid: int, kept: KeptTexts | None = None) -> tuple[Descriptor, ..
     Args:
         kept: of a process that is looked at again and again.
     """
-    numbers = _numbers(pid)
+    numbers = descriptor_numbers(pid)
     with _opened(pid, "fd") as links, _opened(pid, "fdinfo") as texts:
         if kept is None:
             return tuple(found for number in numbers if (found := _descriptor(number, links, texts)) is not None)
@@ -87,7 +87,7 @@ def descriptors(pid: int, kept: KeptTexts | None = None) -> tuple[Descriptor, ..
 
 def descriptors_to(pid: int, target: str) -> tuple[Descriptor, ...]:
     """Those that lead there; of the others nothing more is read."""
-    numbers = [number for number in _numbers(pid) if _target(pid, number) == target]
+    numbers = [number for number in descriptor_numbers(pid) if _target(pid, number) == target]
     return tuple(found for number in numbers if (found := descriptor(pid, number)) is not None)
 
 
@@ -99,7 +99,13 @@ def _target(pid: int, number: int) -> str:
         return ""
 
 
-def _numbers(pid: int) -> list[int]:
+def descriptor_numbers(pid: int) -> list[int]:
+    """The numbers of what is open; of a thread too, by its id.
+
+    Raises:
+        ProcessGoneError: there is none.
+        ProbeError: we may not.
+    """
     try:
         return sorted(map(int, os.listdir(f"/proc/{pid}/fd")))
     except (FileNotFoundError, ProcessLookupError) as error:

@@ -57,6 +57,7 @@ from checkpoint.resources import (
     system_v_memory,
     tcp_connections,
     terminals,
+    thread_tables,
     timerfds,
     unix_names,
     unix_sockets,
@@ -107,6 +108,7 @@ NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
     packet_sockets.KIND: packet_sockets.mismatches,
     system_v_memory.KIND: system_v_memory.mismatches,
     seccomp.KIND: seccomp.mismatches,
+    thread_tables.KIND: thread_tables.mismatches,
 }
 """Kinds that need something of this machine: why it does not have that, one sentence each."""
 OF_KERNEL: Final = {netlink_sockets.KIND: netlink_sockets.prepare, packet_sockets.KIND: packet_sockets.prepare}
@@ -121,6 +123,7 @@ NOT_OPEN: Final = (
     seccomp.KIND,
     joint.KIND,
     untouched.KIND,
+    thread_tables.KIND,
 )
 """Kinds of what no descriptor stands for."""
 KINDS: Final = (files.KIND, streams.KIND, shared.KIND, pipes.KIND, terminals.KIND, *NOT_OPEN, *MADE, *SOCKETS)
@@ -268,6 +271,11 @@ def descriptors_of(state: Snapshot) -> list[Wanted]:
         for held in state.resources
         for number, close_on_exec in _pairs(held.facts["descriptors"])
     ]
+
+
+def open_here(state: Snapshot) -> dict[int, bool]:
+    """The descriptors that a restored process has; whether they are close-on-exec."""
+    return {one.number: one.close_on_exec for one in descriptors_of(state) if not one.resource.facts.get("travelling")}
 
 
 def _pairs(fact: Fact) -> list[tuple[Fact, Fact]]:

@@ -1,6 +1,7 @@
 """Threads that cannot be kept: those that do not share what the threads of a program share. Nothing here touches them.
 
-A thread comes back with the files and the namespaces of the first one, so it must have them now.
+A thread comes back in the namespaces of the first one, so it must be in them now; `thread_tables` tells what else it may have
+for itself.
 
 Source: pthreads(7), credentials(7), unshare(2), kcmp(2).
 """
@@ -18,7 +19,7 @@ from checkpoint.linux import abi, confinement, procfs
 from checkpoint.linux.procfs import Status
 from checkpoint.linux.threads import thread_ids
 from checkpoint.linux.timers import parse_timers
-from checkpoint.resources import seccomp
+from checkpoint.resources import seccomp, thread_tables
 
 CAPABILITIES: Final = (
     preserved(
@@ -35,11 +36,8 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.THREADS,
-        "a thread with namespaces, open files, directory or personality of its own (unshare)",
+        "a thread with namespaces or a personality of its own",
         "let all threads share these",
-        "has its own {} (unshare)",
-        "open files",
-        "working directory and root",
         "lives in a namespace of its own ({})",
         "has an execution domain of its own",
     ),
@@ -69,7 +67,6 @@ THREAD_LIMIT: Final = 4096
 
 CLOCK_THREAD_CPUTIME: Final = 3
 _NAMESPACES: Final = ("net", "ipc", "uts", "cgroup", "mnt", "user", "pid_for_children", "time_for_children")
-_SHARED: Final = ((abi.KCMP_FILES, "open files"), (abi.KCMP_FS, "working directory and root"))
 
 
 def refuse(pid: int, status: Status, kin: Collection[int] = ()) -> Iterator[str]:
@@ -156,22 +153,22 @@ def _namespace(pid: int, tid: int, kind: str) -> str:
 def _refuse_thread(pid: int, first: _Shared, tid: int) -> tuple[str, ...]:
     """What is wrong with one thread; nothing is with one that is about to end, which shares less and less."""
     shared = _Shared.of(pid, tid)
-    own = [what for kind, what in _SHARED if abi.kcmp(pid, tid, kind)]
+    own = thread_tables.own(pid, tid)
     if shared == first and not own:
         return ()
     reasons = tuple(_unlike(pid, tid, shared, first, own))
     return reasons if not procfs.thread_stat(pid, tid).flags & procfs.PF_EXITING else ()
 
 
-def _unlike(pid: int, tid: int, shared: _Shared, first: _Shared, own: list[str]) -> Iterator[str]:
+def _unlike(pid: int, tid: int, shared: _Shared, first: _Shared, own: thread_tables.Own) -> Iterator[str]:
     status = procfs.parse_status(procfs.read_text(pid, f"task/{tid}/status"))
     named = f"its thread {tid} ({status.name})"
     if shared.tracer:
         yield f"{named} is traced by pid {shared.tracer}: end that debugger"
     elif shared.seccomp and (why := confinement.why_not()):
         yield seccomp.not_ours(why, named)
-    for what in own:
-        yield f"{named} has its own {what} (unshare), which is not kept yet"
+    if own:
+        yield from thread_tables.refuse(pid, tid, own)
     pairs = zip(_NAMESPACES, shared.namespaces, first.namespaces, strict=True)
     if differing := [kind for kind, here, there in pairs if here != there]:
         yield f"{named} lives in a namespace of its own ({', '.join(differing)}), which is not kept yet"

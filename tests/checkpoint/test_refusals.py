@@ -32,8 +32,8 @@ pytestmark = [pytest.mark.compiler, pytest.mark.root]
 Compiled = Callable[..., Path]
 
 REFUSED = {
-    "thread_files": "own open files",
-    "thread_directory": "own working directory",
+    "thread_files": "which its first thread has not",
+    "thread_root": "a root directory of its own",
     "thread_namespace": "namespace",
     "child_in_the_same_memory": "shares its memory",
     "child_without_first_thread": "its first thread has ended while 1 others live",

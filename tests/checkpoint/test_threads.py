@@ -27,6 +27,7 @@ from tests.checkpoint.round_trip import (
     captured_at_last,
     ended,
     expect_ok,
+    expect_three_lives,
     protected,
     restored,
     start,
@@ -314,6 +315,12 @@ def test_numpy_with_its_thread_pool_computes_the_same(tmp_path: Path, monkeypatc
     snapshot = three_lives(argv, tmp_path / "disturbed", whole_output(argv, tmp_path / "undisturbed"))
     if len(snapshot.threads) == 1:
         pytest.skip("this numpy has no thread pool")
+
+
+def test_threads_with_directories_and_descriptors_of_their_own_have_them_after_three_lives(
+    compiled: Compiled, tmp_path: Path
+) -> None:
+    expect_three_lives(start_tracee(compiled("thread_tables", "-O2"), tmp_path), tmp_path)
 
 
 def test_a_program_in_pids_of_its_own_keeps_its_thread_ids(compiled: Compiled, tmp_path: Path) -> None:

@@ -138,6 +138,7 @@ THREADS = [
     *cases("threads", "many"),
     *cases("blocked"),
     *cases("thread_rights"),
+    *cases("thread_tables"),
     *cases("deadlines", "deadline slice"),
 ]
 

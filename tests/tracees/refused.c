@@ -55,11 +55,11 @@ static void take_unlike_thread(int (*make)(void)) {
     if (is_unlike < 0) cannot("have a thread that is unlike the first");
 }
 
-static int unshare_files(void) { return unshare(CLONE_FILES); }
-static int unshare_directory(void) { return unshare(CLONE_FS); }
+static int unshare_files(void) { return unshare(CLONE_FILES) || open("/dev/null", O_RDONLY) < 0; }
+static int unshare_root(void) { return unshare(CLONE_FS) || chroot("/proc/self/root/tmp"); }
 static int unshare_names(void) { return unshare(CLONE_NEWUTS); }
 static void take_thread_files(void) { take_unlike_thread(unshare_files); }
-static void take_thread_directory(void) { take_unlike_thread(unshare_directory); }
+static void take_thread_root(void) { take_unlike_thread(unshare_root); }
 static void take_thread_namespace(void) { take_unlike_thread(unshare_names); }
 
 static void *end_the_process(void *unused) {
@@ -381,7 +381,7 @@ static const struct kind {
     void (*take)(void);
 } kinds[] = {{"nothing", NULL},
              {"thread_files", take_thread_files},
-             {"thread_directory", take_thread_directory},
+             {"thread_root", take_thread_root},
              {"thread_namespace", take_thread_namespace},
              {"namespace_of_children", take_namespace_of_children},
              {"dead_leader", take_dead_leader},
