@@ -23,7 +23,7 @@ import os
 import resource
 import signal
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -60,6 +60,7 @@ from checkpoint.resources import (
     joint,
     laying,
     memory_locks,
+    pidfds,
     remembered,
     seccomp,
     stops,
@@ -335,7 +336,9 @@ class ProcessRestore:
         base = self._choose_place(mappings)
         first = self._mappings_table(CallTable(base, descriptors=self._inherited()), vessel, mappings, base + AREA_SIZE)
         opened = CallTable(base, descriptors=set(first.descriptors))
-        self._ended = departed.of(self._state.resources, self._state.process.working_directory)
+        given = self._estate.descriptions if self._estate else {}
+        of_its_own = [held for held in self._state.resources if number_of(held.facts.get("description", 0)) not in given]
+        self._ended = departed.of(of_its_own, self._state.process.working_directory)
         for one in self._ended:
             self._objects |= one.open(opened, NOBODY_YET)
         later = self._later_tables(base, set(opened.descriptors), vessel)
@@ -392,7 +395,7 @@ class ProcessRestore:
         self.notes += self._segments.notes
         if self._rings:
             self._make_rings(self._stub, self._rings, first.descriptors)
-        self._open_what_is_left(self._stub, self._ended, first.descriptors)
+        restore_threads.open_what_is_left(self._tracee, self._start_registers, self._stub, self._ended, first.descriptors)
         restore_memory.fill(self._tracee.memory, self._state, self._legacy, self._untouched)
 
     def _complete(self, later: LaterTables) -> None:
@@ -416,23 +419,6 @@ class ProcessRestore:
         stub.run(made)
         aio_rings.move(moves, rings, [int.from_bytes(self._tracee.memory.read(answer, 8), "little") for answer in answers])
         stub.run(moves)
-
-    def _open_what_is_left(self, stub: Stub, ended: Iterable[Departed], descriptors: Iterable[int]) -> None:
-        """Open what the program holds of processes that have ended: for each a child is born, and ended before it runs."""
-        opened = set(descriptors)
-        for one in ended:
-            child = restore_threads.spawn_any(self._tracee, self._start_registers, stub.base)
-            try:
-                number = procfs.status(child.pid).pids[-1]
-                table = CallTable(stub.base, descriptors=opened)
-                one.open(table, number)
-                stub.run(table)
-                opened = table.descriptors
-            finally:
-                restore_threads.end(child, ())
-            table = CallTable(stub.base)
-            departed.forget(table, number)
-            stub.run(table)
 
     def _inherited(self) -> set[int]:
         """Descriptors that the vessel has."""
@@ -574,6 +560,10 @@ class ProcessRestore:
         for thread in self._state.threads[1:]:
             born = restore_threads.spawn(self._tracee, self._start_registers, base, thread.tid)
             self._others.append((born, thread))
+        if self._others and not self.has_table_of_parent:
+            table = CallTable(base, descriptors=set(open_here(self._state)))
+            pidfds.settle(table, self._state.resources)
+            self._stub.run(table)
         for (tracee, _), table in zip(self._others, tables, strict=True):
             self.notes += Stub(tracee, base).run(table)
 

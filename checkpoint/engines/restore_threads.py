@@ -19,8 +19,11 @@ from typing import Final
 
 from checkpoint.arch import cpu, stubs
 from checkpoint.errors import CheckpointError, ProcessGoneError, RestoreError
-from checkpoint.linux import abi, call_table
+from checkpoint.linux import abi, call_table, procfs
+from checkpoint.linux.call_table import CallTable, Stub
 from checkpoint.linux.tracee import Tracee
+from checkpoint.resources import departed
+from checkpoint.resources.departed import Departed, Descriptors
 
 CLONE_VM: Final = 0x100
 CLONE_FS: Final = 0x200
@@ -69,6 +72,35 @@ def spawn_any(parent: Tracee, registers: bytes, base: int) -> Tracee:
     process = Tracee(_birth(parent, registers, base, (0, 0, ANY_ID), "stand-in for a process that has ended"))
     process.wait(call_table.RUN_TIMEOUT_S)
     return process
+
+
+def open_what_is_left(
+    parent: Tracee, registers: bytes, stub: Stub, ended: Iterable[Departed], descriptors: Iterable[int]
+) -> tuple[set[int], Descriptors]:
+    """Have a process open what is left of others that have ended: for each a child is born, and ended before it runs.
+
+    Args:
+        registers: as for `spawn`.
+        descriptors: that it has.
+
+    Returns:
+        Those that it has now, and where among the nameless objects the new ones are.
+    """
+    opened, made = set(descriptors), Descriptors()
+    for one in ended:
+        child = spawn_any(parent, registers, stub.base)
+        try:
+            number = procfs.status(child.pid).pids[-1]
+            table = CallTable(stub.base, descriptors=opened)
+            made |= one.open(table, number)
+            stub.run(table)
+            opened = table.descriptors
+        finally:
+            end(child, ())
+        table = CallTable(stub.base)
+        departed.forget(table, number)
+        stub.run(table)
+    return opened, made
 
 
 def _birth(parent: Tracee, registers: bytes, base: int, wanted: tuple[int, int, int], what: str) -> int:

@@ -51,7 +51,7 @@ from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Tracee
 from checkpoint.model import PageRun, ProcessState, Resource, Snapshot, Vma, Zombie
-from checkpoint.resources import epolls, files, rebuild, shared, stops, streams, terminals
+from checkpoint.resources import departed, epolls, files, pidfds, rebuild, shared, stops, streams, terminals
 from checkpoint.resources.rebuilding import number_of
 
 PTRACE_O_TRACEFORK: Final = 2
@@ -165,7 +165,8 @@ class TreeRestore:
         base = call_table.find_hole(taken, size)
         resources = _first_told(views)
         objects = dict(_grouped(vmas, restore_memory.is_object_mapping))
-        numbers = itertools.count(max((one.number for view in views for one in rebuild.descriptors_of(view)), default=2) + 1)
+        wanted = (one.number for view in views for one in rebuild.descriptors_of(view))
+        numbers = itertools.count(max(max(wanted, default=2), len(streams.STANDARD) + len(resources)) + 1)
         estate = Estate(
             base=base,
             size=size,
@@ -180,9 +181,11 @@ class TreeRestore:
         taken_by_vessel = pages.extents(PageRun(line.start, line.end) for line in mappings)
         inheritance = forked_memory.of(views, taken_by_vessel)
         self._legacies = inheritance.legacies
-        table = CallTable(estate.base)
+        ended = departed.of([_at(held, estate.descriptions[n]) for n, held in resources.items() if held.kind == pidfds.KIND], "")
+        opened, left = restore_threads.open_what_is_left(self._first, self._registers, stub, ended, streams.STANDARD)
+        table = CallTable(estate.base, descriptors=opened)
         inheritance.leave(table)
-        self._make_nameless(table, vessel, estate, sizes, objects, resources)
+        self._make_nameless(table, vessel, estate, sizes, objects, resources, left)
         if table.end - base > AREA_SIZE:
             raise RestoreError(f"cannot restore: what its processes share takes more than {AREA_SIZE >> 20} MiB")
         self._notes += stub.run(table)
@@ -197,8 +200,13 @@ class TreeRestore:
         sizes: dict[restore_memory.Object, int],
         objects: dict[restore_memory.Object, list[Vma]],
         resources: dict[int, Resource],
+        left: departed.Descriptors,
     ) -> None:
-        """Add the calls that make all that is shared, at the numbers and addresses that the estate says."""
+        """Add the calls that make all that is shared, at the numbers and addresses that the estate says.
+
+        Args:
+            left: what is open of processes that have ended.
+        """
         restore_process.raise_limits(table, vessel)
         opened = self._open_brought(table, resources)  # with our rights, from a place of ours
         if self._options.own_eyes:
@@ -208,7 +216,7 @@ class TreeRestore:
             flags = abi.MAP_SHARED | abi.MAP_ANONYMOUS | abi.MAP_FIXED_NOREPLACE
             arguments = (place, size, abi.PROT_READ | abi.PROT_WRITE, flags, -1, 0)
             table.call(what, "mmap", *arguments, least=place, most=place)
-        made = opened | {key: restore_memory.make_object(table, vmas) for key, vmas in objects.items()}
+        made = opened | left | {key: restore_memory.make_object(table, vmas) for key, vmas in objects.items()}
         made |= {key: files_of_several.make(table, held) for key, held in self._nameless.items()}
         for key, number in estate.objects.items():
             table.duplicate(made[key], number, os.O_CLOEXEC)

@@ -92,6 +92,7 @@ _OBSERVED: Final[Mapping[str, Observer]] = {
     timerfds.TARGET: timerfds.observe,
     epolls.TARGET: epolls.observe,
     watches.TARGET: watches.observe,
+    pidfds.TARGET: pidfds.observe,
 }
 """By the kernel's name for an open file."""
 

@@ -1,7 +1,8 @@
 """Processes by descriptor (pidfd_open(2)): one that stands for a process of the program stands for it again.
 
 Facts: ``descriptors``; ``flags`` of fcntl(2); ``pid``: of another process of the component, as the program knows it; 0: its own;
-of one that has ended, and was waited for, ``ended`` (see `departed`).
+of one that has ended, and was waited for, ``ended`` (see `departed`); of a single thread of the process that holds it ``thread``,
+its id: nobody stands for it before the threads are born, so the process itself does until then.
 
 Source: pidfd_show_fdinfo() in fs/pidfs.c; pidfd_open(2).
 """
@@ -9,12 +10,14 @@ Source: pidfd_show_fdinfo() in fs/pidfs.c; pidfd_open(2).
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
+from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
-from checkpoint.linux.descriptors import descriptors_to
+from checkpoint.linux.descriptors import Descriptor
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile, Surroundings, elsewhere
 from checkpoint.resources.rebuilding import Rebuilding, number_of
@@ -23,11 +26,14 @@ KIND: Final = "pidfds"
 
 CAPABILITIES: Final = (
     preserved(
-        Area.PIPES, "a pidfd of the program itself, of a child of it, or of a process that has ended", "it stands for it again"
+        Area.PIPES,
+        "a pidfd of the program itself, of a child or a thread of it, or of a process that has ended",
+        "it stands for it again",
     ),
     refused(
         Area.PIPES,
-        "a pidfd of another program, or of a single thread; one that several processes share",
+        "a pidfd of another program, of a thread that has ended or that an epoll instance watches; one of a living process that "
+        "several share",
         "let the program close them, or wait by number",
         "is a pidfd of {}, which is not kept",
     ),
@@ -36,6 +42,30 @@ CAPABILITIES: Final = (
 TARGET: Final = "anon_inode:[pidfd]"
 NOBODY: Final = -1
 """What fdinfo tells of a process that has ended, and has been waited for."""
+
+
+def is_of_ended(one: Descriptor) -> bool:
+    """Whether it stands for a process that has ended, and has been waited for."""
+    return one.target == TARGET and not one.flags & os.O_EXCL and _pid_in(one) == NOBODY
+
+
+def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
+    """Of one that stands for a single thread of its process: the id by which the program knows that, and who watches it."""
+    tid = _target(held)
+    if tid in (NOBODY, held.pid) or not held.first.flags & os.O_EXCL:
+        return {}
+    try:
+        inner = procfs.parse_status(procfs.read_text(held.pid, f"task/{tid}/status")).pids[-1]
+    except (ProcessGoneError, ProbeError):
+        return {}
+    numbers = {one.number for one in held.descriptors}
+    return {"thread": inner, "is_watched": any(int(word) in numbers for one in opened for word in _watched_by(one))}
+
+
+def _watched_by(held: OpenFile) -> Iterator[str]:
+    """The numbers that an epoll instance watches; of anything else none."""
+    lines = (line.split() for line in held.first.text.splitlines() if line.startswith("tfd:"))
+    return (words[1] for words in lines)
 
 
 def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
@@ -47,11 +77,17 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
         facts: dict[str, Fact] = {"descriptors": held.numbers, "flags": held.first.flags & ~os.O_CLOEXEC, "pid": 0}
         return Resource(KIND, held.name, {**facts, "ended": held.first.inode})
     inner = procfs.status(pid).pids[-1] if pid in held.kin.pids and pid != held.pid else 0
-    return Resource(KIND, held.name, {"descriptors": held.numbers, "flags": held.first.flags & ~os.O_CLOEXEC, "pid": inner})
+    flags = held.first.flags & ~os.O_CLOEXEC
+    thread: dict[str, Fact] = {"thread": held.observed["thread"]} if "thread" in held.observed else {}
+    return Resource(KIND, held.name, {"descriptors": held.numbers, "flags": flags, "pid": inner, **thread})
 
 
 def _target(held: OpenFile) -> int:
-    return int(held.first.fields.get("Pid", NOBODY))
+    return _pid_in(held.first)
+
+
+def _pid_in(one: Descriptor) -> int:
+    return int(one.fields.get("Pid", NOBODY))
 
 
 def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
@@ -59,24 +95,19 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     if held.first.target != TARGET:
         return None
     pid = _target(held)
-    if pid == NOBODY:
-        is_kept = not held.first.flags & os.O_EXCL and not _is_of_several(held)
-    else:
-        is_kept = pid == held.pid or pid in held.kin.pids
+    is_of_thread = bool(held.first.flags & os.O_EXCL)
+    if is_of_ended(held.first):
+        return elsewhere.refuse(held, "a pidfd")
+    is_kept = pid == held.pid or pid in held.kin.pids or ("thread" in held.observed and not held.observed["is_watched"])
     if is_kept and not held.description:
         return elsewhere.refuse(held, "a pidfd")
-    whom = "a process that has ended" if pid == NOBODY else f"pid {pid}"
-    if held.first.flags & os.O_EXCL:
+    whom = f"pid {pid}"
+    if is_of_thread:
         whom = "a single thread that has ended" if pid == NOBODY else f"the single thread {pid}"
-    if held.description or (pid == NOBODY and not held.first.flags & os.O_EXCL):
+        whom += " that an epoll instance watches" if held.observed.get("is_watched") else ""
+    if held.description:
         whom += " that several processes share"
     return f"{held.name} is a pidfd of {whom}, which is not kept yet: let the program close it, or wait by number"
-
-
-def _is_of_several(held: OpenFile) -> bool:
-    """Whether another process of the component has one of the same ended process: the same it could not become again."""
-    others = (one for pid in held.kin.pids if pid != held.pid for one in descriptors_to(pid, TARGET))
-    return any(one.inode == held.first.inode and int(one.fields.get("Pid", NOBODY)) == NOBODY for one in others)
 
 
 def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
@@ -84,6 +115,22 @@ def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     if held.facts.get("ended"):
         return rebuilding.ended(table, held)
     flags = number_of(held.facts["flags"]) & (os.O_NONBLOCK | os.O_EXCL)
+    if held.facts.get("thread"):
+        return table.obtain(f"open a place for {held.name}", "pidfd_open", rebuilding.inner_pid, 0)
     return table.obtain(
         f"open the pidfd of {held.name}", "pidfd_open", number_of(held.facts["pid"]) or rebuilding.inner_pid, flags
     )
+
+
+def settle(table: CallTable, resources: Iterable[Resource]) -> None:
+    """Have those that stand for a thread do so, now that it has been born."""
+    for held in resources:
+        if held.kind == KIND and held.facts.get("thread"):
+            flags = number_of(held.facts["flags"]) & (os.O_NONBLOCK | os.O_EXCL)
+            made = table.obtain(f"open the pidfd of {held.name}", "pidfd_open", number_of(held.facts["thread"]), flags)
+            descriptors = held.facts["descriptors"]
+            assert isinstance(descriptors, list)
+            for one in descriptors:
+                assert isinstance(one, list)
+                table.duplicate(made, number_of(one[0]), os.O_CLOEXEC if one[1] else 0)
+            table.close(made)

@@ -15,7 +15,7 @@ from typing import Final
 
 from checkpoint.linux import abi
 from checkpoint.linux.descriptors import Descriptor
-from checkpoint.resources import Kin, Opened, OpenFile, pipes, sockets, terminals
+from checkpoint.resources import Kin, Opened, OpenFile, pidfds, pipes, sockets, terminals
 
 _OTHER_END: Final = {os.O_RDONLY: os.O_WRONLY, os.O_WRONLY: os.O_RDONLY}
 OpenedByAll = dict[int, Opened]
@@ -66,14 +66,25 @@ def _numbered(every: Sequence[OpenFile]) -> tuple[dict[Place, int], set[Place]]:
             bucket.append(group)
             groups.append(group)
         group.append(held)
+    ended = _ended_for_several(every)
     numbers: dict[Place, int] = {}
     echoes: set[Place] = set()
     for group in groups:
-        if len(group) > 1 or _leads_somewhere(group[0].first):
+        one = group[0].first
+        if len(group) > 1 or _leads_somewhere(one) or (one.inode in ended and pidfds.is_of_ended(one)):
             number = len(numbers) + 1
             numbers |= {(held.pid, held.first.number): number for held in group}
             echoes |= {(held.pid, held.first.number) for held in group[1:]}
     return numbers, echoes
+
+
+def _ended_for_several(every: Iterable[OpenFile]) -> set[int]:
+    """Processes that have ended, by the number of their pidfds, of which several have one: it must stay one and the same."""
+    holders: dict[int, set[int]] = {}
+    for held in every:
+        if pidfds.is_of_ended(held.first):
+            holders.setdefault(held.first.inode, set()).add(held.pid)
+    return {inode for inode, pids in holders.items() if len(pids) > 1}
 
 
 def _leads_somewhere(one: Descriptor) -> bool:

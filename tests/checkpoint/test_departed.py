@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from checkpoint.engines import ptrace_restore, restore_threads
+from checkpoint.engines import restore_threads
 from checkpoint.errors import RestoreError
 from checkpoint.resources.departed import Departed
 
@@ -21,7 +21,8 @@ def test_a_stand_in_ends_where_what_is_wanted_of_it_cannot_be_opened(monkeypatch
 
     monkeypatch.setattr(restore_threads, "spawn_any", lambda *_: SimpleNamespace(pid=os.getpid()))
     monkeypatch.setattr(restore_threads, "end", lambda child, _: ended.append(child.pid))
-    restoring, stub = SimpleNamespace(_tracee=None, _start_registers=b""), SimpleNamespace(base=1 << 40, run=refuse)
+    stub: Any = SimpleNamespace(base=1 << 40, run=refuse)
+    parent: Any = None
     with pytest.raises(RestoreError):
-        ptrace_restore.ProcessRestore._open_what_is_left(restoring, stub, [Departed(())], ())  # type: ignore[arg-type]
+        restore_threads.open_what_is_left(parent, b"", stub, [Departed(())], ())
     assert ended == [os.getpid()]

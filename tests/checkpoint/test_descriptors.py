@@ -38,7 +38,7 @@ Compiled = Callable[..., Path]
 
 CASES = {
     "event_descriptors": (
-        "eventfd_counter eventfd_semaphore eventfd_full eventfd_many pidfd_self namespaces ended_processes "
+        "eventfd_counter eventfd_semaphore eventfd_full eventfd_many pidfd_self pidfd_thread namespaces ended_processes "
         "ended_directory "
         "timer_relative timer_absolute_monotonic timer_absolute_realtime timer_absolute_boottime timer_periodic timer_unread "
         "timer_disarmed signalfd_waiting "

@@ -129,6 +129,43 @@ def test_a_program_that_is_stopped_stays_so(kind: str, tmp_path: Path) -> None:
         expect_ok(last)
 
 
+ENDED_FOR_SEVERAL = """
+gone = born(signal.pause)
+inherited = os.pidfd_open(gone)
+read_end, write_end = os.pipe()
+
+def work():
+    own = os.pidfd_open(gone)
+    os.write(write_end, b".")
+    wait_for_go()
+    expect("whom the child means", os.fstat(own).st_ino, os.fstat(inherited).st_ino)
+    os.write(write_end, struct.pack("Q", os.fstat(own).st_ino))
+
+child = born(work)
+other = born(signal.pause)
+of_other = os.pidfd_open(other)
+os.read(read_end, 1)
+for one in (gone, other):
+    os.kill(one, signal.SIGKILL)
+    os.waitpid(one, 0)
+is_ready()
+expect_child(child)
+expect("whom both mean", struct.unpack("Q", os.read(read_end, 8))[0], os.fstat(inherited).st_ino)
+expect("that these are two", os.fstat(of_other).st_ino == os.fstat(inherited).st_ino, False)
+for one in (inherited, of_other):
+    try:
+        signal.pidfd_send_signal(one, 0)
+    except ProcessLookupError:
+        continue
+    expect("that it has ended", False, True)
+print("ok", flush=True)
+"""
+
+
+def test_pidfds_of_a_process_that_has_ended_mean_the_same_one_in_all_processes(tmp_path: Path) -> None:
+    goes_through_three_lives(ENDED_FOR_SEVERAL, tmp_path)
+
+
 NAMELESS = """
 import fcntl
 deleted = os.open("deleted", os.O_RDWR | os.O_CREAT)

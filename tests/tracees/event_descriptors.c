@@ -2,6 +2,7 @@
 #include "tracee.h"
 
 #include <poll.h>
+#include <pthread.h>
 #include <sys/epoll.h>
 #include <sys/eventfd.h>
 #include <sys/signalfd.h>
@@ -78,6 +79,35 @@ static void pidfd_self(void) {
     int again = syscall(SYS_pidfd_open, getpid(), 0);
     fstat(self, &before), fstat(again, &after);
     EXPECT(before.st_ino == after.st_ino, "it stands for somebody else");
+}
+
+static pid_t waiter;
+
+static void *await_signal(void *signals) {
+    int number = 0;
+    __atomic_store_n(&waiter, syscall(SYS_gettid), __ATOMIC_SEQ_CST);
+    EXPECT(sigwait(signals, &number) == 0 && number == SIGUSR2, "the thread heard %d", number);
+    return NULL;
+}
+
+static void pidfd_thread(void) {
+    sigset_t signals, pending;
+    pthread_t thread;
+    sigemptyset(&signals), sigaddset(&signals, SIGUSR2), pthread_sigmask(SIG_BLOCK, &signals, NULL);
+    if (pthread_create(&thread, NULL, await_signal, &signals)) cannot("start a thread");
+    while (!__atomic_load_n(&waiter, __ATOMIC_SEQ_CST)) usleep(1000);
+    int of_thread = syscall(SYS_pidfd_open, waiter, O_EXCL | O_NONBLOCK), twin = dup(of_thread);
+    if (of_thread < 0 || twin < 0) cannot("open the pidfd of a thread");
+    wait_here();
+    EXPECT(!is_ready(of_thread), "it has ended");
+    EXPECT_EQUAL("mark", fcntl(of_thread, F_GETFD), FD_CLOEXEC);
+    EXPECT_EQUAL("mark", fcntl(twin, F_GETFD), 0);
+    EXPECT(fcntl(twin, F_GETFL) & O_NONBLOCK, "it waits");
+    EXPECT(syscall(SYS_pidfd_send_signal, twin, SIGUSR2, NULL, 1) == 0, "it takes no signal: %s", strerror(errno));
+    pthread_join(thread, NULL);
+    sigpending(&pending);
+    EXPECT(!sigismember(&pending, SIGUSR2), "the signal came to the process");
+    while (poll(&(struct pollfd){of_thread, POLLIN, 0}, 1, -1) != 1) continue;
 }
 
 /* Children that have ended and were waited for: two pidfds of one, one of another; files of /proc of a third. */
@@ -372,6 +402,7 @@ int main(int count, char **arguments) {
                  {"eventfd_semaphore", eventfd_semaphore},
                  {"eventfd_full", eventfd_full},
                  {"eventfd_many", eventfd_many}, {"pidfd_self", pidfd_self},
+                 {"pidfd_thread", pidfd_thread},
                  {"ended_processes", ended_processes},
                  {"ended_directory", ended_directory},
                  {"namespaces", namespaces},
