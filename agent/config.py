@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from agent.errors import ConfigError
-from agent.hooks import KINDS, check_told
+from agent.hook_kinds import KINDS, check_told
 from checkpoint.device_rules import RULES_MAX, DeviceRule, checked, rule_from
 from checkpoint.engine import is_carriable
 from failover.client import strict_toml

@@ -28,15 +28,13 @@ import logging
 import os
 import secrets
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
+from agent.hook_kinds import Kind
 from agent.units import in_a_unit
 from checkpoint.linux.inheritance import Inheritance
-
-Kind = Literal["before_start", "before_capture", "before_resume", "after_resume"]
-KINDS: Final[tuple[Kind, ...]] = ("before_start", "before_capture", "before_resume", "after_resume")
 
 STARTED: Final = "started"
 CAPTURED: Final = "captured"
@@ -61,35 +59,6 @@ SYSTEMD_S: Final = 2.0
 PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
 log = logging.getLogger("failover.component")
-
-
-SIGNAL: Final = "signal:"
-"""Begins the word that stands in place of a command, see `signal_in`."""
-
-
-def signal_in(command: Sequence[str]) -> int:
-    """The signal by which the program itself is told; 0 where a command is run.
-
-    Raises:
-        ValueError: it names none that a program can handle.
-    """
-    if not command or not command[0].startswith(SIGNAL):
-        return 0
-    number = signal.Signals.__members__.get(command[0].removeprefix(SIGNAL))
-    if len(command) > 1 or number is None or number in (signal.SIGKILL, signal.SIGSTOP):
-        raise ValueError(f"{' '.join(command)!r} names no signal that a program can handle: say {SIGNAL}SIGUSR2, for one")
-    return int(number)
-
-
-def check_told(commands: Mapping[Any, Sequence[str]]) -> None:
-    """Let a signal be a hook where a program can hear it.
-
-    Raises:
-        ValueError: it is none, or meant for another occasion.
-    """
-    for kind, command in commands.items():
-        if signal_in(command) and kind != "after_resume":
-            raise ValueError(f"{kind} = {command[0]!r}: nobody could wait for what its handler does; only after_resume takes one")
 
 
 @dataclass(frozen=True, slots=True)

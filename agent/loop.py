@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final
 
 from agent import ballot as ballot_file
-from agent import clock, door
+from agent import clock, door, kernel
 from agent.beats import BeatLane
 from agent.config import Settings
 from agent.copies import Copies
@@ -138,12 +138,13 @@ class Heart:
         signal.set_wakeup_fd(self._signalled.fileno(), warn_on_full_buffer=False)
         for descriptor in (*self._beats.filenos(), self._persister.fileno(), self._wake.fileno()):
             self._poll.register(descriptor, select.EPOLLIN)
-        self._start_lanes()
+        gc.collect()
+        kernel.give_back()  # before memory is locked: then it would stay
         if self._settings.config.realtime:
             self._notes = clock.become_realtime()
         else:
             self._notes = ("beats run at normal priority, as the configuration says",)
-        gc.collect()
+        self._start_lanes()  # told what was refused
         gc.freeze()
         gc.disable()  # what a turn makes is freed by reference counts; a collection would be a pause of milliseconds
 

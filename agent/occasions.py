@@ -10,7 +10,8 @@ from typing import Final
 from agent import clock, hooks
 from agent.errors import AgentError
 from agent.figures import Figures
-from agent.hooks import Hook, Kind, Occasion
+from agent.hook_kinds import Kind, signal_in
+from agent.hooks import Hook, Occasion
 from agent.surroundings import Surroundings, program_of
 from checkpoint import format
 from failover.core import acts, events
@@ -142,6 +143,6 @@ class Occasions:
 def _signal_in(command: tuple[str, ...]) -> int:
     """Of a command that may have come from another robot: what is no signal is found out when it is run."""
     try:
-        return hooks.signal_in(command)
+        return signal_in(command)
     except ValueError:
         return 0

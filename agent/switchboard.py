@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from agent import config as configuration
-from agent import door
+from agent import door, kernel
 from agent.config import Settings
 from agent.control import ControlServer
 from agent.door import Alive, Ask, Farewell, HearKey, Life, Order, SpeakKey, ToLanes, Told
@@ -142,6 +142,7 @@ class Switchboard:
         self._ways.open()
         server = ControlServer(self._runtime / SOCKET_NAME, self.settings.config.group, self.verbs.table())
         await server.open()
+        kernel.give_back()  # what the start has left
         try:
             await self._end.wait()
         finally:

@@ -28,7 +28,7 @@ from agent.charge import Charge
 from agent.control import Conversation, Verb
 from agent.errands import Order
 from agent.errors import RefusedError
-from agent.hooks import check_told
+from agent.hook_kinds import check_told
 from agent.outflow import Outflow
 from agent.places import Places
 from agent.questions import Lines, Questions

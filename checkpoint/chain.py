@@ -13,10 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-import numpy as np
-from numpy.typing import NDArray
-
 from checkpoint import differences, pages
+from checkpoint.arrays import NDArray, np
 from checkpoint.differences import Rows
 from checkpoint.errors import ChainError
 from checkpoint.gathering import gathered_bytes
@@ -25,8 +23,6 @@ from checkpoint.pages import PageMap, PageTable, Words
 from checkpoint.state import state_digest
 from checkpoint.tree import every_mapping
 from checkpoint.validity import STREAMS, place
-
-NONE: Words = np.empty(0, dtype=np.uint64)
 
 __all__ = ["append", "applied", "check_continues", "check_state", "fold", "position_of", "state_digest"]
 
@@ -160,7 +156,7 @@ def _lay_on(gathered: NDArray[np.uint8], carried: PageMap, layer: _Layer, page_s
 
 def _told_once(sources: PageMap, layers: Sequence[_Layer], page_size: int) -> tuple[PageMap, tuple[PageCopy, ...]]:
     """Pages that lie at different places, and copies of them: those that lie at the same one, and that no layer changes."""
-    changed = np.unique(np.concatenate([NONE, *(layer.addresses for layer in layers)]))
+    changed = np.unique(np.concatenate([np.empty(0, dtype=np.uint64), *(layer.addresses for layer in layers)]))
     own = np.where(np.isin(sources.addresses, changed, assume_unique=True), sources.addresses, np.uint64(0))
     words = np.column_stack((sources.words, own))
     _, firsts, which = np.unique(words, axis=0, return_index=True, return_inverse=True)

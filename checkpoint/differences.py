@@ -9,16 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Final
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Final, TypeAlias
 
 from checkpoint import pages
+from checkpoint.arrays import NDArray, np
 from checkpoint.model import PageRun, Snapshot
 from checkpoint.pages import Buffer, Flags, Words
 
-Rows = NDArray[np.uint8]
+Rows: TypeAlias = "NDArray[np.uint8]"
 """Bytes of pages, one row a page."""
 
 Reference = Callable[[Words], Rows]

@@ -18,12 +18,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import BinaryIO, Protocol
 
-import numpy as np
 import zstandard
 from blake3 import blake3
-from numpy.typing import NDArray
 
 from checkpoint import layout, pages, state
+from checkpoint.arrays import NDArray, np
 from checkpoint.differences import Rows
 from checkpoint.errors import FormatError
 from checkpoint.layout import Codec, FrameHead, Preamble, Section, SectionKind

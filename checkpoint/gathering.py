@@ -6,10 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from checkpoint import pages
+from checkpoint.arrays import NDArray, np
 from checkpoint.pages import Buffer, Flags, PageMap, Words
 
 LONG_COPY: Final = 1 << 18

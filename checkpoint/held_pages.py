@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from checkpoint import format, pages
+from checkpoint.arrays import np
 from checkpoint.differences import Rows
 from checkpoint.errors import ChainError
 from checkpoint.format import Source

@@ -10,9 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
 from checkpoint import differences, pages
+from checkpoint.arrays import np
 from checkpoint.differences import Rows
 from checkpoint.model import Position, Snapshot
 from checkpoint.pages import Flags, PageMap, Words

@@ -12,17 +12,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
-import numpy as np
 import xxhash
-from numpy.typing import NDArray
 
+from checkpoint.arrays import NDArray, np
 from checkpoint.model import PageCopy, PageRun, Vma
 
-Words = NDArray[np.uint64]
+Words: TypeAlias = "NDArray[np.uint64]"
 """Unsigned 64-bit words: addresses (count,), extents (count, 2) or lanes of digests (count, 2)."""
 
-Flags = NDArray[np.bool_]
+Flags: TypeAlias = "NDArray[np.bool_]"
 Buffer = bytes | bytearray | memoryview
 """Bytes of pages, in address order."""
 
@@ -32,7 +32,7 @@ DIGEST_SIZE = 16
 EMPTY_SUM = bytes(DIGEST_SIZE)
 """The page sum of a state that holds no page."""
 
-_LANE = np.dtype("<u8")
+_LANE = "<u8"
 
 DIGESTED = 1024
 """Pages digested at a time: less than a millisecond, after which another thread of a program may run."""

@@ -9,9 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from checkpoint import chain
+from checkpoint.arrays import np
 from checkpoint.differences import Rows, resolved
 from checkpoint.errors import ChainError, FormatError
 from checkpoint.held_pages import pages_at

@@ -18,9 +18,7 @@ from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
+from checkpoint.arrays import NDArray, np
 from checkpoint.errors import SegmentError
 from checkpoint.model import Clocks
 from checkpoint.pages import Words

@@ -12,8 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
-import numpy as np
-
+from checkpoint.arrays import np
 from checkpoint.errors import SegmentBusyError, SegmentError
 from checkpoint.model import Clocks
 from checkpoint.pages import Words

@@ -14,11 +14,9 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
+from checkpoint.arrays import NDArray, np
 from checkpoint.errors import SegmentError
 from checkpoint.segment import (
     BANK_BITS,
@@ -38,7 +36,7 @@ from checkpoint.segment import (
     stretches,
 )
 
-Bytes = NDArray[np.uint8]
+Bytes: TypeAlias = "NDArray[np.uint8]"
 
 NAME: Final = "failover-segment"
 """What /proc/PID/fd and /proc/PID/maps call it."""

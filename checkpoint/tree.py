@@ -11,9 +11,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Final
 
-import numpy as np
-
 from checkpoint import pages
+from checkpoint.arrays import np
 from checkpoint.model import PageCopy, PageRun, Snapshot, Vma
 from checkpoint.pages import Words
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from itertools import pairwise
 
-import numpy as np
-
 from checkpoint import pages
+from checkpoint.arrays import np
 from checkpoint.errors import FormatError
 from checkpoint.layout import MAX_CONTENTS_SIZE
 from checkpoint.model import OutputPiece, PageCopy, PageRun, Position, Snapshot, ThreadState, Vma

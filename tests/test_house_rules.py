@@ -16,7 +16,7 @@ FLOORS = ("checkpoint", "failover", "agent")
 
 PURE_CHECKPOINT = (
     *("errors", "model", "pages", "layout", "state", "validity", "chain", "gathering", "task_channel", "tree", "differences"),
-    "hot_pages",
+    *("hot_pages", "arrays"),
 )
 
 PURE_FILES = (

@@ -29,10 +29,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from checkpoint import carried, pages
+from checkpoint.arrays import NDArray, np
 from checkpoint.chain import position_of
 from checkpoint.engine import COOPERATIVE, CaptureOrder
 from checkpoint.errors import CaptureError, NothingCommittedError, RestoreError, SegmentError, UnsupportedError

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from agent.hooks import STARTED, Hook, Hooks, Occasion, signal_in
+from agent.hook_kinds import signal_in
+from agent.hooks import STARTED, Hook, Hooks, Occasion
 
 PATIENCE_S = 30.0
 STUBBORN = """

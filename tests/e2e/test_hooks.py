@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from agent.hooks import KINDS
+from agent.hook_kinds import KINDS
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_deaths import COUNT

@@ -137,3 +137,10 @@ def test_a_standby_that_falls_silent_leaves_its_primary_unprotected_and_said_so(
     assert "hears nobody" in shown
     before = len(robots.output(first, "count"))
     robots.until(lambda: len(robots.output(first, "count")) > before, "the program to run on")
+
+
+def test_a_heart_without_real_time_priority_says_so_from_the_start(tmp_path: Path) -> None:
+    with robots.two_robots(tmp_path, "realtime = false\n") as (first, _):
+        shown = first.status()
+        assert not shown["realtime"]
+        assert "beats run at normal priority, as the configuration says" in shown["notes"]

@@ -1,0 +1,30 @@
+"""numpy, loaded when it is first used: an agent that holds no snapshot yet does without its 8 MB.
+
+What is imported from here costs nothing more after its first use. Where pages are handled in any case (the keeper), numpy is
+imported as it is.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+else:
+
+    class _Later:
+        """Stands for the module; each name is looked up in it once."""
+
+        def __getattr__(self, name: str) -> Any:
+            import numpy
+
+            found = getattr(numpy, name)
+            setattr(self, name, found)
+            return found
+
+    np = _Later()
+    NDArray = ()
+    """For annotations, which nobody evaluates."""
+
+__all__ = ["NDArray", "np"]
