@@ -1,6 +1,6 @@
 """Measure, side by side with what a user would pick instead; print tables, and write them with the machine's facts.
 
-python -m benchmarks                     all of it, some seven minutes; writes benchmarks/RESULTS.md
+python -m benchmarks                     all of it, some fifteen minutes; writes benchmarks/RESULTS.md
 python -m benchmarks --quick             fewer cases and repetitions, less than 90 seconds; prints only
 python -m benchmarks --quick restore     one of them
 
@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from benchmarks import beside, costs, crowd, encoding, engine, interference, machine, outage, results, task
+from benchmarks import beside, costs, crowd, cuts, encoding, engine, interference, machine, outage, results, task
 from benchmarks.figures import Absent, Findings
 from benchmarks.running import BenchmarkError
 from checkpoint.errors import CheckpointError
@@ -74,6 +74,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "beside": beside.beside,
     "restore": _restore,
     "outage": _outage,
+    "cuts": cuts.cuts,
     "throughput": interference.throughput,
     "costs": costs.costs,
     "beats": interference.beats,

@@ -214,6 +214,9 @@ class Stage:
         settings: str = "",
         interruption: Interruption | None = None,
         cables: Sequence[tuple[str, str]] = CABLES,
+        *,
+        beat_ms: int = BEAT_MS,
+        lease_ms: int = LEASE_MS,
     ) -> None:
         """
         Args:
@@ -222,6 +225,7 @@ class Stage:
             cables: as `CABLES`; beats go over all of them, snapshots over the first.
         """
         self._cables = cables
+        self._pace = f"beat_ms = {beat_ms}\nlease_ms = {lease_ms}\n"
         self.directory = directory
         self._settings = settings
         self.means = allowed
@@ -276,7 +280,7 @@ class Stage:
             f'team_directory = "{directory / "team"}"\n'
             f'state_directory = "{directory / "state"}"\n'
             f'runtime_directory = "{directory / "run"}"\n'
-            f"beat_ms = {BEAT_MS}\nlease_ms = {LEASE_MS}\n{self._settings}"
+            f"{self._pace}{self._settings}"
         )
         command = self.command(name, config)
         if self.means.own_network:

@@ -1,0 +1,36 @@
+"""The phases of a takeover, as the benchmark reads them off a standby's story."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks.cuts import told
+from failover.errors import FailoverError
+
+STORY = [
+    {"at": 99.0, "did": "robot1 was silent for 60 ms on every link (wire): it counts as dead"},
+    {"at": 100.055, "did": "robot1 was silent for 60 ms on every link (wire): it counts as dead"},
+    {"at": 100.055, "did": "robot2 claims epoch 2, to run it from its newest checkpoint: nobody runs it"},
+    {
+        "at": 100.085,
+        "did": "it acts again 85.0 ms after the last word of the robot that ran it: silence 60.5 ms, asking and clearing away "
+        "0.5 ms, opening 3 snapshots 0.5 ms, its descriptors, timers and registers 7.0 ms, letting it go 18.0 ms",
+    },
+]
+
+
+def test_the_phases_add_up_and_what_was_before_the_cut_does_not_count() -> None:
+    cut = told(STORY, 100.0, 100.075)
+    assert cut.whole == pytest.approx(75)
+    assert cut.phases == pytest.approx((55, 4, 16), abs=0.01)
+    assert cut.stages == {
+        "asking and clearing away": 0.5,
+        "opening the snapshots": 0.5,
+        "its descriptors, timers and registers": 7.0,
+        "letting it go": 18.0,
+    }
+
+
+def test_a_story_without_a_takeover_is_no_figure() -> None:
+    with pytest.raises(FailoverError, match="no takeover"):
+        told(STORY[:3], 100.0, 100.075)
