@@ -153,7 +153,11 @@ def relocated(state: Snapshot, places: Mapping[str, str]) -> Snapshot:
 
     return replace(
         state,
-        process=replace(state.process, working_directory=here(state.process.working_directory)),
+        process=replace(
+            state.process,
+            working_directory=here(state.process.working_directory),
+            root_directory=here(state.process.root_directory),
+        ),
         vmas=tuple(
             replace(vma, name=here(vma.name), file=replace(vma.file, path=here(vma.file.path))) if vma.file is not None else vma
             for vma in state.vmas

@@ -73,7 +73,7 @@ def is_of_the_system(path: str) -> bool:
 
 
 def _seen(pid: int, path: str) -> str:
-    return f"/proc/{pid}/root{path}"
+    return f"{procfs.outlook(pid)}{path}"
 
 
 def _listed(pid: int, arguments: Sequence[str], directory: str) -> tuple[str, Iterator[str]]:
@@ -125,7 +125,7 @@ def _package(pid: int, folder: str) -> Iterator[str]:
     count = 0
     for place, folders, names in os.walk(_seen(pid, folder)):
         folders[:] = sorted(one for one in folders if one != CACHE and not one.startswith("."))
-        below = place.removeprefix(f"/proc/{pid}/root")
+        below = place.removeprefix(procfs.outlook(pid))
         for name in sorted(names):
             if stat.S_ISREG(os.lstat(f"{place}/{name}").st_mode):
                 yield f"{below}/{name}"

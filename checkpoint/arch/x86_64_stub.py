@@ -99,6 +99,7 @@ SYSTEM_CALLS: Final = {
     "bind": 49,
     "capset": 126,
     "chdir": 80,
+    "chroot": 161,
     "clone3": 435,
     "close": 3,
     "connect": 42,

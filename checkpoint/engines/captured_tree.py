@@ -488,7 +488,9 @@ def _told_of(process: CapturedProcess, look: Look, seen: SeenOthers, around: Sur
     """
     held = sorted_into_kinds(look.standing.opened, around)
     named = f"its process {process.pid} ({look.standing.status.name})"
-    reasons = [*held.reasons, *process.reasons(look, seen.pids), *_of_namespaces(process.pid, seen)]
+    shared = _joint(look, seen)
+    refused = joint.refuse(shared, process.pid)
+    reasons = [*held.reasons, *process.reasons(look, seen.pids), *refused, *_of_namespaces(process.pid, seen)]
     return SeenProcess(
         captured=process,
         look=look,
@@ -496,7 +498,7 @@ def _told_of(process: CapturedProcess, look: Look, seen: SeenOthers, around: Sur
         threads=process.thread_states(look),
         vmas=process.mappings(look, is_kin=True),
         held=held,
-        unopened=(*process.unopened(look), *_joint(look, seen), *stops.describe(stopped_by, look.standing.stat.exit_code)),
+        unopened=(*process.unopened(look), *shared, *stops.describe(stopped_by, look.standing.stat.exit_code)),
         reasons=tuple(f"{named}: {reason}" for reason in reasons),
     )
 

@@ -100,7 +100,7 @@ class Identities:
 
     def _place(self, line: MapsLine) -> str:
         """Where the very file that is mapped is read: its name may lead elsewhere by now, to what we may read and it may not."""
-        named = f"/proc/{self._pid}/root{line.name}"
+        named = f"{procfs.outlook(self._pid)}{line.name}"
         with contextlib.suppress(OSError):  # it is gone, or closed to us
             about = os.stat(named)
             if (about.st_dev, about.st_ino) == (line.device, line.inode):
@@ -144,7 +144,7 @@ class Identities:
             known = self._known.get(_key(line))
             if known is not None and known.digest == digest:
                 yield f"/proc/{self._pid}/map_files/{line.start:x}-{line.end:x}"
-        yield f"/proc/{self._pid}/root{path}"
+        yield f"{procfs.outlook(self._pid)}{path}"
 
     def _identity(self, path: str, through: str, deleted: bool, *, is_memory: bool = False) -> FileIdentity:
         try:

@@ -14,6 +14,17 @@ CAPABILITIES: Final = (
     ),
     preserved(
         Area.PROCESS,
+        "a root directory of its own (chroot)",
+        "entered again, by who may (CAP_SYS_CHROOT); the directory must be there",
+    ),
+    refused(
+        Area.THERE,
+        "a root directory of its own (chroot), without CAP_SYS_CHROOT",
+        "restore it as root, or in a user namespace (`failover run`)",
+        "and to enter it takes CAP_SYS_CHROOT",
+    ),
+    preserved(
+        Area.PROCESS,
         "signals: actions, masks, what is pending, alternate stacks",
         "as they were; how often a timer went off while its signal was pending is lost",
     ),

@@ -524,6 +524,7 @@ class ProcessRestore:
         restore_process.scheduling(table, thread, vessel)
         deadlines.rebuild(table, state.resources, thread.tid, bool(thread.policy & os.SCHED_RESET_ON_FORK))
         self.notes += restore_process.limits(table, process, vessel)
+        restore_process.enter_root(table, process, vessel)
         self._confine(table, thread, process.credentials)
         self.notes += restore_process.rights(table, process, vessel)
         restore_process.pending_signals(table, process, vessel.inner_pid)

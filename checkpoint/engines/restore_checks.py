@@ -77,10 +77,10 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.THERE,
-        "a directory in which the program works is missing",
+        "the directory in which the program works, or its root directory, is missing",
         "make it",
         "its working directory {} is missing",
-        "its root directory is",
+        "its root directory {} is missing",
     ),
     refused(
         Area.THERE,
@@ -186,8 +186,8 @@ def _of_machine(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
     yield from aio_rings.mismatches(state.vmas)
     if any(vma.guards for vma in state.vmas) and not can_install_guards():
         yield f"it has guard pages of madvise(2), which our kernel ({here.kernel}) does not know: boot Linux 6.13 or later"
-    if state.process.root_directory != "/":
-        yield f"its root directory is {state.process.root_directory}: programs in a chroot are not supported"
+    if not os.path.isdir(state.process.root_directory):
+        yield f"its root directory {state.process.root_directory} is missing: make it"
     directory = state.process.working_directory
     is_made = directory in options.accept_changed or (options.contents and missing_directories(state))
     if not (os.path.isdir(directory) or procfs.is_gone(directory) or is_made):

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from checkpoint.errors import RestoreError
+from checkpoint.errors import MismatchError, RestoreError
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.call_table import AT_FDCWD, CallTable
 from checkpoint.model import Credentials, IntervalTimer, PosixTimer, ProcessState, SignalAction, ThreadState
@@ -57,6 +57,7 @@ RAISED_LIMITS: Final = (1, 2, 7, 8, 9)
 CAP_SETGID: Final = 6
 CAP_SETUID: Final = 7
 CAP_SETPCAP: Final = 8
+CAP_SYS_CHROOT: Final = 18
 CAP_SYS_ADMIN: Final = 21
 CAP_SYS_RESOURCE: Final = 24
 CAP_CHECKPOINT_RESTORE: Final = 40
@@ -327,6 +328,21 @@ def enter_directory(table: CallTable, directory: str, opened: int | None) -> Non
         table.close(made)
     else:
         table.call(f"enter the working directory {directory}", "chdir", table.place_path(directory))
+
+
+def enter_root(table: CallTable, process: ProcessState, vessel: Vessel) -> None:
+    """Have the program see the root directory that it had (chroot): after all that is opened by our paths, with its rights left.
+
+    Raises:
+        MismatchError: the vessel may not.
+    """
+    root = process.root_directory
+    if root == "/":
+        return
+    if not vessel.may(CAP_SYS_CHROOT):
+        reason = f"its root directory is {root}, and to enter it takes CAP_SYS_CHROOT: restore it as root"
+        raise MismatchError(reason, (reason,))
+    table.call(f"make {root} its root directory", "chroot", table.place_path(root))
 
 
 def surroundings(table: CallTable, process: ProcessState) -> None:

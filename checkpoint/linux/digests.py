@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from checkpoint import pages
-from checkpoint.linux import abi
+from checkpoint.linux import abi, procfs
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.pagetables import existence
 from checkpoint.linux.procfs import MapsLine
@@ -181,7 +181,7 @@ class SharedPages:
         with contextlib.suppress(OSError):  # root alone may look there
             return os.open(f"/proc/{self._pid}/map_files/{line.start:x}-{line.end:x}", os.O_RDONLY | os.O_CLOEXEC)
         with contextlib.suppress(OSError):  # it has no name any more
-            file = os.open(f"/proc/{self._pid}/root{line.name}", os.O_RDONLY | os.O_CLOEXEC)
+            file = os.open(f"{procfs.outlook(self._pid)}{line.name}", os.O_RDONLY | os.O_CLOEXEC)
             about = os.fstat(file)
             if (about.st_dev, about.st_ino) == (line.device, line.inode):
                 return file

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
-from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
+
+from checkpoint.errors import ProbeError, ProcessGoneError
+from checkpoint.linux import procfs
 
 NETWORK_TYPES: Final = frozenset(
     ("nfs", "nfs4", "cifs", "smb3", "smbfs", "9p", "ceph", "afs", "coda", "lustre", "glusterfs", "ocfs2", "gfs2", "beegfs")
@@ -42,14 +45,39 @@ def _type_at(mounts: list[tuple[str, str]], path: str) -> str:
 
 def _mounts(pid: int) -> list[tuple[str, str]]:
     """(mount point, type) of each mount, oldest first."""
+    return [(one.point, one.kind) for one in mounts_of(pid)]
+
+
+class Mount(NamedTuple):
+    """A mount: its number, ``major:minor`` of its device, its path and the type of its file system."""
+
+    number: str
+    device: str
+    point: str
+    kind: str
+
+
+def mounts_of(pid: int) -> list[Mount]:
+    """Each mount that a process sees, oldest first; nothing of one that is gone.
+
+    Of one with a root directory of its own (chroot) the kernel tells what lies below that, and from there: then ours count, if it
+    lives among them.
+    """
+    root = ""
+    with contextlib.suppress(OSError):  # not ours to look at: then what it sees counts
+        root = os.readlink(f"/proc/{pid}/root").rstrip("/")
+        if root and os.readlink(f"/proc/{pid}/ns/mnt") == os.readlink("/proc/self/ns/mnt"):
+            pid, root = os.getpid(), ""
     try:
-        lines = Path(f"/proc/{pid}/mountinfo").read_bytes().split(b"\n")
-    except OSError:
+        lines = procfs.read_bytes(pid, "mountinfo").split(b"\n")
+    except (ProbeError, ProcessGoneError):
         return []
     found = []
     for line in filter(None, lines):
         before, _, after = line.partition(b" - ")
-        found.append((unescaped(before.split(b" ")[4]), os.fsdecode(after.split(b" ")[0])))
+        words = before.split(b" ")
+        point, kind = (root + unescaped(words[4])).rstrip("/") or "/", os.fsdecode(after.split(b" ")[0])
+        found.append(Mount(os.fsdecode(words[0]), os.fsdecode(words[2]), point, kind))
     return found
 
 

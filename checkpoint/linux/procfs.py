@@ -129,6 +129,20 @@ def read_link(pid: int, name: str) -> str:
         ) from error
 
 
+def outlook(pid: int) -> str:
+    """What to put before an absolute path that the kernel tells of a process, so that we find there what it finds.
+
+    The kernel tells paths from the root of the mount namespace, also of a process that has another root directory (chroot).
+    Of a process that is gone, or not ours to look at, the answer leads nowhere.
+
+    Source: d_path() in fs/d_path.c; path_resolution(7): ".." is held back at our own root directory only.
+    """
+    root = f"/proc/{pid}/root"
+    with contextlib.suppress(OSError):
+        return root + "/.." * len([name for name in os.readlink(root).split("/") if name])
+    return root
+
+
 # Mappings
 
 

@@ -168,7 +168,7 @@ class CarriedTrees:
     def __post_init__(self) -> None:
         """Raises CaptureError: the process has gone."""
         try:
-            self._root = os.open(f"/proc/{self.pid}/root", os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+            self._root = os.open(procfs.outlook(self.pid), os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
         except OSError as error:
             raise CaptureError(f"cannot look at the files of pid {self.pid}: {error.strerror}") from error
 

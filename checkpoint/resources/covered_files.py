@@ -103,7 +103,7 @@ def _found(held: OpenFile) -> tuple[str, bytes] | None:
         return None
     size = int.from_bytes(handle.raw[:4], "little")
     told = handle.raw[: 8 + size]
-    with _opened(f"/proc/{held.pid}/root{mounted}", told) as place:
+    with _opened(f"{procfs.outlook(held.pid)}{mounted}", told) as place:
         if place and os.stat(place).st_ino == held.first.inode and os.readlink(place) == held.first.target:
             return mounted, told
     return None
@@ -111,11 +111,7 @@ def _found(held: OpenFile) -> tuple[str, bytes] | None:
 
 def _mount_point(pid: int, number: str) -> str:
     """Where the mount with a number of mountinfo lies; "" where the process has none such."""
-    for line in procfs.read_bytes(pid, "mountinfo").split(b"\n"):
-        words = line.split(b" ")
-        if words[0] == number.encode() and len(words) > 4:
-            return mounts.unescaped(words[4])
-    return ""
+    return next((one.point for one in mounts.mounts_of(pid) if one.number == number), "")
 
 
 @contextlib.contextmanager

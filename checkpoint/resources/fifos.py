@@ -131,7 +131,7 @@ def _is_nameless(held: OpenFile) -> bool:
 
 def _leads_there(held: OpenFile) -> bool:
     try:
-        about = os.stat(f"/proc/{held.pid}/root{held.first.target}")
+        about = os.stat(f"{procfs.outlook(held.pid)}{held.first.target}")
     except OSError:
         return False
     return (about.st_dev, about.st_ino) == (held.first.device, held.first.inode)

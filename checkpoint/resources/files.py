@@ -184,7 +184,7 @@ def _above(path: str) -> Iterator[str]:
 
 def _entry_of(held: OpenFile, directory: str) -> str:
     try:
-        with os.scandir(f"/proc/{held.pid}/root{directory}") as entries:
+        with os.scandir(f"{procfs.outlook(held.pid)}{directory}") as entries:
             for entry in islice(entries, ENTRIES_MAX):
                 if entry.inode() == held.first.inode and entry.stat(follow_symlinks=False).st_dev == held.first.device:
                     return os.path.join(directory, entry.name)
@@ -205,7 +205,7 @@ def _is_or_was_found(held: OpenFile) -> bool:
 def is_found(held: OpenFile) -> bool:
     """Whether its path leads to it, as the process sees paths."""
     try:
-        about = os.stat(f"/proc/{held.pid}/root{held.first.target}", follow_symlinks=not held.first.flags & O_PATH)
+        about = os.stat(f"{procfs.outlook(held.pid)}{held.first.target}", follow_symlinks=not held.first.flags & O_PATH)
     except OSError:
         return False
     return (about.st_dev, about.st_ino) == (held.first.device, held.first.inode)
@@ -228,7 +228,7 @@ def _has_just_lost_its_name(held: OpenFile) -> bool:
 def _was_found(held: OpenFile) -> bool:
     """Whether a deleted file lies on the file system of the directory where its name was; a message queue does not."""
     try:
-        about = os.stat(f"/proc/{held.pid}/root{os.path.dirname(held.first.target)}")
+        about = os.stat(f"{procfs.outlook(held.pid)}{os.path.dirname(held.first.target)}")
     except OSError:
         return True  # the directory has gone too; the content is what counts
     return about.st_dev == held.first.device

@@ -9,13 +9,13 @@ Source: clone(2), kcmp(2).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Final
 
-from checkpoint.capability import Area, preserved
+from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import ProcessGoneError
-from checkpoint.linux import abi
+from checkpoint.linux import abi, procfs
 from checkpoint.model import Resource, Snapshot
 from checkpoint.resources.rebuilding import number_of
 
@@ -27,6 +27,12 @@ CAPABILITIES: Final = (
         Area.PROCESS,
         "processes that share their table of descriptors, or directories and umask, with their parent (clone(2))",
         "they share them again; record locks of such a table are those of the parent",
+    ),
+    refused(
+        Area.PROCESS,
+        "a root directory (chroot) that two processes share by CLONE_FS",
+        "have the child make it its own (unshare), or run it without the chroot",
+        "it has its directories in common with its parent",
     ),
 )
 _KINDS: Final = ((abi.KCMP_FILES, CLONE_FILES), (abi.KCMP_FS, CLONE_FS))
@@ -45,6 +51,18 @@ def describe(pid: int, parent: int) -> tuple[Resource, ...]:
             raise ProcessGoneError(f"process {pid} or its parent {parent} has ended")
         flags |= flag if order == 0 else 0
     return (Resource(KIND, "shared with its parent", {"descriptors": [], "flags": flags}),) if flags else ()
+
+
+def refuse(shared: Iterable[Resource], pid: int) -> Iterator[str]:
+    """Why what it shares with its parent cannot be kept: who enters a root directory first
+    takes the other along, which still opens files.
+
+    Raises:
+        ProcessGoneError: it has ended.
+    """
+    root = procfs.read_link(pid, "root")
+    if root != "/" and flags_of(shared) & CLONE_FS:
+        yield f"it has its directories in common with its parent, in the root directory {root} (chroot), which is not kept yet"
 
 
 def flags_of(resources: Iterable[Resource]) -> int:

@@ -108,7 +108,7 @@ def _path_of(held: OpenFile) -> str:
 
 def _has_ended(held: OpenFile, number: str) -> bool:
     """Whether a process of whom it has a file is no more: others may have got its number, but the file's name is gone then."""
-    place = f"/proc/{held.pid}/root/proc"
+    place = f"{procfs.outlook(held.pid)}/proc"
     is_named = not held.first.target.endswith(procfs.DELETED) and os.path.exists(f"{place}/{number}")
     return not is_named and os.path.exists(f"{place}/self")
 

@@ -261,7 +261,7 @@ def rebuild_last(table: CallTable, state: Snapshot, inner_pid: int) -> None:
         locks.settle(table, held, first, inner_pid)
         signalling.settle(table, first, held)
         if held.kind == watches.KIND:
-            watches.settle(table, held, first)
+            watches.settle(table, held, first, state.process.root_directory)
 
 
 def descriptors_of(state: Snapshot) -> list[Wanted]:

@@ -218,7 +218,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
 def _other_opener(held: OpenFile, number: int) -> int | None:
     """Another process that has the slave open; terminals of other mounts (devpts) have the same names."""
     try:
-        about = os.stat(f"/proc/{held.pid}/root/dev/pts/{number}")
+        about = os.stat(f"{procfs.outlook(held.pid)}/dev/pts/{number}")
     except OSError:
         return None
     name = held.first.target if held.observed["end"] == SLAVE else f"/dev/pts/{number}"
@@ -335,7 +335,7 @@ class _Work:
 
 def _numbers_in_use(pid: int) -> Iterator[int]:
     with contextlib.suppress(OSError):
-        yield from (int(name) for name in os.listdir(f"/proc/{pid}/root/dev/pts") if name.isdigit())
+        yield from (int(name) for name in os.listdir(f"{procfs.outlook(pid)}/dev/pts") if name.isdigit())
 
 
 @dataclass(frozen=True, slots=True)

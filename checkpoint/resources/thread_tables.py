@@ -168,6 +168,8 @@ def _look_at(pid: int, tid: int, kinds: Own) -> tuple[list[Fact], list[str]]:
 def _against_directory(pid: int, tid: int, directory: str, named: str) -> Iterator[str]:
     if procfs.read_link(pid, f"task/{tid}/root") != procfs.read_link(pid, "root"):
         yield f"{named} has a root directory of its own, which is not kept yet"
+    elif procfs.read_link(pid, "root") != "/":
+        yield f"{named} has a root directory of its own, if the same one (chroot): that is not kept yet"
     if procfs.is_gone(directory):
         yield f"{named} has a working directory of its own that was deleted, which is not kept yet"
     if directory.startswith("/proc/"):

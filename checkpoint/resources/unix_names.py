@@ -5,7 +5,8 @@ its predecessor has left is replaced, one that somebody listens to is not. A soc
 its file removed again; where it was bound by a relative name, in a directory that is made for it.
 
 Facts of unix sockets that are told here: ``path`` of its name, "" if that is no file's; ``mode`` and ``file_owner`` of that file,
-mode -1 if it is gone; ``directory`` in which it was bound by a relative name, "" if it was not, or if that is the program's own.
+mode -1 if it is gone; ``directory`` in which it was bound by a relative name, "" if it was not, or if that is the program's own;
+``root``: the root directory from which its whole name leads, "" for the machine's.
 
 Source: unix(7), bind(2).
 """
@@ -64,13 +65,13 @@ def observe(held: OpenFile, looked: socket.socket, name: bytes) -> dict[str, Fac
         name: as the kernel tells it, in full.
     """
     if not name or name[:1] == b"\0":
-        return {"path": "", "mode": GONE, "file_owner": [], "directory": ""}
+        return {"path": "", "mode": GONE, "file_owner": [], "directory": "", "root": ""}
     told = os.fsdecode(name.rstrip(b"\0"))
-    working = procfs.read_link(held.pid, "cwd")
+    working, root = procfs.read_link(held.pid, "cwd"), procfs.read_link(held.pid, "root").rstrip("/")
     opened = bound_file(looked)
     if opened is None:  # we may not ask the socket: then the name counts, as the program would look for it now
-        path = os.path.join(working, told)
-        about = _socket_at(f"/proc/{held.pid}/root{path}")
+        path = root + told if os.path.isabs(told) else os.path.join(working, told)
+        about = _socket_at(f"{procfs.outlook(held.pid)}{path}")
     else:
         try:
             path, about = os.readlink(f"/proc/self/fd/{opened}"), os.fstat(opened)
@@ -79,7 +80,13 @@ def observe(held: OpenFile, looked: socket.socket, name: bytes) -> dict[str, Fac
         path = path.removesuffix(DELETED) if not about.st_nlink else path
     mode, owner = (GONE, []) if about is None or not about.st_nlink else (about.st_mode, [about.st_uid, about.st_gid])
     directory = "" if os.path.isabs(told) else os.path.normpath(path).removesuffix(f"/{os.path.normpath(told)}") or "/"
-    return {"path": path, "mode": mode, "file_owner": list(owner), "directory": "" if directory == working else directory}
+    return {
+        "path": path,
+        "mode": mode,
+        "file_owner": list(owner),
+        "directory": "" if directory == working else directory,
+        "root": root if path == root + told else "",
+    }
 
 
 def _socket_at(path: str) -> os.stat_result | None:
@@ -97,7 +104,7 @@ def refuse(held: OpenFile) -> str | None:
         return None
     if seen["directory"] and ".." in told.split("/"):
         return f"{held.name} is a unix socket with a name ({told}) from a directory that it has left: let it bind a whole path"
-    if seen["mode"] == GONE and os.path.isabs(told) and _is_something_else(f"/proc/{held.pid}/root{path}"):
+    if seen["mode"] == GONE and os.path.isabs(told) and _is_something_else(f"{procfs.outlook(held.pid)}{path}"):
         return f"{held.name} is a unix socket whose name is something else by now ({path}): let the program bind another one"
     return None
 
@@ -234,7 +241,8 @@ class Naming:
         table, path, directory = self._table, str(one.facts["path"]), str(one.facts.get("directory", ""))
         place = table.place_path(path)
         table.attempt("", "unlinkat", AT_FDCWD, place, 0)
-        with self._inside(directory):
+        root = _root_of(one)
+        with self._inside(directory), self._below(root):
             self._bind(one, made)
         made_file = table.open(path, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC)  # a link may have taken its place meanwhile
         owner = one.facts.get("file_owner")
@@ -245,7 +253,7 @@ class Naming:
         again = table.place_path(f"/proc/self/fd/{made_file}")
         table.call(f"set the mode of {path}", "fchmodat", AT_FDCWD, again, number_of(one.facts["mode"]) & 0o7777)
         table.close(made_file)
-        if directory:
+        if directory or root:
             self._keep(one, path)
 
     def _bind_ghost(self, one: Resource, made: int) -> None:
@@ -254,13 +262,13 @@ class Naming:
         root = "" if os.path.isabs(told) else tempfile.mkdtemp(prefix="failover-socket-")
         if root:
             os.rmdir(root)  # its name is ours: the vessel makes it, with its program's rights
-        directories = _missing([root] if root else [], os.path.dirname(os.path.join(root, told)))
+        path = os.path.join(root, told) if root else _root_of(one) + told
+        directories = _missing([root] if root else [], os.path.dirname(path))
         for directory in directories:
             table.call(f"make the directory {directory}", "mkdirat", AT_FDCWD, table.place_path(directory), 0o700)
-        path = os.path.join(root, told)
         if not root:
             table.attempt("", "unlinkat", AT_FDCWD, table.place_path(path), 0)
-        with self._inside(root):
+        with self._inside(root), self._below(_root_of(one)):
             self._bind(one, made)
         self._keep(one, path)
         table.call(f"unlink {path}", "unlinkat", AT_FDCWD, table.place_path(path), 0)
@@ -276,6 +284,27 @@ class Naming:
         yield
         if directory:
             table.call(f"enter {self._working}", "chdir", table.place_path(self._working))
+
+    @contextlib.contextmanager
+    def _below(self, root: str) -> Iterator[None]:
+        """Have the vessel see a root directory for the body, "" for its own; it works in the same directory meanwhile."""
+        table = self._table
+        if not root:
+            yield
+            return
+        whole, here = (table.open(path, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC) for path in ("/", "."))
+        table.call(f"make {root} the root directory for a while", "chroot", table.place_path(root))
+        yield
+        table.call("leave the root directory", "fchdir", whole)
+        table.call("leave the root directory", "chroot", table.place_path("."))
+        table.call("enter the working directory again", "fchdir", here)
+        table.close(whole)
+        table.close(here)
+
+
+def _root_of(one: Resource) -> str:
+    """From where its whole name leads; snapshots of before do not tell."""
+    return str(one.facts.get("root", ""))
 
 
 def packed(name: bytes) -> bytes:

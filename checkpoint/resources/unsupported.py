@@ -87,10 +87,10 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.PROCESS,
-        "a working directory of /sys that is gone, a root directory of its own (chroot)",
-        "change the directory; run it without the chroot",
+        "a working directory of /sys, or a root directory of its own (chroot), that is gone",
+        "change the directory; run it in one that stays",
         "its working directory",
-        "its root directory is",
+        "its root directory",
     ),
     refused(
         Area.PROCESS,
@@ -330,8 +330,8 @@ def _refuse_places(pid: int) -> Iterator[str]:
     if procfs.is_gone(directory) and is_kernels:
         yield f"its working directory {directory} is gone: let it change to another one"
     root = procfs.read_link(pid, "root")
-    if root != "/":
-        yield f"its root directory is {root}: a program in a chroot is not kept yet; run it without"
+    if procfs.is_gone(root):
+        yield f"its root directory {root} is gone: run it in one that stays"
 
 
 def _refuse_namespaces(pid: int) -> Iterator[str]:

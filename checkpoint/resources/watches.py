@@ -23,7 +23,7 @@ from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError
-from checkpoint.linux import procfs
+from checkpoint.linux import mounts, procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.descriptors import copy_of
 from checkpoint.model import Fact, Resource
@@ -46,9 +46,10 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.PIPES,
-        "an inotify watch of a file without a name that is not open, or the ten thousandth",
+        "an inotify watch of a file without a name that is not open, or outside its root directory, or the ten thousandth",
         "remove the watch, or open another instance",
         "is of a file that no path leads to",
+        "outside its root directory",
         "whose watch has number",
     ),
     refused(Area.THERE, "what the program watches (inotify) is missing", "make it", "which the program watches by"),
@@ -122,7 +123,14 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
             return f"{what} whose watch {number} is of a file that no path leads to: let the program remove that watch"
         if number > NUMBER_MAX:
             return f"{what} whose watch has number {number}; the limit is {NUMBER_MAX}: let the program open another instance"
+        if not _is_below(procfs.read_link(held.pid, "root"), path):
+            return f"{what} whose watch {number} is of {path}, outside its root directory: let the program remove that watch"
     return elsewhere.refuse(held, "an inotify instance")
+
+
+def _is_below(root: str, path: str) -> bool:
+    """Whether a program with this root directory has a name for a path of ours."""
+    return root == "/" or path.startswith(root + "/")
 
 
 def _watches(held: OpenFile) -> Iterator[tuple[int, str, int]]:
@@ -163,7 +171,7 @@ def _known_path(pid: int, device: int, inode: int, kind: int, handle: str) -> st
     major_minor = _kernels(device)
     for path in (*_by_handle(pid, major_minor, kind, bytes.fromhex(handle)), *_near(pid)):
         try:
-            about = os.lstat(f"/proc/{pid}/root{path}")
+            about = os.lstat(f"{procfs.outlook(pid)}{path}")
         except OSError:
             continue
         if about.st_ino == inode and _major_minor(about.st_dev) == major_minor:
@@ -184,13 +192,9 @@ def _near(pid: int) -> Iterator[str]:
 def _by_handle(pid: int, device: str, kind: int, handle: bytes) -> Iterator[str]:
     """Paths that a file handle leads to; nothing where the file system has none, or we lack CAP_DAC_READ_SEARCH."""
     packed = len(handle).to_bytes(4, "little") + kind.to_bytes(4, "little") + handle
-    for line in procfs.read_text(pid, "mountinfo").splitlines():
-        words = line.split()
-        if words[2] != device:
-            continue
-        mounted = words[4].encode().decode("unicode_escape")
+    for place in (one.point for one in mounts.mounts_of(pid) if one.device == device):
         try:
-            mount = os.open(f"/proc/{pid}/root{mounted}", os.O_RDONLY | os.O_CLOEXEC)
+            mount = os.open(f"{procfs.outlook(pid)}{place}", os.O_RDONLY | os.O_CLOEXEC)
         except OSError:
             continue
         try:
@@ -224,11 +228,15 @@ def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     )
 
 
-def settle(table: CallTable, held: Resource, descriptor: int) -> None:
-    """Add its watches under their numbers; those in between are added and removed, and the word about that is read away."""
+def settle(table: CallTable, held: Resource, descriptor: int, root: str) -> None:
+    """Add its watches under their numbers; those in between are added and removed, and the word about that is read away.
+
+    Args:
+        root: the program's root directory, which it has by now.
+    """
     last, unread, buffer = 0, 0, 0
     for number, path, mask in _listed(held):
-        place, what = table.place_path(path), f"watch {path} by {held.name}"
+        place, what = table.place_path(path if root == "/" else path.removeprefix(root)), f"watch {path} by {held.name}"
         for between in range(last + 1, number):
             buffer = buffer or table.place(bytes(EVENT_SIZE * EVENTS_AT_ONCE))
             table.call(what, "inotify_add_watch", descriptor, place, IN_DELETE_SELF, least=between, most=between)

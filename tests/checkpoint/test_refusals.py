@@ -66,7 +66,6 @@ REFUSED = {
     "proc_file": "/proc",
     "kernel_switch": "for writing",
     "secret_memory": "secret",
-    "root": "root",
     "own_namespace": "namespace",
     "namespace_of_children": "its children are to live in a pid namespace",
     "owner_group": "process group",

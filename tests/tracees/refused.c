@@ -339,12 +339,6 @@ static void take_no_vdso(void) {
     if (!end || munmap((void *)start, end - start)) cannot("unmap the vdso");
 }
 
-static void take_root(void) {
-    mkdir("jail", 0700);
-    if (chroot("jail")) cannot("change the root");
-    go = "go"; /* the working directory stays outside */
-}
-
 static void take_traced_child(void) {
     child = fork();
     if (child == 0) {
@@ -426,7 +420,6 @@ static const struct kind {
              {"memory_file", take_memory_file},
               {"no_vdso", take_no_vdso},
              {"user_dispatch", take_user_dispatch},
-             {"root", take_root},
              {"own_namespace", take_own_namespace},
              {"owner_group", take_owner_group},
              {"directory_notice", take_directory_notice}};
