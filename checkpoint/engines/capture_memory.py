@@ -7,17 +7,21 @@ reads what was named since. A page's newest copy is its content.
 
 What a scan has found is remembered until a snapshot that holds it is acknowledged, whoever scanned and whatever became of the
 capture: its protection is renewed, so that nobody else will name it.
+
+While the program stands still sets of pages are worked with as little as can be: each step takes tens of µs.
+What is still to be copied is known before (`RunningCopy.owed`), and what a snapshot carries is worked out afterwards
+(`checkpoint.engines.taken_memory`).
 """
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
-from checkpoint import gathering, pages
+from checkpoint import pages
+from checkpoint.engines.taken_memory import Taken, Unacknowledged, joined, since, with_one_tail
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.gathering import Copy
 from checkpoint.linux import abi, digests, pagetables, tracking
@@ -33,8 +37,10 @@ from checkpoint.resources import aio_rings
 
 BUFFER_SIZE: Final = 8 << 20
 """Bytes that a freeze may copy without asking for memory first."""
+WORTH_COUNT: Final = 16
+"""Pages that are worth the first pass of a delta while the program runs."""
 LARGE_COUNT: Final = 256
-"""Pages that are worth a pass while the program runs: they take 0.4 ms to copy, as long as everything else about them."""
+"""Pages that are worth another pass: they take 0.4 ms to copy, as long as everything else about them."""
 PASS_LIMIT: Final = 3
 """Passes after the first: a program that writes faster than we copy is not caught up with by more of them."""
 VDSO: Final = "[vdso]"
@@ -56,15 +62,6 @@ def _is_within(line: MapsLine, places: SharedPlaces) -> bool:
     return any(place[:2] == (device, inode) and place[2] <= first and last <= place[3] for place in places)
 
 
-@dataclass(frozen=True, slots=True)
-class Unacknowledged:
-    """What one scan found, kept until a position that holds it is acknowledged."""
-
-    position: Position | None
-    written: Words
-    cleared: Words
-
-
 @dataclass(slots=True)
 class RunningCopy:
     """What was copied while the program ran.
@@ -72,10 +69,12 @@ class RunningCopy:
     Attributes:
         copies: oldest first; of a page that several have, the newest counts.
         valid: the pages of ``copies`` that no later scan has named.
+        owed: what the snapshot would carry besides, by what was known when the last pass was over.
     """
 
     copies: list[Copy] = field(default_factory=list)
     valid: Words = field(default_factory=lambda: NONE)
+    owed: Words = field(default_factory=lambda: NONE)
 
     def add(self, copy: Copy) -> None:
         """Take in what was read since the last scan."""
@@ -87,46 +86,11 @@ class RunningCopy:
         self.valid = pages.difference(pages.difference(self.valid, scan.written), scan.cleared)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Taken:
-    """The memory of one capture, when the program stood still.
-
-    Attributes:
-        lines: the mappings.
-        carried: pages that the snapshot must tell of; each is in one of ``copies`` at least.
-        cleared: pages whose earlier content is forgotten, relative to the acknowledged position; ``carried`` comes on top.
-        guards: see ``checkpoint.model.Vma.guards``.
-        copies: oldest first; the last one was made while the program stood still, in a buffer that the next one uses again.
-        untouched: see `checkpoint.resources.untouched`.
-    """
-
-    lines: tuple[MapsLine, ...]
-    carried: Words
-    cleared: Words
-    guards: Words
-    copies: tuple[Copy, ...]
-    untouched: Words = field(default_factory=lambda: NONE)
-
-    @property
-    def frozen_size(self) -> int:
-        """Bytes that were copied while the program stood still."""
-        return pages.total_size(self.copies[-1].pages)
-
-    def contents(self) -> tuple[Words, memoryview, Words]:
-        """The carried pages that are to be sent, in order, their bytes, and those of anonymous memory that are all zero."""
-        sources, _ = gathering.newest(self.copies, abi.PAGE_SIZE).without(self.carried, NONE)
-        of_files = tracking.extents_of([line for line in self.lines if line.has_file])
-        zero = gathering.are_zero(self.copies, sources, abi.PAGE_SIZE) & ~pages.covered(of_files, sources.addresses)
-        dropped = pages.extents_of_addresses(sources.addresses[zero], abi.PAGE_SIZE)
-        sent, _ = sources.without(self.carried, dropped)
-        return sent.addresses, gathering.gathered([copy.content for copy in self.copies], sent, abi.PAGE_SIZE), dropped
-
-
 class MemoryCapture:
     """Follows the memory of one process.
 
-    Invariants: ``_unacknowledged`` holds every page that was named since the newest acknowledged position; its last entry alone
-    may be without position, of a capture that is not finished or was refused.
+    Invariants: ``_unacknowledged`` holds every page that was named since the newest acknowledged position; its last entries alone
+    may be without position, of a capture that is not finished or was refused; they are made one when the program runs.
 
     Attributes:
         lines: the mappings when they were last read, without our own.
@@ -161,6 +125,7 @@ class MemoryCapture:
         self._buffer = bytearray(BUFFER_SIZE)
         self._is_armed = False
         self._unacknowledged: list[Unacknowledged] = []
+        self._left_out: Words = NONE
         self.acknowledged: Position | None = None
         self.lines: tuple[MapsLine, ...] = ()
         self.has_rings = False
@@ -181,6 +146,7 @@ class MemoryCapture:
 
     def settle(self, position: Position) -> None:
         """The last look has become the snapshot with this position."""
+        self._join()
         last = self._unacknowledged[-1]
         self._unacknowledged[-1] = Unacknowledged(position, last.written, last.cleared)
 
@@ -193,6 +159,7 @@ class MemoryCapture:
         self._is_armed, self.acknowledged = False, None
         self._guards.forget()
         self._unacknowledged.clear()
+        self._left_out = NONE
 
     # While the program runs
 
@@ -202,12 +169,13 @@ class MemoryCapture:
         copied = RunningCopy()
         if base:
             self._copy_everything(copied)
-        for _ in range(PASS_LIMIT):
-            if not self._is_behind(copied, base=base):
+        for turn in range(PASS_LIMIT):
+            if not self._is_behind(copied, LARGE_COUNT if turn or base else WORTH_COUNT, base=base):
                 break
             self._catch_up(copied)
             self._read_into(copied, self._missing(copied, base=base))
             self.refresh()
+        copied.owed = pages.difference(self._since_acknowledged(base=base)[0], copied.valid)
         return copied
 
     def _copy_everything(self, copied: RunningCopy) -> None:
@@ -221,21 +189,21 @@ class MemoryCapture:
         if self._tracker.sees_every_write:
             self._read_into(copied, self._tracker.existing(self._private))
 
-    def _is_behind(self, copied: RunningCopy, *, base: bool) -> bool:
-        """Whether the freeze would have much to copy, and a pass can change that."""
+    def _is_behind(self, copied: RunningCopy, count: int, *, base: bool) -> bool:
+        """Whether the freeze would have so many pages to copy, and a pass can change that."""
         if not self._is_armed or not self._tracker.scans_running:
             return False
-        if self._backlog() >= LARGE_COUNT:
+        if self._backlog(count) >= count:
             return True
-        return bool(self._unacknowledged) and pages.total_size(self._missing(copied, base=base)) >= LARGE_COUNT * abi.PAGE_SIZE
+        return bool(self._unacknowledged) and pages.total_size(self._missing(copied, base=base)) >= count * abi.PAGE_SIZE
 
     def _missing(self, copied: RunningCopy, *, base: bool) -> Words:
         """Private pages that the snapshot would carry, and that are not copied. Shared ones are told by their digests: they may
         be changed, copied, and changed back."""
         return pages.intersection(pages.difference(self._since_acknowledged(base=base)[0], copied.valid), self._followed)
 
-    def _backlog(self) -> int:
-        count = self._tracker.backlog(self._private, LARGE_COUNT, changed=self._has_moved)
+    def _backlog(self, limit: int) -> int:
+        count = self._tracker.backlog(self._private, limit, changed=self._has_moved)
         self._has_moved = False
         return count
 
@@ -266,29 +234,30 @@ class MemoryCapture:
         """Copy what is not copied yet, or not any more. The program stands still."""
         self.refresh()
         scan = self._scan()
-        self._remember(scan)
-        copied.spoil(scan)
+        self._guards.named(scan)
+        self._unacknowledged.append(Unacknowledged(None, scan.written, scan.cleared))
         try:
-            return self._taken(copied, self._guards.found(self._mapped, self._tracker.watched), base=base)
+            return self._taken(copied, scan, self._guards.found(self._mapped, self._tracker.watched), base=base)
         except ProcessGoneError:
             raise
         except CaptureError:  # a page that has become a guard cannot be read
-            return self._taken(copied, self._guards.found_everywhere(self._mapped, self._tracker.watched), base=base)
+            guards = self._guards.found_everywhere(self._mapped, self._tracker.watched)
+            return self._taken(copied, scan, guards, base=base)
 
-    def _taken(self, copied: RunningCopy, guards: Words, *, base: bool) -> Taken:
-        self._leave_out(guards)
-        written, cleared = self._since_acknowledged(base=base)
-        if copied.copies:
-            copied.valid = pages.intersection(copied.valid, self._mapped if base else written)
-        missing = pages.difference(written, copied.valid)
+    def _taken(self, copied: RunningCopy, scan: Scan, guards: Words, *, base: bool) -> Taken:
+        owed = pages.intersection(pages.difference(copied.owed, scan.cleared), self._mapped)
+        missing = pages.difference(pages.union(owed, scan.written), guards)
         if base:
             missing = pages.union(missing, self._vdso)  # for a machine whose kernel has another one
         content = memoryview(self._memory.read_pages(missing, self._buffer))[: pages.total_size(missing)]
+        self._left_out = guards
         return Taken(
             lines=self.lines,
-            carried=pages.union(missing, copied.valid),
-            cleared=cleared,
+            mapped=self._mapped,
+            is_base=base,
             guards=guards,
+            scans=tuple(self._unacknowledged),
+            valid=copied.valid,
             copies=(*copied.copies, Copy(missing, content)),
             untouched=self._untouched(),
         )
@@ -352,34 +321,19 @@ class MemoryCapture:
     def _remember(self, scan: Scan) -> None:
         """Keep what a scan found until it is acknowledged; one that has become no snapshot is joined with the next."""
         self._guards.named(scan)
-        written, cleared = scan.written, scan.cleared
-        if self._unacknowledged and self._unacknowledged[-1].position is None:
-            last = self._unacknowledged.pop()
-            still = pages.intersection(pages.difference(last.written, cleared), self._mapped)
-            written, cleared = pages.union(still, written), pages.union(last.cleared, cleared)
-        self._unacknowledged.append(Unacknowledged(None, written, cleared))
+        self._join()
+        self._unacknowledged.append(Unacknowledged(None, scan.written, scan.cleared))
+        self._join()
+
+    def _join(self) -> None:
+        """Make one of what has no position yet."""
+        left_out, self._left_out = self._left_out, NONE
+        self._unacknowledged = with_one_tail(self._unacknowledged, self._mapped, left_out)
         if len(self._unacknowledged) > UNACKNOWLEDGED_LIMIT:
             oldest, next_one, *rest = self._unacknowledged
-            self._unacknowledged = [_joined(oldest, next_one), *rest]
-
-    def _leave_out(self, guards: Words) -> None:
-        """A page that has become a guard counts as written, and there is nothing to read."""
-        last = self._unacknowledged[-1]
-        installed = pages.intersection(last.written, guards)
-        if len(installed):
-            written, cleared = pages.difference(last.written, installed), pages.union(last.cleared, installed)
-            self._unacknowledged[-1] = Unacknowledged(None, written, cleared)
+            self._unacknowledged = [joined(oldest, next_one), *rest]
 
     def _since_acknowledged(self, *, base: bool) -> tuple[Words, Words]:
         """What a delta must carry: the union of all scans since. A base needs what has become no snapshot yet."""
-        scans = self._unacknowledged[-1:] if base else self._unacknowledged
-        if len(scans) == 1:
-            return scans[0].written, scans[0].cleared
-        union = functools.reduce(_joined, scans)
-        return pages.intersection(union.written, self._mapped), union.cleared
-
-
-def _joined(earlier: Unacknowledged, later: Unacknowledged) -> Unacknowledged:
-    """Two scans as one, known by the later one's position."""
-    written = pages.union(pages.difference(earlier.written, later.cleared), later.written)
-    return Unacknowledged(later.position, written, pages.union(earlier.cleared, later.cleared))
+        self._join()
+        return since(self._unacknowledged, self._mapped, is_base=base)

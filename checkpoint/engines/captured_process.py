@@ -13,13 +13,14 @@ from dataclasses import dataclass
 from checkpoint.arch import extended
 from checkpoint.engine import ProtectOrder
 from checkpoint.engines import entering, waits
-from checkpoint.engines.capture_memory import MemoryCapture, RunningCopy, SharedPlaces, Taken
+from checkpoint.engines.capture_memory import MemoryCapture, RunningCopy, SharedPlaces
 from checkpoint.engines.capture_process import process_state, thread_states
 from checkpoint.engines.entering import Entered
 from checkpoint.engines.identities import Identities
 from checkpoint.engines.outputs import Outputs
 from checkpoint.engines.restart import Interruptions
 from checkpoint.engines.standing import Onlooker, Standing
+from checkpoint.engines.taken_memory import Taken
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.procfs import MapsLine

@@ -78,6 +78,7 @@ def passes(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> N
     """Where snapshots get lost, also small deltas are copied beforehand: as if every one of them were large."""
     if "some_lost" in request.node.name:
         monkeypatch.setattr(capture_memory, "LARGE_COUNT", 1)
+        monkeypatch.setattr(capture_memory, "WORTH_COUNT", 1)
 
 
 def _captured(session: Session, order: CaptureOrder) -> Snapshot:
@@ -264,6 +265,21 @@ def test_a_freeze_copies_only_what_was_written_since_the_last_pass(
     assert len(snapshot.contents) >= (32 << 20 if is_base else 7000 * 4096)
     own = 200  # pages of the interpreter's, between two looks for orders
     assert 50 <= session.frozen_size // 4096 <= 50 + own
+
+
+def test_a_small_delta_is_copied_while_the_program_runs(tmp_path: Path) -> None:
+    """What was written a while ago does not wait for the freeze, as little as it is."""
+    with ended(start([sys.executable, "-S", "-c", OBEDIENT, tmp_path], tmp_path)) as program, protected(program) as session:
+        assert isinstance(session, PtraceSession)
+        program.wait_for_line("ready")
+        session.acknowledge(session.capture(CaptureOrder(base=True, sequence=1)).position)
+        (tmp_path / "next").write_text("100")
+        (tmp_path / "next").replace(tmp_path / "orders")
+        program.wait_for_line("100")
+        snapshot = session.capture(CaptureOrder(base=False, sequence=2))
+        program.kill()
+    assert len(snapshot.contents) >= 100 * 4096
+    assert session.frozen_size < 100 * 4096, "of the hundred pages, and some of the interpreter's, few were left"
 
 
 def test_memory_that_is_written_while_its_base_is_taken_is_of_one_instant(compiled: Compiled, tmp_path: Path) -> None:

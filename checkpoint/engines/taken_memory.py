@@ -1,0 +1,120 @@
+"""What scans have named, put together when the program runs again: what a snapshot carries, and the bytes of it."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from checkpoint import gathering, pages
+from checkpoint.gathering import Copy
+from checkpoint.linux import abi, tracking
+from checkpoint.linux.procfs import MapsLine
+from checkpoint.linux.tracking import NONE
+from checkpoint.model import Position
+from checkpoint.pages import Words
+
+
+@dataclass(frozen=True, slots=True)
+class Unacknowledged:
+    """What one scan found, kept until a position that holds it is acknowledged."""
+
+    position: Position | None
+    written: Words
+    cleared: Words
+
+
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """The memory of one capture, when the program stood still.
+
+    Attributes:
+        lines: the mappings.
+        mapped: all that may be carried.
+        is_base: whether it is for a base.
+        guards: see ``checkpoint.model.Vma.guards``.
+        scans: everything that was named and is not acknowledged, the last scan's at the end.
+        valid: pages of ``copies`` that only the last scan may have named since.
+        copies: oldest first; the last one was made while the program stood still, in a buffer that the next one uses again.
+        untouched: see `checkpoint.resources.untouched`.
+    """
+
+    lines: tuple[MapsLine, ...]
+    mapped: Words
+    is_base: bool
+    guards: Words
+    scans: tuple[Unacknowledged, ...]
+    valid: Words
+    copies: tuple[Copy, ...]
+    untouched: Words = field(default_factory=lambda: NONE)
+
+    @functools.cached_property
+    def _named(self) -> tuple[Words, Words]:
+        """What was written and cleared since the acknowledged position."""
+        return since(with_one_tail(self.scans, self.mapped, self.guards), self.mapped, is_base=self.is_base)
+
+    @functools.cached_property
+    def carried(self) -> Words:
+        """Pages that the snapshot must tell of; each is in one of ``copies`` at least."""
+        missing, last = self.copies[-1].pages, self.scans[-1]
+        if not len(self.valid):
+            return missing
+        valid = pages.difference(pages.difference(self.valid, last.written), last.cleared)
+        return pages.union(missing, pages.intersection(valid, self.mapped if self.is_base else self._named[0]))
+
+    @property
+    def cleared(self) -> Words:
+        """Pages whose earlier content is forgotten, relative to the acknowledged position; ``carried`` comes on top."""
+        return self._named[1]
+
+    @property
+    def frozen_size(self) -> int:
+        """Bytes that were copied while the program stood still."""
+        return pages.total_size(self.copies[-1].pages)
+
+    def contents(self) -> tuple[Words, memoryview, Words]:
+        """The carried pages that are to be sent, in order, their bytes, and those of anonymous memory that are all zero."""
+        sources, _ = gathering.newest(self.copies, abi.PAGE_SIZE).without(self.carried, NONE)
+        of_files = tracking.extents_of([line for line in self.lines if line.has_file])
+        zero = gathering.are_zero(self.copies, sources, abi.PAGE_SIZE) & ~pages.covered(of_files, sources.addresses)
+        dropped = pages.extents_of_addresses(sources.addresses[zero], abi.PAGE_SIZE)
+        sent, _ = sources.without(self.carried, dropped)
+        return sent.addresses, gathering.gathered([copy.content for copy in self.copies], sent, abi.PAGE_SIZE), dropped
+
+
+def since(scans: Sequence[Unacknowledged], mapped: Words, *, is_base: bool) -> tuple[Words, Words]:
+    """What these scans have named, in order, the last of which alone may be without position: written and cleared."""
+    if is_base:
+        scans = [one for one in scans[-1:] if one.position is None]
+    if not scans:
+        return NONE, NONE
+    if len(scans) == 1:
+        return scans[0].written, scans[0].cleared
+    union = functools.reduce(joined, scans)
+    return pages.intersection(union.written, mapped), union.cleared
+
+
+def with_one_tail(scans: Sequence[Unacknowledged], mapped: Words, guards: Words) -> list[Unacknowledged]:
+    """The same, with those at the end that have no position as one.
+
+    Args:
+        guards: they count as written, and there is nothing to read.
+    """
+    named = [one for one in scans if one.position is not None]
+    tail = scans[len(named) :]
+    if not tail:
+        return named
+    last = tail[0]
+    for one in tail[1:]:
+        still = pages.intersection(pages.difference(last.written, one.cleared), mapped)
+        last = Unacknowledged(None, pages.union(still, one.written), pages.union(last.cleared, one.cleared))
+    installed = pages.intersection(last.written, guards)
+    if len(installed):
+        last = Unacknowledged(None, pages.difference(last.written, installed), pages.union(last.cleared, installed))
+    return [*named, last]
+
+
+def joined(earlier: Unacknowledged, later: Unacknowledged) -> Unacknowledged:
+    """Two scans as one, known by the later one's position."""
+    written = pages.union(pages.difference(earlier.written, later.cleared), later.written)
+    return Unacknowledged(later.position, written, pages.union(earlier.cleared, later.cleared))
