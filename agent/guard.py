@@ -74,8 +74,13 @@ _PEER: Final = struct.Struct("3i")
 class Guard:
     """The loop and what it was told. One thread; the pump of `Ward` is the only other one."""
 
-    def __init__(self, listener: socket.socket, notes: tuple[str, ...]) -> None:
+    def __init__(self, listener: socket.socket, path: str, notes: tuple[str, ...]) -> None:
+        """
+        Args:
+            path: where it listens; the listener's own name may be another, see `checkpoint.linux.address`.
+        """
         self._listener = listener
+        self._path = path
         self._notes = notes
         self._agent: Channel[Any] | None = None
         self._ward: Ward | None = None
@@ -281,7 +286,7 @@ class Guard:
 
     def _stop_listening(self) -> None:
         with contextlib.suppress(FileNotFoundError):
-            os.unlink(self._listener.getsockname())
+            os.unlink(self._path)
         self._listener.close()
 
     def _forget(self, _: Forget, __: tuple[int, ...]) -> None:
@@ -353,7 +358,7 @@ def main(arguments: list[str]) -> int:
         print(f"guard: cannot listen on {path}: {error.strerror or error}", file=sys.stderr)
         return 1
     try:
-        Guard(listener, _settle()).run()
+        Guard(listener, path, _settle()).run()
     finally:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(path)

@@ -16,6 +16,7 @@ import msgspec
 
 from agent.guard_messages import Describe, Described, Event, Exited, FrozenByLease, Reply, Start, Started
 from checkpoint.channel import Channel, ChannelClosedError, close_all
+from checkpoint.linux.address import address_of
 
 PATIENCE_S: Final = 30.0
 """A generous bound for whatever is waited for; the machine may be busy."""
@@ -47,7 +48,8 @@ class Agent:
 
     def _connected(self, path: Path) -> bool:
         try:
-            self.end.connect(str(path))
+            with address_of(path) as address:
+                self.end.connect(address)
         except (FileNotFoundError, ConnectionRefusedError):
             return False
         return True

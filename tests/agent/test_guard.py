@@ -33,6 +33,7 @@ from agent.guard_messages import (
     Watch,
 )
 from checkpoint import channel
+from checkpoint.linux.address import PATH_SIZE_MAX
 from checkpoint.model import Clocks
 from tests.agent.guards import PYTHON, GuardProcess, guarding, lives, until
 
@@ -408,6 +409,20 @@ def test_a_program_that_was_let_go_is_found_by_nobody_and_its_guard_ends_with_it
     (tmp_path / "go").touch()
     assert guard.ended() == 0
     assert guard.output() == b"before\nafter\n"
+
+
+def test_below_a_path_that_no_address_holds_a_program_is_let_go_as_anywhere(tmp_path: Path) -> None:
+    place = tmp_path / ("d" * PATH_SIZE_MAX)
+    place.mkdir()
+    with guarding(place) as guard:
+        agent = guard.agent()
+        guard.start(agent, "/bin/sh", "-c", "until [ -e go ]; do sleep 0.01; done; echo after")
+        assert agent.ask(LetGo()) == Done()
+        agent.close()
+        assert not guard.path.exists()
+        (place / "go").touch()
+        assert guard.ended() == 0
+        assert guard.output() == b"after\n"
 
 
 def test_the_end_of_somebody_elses_child_is_noticed_without_its_status(guard: GuardProcess) -> None:
