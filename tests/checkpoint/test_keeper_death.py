@@ -20,13 +20,14 @@ import pytest
 from checkpoint import channel
 from checkpoint.arch import cpu
 from checkpoint.channel import Channel, ChannelError, Reply
-from checkpoint.engine import CaptureOrder
+from checkpoint.engine import CaptureOrder, ProtectOrder
 from checkpoint.errors import CaptureError
 from checkpoint.linux import entry, remote
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.remote import Desk
 from checkpoint.linux.vessel import Birth, Born, spawn_vessel
 from tests.checkpoint.round_trip import (
+    ENGINE,
     PATIENCE_S,
     Program,
     calls_of,
@@ -194,8 +195,8 @@ def test_a_keeper_that_is_late_with_its_first_entry_does_no_harm_either(worker: 
         assert goes_on(worker)
 
     monkeypatch.setattr(entry, "_wait_in_call", wait_too_long)
-    with pytest.raises(CaptureError, match="has run on while it was looked at"), protected(worker):
-        pass
+    with pytest.raises(CaptureError, match="has run on while it was looked at"):
+        ENGINE.protect(worker.pid, ProtectOrder("/test/worker")).close()
     monkeypatch.undo()
     with protected(worker) as session:
         session.capture(CaptureOrder(base=True, generation=1, sequence=1))
