@@ -5,6 +5,7 @@ They are the demo's own robots (`failover.cli.demo.robots`), so that what people
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import subprocess
@@ -16,7 +17,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from failover.cli.demo.robots import CABLES, RobotMachine, Stage, agent_command, ip_inside, means
+from failover.cli.demo import robots as demo
+from failover.cli.demo.robots import CABLES, Means, RobotMachine, Stage, agent_command, ip_inside
 from failover.client.control import Output, Result
 from failover.errors import LostAgentError, NoAgentError
 
@@ -32,6 +34,12 @@ NO_ANSWER = (NoAgentError, LostAgentError)
 """What a robot whose agent is being replaced says."""
 
 T = TypeVar("T")
+
+
+@functools.cache
+def means() -> Means:
+    """What this machine allows, found out once: to ask costs an interpreter."""
+    return demo.means()
 
 
 @contextmanager

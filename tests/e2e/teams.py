@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from failover.cli import keys
-from failover.cli.demo.robots import RobotMachine, Stage, agent_command, free_ports, host_command, means
+from failover.cli.demo.robots import RobotMachine, Stage, agent_command, free_ports, host_command
 from failover.client import team
 from failover.client.team import Robot, Role, Team
 from tests.e2e import robots
@@ -24,7 +24,7 @@ class TeamStage(Stage):
     """The members and the place where they stand; each can be cut off from its power and switched on again."""
 
     def __init__(self, directory: Path, roles: Mapping[str, Role], settings: str = "") -> None:
-        super().__init__(directory, replace(means(), own_network=False), settings)
+        super().__init__(directory, replace(robots.means(), own_network=False), settings)
         self._roles = roles
         self.members: dict[str, RobotMachine] = {}
 

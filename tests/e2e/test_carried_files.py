@@ -15,13 +15,14 @@ from typing import Any
 
 import pytest
 
-from failover.cli.demo.robots import RobotMachine, Stage, means
+from failover.cli.demo.robots import RobotMachine, Stage
 from tests.checkpoint.test_carried_files import COUNTER
 from tests.e2e.robots import (
     LOG_LINES,
     component,
     connected,
     failover,
+    means,
     mistake,
     numbers,
     output,

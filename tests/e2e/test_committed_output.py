@@ -22,7 +22,7 @@ from typing import Final
 import pytest
 
 from agent.pump import HOLD_LIMIT, READ_SIZE
-from failover.cli.demo.robots import RobotMachine, Stage, means
+from failover.cli.demo.robots import RobotMachine, Stage
 from tests.e2e import robots
 from tests.e2e.test_kept_state_killed import come_back
 
@@ -86,7 +86,7 @@ def command(robot: RobotMachine, verb: str, *arguments: str) -> list[str]:
 @contextmanager
 def stage_of(directory: Path) -> Iterator[Stage]:
     """Two robots that share the loopback, so that one that was switched off can come back."""
-    with Stage(directory / "stage", replace(means(), own_network=False)) as stage:
+    with Stage(directory / "stage", replace(robots.means(), own_network=False)) as stage:
         stage.directory.mkdir()
         stage.start()
         for robot in stage.robots:

@@ -11,14 +11,14 @@ from typing import Any
 
 import pytest
 
-from failover.cli.demo.robots import ip_inside, means
+from failover.cli.demo.robots import ip_inside
 from tests.checkpoint.test_carried_connections import PYTHON, TALKERS, run
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 
 pytestmark = [
     pytest.mark.root,
-    pytest.mark.skipif(not means().own_network, reason="needs the right to make network namespaces"),
+    pytest.mark.skipif(not robots.means().own_network, reason="needs the right to make network namespaces"),
 ]
 
 PEER, MOVES = "10.88.0.1", "10.88.0.9"

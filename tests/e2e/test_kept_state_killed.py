@@ -21,7 +21,7 @@ from typing import Final
 
 import pytest
 
-from failover.cli.demo.robots import RobotMachine, Stage, means
+from failover.cli.demo.robots import RobotMachine, Stage
 from tests.e2e import robots
 from tests.e2e.ships_log import Resumption, ShipsLog
 from tests.e2e.test_deaths import kill, revived
@@ -101,7 +101,7 @@ def voyage(directory: Path, dice: random.Random, *arguments: str) -> Iterator[Vo
     """
     directory.mkdir()
 
-    with Stage(directory / "stage", replace(means(), own_network=False)) as stage:
+    with Stage(directory / "stage", replace(robots.means(), own_network=False)) as stage:
         stage.directory.mkdir()
         stage.start()
         try:

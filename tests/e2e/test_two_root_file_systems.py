@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from failover.cli.demo.robots import RobotMachine, Stage, means
+from failover.cli.demo.robots import RobotMachine, Stage
 from tests.e2e import robots
 from tests.e2e.test_brought_programs import CPYTHON, contents_of, goes_on
 
@@ -63,7 +63,7 @@ class TwoReleases(Stage):
 
 @pytest.fixture
 def pair(tmp_path: Path) -> Iterator[Pair]:
-    with TwoReleases(tmp_path / "stage", means()) as stage:
+    with TwoReleases(tmp_path / "stage", robots.means()) as stage:
         stage.directory.mkdir()
         stage.start()
         first, second = stage.robots
