@@ -32,7 +32,7 @@ def _freeze(quick: bool, directory: Path) -> Findings:
     return Findings(
         "Freeze time",
         "How long the keeper holds the program still, by its own account, for its first snapshot (a base, copied while the "
-        "program runs) and for the deltas after it, ten a second; the time until a delta is encoded; what it carries.",
+        "program runs) and for the deltas after it, twenty a second; the time until a delta is encoded; what it carries.",
         tuple(engine.freeze(quick, directory)),
     )
 
@@ -51,7 +51,8 @@ def _restore(quick: bool, directory: Path) -> Findings:
     ours = engine.restore(quick, directory)
     return Findings(
         "Restore",
-        "From the snapshot in memory to the program running. gcore's files cannot be restored.",
+        "From the snapshot in memory to the program running: all of it brought back; the takeover: the order to a standby that "
+        "has the memory in a stopped process already (`ready_copy = true`). gcore's files cannot be restored.",
         tuple(sorted([*ours, *theirs], key=lambda figure: int(figure.case.split()[0]))),
         absent,
     )

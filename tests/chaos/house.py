@@ -51,8 +51,8 @@ SETTINGS: Final = f'beat_ms = {BEAT_MS}\nlease_ms = {LEASE_MS}\nsnapshot_period_
 
 DISK: Final = "size=96m"
 PATIENCE_S: Final = 300.0
-"""A generous bound for whatever is waited for: after a blackout seven agents begin at once, some forty seconds of processor time, and the
-machine may be slow or busy."""
+"""A generous bound for whatever is waited for: after a blackout seven agents begin at once, which takes some forty seconds of
+processor time, and the machine may be slow or busy."""
 
 POLL_S: Final = 0.02
 LOOK_S: Final = 0.25
