@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import socket
 
@@ -69,7 +70,9 @@ def this_machine() -> Machine:
     )
 
 
+@functools.cache
 def _vdso_digest() -> bytes:
+    """Of our own, which stays the same as long as we live; a restore asks for it three times a process."""
     own = os.getpid()
     for line in procfs.parse_maps(procfs.read_text(own, "maps")):
         if line.name == "[vdso]":

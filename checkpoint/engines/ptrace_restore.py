@@ -28,7 +28,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from checkpoint import carried, epoch_variable, rights, room, tree
+from checkpoint import carried, epoch_variable, rights, room
 from checkpoint.arch import cpu, extended, stubs
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import (
@@ -200,7 +200,8 @@ class Estate:
 
 def options_for(state: Snapshot) -> int:
     """Those with which a vessel is traced; whoever is born of it is traced with the same."""
-    confined = any(seccomp.is_confined(view.resources) for view in tree.views(state))
+    everybodys = (state.resources, *(member.resources for member in state.members))
+    confined = any(map(seccomp.is_confined, everybodys))
     return OPTIONS | (abi.PTRACE_O_SUSPEND_SECCOMP if confined else 0)
 
 
