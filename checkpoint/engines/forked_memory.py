@@ -4,14 +4,17 @@ What is equal at the same address in several processes is put into the vessel of
 are born with it, and the kernel keeps one copy until somebody writes (copy-on-write). Each keeps of it what lies in mappings of
 its own, and is given the rest as ever.
 
-Only plain memory counts: private, anonymous, to be read and written. Pure but for `Inheritance.leave` and `Inheritance.put_in`.
+Only plain memory counts: private, to be read and written, anonymous or of a file that has a name. What is anonymous, and what is
+of each file, is compared apart. Pure but for the methods of `Inheritance`.
 
 Source: fork(2); mmap(2).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -50,7 +53,7 @@ class Legacy:
 
     def without_kept(self, vma: Vma) -> tuple[tuple[int, int], ...]:
         """Start and end of the parts of a mapping that must be mapped."""
-        if not _is_plain(vma):
+        if not (_is_plain(vma) or _file_of(vma)):
             return ((vma.start, vma.end),)
         return tuple((start, end) for start, end in pages.difference(pages.extents([vma]), self.kept).tolist())
 
@@ -65,12 +68,14 @@ class Inheritance:
     """What all of them are born with.
 
     Attributes:
-        regions: where the vessel has it mapped.
+        regions: where the vessel has it mapped, as far as it is anonymous.
+        of_files: the same of files.
         sources: of whom the pages are: their places in his contents, and in memory.
         legacies: of each process.
     """
 
     regions: Words
+    of_files: tuple[tuple[FilePlace, Words], ...]
     sources: tuple[tuple[Snapshot, NDArray[np.intp], Words], ...]
     legacies: tuple[Legacy, ...]
 
@@ -80,6 +85,18 @@ class Inheritance:
         for start, end in self.regions.tolist():
             arguments = (start, end - start, abi.PROT_READ | abi.PROT_WRITE, flags, -1, 0)
             table.call(f"map {(end - start) >> 10} KiB for several processes", "mmap", *arguments, least=start, most=start)
+
+    def leave_files(self, table: CallTable) -> None:
+        """Add the calls that map there what is of files, opened with the rights that the vessel has by then."""
+        for (path, _, _, shift), regions in self.of_files:
+            opened = table.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            for start, end in regions.tolist():
+                flags = abi.MAP_PRIVATE | abi.MAP_FIXED_NOREPLACE
+                arguments = (start, end - start, abi.PROT_READ | abi.PROT_WRITE, flags, opened, start - shift)
+                table.call(
+                    f"map {(end - start) >> 10} KiB of {path} for several processes", "mmap", *arguments, least=start, most=start
+                )
+            table.close(opened)
 
     def put_in(self, memory: Memory) -> None:
         """Write the pages to the vessel."""
@@ -102,17 +119,82 @@ class _Known:
     is_common: NDArray[np.bool_]
 
 
-def of(views: Sequence[Snapshot], taken: Words) -> Inheritance:
+FilePlace = tuple[str, int, int, int]
+"""Path, device and inode of a file, and the address at which its first byte would lie."""
+
+
+def of(views: Sequence[Snapshot], taken: Words, elsewhere: Collection[str] = ()) -> Inheritance:
     """What these processes have in common.
 
     Args:
         taken: where the vessel has something mapped.
+        elsewhere: paths of files that are not this machine's own.
     """
+    addresses = [pages.addresses_of(pages.extents(view.runs), abi.PAGE_SIZE) for view in views]
+    anonymous = _alike(views, addresses, taken, _is_plain)
+    taken = pages.union(taken, anonymous.regions)
+    parts, of_files = [anonymous], []
+    for place in _files_of_several(views):
+        if place[0] not in elsewhere:
+            part = _alike(views, addresses, taken, lambda vma, place=place: _file_of(vma) == place)  # type: ignore[misc]
+            taken = pages.union(taken, part.regions)
+            parts.append(part)
+            of_files.append((place, part.regions))
+    return Inheritance(
+        anonymous.regions,
+        tuple((place, regions) for place, regions in of_files if len(regions)),
+        tuple(source for part in parts for source in part.sources),
+        tuple(map(_joined, zip(*(part.legacies for part in parts), strict=True))),
+    )
+
+
+def _files_of_several(views: Sequence[Snapshot]) -> list[FilePlace]:
+    """Where several processes have the same file mapped, and pages of their own in it."""
+    counts: Counter[FilePlace] = Counter()
+    for view in views:
+        starts, ends = pages.extents(view.runs).T
+        counts.update({place for vma in view.vmas if (place := _file_of(vma)) and _is_within(vma, starts, ends)})
+    return [place for place, count in counts.items() if count > 1]
+
+
+def _is_within(vma: Vma, starts: Words, ends: Words) -> bool:
+    index = int(np.searchsorted(ends, np.uint64(vma.start), side="right"))
+    return index < len(starts) and int(starts[index]) < vma.end
+
+
+def _file_of(vma: Vma) -> FilePlace | None:
+    """Of which file a plain mapping is, and where; None: it is not of a file, or not plain."""
+    file = vma.file
+    if vma.kind is not VmaKind.FILE or file is None or file.deleted or vma.shared or vma.guards:
+        return None
+    if vma.protection != abi.PROT_READ | abi.PROT_WRITE or not PLAIN_FLAGS.issuperset(vma.flags):
+        return None
+    return file.path, file.device, file.inode, vma.start - vma.offset
+
+
+def _joined(legacies: Sequence[Legacy]) -> Legacy:
+    kept, there, stale = NO_PAGES, NO_PAGES, NO_PAGES
+    for one in legacies:
+        kept, there, stale = pages.union(kept, one.kept), pages.union(there, one.there), pages.union(stale, one.stale)
+    return Legacy(kept, there, stale)
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """Of one sort of memory: see `Inheritance`."""
+
+    regions: Words
+    sources: tuple[tuple[Snapshot, NDArray[np.intp], Words], ...]
+    legacies: tuple[Legacy, ...]
+
+
+def _alike(views: Sequence[Snapshot], all_addresses: Sequence[Words], taken: Words, counts: Callable[[Vma], bool]) -> _Part:
+    """What is common of the mappings that count."""
     known = _Known(np.empty(0, np.uint64), np.empty(0, np.intp), np.empty(0, np.intp), np.empty(0, np.bool_))
-    plain = [pages.difference(pages.extents(vma for vma in view.vmas if _is_plain(vma)), taken) for view in views]
-    equal = [_compared(known, views, index, plain[index]) for index in range(len(views))]
+    plain = [pages.difference(pages.extents(vma for vma in view.vmas if counts(vma)), taken) for view in views]
+    equal = [_compared(known, views, index, plain[index], all_addresses[index]) for index in range(len(views))]
     common = known.addresses[known.is_common]
-    regions = _regions(views, plain, known)
+    regions = _regions(views, plain, known, counts)
     legacies = tuple(
         _legacy(view, pages.intersection(regions, ours), addresses, known, common, index)
         for index, (view, ours, addresses) in enumerate(zip(views, plain, equal, strict=True))
@@ -122,7 +204,7 @@ def of(views: Sequence[Snapshot], taken: Words) -> Inheritance:
         mine = known.is_common & (known.views == index)
         if mine.any():
             sources.append((view, known.rows[mine], known.addresses[mine]))
-    return Inheritance(regions, tuple(sources), legacies)
+    return _Part(regions, tuple(sources), legacies)
 
 
 def _is_plain(vma: Vma) -> bool:
@@ -134,9 +216,8 @@ def _rows(view: Snapshot) -> NDArray[np.uint8]:
     return np.frombuffer(view.contents, np.uint8).reshape(-1, abi.PAGE_SIZE)
 
 
-def _compared(known: _Known, views: Sequence[Snapshot], index: int, plain: Words) -> Words:
+def _compared(known: _Known, views: Sequence[Snapshot], index: int, plain: Words, all_addresses: Words) -> Words:
     """Where a process has what is known, by address; what nobody has had before is known from then on."""
-    all_addresses = pages.addresses_of(pages.extents(views[index].runs), abi.PAGE_SIZE)
     rows = np.flatnonzero(pages.covered(plain, all_addresses)) if len(plain) else np.empty(0, np.intp)
     addresses = all_addresses[rows]
     _, theirs, ours = np.intersect1d(known.addresses, addresses, assume_unique=True, return_indices=True)
@@ -163,14 +244,14 @@ def _add(known: _Known, addresses: Words, rows: NDArray[np.intp], index: int) ->
     known.is_common = np.concatenate((known.is_common, np.zeros(len(addresses), np.bool_)))[order]
 
 
-def _regions(views: Sequence[Snapshot], plain: Sequence[Words], known: _Known) -> Words:
+def _regions(views: Sequence[Snapshot], plain: Sequence[Words], known: _Known, counts: Callable[[Vma], bool]) -> Words:
     """The whole mappings in which something is common."""
     found = NO_PAGES
     for index, view in enumerate(views):
         addresses = known.addresses[known.is_common & (known.views == index)]
         if not len(addresses):
             continue
-        for vma in filter(_is_plain, view.vmas):
+        for vma in filter(counts, view.vmas):
             first, last = np.searchsorted(addresses, np.array([vma.start, vma.end], np.uint64)).tolist()
             if first < last:
                 found = pages.union(found, pages.intersection(pages.extents([vma]), plain[index]))

@@ -134,7 +134,9 @@ def map_program(
         else:
             descriptor = table.open(path, (os.O_RDWR if writable else os.O_RDONLY) | os.O_CLOEXEC)
         for vma in pieces:
-            _map(table, vma, first_protection(vma, carried), descriptor)
+            for start, end in legacy.without_kept(vma):
+                piece = replace(vma, start=start, end=end, offset=vma.offset + start - vma.start)
+                _map(table, piece, first_protection(vma, carried), descriptor)
         table.close(descriptor)
     objects = [vma for vma in mapped if is_object_mapping(vma) or _shows_object(vma, untouched)]
     made = {

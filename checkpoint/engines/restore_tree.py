@@ -179,13 +179,14 @@ class TreeRestore:
         image = restore_memory.kernel_pages(mappings)[-1]
         stub.install(image.start + self._first.memory.read(image.start, image.size).find(cpu.SYSCALL), AREA_SIZE)
         taken_by_vessel = pages.extents(PageRun(line.start, line.end) for line in mappings)
-        inheritance = forked_memory.of(views, taken_by_vessel)
+        inheritance = forked_memory.of(views, taken_by_vessel, {path for one in self._brought for path in one.run})
         self._legacies = inheritance.legacies
         ended = departed.of([_at(held, estate.descriptions[n]) for n, held in resources.items() if held.kind == pidfds.KIND], "")
         opened, left = restore_threads.open_what_is_left(self._first, self._registers, stub, ended, streams.STANDARD)
         table = CallTable(estate.base, descriptors=opened)
         inheritance.leave(table)
         self._make_nameless(table, vessel, estate, sizes, objects, resources, left)
+        inheritance.leave_files(table)
         if table.end - base > AREA_SIZE:
             raise RestoreError(f"cannot restore: what its processes share takes more than {AREA_SIZE >> 20} MiB")
         self._notes += stub.run(table)

@@ -136,6 +136,14 @@ def test_what_a_process_has_of_another_by_descriptor_is_as_it_was_after_three_li
 
 
 @pytest.mark.compiler
+def test_pages_of_a_file_that_a_fork_left_in_common_are_there_once(compiled: Callable[..., Path], tmp_path: Path) -> None:
+    tracee, _ = three_lives(start_tracee(compiled("forked_files", "-O2"), tmp_path, isolate=True), lambda _: True)
+    with ended(tracee):
+        tracee.tell()
+        expect_ok(tracee)
+
+
+@pytest.mark.compiler
 @pytest.mark.parametrize("kind", ["files", "directories"])
 def test_what_a_process_shares_with_its_parent_is_shared_after_three_lives(
     kind: str, compiled: Callable[..., Path], tmp_path: Path
