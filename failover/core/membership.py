@@ -1,8 +1,9 @@
 """Who lives, who hears whom, and for how long a beat that was heard lets its sender act.
 
 A peer is *suspect* when beats are missing, *dead* when it was silent on all links for longer than any lease it may still act
-on. Invariants: a peer's counter and boot only grow; a lease counts from the asking (the instant our beat left), never from the
-answer; lateness of our own loop makes peers look silent and is taken back before anybody is judged.
+on, and for as much longer as its beats have lately come late. Invariants: a peer's counter and boot only grow; a lease counts
+from the asking (the instant our beat left), never from the answer; lateness of our own loop makes peers look silent and is
+taken back before anybody is judged.
 """
 
 from __future__ import annotations
@@ -17,8 +18,17 @@ from failover.core.types import COMPONENTS_MAX, Config, PeerView, State
 ASKED_MAX = 512
 """Beats of ours whose instant of leaving is remembered; ten seconds of them at 20 ms."""
 
+AWAY_LOYALTIES = 2
+"""A silence of so many loyalties is no lateness of a beat."""
+
 DEAF_LOYALTIES = 2
 """Loyalties for which a peer that we hear may show no sign of hearing us."""
+
+UNSTEADY_BEATS = 512
+"""Beats after which a lateness that was seen counts for a third still: five seconds at 10 ms."""
+
+UNSTEADY_FACTOR = 2
+"""The margin is so many times the lateness that was seen: the next one may be longer."""
 
 SUSPECT_BEATS = 3
 """Beats that may be missing before a peer is called suspect."""
@@ -41,6 +51,7 @@ class Peer:
         heard_us_ns: when the newest beat of ours left that it has heard.
         told_ns: when we last let it act on a beat of its own.
         settled: see ``messages.Beat``.
+        unsteady_ns: how late its beats come at worst, lately: silence beyond a period.
         at_odds: number of its rule, where that is not ours: it is known to live, and nothing else it says counts.
     """
 
@@ -55,6 +66,7 @@ class Peer:
     counter: int = 0
     echoed: int = 0
     settled: int = 0
+    unsteady_ns: int = 0
     at_odds: int = 0
     total: int = 0
     load: int = 0
@@ -90,6 +102,10 @@ class Peer:
         if beat.counter > self.counter:
             self.counter, self.settled, self.total, self.load = beat.counter, beat.settled, beat.total, beat.load
         return tuple(entry for entry in beat.entries if self._news(entry, beat.counter))
+
+    def timed(self, late_ns: int) -> None:
+        """A beat came so much later than a period after the one before; what is seldom seen again is forgotten."""
+        self.unsteady_ns = max(late_ns, self.unsteady_ns - self.unsteady_ns // UNSTEADY_BEATS - 1, 0)
 
     def carried(self, copies: tuple[tuple[str, int], ...]) -> None:
         """Links over which copies of its beats came; whether it lives is for the first of each beat to say."""
@@ -130,11 +146,18 @@ class Membership:
         peer = self.peers.get(beat.sender)
         if peer is None:
             return ()
+        self._time(peer, beat, now_ns)
         before = (peer.echoed, peer.heard_us)
         news = peer.take(beat, self._own, link, now_ns, self._rule)
         if (peer.echoed, peer.heard_us) != before:
             peer.asked_ns, peer.heard_us_ns = self._left_ns(peer.echoed), self._left_ns(peer.heard_us)
         return news
+
+    def _time(self, peer: Peer, beat: Beat, now_ns: int) -> None:
+        """Learn how late its beats come. A silence of two loyalties was no lateness: it was away."""
+        silent_ns = now_ns - peer.heard_ns
+        if beat.boot == peer.boot and beat.counter > peer.counter and silent_ns < AWAY_LOYALTIES * self._loyalty_ns:
+            peer.timed(silent_ns - self._config.beat_ns)
 
     def _left_ns(self, counter: int) -> int:
         """When our beat of that number left, or the one before it; 0 if that is forgotten."""
@@ -154,9 +177,21 @@ class Membership:
         self._born_ns += late_ns
 
     def loyal_until_ns(self, robot: str) -> int:
-        """Until when this robot must not be replaced, as far as we know now."""
+        """Until when this robot must not be replaced, as far as we know now.
+
+        The lease and a margin: as long as its beats' lateness asks for, at least the configured one, at most another lease.
+        """
         peer = self.peers[robot]
-        return peer.heard_ns + (self._loyalty_ns if peer.boot else self._grace_ns)
+        return peer.heard_ns + (self._loyalty_ns + self._wider_ns(peer) if peer.boot else self._grace_ns)
+
+    def _wider_ns(self, peer: Peer) -> int:
+        """By how much the margin is to be wider than the configured one."""
+        lease_ns = self._config.lease_ns
+        return max(min(UNSTEADY_FACTOR * peer.unsteady_ns, lease_ns) - (self._loyalty_ns - lease_ns), 0)
+
+    def next_death_ns(self, now_ns: int) -> int | None:
+        """When the next of those who live counts as dead if it stays silent; None if nobody does."""
+        return min((until for robot in self.peers if (until := self.loyal_until_ns(robot)) > now_ns), default=None)
 
     def dead(self, robot: str, now_ns: int) -> bool:
         """Silent for longer than any lease that it may still act on. A robot that is no peer at all is dead to us."""

@@ -270,6 +270,9 @@ class Node:
 
     def _deadline_ns(self) -> int:
         instants = [self._next_beat_ns]
+        death_ns = self._team.next_death_ns(self._now_ns)
+        if death_ns is not None:
+            instants.append(death_ns)
         for component in self._components.values():
             instants += _instants(component)
         return max(min(instants), self._now_ns + REST_NS)

@@ -19,7 +19,12 @@ Mutant = Callable[[], Any]
 
 def impatient_standby() -> Any:
     """A peer is replaced after half of the lease that it may still act on."""
-    return patch.object(Config, "loyalty_ns", property(lambda self: self.lease_ns // 2))
+    return _loyal_for(lambda self: self.lease_ns // 2)
+
+
+def _loyal_for(how_long: Callable[[Config], int]) -> Any:
+    """Exactly so long, however late beats come."""
+    return patch.object(Config, "loyalty_ns", property(how_long)), patch.object(Membership, "_wider_ns", lambda *_: 0)
 
 
 def lease_from_the_answer() -> Any:
@@ -194,7 +199,7 @@ def double_voting() -> Any:
 
 def no_margin() -> Any:
     """The drift margin is removed: loyal for exactly a lease."""
-    return patch.object(Config, "loyalty_ns", property(lambda self: self.lease_ns))
+    return _loyal_for(lambda self: self.lease_ns)
 
 
 def disloyal_voter() -> Any:
