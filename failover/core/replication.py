@@ -203,6 +203,7 @@ def _checkpoint(component: Component, turn: Turn, position: Position, *, is_safe
     component.parent = component.acked = position
     component.trail.append((position, flight.parent))
     component.acked_ns = flight.state_ns
+    component.took_ns = turn.now_ns - flight.started_ns if flight.parent is not None else 0
     component.due_ns = max(flight.started_ns + _period_ns(component, turn, flight), turn.now_ns)
     component.flight = None
     if flight.final and component.handing is not None and flight.to == component.handing.to:

@@ -9,6 +9,9 @@ from failover.core.warmth import is_warm
 
 NS_PER_S = 10**9
 
+SLOW_FACTOR = 2
+"""Deltas that take so many periods to become checkpoints are told of: fewer are taken, and each carries more."""
+
 STALE_NS = 2 * NS_PER_S
 """A checkpoint that is older is not what was promised: the protection is degraded while the next one does not arrive."""
 
@@ -77,6 +80,19 @@ def _overdue(component: Component, turn: Turn) -> bool:
     return bool(component.undelivered) and turn.now_ns - _state_ns(component) > limit_ns
 
 
+def _slow(component: Component, turn: Turn) -> str:
+    """Where deltas take longer than their period allows: how seldom they are taken, and where they go; "" otherwise."""
+    flight = component.flight
+    under_way_ns = turn.now_ns - flight.started_ns if flight is not None and flight.parent is not None else 0
+    took_ns, period_ns = max(component.took_ns, under_way_ns), component.rules.period_ms * MS
+    if not turn.alive(component.standby) or took_ns <= SLOW_FACTOR * period_ns:
+        return ""
+    return (
+        f"captured every {took_ns / NS_PER_S:.1f} s instead of every {period_ns / NS_PER_S:.1f} s: it takes that long until "
+        f"{component.standby} has one; what is written meanwhile travels in the next one, once"
+    )
+
+
 def _state_ns(component: Component) -> int:
     """When the newest state was captured from which another robot, or this one, could go on; -1 if there is none."""
     return max(component.acked_ns, component.resumed_ns)
@@ -99,6 +115,8 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
         notes.append(f"nothing to protect yet: {component.awaited}; {_age(component, turn)}")
     elif component.holding and _overdue(component, turn):
         notes.append(f"snapshots do not arrive: {component.undelivered}; {_age(component, turn)}")
+    if component.holding and (slow := _slow(component, turn)):
+        notes.append(slow)
     if component.holding and component.resumed_age_ns >= STALE_NS:
         notes.append(f"it went on at {turn.me} from a checkpoint that was {component.resumed_age_ns / NS_PER_S:.1f} s old")
     if staying := homecoming.note(component):
