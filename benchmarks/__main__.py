@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from benchmarks import beside, costs, crowd, cuts, encoding, engine, interference, machine, outage, results, task
+from benchmarks import beside, costs, crowd, cuts, encoding, engine, interference, machine, outage, overload, results, task
 from benchmarks.figures import Absent, Findings
 from benchmarks.running import BenchmarkError
 from checkpoint.errors import CheckpointError
@@ -76,6 +76,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "restore": _restore,
     "outage": _outage,
     "cuts": cuts.cuts,
+    "overload": overload.overload,
     "throughput": interference.throughput,
     "costs": costs.costs,
     "beats": interference.beats,
