@@ -322,7 +322,7 @@ def _of_descriptors(state: Snapshot, options: RestoreOptions, brought: dict[str,
                 yield from (reason + damage for reason in reasons)
         elif held.kind == attached_devices.KIND:
             yield from attached_devices.mismatches(held, options.terms.devices)
-        elif held.kind == covered_files.KIND and options.own_eyes:
+        elif "handle" in held.facts and options.own_eyes:
             yield covered_files.refuse_user(held)
         elif held.kind in rebuild.NEEDED:
             yield from rebuild.NEEDED[held.kind](held)

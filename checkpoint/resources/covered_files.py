@@ -60,7 +60,7 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
     """What must be known to open it again."""
     first, found = held.first, None
     with contextlib.suppress(ProcessGoneError, OSError):  # it has ended since it was stopped, or in a look at a running one
-        found = _found(held) if _may_be(held) else None
+        found = place_of(held) if _may_be(held) else None
     if found is None:
         return None
     return Resource(
@@ -94,8 +94,8 @@ def _may_be(held: OpenFile) -> bool:
     return not files.is_deleted(first) and not files.is_found(held)
 
 
-def _found(held: OpenFile) -> tuple[str, bytes] | None:
-    """Where its file system is mounted, and its handle, by which it is really found."""
+def place_of(held: OpenFile) -> tuple[str, bytes] | None:
+    """Where the file system of what is open is mounted, and its handle, by which it is really found; None where it has none."""
     mounted = _mount_point(held.pid, held.first.text.partition("mnt_id:")[2].split("\n")[0].strip())
     handle = (ctypes.c_char * (8 + HANDLE_SIZE)).from_buffer_copy(HANDLE_SIZE.to_bytes(4, "little") + bytes(4 + HANDLE_SIZE))
     path, mount = f"/proc/{held.pid}/fd/{held.first.number}".encode(), ctypes.c_int()
@@ -103,7 +103,7 @@ def _found(held: OpenFile) -> tuple[str, bytes] | None:
         return None
     size = int.from_bytes(handle.raw[:4], "little")
     told = handle.raw[: 8 + size]
-    with _opened(f"{procfs.outlook(held.pid)}{mounted}", told) as place:
+    with opened(f"{procfs.outlook(held.pid)}{mounted}", told) as place:
         if place and os.stat(place).st_ino == held.first.inode and os.readlink(place) == held.first.target:
             return mounted, told
     return None
@@ -115,7 +115,7 @@ def _mount_point(pid: int, number: str) -> str:
 
 
 @contextlib.contextmanager
-def _opened(mounted: str, handle: bytes) -> Iterator[str]:
+def opened(mounted: str, handle: bytes) -> Iterator[str]:
     """A path of ours that leads to what a handle stands for, for the body; "" where it does not stand for anything."""
     found = -1
     try:
@@ -144,7 +144,7 @@ def mismatches(held: Resource) -> Iterator[str]:
     facts, handle = held.facts, held.facts["handle"]
     assert isinstance(handle, bytes)
     what = f"{facts['path']!s}, open as {held.name}, which a mount covers,"
-    with _opened(str(facts["mounted"]), handle) as place:
+    with opened(str(facts["mounted"]), handle) as place:
         about = os.stat(place) if place else None
         if about is None or about.st_ino != facts["inode"] or stat.S_IFMT(about.st_mode) != stat.S_IFMT(number_of(facts["mode"])):
             yield f"{what} is not on this machine: restore it where it was captured"
@@ -169,14 +169,20 @@ def _differs(held: Resource, about: os.stat_result) -> bool:
     return (about.st_size, about.st_mtime_ns) != (held.facts["size"], held.facts["mtime_ns"])
 
 
-def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
-    """Open it by its handle."""
+def open_again(table: CallTable, held: Resource, flags: int) -> int:
+    """Add the calls that open by its handle what has one."""
     facts, handle = held.facts, held.facts["handle"]
     assert isinstance(handle, bytes)
     mount = table.open(str(facts["mounted"]), os.O_RDONLY | os.O_DIRECTORY)
-    what, flags = f"open {facts['path']!s} by its handle", number_of(facts["flags"]) & REOPENED
-    made = table.obtain(what, "open_by_handle_at", mount, table.place(handle), flags)
+    made = table.obtain(f"open {facts['path']!s} by its handle", "open_by_handle_at", mount, table.place(handle), flags)
     table.close(mount)
+    return made
+
+
+def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
+    """Open it by its handle."""
+    facts = held.facts
+    made = open_again(table, held, number_of(facts["flags"]) & REOPENED)
     if _grows(held):
         size = number_of(facts["size"])
         table.call(f"cut {facts['path']!s} back to {size} bytes", "ftruncate", made, size)

@@ -2,13 +2,15 @@
 
 Facts: ``descriptors``; ``path``; ``flags`` of open(2); ``mode``; ``device`` and ``inode`` at the capture; ``capacity`` in bytes;
 ``content``: the bytes in it, with one descriptor of each named pipe, b"" with the others; of one whose name was deleted,
-``deleted`` true, and ``uid`` and ``gid``.
+``deleted`` true, and ``uid`` and ``gid``; of one over whose path something was mounted, ``mounted`` and
+``handle`` (`covered_files`).
 
 Source: fifo(7), tee(2).
 """
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import stat
@@ -21,7 +23,7 @@ from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.descriptors import Descriptor, copy_of
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings, elsewhere, nameless, pipes
+from checkpoint.resources import OpenFile, Surroundings, covered_files, elsewhere, nameless, pipes
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "fifos"
@@ -30,21 +32,23 @@ CAPABILITIES: Final = (
     preserved(
         Area.PIPES,
         "named pipes (fifo) that nobody else has open",
-        "opened again by name, or without one where that was deleted, with what is in them; made where they are missing",
+        "opened again by name, or without one where that was deleted, by handle where a mount covers it, with what is in them; "
+        "made where they are missing",
     ),
     refused(
         Area.PIPES,
-        "a named pipe that another process has open, or that was renamed or covered since",
+        "a named pipe that another process has open, or whose name is gone",
         "protect the program when the other has closed it; let it open a name that stays",
         "whose name is gone",
         "has open too",
     ),
     refused(
         Area.THERE,
-        "the place of a named pipe is missing, or something else has its name",
+        "the place of a named pipe is missing, or something else has its name; one that a mount covers, on another machine",
         "make the directory; remove what is there",
         "is no named pipe here",
         "the directory of the named pipe",
+        "is not on this machine: restore it where it was captured",
     ),
 )
 
@@ -109,6 +113,8 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
     }
     if _is_nameless(held):
         facts |= {"deleted": True, "path": first.target.removesuffix(procfs.DELETED), "uid": first.uid, "gid": first.gid}
+    elif place := _covered(held):
+        facts |= {"mounted": place[0], "handle": place[1]}
     return Resource(KIND, held.name, facts)
 
 
@@ -118,7 +124,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     if not is_fifo(first):
         return None
     what = f"{held.name} is the named pipe {first.target}"
-    if not (_is_nameless(held) or _leads_there(held)):
+    if not (_is_nameless(held) or _leads_there(held) or _covered(held)):
         return f"{what}, whose name is gone: let the program open it by a name that stays"
     if other := elsewhere.opener_of(held):
         return f"{what}, which pid {other} has open too: protect the program when that has closed it"
@@ -127,6 +133,15 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
 
 def _is_nameless(held: OpenFile) -> bool:
     return not held.first.links and held.first.target.endswith(procfs.DELETED)
+
+
+def _covered(held: OpenFile) -> tuple[str, bytes] | None:
+    """Where it is found nevertheless, if a mount covers its path."""
+    if _leads_there(held):
+        return None
+    with contextlib.suppress(OSError):  # it has ended since
+        return covered_files.place_of(held)
+    return None
 
 
 def _leads_there(held: OpenFile) -> bool:
@@ -142,6 +157,13 @@ def mismatches(held: Resource) -> Iterator[str]:
     path = str(held.facts["path"])
     if held.facts.get("deleted"):
         return
+    if handle := held.facts.get("handle"):
+        assert isinstance(handle, bytes)
+        with covered_files.opened(str(held.facts["mounted"]), handle) as place:
+            if not (place and stat.S_ISFIFO(os.stat(place).st_mode)):
+                what = f"the named pipe {path}, open as {held.name}, which a mount covers,"
+                yield f"{what} is not on this machine: restore it where it was captured"
+        return
     if os.path.lexists(path):
         if not stat.S_ISFIFO(os.stat(path).st_mode):
             yield f"{path}, open as {held.name}, is no named pipe here: remove it"
@@ -151,12 +173,23 @@ def mismatches(held: Resource) -> Iterator[str]:
 
 def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     """Open it as it was, without waiting for somebody at its other end, and fill it."""
-    path, content = str(held.facts["path"]), held.facts["content"]
+    path, content, hidden = str(held.facts["path"]), held.facts["content"], -1
     flags = number_of(held.facts["flags"]) & ~os.O_ASYNC  # opened with it nobody would be told: `signalling` sets it
     if held.facts.get("deleted"):
         path = f"/proc/self/fd/{_nameless(table, held, rebuilding)}"
+    elif held.facts.get("handle"):
+        hidden = covered_files.open_again(table, held, O_PATH)
+        path = f"/proc/self/fd/{hidden}"
     elif not os.path.lexists(path):
         _make(table, path, number_of(held.facts["mode"]))
+    made = _open(table, held, path, flags, content)
+    if hidden >= 0:
+        table.close(hidden)
+    return made
+
+
+def _open(table: CallTable, held: Resource, path: str, flags: int, content: Fact) -> int:
+    """Open it by a path that leads there, and fill it."""
     assert isinstance(content, bytes)
     if not content and flags & os.O_ACCMODE == os.O_RDONLY:
         # Whoever reads and has never seen a writer waits; opened beside a writer of ours it would be told that he hung up.

@@ -2,11 +2,13 @@
 
 A name is what bind(2) was told, and stays so when the directory has changed or the file has another name or none. The file that
 its predecessor has left is replaced, one that somebody listens to is not. A socket whose file is gone (a *ghost*) is bound, and
-its file removed again; where it was bound by a relative name, in a directory that is made for it.
+its file removed again; where it was bound by a relative name, in a directory that is made for it. So is one by a whole name that
+leads to something else by now: that directory is its root directory for the while.
 
 Facts of unix sockets that are told here: ``path`` of its name, "" if that is no file's; ``mode`` and ``file_owner`` of that file,
 mode -1 if it is gone; ``directory`` in which it was bound by a relative name, "" if it was not, or if that is the program's own;
-``root``: the root directory from which its whole name leads, "" for the machine's.
+``root``: the root directory from which its whole name leads, "" for the machine's; ``covered`` true where the file is there,
+but a mount hides it (mode -1, too).
 
 Source: unix(7), bind(2).
 """
@@ -34,8 +36,9 @@ from checkpoint.resources.rebuilding import number_of
 CAPABILITIES: Final = (
     refused(
         Area.SOCKETS,
-        "a unix socket whose name is something else by now, or was given from a directory that was left (../name)",
+        "a unix socket whose name a mount hides (not an accepted one), or was given from a directory that was left (../name)",
         "let the program bind a name that stays",
+        "is a unix socket whose name a mount hides",
         "is a unix socket whose name is something else",
         "from a directory that it has left",
     ),
@@ -78,7 +81,10 @@ def observe(held: OpenFile, looked: socket.socket, name: bytes) -> dict[str, Fac
         finally:
             os.close(opened)
         path = path.removesuffix(DELETED) if not about.st_nlink else path
-    mode, owner = (GONE, []) if about is None or not about.st_nlink else (about.st_mode, [about.st_uid, about.st_gid])
+    is_covered = about is not None and about.st_nlink > 0 and not _leads_to(f"{procfs.outlook(held.pid)}{path}", about)
+    mode, owner = (
+        (GONE, []) if about is None or not about.st_nlink or is_covered else (about.st_mode, [about.st_uid, about.st_gid])
+    )
     directory = "" if os.path.isabs(told) else os.path.normpath(path).removesuffix(f"/{os.path.normpath(told)}") or "/"
     return {
         "path": path,
@@ -86,7 +92,16 @@ def observe(held: OpenFile, looked: socket.socket, name: bytes) -> dict[str, Fac
         "file_owner": list(owner),
         "directory": "" if directory == working else directory,
         "root": root if path == root + told else "",
+        "covered": is_covered,
     }
+
+
+def _leads_to(path: str, about: os.stat_result) -> bool:
+    """Whether a path leads to a certain file."""
+    with contextlib.suppress(OSError):
+        found = os.lstat(path)
+        return (found.st_dev, found.st_ino) == (about.st_dev, about.st_ino)
+    return False
 
 
 def _socket_at(path: str) -> os.stat_result | None:
@@ -104,8 +119,11 @@ def refuse(held: OpenFile) -> str | None:
         return None
     if seen["directory"] and ".." in told.split("/"):
         return f"{held.name} is a unix socket with a name ({told}) from a directory that it has left: let it bind a whole path"
-    if seen["mode"] == GONE and os.path.isabs(told) and _is_something_else(f"{procfs.outlook(held.pid)}{path}"):
-        return f"{held.name} is a unix socket whose name is something else by now ({path}): let the program bind another one"
+    if seen["mode"] == GONE and os.geteuid() and os.path.isabs(told) and _is_something_else(f"{procfs.outlook(held.pid)}{path}"):
+        return f"{held.name} is a unix socket whose name is something else by now ({path}): bind another, or protect it as root"
+    is_reached_by_name = seen["state"] != ESTABLISHED or seen["type"] == socket.SOCK_DGRAM
+    if seen.get("covered") and is_reached_by_name:
+        return f"{held.name} is a unix socket whose name a mount hides ({path}): let the program bind another one"
     return None
 
 
@@ -184,8 +202,11 @@ def is_ghost(held: Resource) -> bool:
 
 
 def _is_hidden(held: Resource) -> bool:
-    """Whether it is bound where nobody looks: a ghost by a relative name."""
-    return is_ghost(held) and not os.path.isabs(_told(held.facts["name"]))
+    """Whether it is bound where nobody looks: a ghost by a relative name, or by one that leads to something else."""
+    told = _told(held.facts["name"])
+    return is_ghost(held) and (
+        not os.path.isabs(told) or bool(held.facts.get("covered")) or _is_something_else(_root_of(held) + told)
+    )
 
 
 # --- Restore -----------------------------------------------------------------------------------------------------------
@@ -259,16 +280,18 @@ class Naming:
     def _bind_ghost(self, one: Resource, made: int) -> None:
         """Bind it, keep hold of its file, and remove that; directories that are made for it go again."""
         table, told = self._table, _told(one.facts["name"])
-        root = "" if os.path.isabs(told) else tempfile.mkdtemp(prefix="failover-socket-")
+        is_whole = os.path.isabs(told)
+        is_free = is_whole and not one.facts.get("covered") and not _is_something_else(_root_of(one) + told)
+        root = "" if is_free else tempfile.mkdtemp(prefix="failover-socket-")
         if root:
             os.rmdir(root)  # its name is ours: the vessel makes it, with its program's rights
-        path = os.path.join(root, told) if root else _root_of(one) + told
+        path = os.path.join(root, told.lstrip("/")) if root else _root_of(one) + told
         directories = _missing([root] if root else [], os.path.dirname(path))
         for directory in directories:
             table.call(f"make the directory {directory}", "mkdirat", AT_FDCWD, table.place_path(directory), 0o700)
         if not root:
             table.attempt("", "unlinkat", AT_FDCWD, table.place_path(path), 0)
-        with self._inside(root), self._below(_root_of(one)):
+        with self._inside("" if is_whole else root), self._below(root if root and is_whole else _root_of(one)):
             self._bind(one, made)
         self._keep(one, path)
         table.call(f"unlink {path}", "unlinkat", AT_FDCWD, table.place_path(path), 0)

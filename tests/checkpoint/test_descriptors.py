@@ -11,7 +11,7 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -24,6 +24,7 @@ from checkpoint.resources import aio_rings, covered_files
 from tests.checkpoint.round_trip import (
     ENGINE,
     captured_and_killed,
+    covered,
     ended,
     expect_ok,
     expect_three_lives,
@@ -89,16 +90,6 @@ def test_a_namespace_in_which_the_program_does_not_live_is_refused(tmp_path: Pat
         program.wait_for_line("ready")
         with pytest.raises(UnsupportedError, match="a namespace in which the program does not live"):
             ENGINE.protect(program.pid, ProtectOrder("/test/elsewhere"))
-
-
-@contextlib.contextmanager
-def covered(place: Path) -> Iterator[None]:
-    """Mount something over a directory, for the body."""
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "covers", place], check=True)
-    try:
-        yield
-    finally:
-        subprocess.run(["umount", place], check=True)
 
 
 def test_files_that_a_mount_covers_are_as_they_were_after_three_restores(compiled: Compiled, tmp_path: Path) -> None:
