@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.figures import Figure, Findings
+from benchmarks import keepalived
+from benchmarks.figures import Absent, Figure, Findings
 from benchmarks.running import BenchmarkError
 from failover.cli.demo.robots import RobotMachine, Stage, means
 from failover.errors import FailoverError
@@ -18,6 +19,10 @@ from failover.errors import FailoverError
 BEAT_MS: Final = 10
 LEASE_MS: Final = 40
 """Four beats, the least that the rules allow."""
+
+WHOLE: Final = "power cut to next output"
+OTHERS_CUTS: Final = 20
+"""Of keepalived."""
 
 NAME: Final = "count"
 COMPONENT: Final = "/demo/robot1/count"
@@ -75,19 +80,32 @@ def cuts(quick: bool, directory: Path) -> Findings:
     for case in CASES:
         found = [_cut(case, directory / f"cut-{case.ready:d}-{i}") for i in range(case.quick_cuts if quick else case.cuts)]
         figures += _figures(case.name, found)
+    absent = _beside(quick, directory / "keepalived", figures)
     return Findings(
         "From a power cut to the next output",
         f"Two robots on this machine, in namespaces of their own where root allows; beats each {BEAT_MS} ms, a lease of "
         f"{LEASE_MS} ms. Every process of the primary stands still from one instant on, and is killed once its program has "
         "gone on. The program prints each 10 ms; the phases are read off the standby's story (`failover why`), and the stages of "
-        "its resume below them; the last one ends after its first output.",
+        "its resume below them; the last one ends after its first output. keepalived, with adverts as often as our beats, brings "
+        "an address to the other machine; the program that answers there must run already, and knows nothing.",
         tuple(figures),
+        absent,
     )
+
+
+def _beside(quick: bool, directory: Path, figures: list[Figure]) -> tuple[Absent, ...]:
+    """What moves an address alone, put in after ours; or why it was not measured."""
+    if why := keepalived.why_absent():
+        return (Absent(keepalived.WHO, why),)
+    ours = CASES[0]
+    values = keepalived.outages(ours.quick_cuts if quick else OTHERS_CUTS, directory)
+    figures.insert(1, Figure(WHOLE, ours.name, "ms", values, keepalived.WHO))
+    return ()
 
 
 def _figures(case: str, found: list[Cut]) -> list[Figure]:
     """The whole, its phases, and those stages that every cut had."""
-    figures = [Figure("power cut to next output", case, "ms", tuple(one.whole for one in found))]
+    figures = [Figure(WHOLE, case, "ms", tuple(one.whole for one in found))]
     for number, phase in enumerate(PHASES):
         figures.append(Figure(f"… {phase}", case, "ms", tuple(one.phases[number] for one in found)))
     stages = [stage for stage in found[0].stages if all(stage in one.stages for one in found)]
