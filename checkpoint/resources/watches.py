@@ -1,7 +1,10 @@
 """What a program hears of files by inotify(7): its watches, under the numbers that they had, each again on the same path.
 
-Events that it has not read yet cannot be put back: while there are any, nothing is captured. What happens to the files between
-the capture and the restore it does not hear of.
+Events that it has not read yet are not kept: while there are any, nothing is captured; the next capture comes once it has read
+them. Nobody can see them but by taking them (read(2) is the only way in, and the kernel tells no more than how many bytes there
+are). They could be put back only by making them happen, which would touch its files, and be heard by others who watch them; a
+watch of something else under the same number would have to end, which is an event, too (IN_IGNORED). What happens to the files
+between the capture and the restore it does not hear of.
 
 Facts: ``descriptors``; ``flags`` of fcntl(2); ``watches``: a list of [number, path, mask]; the path of a file without a
 name that the program has open is /proc/self/fd/N.
