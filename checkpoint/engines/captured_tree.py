@@ -21,7 +21,7 @@ import itertools
 import operator
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Final, NoReturn
 
@@ -143,6 +143,7 @@ class SeenOthers:
     def members(self, first: Look) -> tuple[Member, ...]:
         """All of them."""
         inner = self._inner(first)
+        continued = {look.standing.told.continued_child for look in (first, *(seen.look for seen in self.processes))}
         return tuple(
             Member(
                 slot=seen.captured.slot,
@@ -150,7 +151,7 @@ class SeenOthers:
                 process=replace(seen.process, ppid=inner.get(seen.stat.ppid, 0)),
                 threads=seen.threads,
                 vmas=seen.vmas,
-                resources=(*seen.captured.known(seen.held.resources), *seen.unopened),
+                resources=(*seen.captured.known(seen.held.resources), *seen.unopened, *_going_on(seen, continued)),
             )
             for seen in sorted(self.processes, key=lambda seen: seen.captured.slot)
         )
@@ -177,6 +178,16 @@ class SeenOthers:
         status = first.standing.status
         found += births.refuse(status, self.members(first), self.zombies(first), kinship.taken_pids(status.pids[0]))
         return tuple(dict.fromkeys(found))
+
+
+def _going_on(seen: SeenProcess, continued: Collection[int]) -> tuple[Resource, ...]:
+    """That a process goes on, of which its parent has not been told.
+
+    Args:
+        continued: the children of whom that is known, as the component sees them.
+    """
+    is_stopped = stops.stop_of(seen.unopened) is not None
+    return (stops.going_on(),) if seen.status.pids[-1] in continued and not is_stopped else ()
 
 
 class CapturedTree:

@@ -3,10 +3,10 @@
 It is told of children only, and only while the first process runs, where the component has a guard: that may hold the whole of
 it by SIGSTOP, and is another one when it is brought back.
 
-That it goes on, which its parent has not been told yet (WCONTINUED), only the parent itself could ask.
+That it goes on, which its parent has not been told yet (WCONTINUED), the parent itself is asked; it is told of one child only.
 
-Facts: ``descriptors`` (none); ``signal`` by which it is stopped; ``untold``: what wait(2) still has to tell its parent
-(CLD_STOPPED, 5), 0 if nothing.
+Facts: ``descriptors`` (none); ``signal`` by which it is stopped, 0 if it goes on again and its parent is to be told; ``untold``:
+what wait(2) still has to tell its parent of the stop (CLD_STOPPED, 5), 0 if nothing.
 
 Source: wait(2); do_signal_stop() and prepare_signal() in kernel/signal.c; do_task_stat() in fs/proc/array.c.
 """
@@ -30,8 +30,8 @@ CAPABILITIES: Final = (
     ),
     by_rule(
         Area.PROCESS,
-        "that a child goes on which its parent has not been told (WCONTINUED); the time of ended children (RUSAGE_CHILDREN)",
-        "it stays untold; that time begins at zero",
+        "that children go on which their parent has not been told (WCONTINUED); the time of ended children (RUSAGE_CHILDREN)",
+        "of several such children it is told of one; that time begins at zero",
     ),
 )
 CLD_STOPPED: Final = 5
@@ -47,6 +47,11 @@ def describe(stopped_by: int, exit_code: int) -> tuple[Resource, ...]:
     if not stopped_by:
         return ()
     return (Resource(KIND, "stopped", {"descriptors": [], "signal": stopped_by, "untold": CLD_STOPPED if exit_code else 0}),)
+
+
+def going_on() -> Resource:
+    """A child that runs again after a stop, of which its parent has not been told."""
+    return Resource(KIND, "goes on", {"descriptors": [], "signal": 0, "untold": 0})
 
 
 def stop_of(resources: Iterable[Resource]) -> tuple[int, int] | None:

@@ -103,6 +103,26 @@ def test_stopped_children_stay_so_and_their_parent_is_told_once(tmp_path: Path) 
     goes_through_three_lives(STOPPED, tmp_path)
 
 
+CONTINUED = """
+child = born(signal.pause)
+os.kill(child, signal.SIGSTOP)
+os.waitpid(child, os.WUNTRACED)
+os.kill(child, signal.SIGCONT)
+os.waitid(os.P_PID, child, os.WCONTINUED | os.WNOWAIT)
+is_ready()
+expect("what is told of a stop", os.waitpid(child, os.WUNTRACED | os.WNOHANG), (0, 0))
+expect("what is told of going on", os.waitpid(child, os.WCONTINUED | os.WNOHANG), (child, 0xFFFF))
+expect("what is told twice", os.waitpid(child, os.WCONTINUED | os.WNOHANG), (0, 0))
+os.kill(child, signal.SIGTERM)
+expect("its end", os.waitpid(child, 0), (child, signal.SIGTERM))
+print("ok", flush=True)
+"""
+
+
+def test_that_a_child_goes_on_is_told_its_parent_once_over_three_lives(tmp_path: Path) -> None:
+    goes_through_three_lives(CONTINUED, tmp_path)
+
+
 ALL_STOPPED = """
 child = born(wait_for_go) if sys.argv[1:] == ["parent"] else 0
 is_ready()
