@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from failover.cli.demo.host import descendants
+from tests.agent.guards import lives
 from tests.e2e import robots
 from tests.e2e.test_decorator_page_typed import PAGE as DECORATOR_PAGE
 from tests.e2e.test_decorator_page_typed import Terminal, terminal
@@ -16,7 +18,7 @@ from tests.e2e.test_decorator_page_typed import Terminal, terminal
 PAGE = DECORATOR_PAGE.with_name("servers.md")
 MEMBERS = ("r1", "r2", "hall")
 KEPT = "json=$(failover status --json --socket hall/run/control.sock); echo $json"
-SEEN = 50
+SEEN = 20
 """Numbers that are counted before the robots die, and after."""
 
 pytestmark = [pytest.mark.root, pytest.mark.command("unshare"), pytest.mark.command("ip")]
@@ -28,6 +30,7 @@ def ending(typed: Terminal) -> Iterator[None]:
     try:
         yield
     finally:
+        print(typed.type(f"tail -n {robots.LOG_LINES} */log"))  # shown by pytest where a test fails
         typed.type("kill -9 $(cat hall/pid)")
 
 
@@ -46,7 +49,11 @@ def test_the_server_returns_a_component_to_an_empty_robot_as_the_page_tells_it(t
         said = typed.type(protect)
         robots.until(lambda: len(typed.type(at_r1).split()) > SEEN, f"the counter to count after: {said}")
         robots.until(lambda: '"role": "standby"' in typed.type(KEPT), "a checkpoint at the server")
-        typed.type(lose)
+        kill, *later = lose.splitlines()
+        there = [pid for robot in ("r1", "r2") for pid in descendants(int((tmp_path / robot / "pid").read_text()))]
+        typed.type(kill)  # people type slowly: what it ends may still write to the directory that goes next
+        robots.until(lambda: not any(map(lives, there)), "the end of both robots")
+        typed.type("\n".join(later))
         robots.until(lambda: "it goes on from checkpoint" in typed.type(why), "the counter to go on")
         before = len(typed.type(logs).split())
         robots.until(lambda: len(typed.type(logs).split()) > before + SEEN, "the counter to count on")
