@@ -27,6 +27,7 @@ from tests.checkpoint.round_trip import (
     NOBODY,
     Program,
     captured_and_killed,
+    captured_at_last,
     ended,
     expect_ok,
     protected,
@@ -223,7 +224,7 @@ def test_what_is_lacking_here_is_told_while_the_program_runs_elsewhere(stage: St
     ) as program:
         program.wait_until(lambda: log.exists() and "ready" in log.read_text(), "its start")
         with protected(program) as session:
-            snapshot = transported(session.capture(CaptureOrder()))
+            snapshot = transported(captured_at_last(session, CaptureOrder()))
             outline = replace(snapshot, contents=b"")
             log.write_text("cut")
             assert ENGINE.lacks(outline, RestoreOptions()) == ()

@@ -27,7 +27,17 @@ from checkpoint.linux.memory import Memory
 from checkpoint.linux.pagetables import PageScanner
 from checkpoint.linux.write_protection import PagemapTracker
 from checkpoint.model import Snapshot
-from tests.checkpoint.round_trip import Program, ended, expect_ok, protected, restored, start, start_tracee, transported
+from tests.checkpoint.round_trip import (
+    Program,
+    captured_at_last,
+    ended,
+    expect_ok,
+    protected,
+    restored,
+    start,
+    start_tracee,
+    transported,
+)
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
@@ -85,7 +95,7 @@ def _captured(session: Session, order: CaptureOrder) -> Snapshot:
     """A capture; where the program holds something unsupported for a moment (/proc/self/mem), the next one that works."""
     while True:
         try:
-            return session.capture(order)
+            return captured_at_last(session, order)
         except UnsupportedError:
             continue
 
@@ -221,9 +231,9 @@ while True:
         done += 1
         if done == wanted:
             print(done, flush=True)
-    time.sleep(0.001)
+    time.sleep(float(sys.argv[2]))
 """
-"""Writes as many pages, one after the other, as it is told to; says when it has."""
+"""Writes as many pages, one after the other, as it is told to, says when it has; rests for as long as it is told."""
 
 
 @pytest.mark.parametrize("is_base", [True, False], ids=["base", "delta"])
@@ -241,7 +251,10 @@ def test_a_freeze_copies_only_what_was_written_since_the_last_pass(
         program.wait_for_line(str(told))
 
     copy_everything, catch_up, counts = MemoryCapture._copy_everything, MemoryCapture._catch_up, [2000, 1000, 50]
-    with ended(start([sys.executable, "-S", "-c", OBEDIENT, tmp_path], tmp_path)) as program, protected(program) as session:
+    with (
+        ended(start([sys.executable, "-S", "-c", OBEDIENT, tmp_path, "0.001"], tmp_path)) as program,
+        protected(program) as session,
+    ):
         assert isinstance(session, PtraceSession)
         program.wait_for_line("ready")
         if not is_base:
@@ -269,7 +282,7 @@ def test_a_freeze_copies_only_what_was_written_since_the_last_pass(
 
 def test_a_small_delta_is_copied_while_the_program_runs(tmp_path: Path) -> None:
     """What was written a while ago does not wait for the freeze, as little as it is."""
-    with ended(start([sys.executable, "-S", "-c", OBEDIENT, tmp_path], tmp_path)) as program, protected(program) as session:
+    with ended(start([sys.executable, "-S", "-c", OBEDIENT, tmp_path, "1"], tmp_path)) as program, protected(program) as session:
         assert isinstance(session, PtraceSession)
         program.wait_for_line("ready")
         session.acknowledge(session.capture(CaptureOrder(base=True, sequence=1)).position)

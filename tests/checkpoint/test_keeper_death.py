@@ -176,14 +176,14 @@ def test_a_keeper_that_is_late_does_not_send_the_program_back_to_where_it_stood(
         return tables
 
     with protected(worker) as session:
-        snapshot = session.capture(CaptureOrder(base=True, generation=1, sequence=1))
+        snapshot = captured_at_last(session, CaptureOrder(base=True, generation=1, sequence=1))
         session.acknowledge(snapshot.position)
         monkeypatch.setattr(remote, "_tables_when_done", wait_too_long)
         with pytest.raises(CaptureError, match=f"pid {worker.pid} has run on while it was looked at"):
             session.capture(CaptureOrder(base=False, generation=1, sequence=2))
         assert goes_on(worker)
         monkeypatch.undo()
-        session.capture(CaptureOrder(base=False, generation=1, sequence=2))
+        captured_at_last(session, CaptureOrder(base=False, generation=1, sequence=2))
     expect_undisturbed(worker)
 
 
@@ -199,7 +199,7 @@ def test_a_keeper_that_is_late_with_its_first_entry_does_no_harm_either(worker: 
         ENGINE.protect(worker.pid, ProtectOrder("/test/worker")).close()
     monkeypatch.undo()
     with protected(worker) as session:
-        session.capture(CaptureOrder(base=True, generation=1, sequence=1))
+        captured_at_last(session, CaptureOrder(base=True, generation=1, sequence=1))
     expect_undisturbed(worker)
 
 

@@ -97,7 +97,7 @@ def test_advice_to_a_whole_mapping_is_seen_by_the_next_base(compiled: Compiled, 
     """/proc/PID/maps stays the same meanwhile."""
     with ended(start_tracee(compiled("special_memory", "-O2"), tmp_path, "locked_late")) as tracee:
         with protected(tracee) as session:
-            session.capture(CaptureOrder())
+            captured_at_last(session, CaptureOrder())
             (tmp_path / "second").touch()
             tracee.wait_for_line("advised")
             snapshot = transported(captured_at_last(session, replace(CaptureOrder(), sequence=2)))
