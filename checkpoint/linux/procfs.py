@@ -66,11 +66,12 @@ def _explained(pid: int, name: str) -> Iterator[None]:
 
 
 def _read_whole(descriptor: int) -> bytes:
-    found = piece = os.pread(descriptor, READ_SIZE, 0)
-    while piece:
-        piece = os.pread(descriptor, READ_SIZE, len(found))
-        found += piece
-    return found
+    pieces: list[bytes] = []
+    size = 0
+    while piece := os.pread(descriptor, READ_SIZE, size):
+        pieces.append(piece)
+        size += len(piece)
+    return b"".join(pieces)  # once: the smaps of ten thousand mappings come in thousands of pieces
 
 
 class KeptFiles:
