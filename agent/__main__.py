@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sys
 
+from agent import lean
 from checkpoint import quiet
 
 
 def main() -> int:
     """Load and run the daemon's command line."""
     quiet.begin()
+    lean.begin()
     from agent.main import main as run
 
     return run()

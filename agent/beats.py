@@ -85,7 +85,8 @@ class BeatLane:
 def _bound(address: str) -> socket.socket:
     host, port = split_address(address, "beat address")
     try:
-        family, kind, protocol, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)[0]
+        given = host.encode() if host.isascii() else host  # a str would go through the codec of names, half a megabyte
+        family, kind, protocol, _, where = socket.getaddrinfo(given, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)[0]
         link = socket.socket(family, kind | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC, protocol)
         link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         with contextlib.suppress(OSError):

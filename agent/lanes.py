@@ -1,6 +1,6 @@
 """The lanes process: snapshots, programs and people; everything that may take its time.
 
-Started as `python -m agent.lanes CONFIG DESCRIPTOR`. One asyncio loop at ordinary priority. The heart orders
+Started as `python -m agent.lean agent.lanes CONFIG DESCRIPTOR`. One asyncio loop at ordinary priority. The heart orders
 (`agent.door`), this carries out and answers. If it dies, the heart starts another; guards and programs live on and are found
 again by their sockets. If the heart dies, this ends.
 """
@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import sys
 from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any, Final
@@ -380,7 +379,3 @@ def _keeps_state(store: Store, name: str) -> bool:
 def main() -> int:
     """Be the lanes of the heart that started us."""
     return live(Lanes)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

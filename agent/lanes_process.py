@@ -56,7 +56,7 @@ class LanesProcess:
         ours, theirs = pair()
         ours.setblocking(False)
         module = "agent.witness" if self._settings.me.role == "witness" else "agent.lanes"
-        command = [sys.executable, "-m", module, str(self._settings.path), str(theirs.fileno())]
+        command = [sys.executable, "-m", "agent.lean", module, str(self._settings.path), str(theirs.fileno())]
         try:
             self._child = subprocess.Popen(
                 command,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from agent import config as configuration
-from agent import kernel
+from agent import kernel, lean
 from agent.errors import AgentError
 from agent.journal import set_up_log
 from agent.systemd import notifier
@@ -94,4 +94,5 @@ def command_line() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
+    lean.begin()
     sys.exit(main())

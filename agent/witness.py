@@ -1,13 +1,13 @@
 """A witness's other process: it hands over the keys of beats and answers people, and that is all.
 
-Started as `python -m agent.witness CONFIG DESCRIPTOR` in place of `agent.lanes`. There is no store, no nursery and no log of any
+Started as `python -m agent.lean agent.witness CONFIG DESCRIPTOR` in place of `agent.lanes`.
+There is no store, no nursery and no log of any
 output; nothing that could read a snapshot or start a program is even imported. It needs no right that an ordinary user has not.
 """
 
 from __future__ import annotations
 
 import logging
-import sys
 from typing import Any
 
 from agent.config import Settings
@@ -53,7 +53,3 @@ class Witness(Switchboard):
 def main() -> int:
     """Be the other process of the witness's heart that started us."""
     return live(Witness)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import re
 import tomllib
 import types
@@ -94,6 +93,8 @@ def _nested(hint: Any) -> Any:
 
 
 def _unknown_key(path: Path, text: str, keys: tuple[str, ...], valid: list[str]) -> str:
+    import difflib  # for a mistake only
+
     near = difflib.get_close_matches(keys[-1], valid, 1, 0.5)
     cure = f"did you mean {near[0]!r}?" if near else "valid here: " + ", ".join(valid)
     return f"{path}:{line_of(text, keys)}: unknown key {keys[-1]!r}; {cure}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import unicodedata
 
 from failover.errors import NameFormatError
 
@@ -25,9 +24,15 @@ def weight(name: str) -> Weight:
     Natural (``robot2`` before ``robot10``), for any alphabet's digits, on the NFKC form; ties by code point, so that two
     names are equal only if they are the same text.
     """
-    normal = unicodedata.normalize("NFKC", name)
+    normal = name if name.isascii() else _normal(name)
     parts = tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in _RUNS.split(normal) if part)
     return parts, normal, name
+
+
+def _normal(name: str) -> str:
+    import unicodedata  # half a megabyte, for names that need it
+
+    return unicodedata.normalize("NFKC", name)
 
 
 def check_robot(name: str) -> str:

@@ -62,7 +62,7 @@ STEP_MS: Final = 50
 
 PROGRAMS: Final = Path(__file__).parent / "programs"
 MODULES: Final = {"heart": b"agent.main", "lanes": b"agent.lanes", "keeper": b"checkpoint", "guard": b"agent.guard"}
-"""Of each part of an agent: the third word of its command line."""
+"""Of each part of an agent: the third word of its command line, or the fourth."""
 
 AWAY: Final = (NoAgentError, LostAgentError)
 """What a member whose agent is not there, or stands still, says."""
@@ -147,7 +147,7 @@ class Member:
         found = []
         for pid in self.machine.processes() if self.machine is not None else ():
             with contextlib.suppress(OSError):
-                if Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[2:3] == [MODULES[name]]:
+                if MODULES[name] in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[2:4]:
                     found.append(pid)
         return found
 

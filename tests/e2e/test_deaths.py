@@ -60,7 +60,7 @@ def parts(robot: RobotMachine, name: str) -> list[int]:
     found = []
     for pid in robot.processes():
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-            if Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[2:3] == [NAMES[name]]:
+            if NAMES[name] in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[2:4]:
                 found.append(pid)
     return found
 
