@@ -36,6 +36,7 @@ from checkpoint.engines.outputs import Outputs
 from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import abi, kinship, procfs
 from checkpoint.linux.kinship import Kinship
+from checkpoint.linux.precedence import Precedence
 from checkpoint.model import Position, Snapshot
 from checkpoint.pages import PageTable
 from checkpoint.resources import OpenFile, Surroundings, carried_connections, carried_trees, glance, kinds, look
@@ -102,6 +103,7 @@ class PtraceSession:
         self._refused = False
         self._held = False
         self._collects = False
+        self._precedence = Precedence()
         self._closed = False
 
     # Opening and closing
@@ -279,16 +281,18 @@ class PtraceSession:
             return time.perf_counter_ns()
         self._collects = gc.isenabled()
         gc.disable()
+        self._precedence.take()
         began = time.perf_counter_ns()
         try:
             self._first.threads.freeze()
         except BaseException:
-            self._collect_again()
+            self._be_ordinary()
             raise
         return began
 
     def _hold(self) -> None:
         """Leave it standing."""
+        self._precedence.give_back()
         self._held = True
         self._first.threads.hold()
         self._tree.hold()
@@ -299,9 +303,11 @@ class PtraceSession:
         self._held = False
         self._first.threads.thaw()
         self._tree.thaw()
-        self._collect_again()
+        self._be_ordinary()
 
-    def _collect_again(self) -> None:
+    def _be_ordinary(self) -> None:
+        """As before the freeze: what this thread makes may be collected, and it has no precedence."""
+        self._precedence.give_back()
         if self._collects:
             gc.enable()
 

@@ -36,7 +36,7 @@ from checkpoint.linux.remote import (
     give_back,
     resumed,
 )
-from checkpoint.linux.tracee import Tracee
+from checkpoint.linux.tracee import Tracee, rest
 
 FAULTS_FLAGS: Final = abi.O_CLOEXEC | abi.O_NONBLOCK
 """With which the userfaultfd is opened inside."""
@@ -125,15 +125,16 @@ def _wait_in_call(pid: int, name: str) -> None:
 
     Source: proc_pid_syscall(5): the number is the first word.
     """
-    deadline = time.perf_counter() + BATCH_TIMEOUT_S
+    began = time.perf_counter()
     wanted = str(arch.SYSCALLS[name])
     while procfs.read_text(pid, "syscall").partition(" ")[0] != wanted:
-        if time.perf_counter() > deadline:
+        waited = time.perf_counter() - began
+        if waited > BATCH_TIMEOUT_S:
             raise CaptureError(
                 f"pid {pid} did not run for {BATCH_TIMEOUT_S:g} s while it was looked at: it is frozen by its cgroup, or higher "
                 "priorities leave it no processor; protect it again when it runs"
             )
-        os.sched_yield()
+        rest(waited)
 
 
 def _taken(pid: int, inside: int) -> int:

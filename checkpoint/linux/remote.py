@@ -30,7 +30,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
-import os
 import struct
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -43,7 +42,7 @@ from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import abi
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.rounds import Round
-from checkpoint.linux.tracee import Tracee
+from checkpoint.linux.tracee import Tracee, rest
 
 LARGE_DESK: Final = 4 * abi.PAGE_SIZE
 """Bytes of the large desk's code, and of its table."""
@@ -415,19 +414,20 @@ def _tables_when_done(memory: Memory, desks: Sequence[Desk], end: int) -> list[b
     Raises:
         CaptureError: they were not, in time.
     """
-    deadline = time.perf_counter() + BATCH_TIMEOUT_S
+    began = time.perf_counter()
     size = desks[0].size
     while True:
         raw = memory.read(desks[0].table, (len(desks) - 1) * size + end)
         tables = [raw[place * size : (place + 1) * size] for place in range(len(desks))]
         if all(desk.is_done(table) for desk, table in zip(desks, tables, strict=True)):
             return tables
-        if time.perf_counter() > deadline:
+        waited = time.perf_counter() - began
+        if waited > BATCH_TIMEOUT_S:
             raise CaptureError(
                 f"pid {memory.pid} did not run for {BATCH_TIMEOUT_S:g} s while it was looked at: it is frozen by its "
                 "cgroup, or higher priorities leave it no processor; capture it again when it runs"
             )
-        os.sched_yield()
+        rest(waited)
 
 
 def give_back(tracee: Tracee, registers: bytes, mask: int, is_ours: Callable[[int], bool]) -> Registers:

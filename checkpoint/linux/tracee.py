@@ -33,7 +33,11 @@ XSTATE_SIZE: Final = 16384
 STOP_TIMEOUT_S: Final = 2.0
 """How long a thread may take to stop: a disk that sleeps answers within this, a dead network file system does not."""
 SPIN_S: Final = 0.001
-"""How long we look without sleeping: a thread stops within 0.1 ms when nothing holds it."""
+"""How long we look for the stops of many before we look at each singly."""
+YIELDING_S: Final = 0.0001
+"""How long we look without sleeping: a thread stops within 0.1 ms when nothing holds it. One that is to run where we do waits for
+our sleep, if we have precedence (`checkpoint.linux.precedence`)."""
+REST_S: Final = 0.00005
 PEEK_COUNT: Final = 64
 """Pending signals asked for in one call."""
 PENDING_LIMIT: Final = 4096
@@ -76,10 +80,10 @@ def no_stop(tid: int, waited_s: float) -> CaptureError:
 
 def rest(waited_s: float) -> None:
     """Leave the processor to others before a thread is looked at again that we have waited for so long already."""
-    if waited_s < SPIN_S:
+    if waited_s < YIELDING_S:
         os.sched_yield()
     else:
-        time.sleep(0.0001)
+        time.sleep(REST_S if waited_s < SPIN_S else 2 * REST_S)
 
 
 class Tracee:
