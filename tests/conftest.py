@@ -11,8 +11,12 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
+
+if TYPE_CHECKING:
+    from xdist.scheduler import LoadScopeScheduling
 
 TRACEES = Path(__file__).parent / "tracees"
 
@@ -65,6 +69,27 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     reason = why_not(item)
     if reason is not None:
         pytest.skip(reason)
+
+
+# --- Side by side ----------------------------------------------------------------------------------------------------
+
+SEGMENTS = ("tests/checkpoint/test_memory_kinds.py", "tests/checkpoint/test_refusals.py")
+"""They make System V segments, or look at all that there are on the machine."""
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadScopeScheduling:
+    """With ``-n 2`` files run side by side, but never two tests of whole robots: one worker begins with these, in their order."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class OneStage(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.split("::")[0]
+            if file.startswith("tests/e2e/"):
+                return "robots"
+            return "segments" if file in SEGMENTS else file
+
+    return OneStage(config, log)
 
 
 # --- Tracees ---------------------------------------------------------------------------------------------------------
