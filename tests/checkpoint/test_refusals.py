@@ -42,7 +42,6 @@ REFUSED = {
     "unix_waiting_data": "accepted with data",
     "unix_waiting_gone": "client has gone",
     "unix_urgent": "out-of-band",
-    "unix_other_name": "something else",
     "netlink_socket": "netlink socket of family 12",
     "netlink_answer": "answer of the kernel waits",
     "vsock": "a socket (vsock",

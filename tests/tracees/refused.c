@@ -174,15 +174,6 @@ static void take_unix_urgent(void) {
     keep(ends[1], "a socket");
 }
 
-static void take_unix_other_name(void) {
-    struct sockaddr_un address = {.sun_family = AF_UNIX};
-    if (!getcwd(address.sun_path, 80)) cannot("see where I am");
-    strcat(address.sun_path, "/name");
-    keep(socket(AF_UNIX, SOCK_STREAM, 0), "a socket");
-    if (bind(opened, (struct sockaddr *)&address, sizeof address) || listen(opened, 1) || unlink("name")) cannot("listen");
-    close(open("name", O_CREAT | O_WRONLY, 0600));
-}
-
 static void take_netlink_socket(void) { keep(socket(AF_NETLINK, SOCK_RAW, 12 /* NETLINK_NETFILTER */), "a socket"); }
 
 static void take_netlink_answer(void) {
@@ -390,7 +381,6 @@ static const struct kind {
              {"unix_waiting_data", take_unix_waiting_data},
              {"unix_waiting_gone", take_unix_waiting_gone},
              {"unix_urgent", take_unix_urgent},
-             {"unix_other_name", take_unix_other_name},
              {"netlink_socket", take_netlink_socket},
              {"netlink_answer", take_netlink_answer},
              {"vsock", take_vsock},
