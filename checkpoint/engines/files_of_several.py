@@ -1,8 +1,9 @@
-"""Files without a name (deleted ones, memory files) that several processes of a component have open, or mapped, each by itself.
+"""Files without a name (deleted ones, memory files) and named pipes that several processes of a component have opened themselves.
 
-Each process tells of such a file as if it were its own, with its whole content. They are made once, before the processes are
+Each process tells of such a file as if it were its own, with its whole content. Files are made once, before the processes are
 born, filled and sealed there, and what the processes tell of content and seals is left out. Where one is mapped its pages come
-with the mappings: it is sealed when all have mapped it.
+with the mappings: it is sealed when all have mapped it. A named pipe is filled by one of them, when that opens it; one whose name
+is gone is made before they are born, too.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import replace
 from checkpoint.engines.restore_memory import Object, is_object_mapping, object_of
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Resource, Snapshot
-from checkpoint.resources import files, memory_files, rebuild
+from checkpoint.resources import fifos, files, memory_files, rebuild
 from checkpoint.resources.rebuilding import number_of
 
 Found = dict[Object, Resource]
@@ -22,6 +23,7 @@ Found = dict[Object, Resource]
 
 def made_once(views: Sequence[Snapshot]) -> tuple[tuple[Snapshot, ...], Found]:
     """The processes, which only open what several of them have, and what is to be made of that before they are born."""
+    views = _filled_once(views)
     mapped = {object_of(vma) for view in views for vma in view.vmas if is_object_mapping(vma)}
     found = {key: held for key, held in _of_several(views).items() if key not in mapped}
     return _told_once(views, found, mapped), found
@@ -41,7 +43,7 @@ def _of_several(views: Sequence[Snapshot]) -> Found:
 def _of(resources: Iterable[Resource]) -> Found:
     found: Found = {}
     for held in resources:
-        if held.kind == memory_files.KIND or (held.kind == files.KIND and held.facts.get("deleted")):
+        if held.kind == memory_files.KIND or (held.kind in (files.KIND, fifos.KIND) and held.facts.get("deleted")):
             key = _key(held)
             if key not in found or _has_content(held):
                 found[key] = held
@@ -60,7 +62,25 @@ def make(table: CallTable, held: Resource) -> int:
     """Make one, with everything that it had."""
     if held.kind == memory_files.KIND:
         return memory_files.make_whole(table, held)
+    if held.kind == fifos.KIND:
+        return fifos.make_nameless(table, held)
     return rebuild.make_deleted(table, held)
+
+
+def _filled_once(views: Sequence[Snapshot]) -> tuple[Snapshot, ...]:
+    """The same processes, of which one alone tells what is in a named pipe: by an open file that is shared, if one is."""
+    tells: dict[Object, Resource] = {}
+    for held in (held for view in views for held in view.resources if held.kind == fifos.KIND and _has_content(held)):
+        key = fifos.key_of(held)
+        if key not in tells or ("description" in held.facts and "description" not in tells[key].facts):
+            tells[key] = held
+
+    def told(held: Resource) -> Resource:
+        if held.kind != fifos.KIND or held is tells.get(fifos.key_of(held)):
+            return held
+        return replace(held, facts={**held.facts, "content": b""})
+
+    return tuple(replace(view, resources=tuple(map(told, view.resources))) for view in views)
 
 
 def _told_once(views: Sequence[Snapshot], made: Container[Object], mapped: Container[Object]) -> tuple[Snapshot, ...]:

@@ -211,14 +211,24 @@ def _open(table: CallTable, held: Resource, path: str, flags: int, content: Fact
 
 def _nameless(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     """A descriptor that leads to a named pipe without a name, made if this is its first open file."""
-    key = number_of(held.facts["device"]), number_of(held.facts["inode"])
+    key = key_of(held)
     if key not in rebuilding.objects:
-        made = nameless.make_node(table, str(held.facts["path"]), number_of(held.facts["mode"]))
-        owner = number_of(held.facts["uid"]), number_of(held.facts["gid"])
-        lost = f"the named pipe of {held.name} belongs to whom the program runs as"
-        table.attempt(lost, "fchownat", made, table.place_path(""), *owner, AT_EMPTY_PATH)
-        rebuilding.keep(table, key, made)
+        rebuilding.keep(table, key, make_nameless(table, held))
     return rebuilding.objects[key]
+
+
+def make_nameless(table: CallTable, held: Resource) -> int:
+    """Make a named pipe without a name, empty, to be opened through the number that this gives."""
+    made = nameless.make_node(table, str(held.facts["path"]), number_of(held.facts["mode"]))
+    owner = number_of(held.facts["uid"]), number_of(held.facts["gid"])
+    lost = f"the named pipe of {held.name} belongs to whom the program runs as"
+    table.attempt(lost, "fchownat", made, table.place_path(""), *owner, AT_EMPTY_PATH)
+    return made
+
+
+def key_of(held: Resource) -> tuple[int, int]:
+    """Which named pipe it is: device and inode number where it was captured."""
+    return number_of(held.facts["device"]), number_of(held.facts["inode"])
 
 
 def _make(table: CallTable, path: str, mode: int) -> None:

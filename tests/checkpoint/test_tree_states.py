@@ -253,6 +253,52 @@ def test_a_file_without_a_name_that_two_processes_have_opened_is_one_file(tmp_pa
     goes_through_three_lives(NAMELESS, tmp_path)
 
 
+NAMED_PIPES = """
+def full(mark):
+    return mark * 60000
+
+for name in ("plain", "deleted", "shared"):
+    os.mkfifo(name)
+shared = os.open("shared", os.O_RDWR)
+os.write(shared, full(b"s"))
+
+def work():
+    mine = [os.open(name, os.O_RDONLY) for name in ("plain", "deleted", "shared")]
+    wait_for_go()
+    for descriptor, mark in zip(mine, (b"p", b"d", b"s")):
+        expect("what the child reads of " + mark.decode(), os.read(descriptor, 100000), full(mark))
+    os.write(answer, b"x")
+    for descriptor in mine[:2]:
+        expect("what it reads of its parent", os.read(descriptor, 100), b"more")
+        expect("what it reads once its parent has closed it", os.read(descriptor, 100), b"")
+
+told, answer = os.pipe()
+child = born(work)
+writers = [os.open(name, os.O_WRONLY) for name in ("plain", "deleted")]
+for descriptor, mark in zip(writers, (b"p", b"d")):
+    os.write(descriptor, full(mark))
+while not os.readlink(f"/proc/{child}/fd/{max(map(int, os.listdir(f'/proc/{child}/fd')))}").endswith("/shared"):
+    time.sleep(0.01)
+os.unlink("deleted")
+is_ready()
+expect("the child's word", os.read(told, 1), b"x")
+os.set_blocking(shared, False)
+try:
+    expect("what is left", os.read(shared, 100), b"nothing")
+except BlockingIOError:
+    pass
+for descriptor in writers:
+    os.write(descriptor, b"more")
+    os.close(descriptor)
+expect_child(child)
+print("ok", flush=True)
+"""
+
+
+def test_named_pipes_that_two_processes_have_opened_are_filled_once(tmp_path: Path) -> None:
+    goes_through_three_lives(NAMED_PIPES, tmp_path)
+
+
 OWNERS = """
 import fcntl
 heard = []
