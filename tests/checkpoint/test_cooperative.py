@@ -116,8 +116,13 @@ def test_the_segment_of_a_process_is_found_and_read_after_its_death() -> None:
 def test_a_state_that_a_program_was_handed_is_not_taken_for_what_it_commits() -> None:
     """It may be read for long, and be the only one until there is a first commit."""
     handed = fill_segment(base_of(7))
-    with pytest.raises(CaptureError, match="no segment"):
-        open_segment(os.getpid())
+    with subprocess.Popen(["/bin/sleep", "60"], pass_fds=[handed.descriptor]) as program:  # it has no other
+        try:
+            assert os.readlink(f"/proc/{program.pid}/fd/{handed.descriptor}") == os.readlink(f"/proc/self/fd/{handed.descriptor}")
+            with pytest.raises(CaptureError, match="no segment"):
+                open_segment(program.pid)
+        finally:
+            program.kill()
     handed.close()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import time
 from collections.abc import Iterator
@@ -60,7 +61,18 @@ def test_the_service_is_ready_when_it_protects(machine: Machine) -> None:
     assert machine.property(SERVICE, "ActiveState") == "active"
     assert machine.property(SERVICE, "StatusText") == "protecting this robot and its neighbours"
     assert json.loads(machine.run("failover", "status", "--json").stdout)["robot"] == "robot1"
-    assert status(machine)["realtime"]
+
+
+def test_the_beats_have_real_time_priority_where_this_machine_may_give_it(machine: Machine) -> None:
+    """The unit asks for it; a systemd that may not raise limits itself gives less, and the status says so."""
+    assert [machine.property(SERVICE, name) for name in ("LimitRTPRIO", "LimitMEMLOCK")] == ["99", "infinity"]
+    limits = machine.run("cat", f"/proc/{main_pid(machine)}/limits").stdout
+    may_come_first = re.search(r"^Max realtime priority +99 ", limits, re.MULTILINE) is not None
+    may_stay = re.search(r"^Max locked memory +unlimited ", limits, re.MULTILINE) is not None
+    told = status(machine)
+    assert told["realtime"] == (may_come_first and may_stay)
+    assert any("SCHED_FIFO was refused" in note for note in told["notes"]) == (not may_come_first)
+    assert any("can be swapped out" in note for note in told["notes"]) == (not may_stay)
 
 
 def test_the_service_is_shut_in_and_has_no_capability(machine: Machine) -> None:
