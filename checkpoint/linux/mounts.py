@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 from checkpoint.errors import ProbeError, ProcessGoneError
@@ -29,7 +30,7 @@ def network_mount(pid: int, path: str) -> str:
 
 def type_of_mount(pid: int, path: str) -> str:
     """The type of the file system that a path lies on; "" if that cannot be told."""
-    return _type_at(_mounts(pid), path)
+    return _at(_mounts(pid), path)
 
 
 def is_mount_point(path: str) -> bool:
@@ -37,9 +38,14 @@ def is_mount_point(path: str) -> bool:
     return os.path.realpath(path) in dict(_mounts(os.getpid()))
 
 
-def _type_at(mounts: list[tuple[str, str]], path: str) -> str:
-    """Of the innermost mount above a path; of several at one point the last one counts."""
-    above = [(point, kind) for point, kind in mounts if path == point or path.startswith(point.rstrip("/") + "/")]
+def innermost(mounts: Iterable[Mount], path: str) -> str:
+    """The number of the innermost mount above a path, which is what is found there; "" without one."""
+    return _at([(one.point, one.number) for one in mounts], path)
+
+
+def _at(mounts: list[tuple[str, str]], path: str) -> str:
+    """What is told of the innermost mount above a path; of several at one point the last one counts."""
+    above = [(point, told) for point, told in mounts if path == point or path.startswith(point.rstrip("/") + "/")]
     return max(reversed(above), key=lambda mount: len(mount[0]))[1] if above else ""
 
 

@@ -14,7 +14,7 @@ import contextlib
 import ctypes
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Final
 
 from checkpoint.capability import Area, by_rule, refused
@@ -95,11 +95,17 @@ def _may_be(held: OpenFile) -> bool:
 
 
 def place_of(held: OpenFile) -> tuple[str, bytes] | None:
-    """Where the file system of what is open is mounted, and its handle, by which it is really found; None where it has none."""
-    mounted = _mount_point(held.pid, held.first.text.partition("mnt_id:")[2].split("\n")[0].strip())
+    """Where the file system of what a mount covers is mounted, and its handle, by which it is really found.
+
+    None where it has none, and where no mount covers its path: one that is not found there has just been deleted or replaced.
+    """
+    number, of_process = held.first.text.partition("mnt_id:")[2].split("\n")[0].strip(), mounts.mounts_of(held.pid)
+    mounted = _mount_point(of_process, number)
+    if not mounted or mounts.innermost(of_process, held.first.target) == number:
+        return None
     handle = (ctypes.c_char * (8 + HANDLE_SIZE)).from_buffer_copy(HANDLE_SIZE.to_bytes(4, "little") + bytes(4 + HANDLE_SIZE))
     path, mount = f"/proc/{held.pid}/fd/{held.first.number}".encode(), ctypes.c_int()
-    if not mounted or _libc.name_to_handle_at(AT_FDCWD, path, handle, ctypes.byref(mount), AT_SYMLINK_FOLLOW):
+    if _libc.name_to_handle_at(AT_FDCWD, path, handle, ctypes.byref(mount), AT_SYMLINK_FOLLOW):
         return None
     size = int.from_bytes(handle.raw[:4], "little")
     told = handle.raw[: 8 + size]
@@ -109,9 +115,9 @@ def place_of(held: OpenFile) -> tuple[str, bytes] | None:
     return None
 
 
-def _mount_point(pid: int, number: str) -> str:
+def _mount_point(of_process: Iterable[mounts.Mount], number: str) -> str:
     """Where the mount with a number of mountinfo lies; "" where the process has none such."""
-    return next((one.point for one in mounts.mounts_of(pid) if one.number == number), "")
+    return next((one.point for one in of_process if one.number == number), "")
 
 
 @contextlib.contextmanager

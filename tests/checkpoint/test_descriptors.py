@@ -13,13 +13,15 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from checkpoint.engine import ProtectOrder, RestoreOptions
 from checkpoint.engines import restore_checks
 from checkpoint.errors import CheckpointError, MismatchError, UnsupportedError
-from checkpoint.linux import procfs
+from checkpoint.linux import mounts, procfs
 from checkpoint.resources import aio_rings, covered_files
 from tests.checkpoint.round_trip import (
     ENGINE,
@@ -111,8 +113,23 @@ def test_a_mount_point_is_read_whatever_its_name(name: str, monkeypatch: pytest.
     told = b"".join(b"\\%03o" % byte if byte in b" \t\n\\" else bytes((byte,)) for byte in os.fsencode(f"/mnt/{name}"))
     lines = b"22 1 8:1 / / rw - ext4 x rw\n23 22 0:5 / " + told + b" rw - tmpfs x rw\n"
     monkeypatch.setattr(procfs, "read_bytes", lambda *_: lines)
-    assert covered_files._mount_point(1, "23") == f"/mnt/{name}"
-    assert covered_files._mount_point(1, "") == covered_files._mount_point(1, "7") == ""
+    assert covered_files._mount_point(mounts.mounts_of(1), "23") == f"/mnt/{name}"
+    assert covered_files._mount_point(mounts.mounts_of(1), "") == covered_files._mount_point(mounts.mounts_of(1), "7") == ""
+    places = [("/file", "22"), (f"/mnt/{name}/file", "23"), (f"/mnt/{name}", "23"), (f"/mnt/{name}er", "22")]
+    assert [mounts.innermost(mounts.mounts_of(1), path) for path, _ in places] == [number for _, number in places]
+
+
+def test_a_file_that_was_just_replaced_by_one_of_its_inode_number_is_not_taken_for_a_covered_one(tmp_path: Path) -> None:
+    """As a database does with its journal: its path led to nothing a moment ago, and to the same inode now."""
+    with (tmp_path / "journal").open("wb") as file:
+        number, inode = file.fileno(), os.fstat(file.fileno()).st_ino
+        text = Path(f"/proc/self/fdinfo/{number}").read_text()
+        first = SimpleNamespace(number=number, inode=inode, target=file.name, text=text)
+        held: Any = SimpleNamespace(pid=os.getpid(), first=first)
+        assert covered_files.place_of(held) is None
+        with covered(tmp_path):
+            place = covered_files.place_of(held)
+            assert place is not None and tmp_path.is_relative_to(place[0])
 
 
 def test_a_file_that_a_mount_covers_and_that_has_changed_stops_the_restore(compiled: Compiled, tmp_path: Path) -> None:
