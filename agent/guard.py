@@ -67,7 +67,8 @@ FIRST_CALL_S: Final = 30.0
 SEND_TIMEOUT_S: Final = 1.0
 """An agent that does not read for so long is treated as lost; a lease must not wait for it."""
 
-REALTIME_PRIORITY: Final = 1
+REALTIME_PRIORITY: Final = 2
+"""Before keepers that hold a program still, who have the lowest (`checkpoint.linux.precedence`): no lease waits for them."""
 _PEER: Final = struct.Struct("3i")
 
 

@@ -301,9 +301,13 @@ class PtraceSession:
         self._departing.stay(self.pid)
         self._departing = carried_connections.NOBODY
         self._held = False
-        self._first.threads.thaw()
-        self._tree.thaw()
-        self._be_ordinary()
+        try:
+            self._first.threads.thaw()
+        finally:
+            try:
+                self._tree.thaw()
+            finally:
+                self._be_ordinary()
 
     def _be_ordinary(self) -> None:
         """As before the freeze: what this thread makes may be collected, and it has no precedence."""

@@ -18,6 +18,8 @@ import pytest
 from agent.clock import now_ns
 from agent.guard_messages import (
     Commit,
+    Describe,
+    Described,
     Done,
     Exited,
     Forget,
@@ -33,6 +35,7 @@ from agent.guard_messages import (
     Watch,
 )
 from checkpoint import channel
+from checkpoint.linux import precedence
 from checkpoint.linux.address import PATH_SIZE_MAX
 from checkpoint.model import Clocks
 from tests.agent.guards import PYTHON, GuardProcess, guarding, lives, until
@@ -423,6 +426,15 @@ def test_below_a_path_that_no_address_holds_a_program_is_let_go_as_anywhere(tmp_
         (place / "go").touch()
         assert guard.ended() == 0
         assert guard.output() == b"after\n"
+
+
+def test_a_guard_comes_before_keepers_that_hold_programs_still(guard: GuardProcess) -> None:
+    """Its lease runs out on the instant, whatever a keeper is copying on the same processor."""
+    assert isinstance(guard.agent().ask(Describe()), Described)
+    pid = guard.process.pid
+    if os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
+        pytest.skip("no real-time priority here")
+    assert os.sched_getparam(pid).sched_priority > precedence.PRIORITY
 
 
 def test_the_end_of_somebody_elses_child_is_noticed_without_its_status(guard: GuardProcess) -> None:
