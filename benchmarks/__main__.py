@@ -1,7 +1,7 @@
 """Measure, side by side with what a user would pick instead; print tables, and write them with the machine's facts.
 
 python -m benchmarks                     all of it, some fifteen minutes; writes benchmarks/RESULTS.md
-python -m benchmarks --quick             fewer cases and repetitions, less than 90 seconds; prints only
+python -m benchmarks --quick             fewer cases and repetitions, some minutes; prints only
 python -m benchmarks --quick restore     one of them
 
 As root more is measured (CRIU, beats on the wire). Nothing else should run meanwhile; a busy machine is warned of.
