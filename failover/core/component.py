@@ -136,7 +136,7 @@ class Component:
         generation, sequence: of the next snapshot; ``parent``: newest position that the keeper may count from.
         born: epoch under which the present process was started or restored.
         crashed: wait status of a program that died while it was held still; it is resumed when it may act.
-        took_ns: from the order of the last delta until it was a checkpoint; no other is taken meanwhile.
+        took_ns: from the order of the last delta until it was a checkpoint, 0 if that was none; no other is taken meanwhile.
         due_ns: next capture; ``until_ns``: when the present claim, start or restore is overdue.
         resumed_ns: when the state was captured that this primacy began with, -1 for a fresh start; ``resumed_age_ns``: how old
             it was then.

@@ -94,7 +94,7 @@ def unchanged(component: Component, turn: Turn, event: Unchanged) -> None:
     if flight is None or flight.position is not None or (event.epoch, event.sequence) != (component.epoch, component.sequence):
         return
     component.sequence -= 1  # no snapshot bears this number, and so every number that is due for pruning is met
-    component.degraded, component.flight = "", None
+    component.degraded, component.flight, component.took_ns = "", None, 0
     is_theirs = not flight.to or flight.to in component.entrusted
     if event.position != component.acked or not is_theirs:
         component.base_wanted, component.due_ns = True, turn.now_ns
@@ -221,7 +221,7 @@ def _give_up(component: Component, turn: Turn, why: str = "") -> None:
     """Nothing is forgotten: the keeper's next delta counts from the same position. A handover's last delta is not tried twice."""
     if component.handing is not None and component.flight is not None and component.flight.final:
         component.handing.until_ns = turn.now_ns
-    component.flight = None
+    component.flight, component.took_ns = None, 0
     component.due_ns = turn.now_ns + turn.config.retry_ms * MS
     if why:
         component.undelivered = why
