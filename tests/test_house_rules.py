@@ -140,6 +140,20 @@ def test_an_arrow_that_points_up_is_seen_wherever_it_hides(text: str) -> None:
     assert upward(ROOT / "failover" / "core" / "node.py", ast.parse(text.replace("..agent", "...agent"))) != []
 
 
+# --- Whole robots ----------------------------------------------------------------------------------------------------
+
+
+def test_whole_robots_are_started_where_no_two_tests_of_them_run_at_once() -> None:
+    wrong = [
+        f"{name_of(path)}:{line} imports {module}: a test that starts whole robots lies in tests/e2e (see tests/conftest.py)"
+        for path in sources("tests")
+        if not name_of(path).startswith("tests/e2e/")
+        for line, module in imports(parsed(path), package_of(path))
+        if module.startswith("tests.e2e")
+    ]
+    assert wrong == []
+
+
 # --- Purity ----------------------------------------------------------------------------------------------------------
 
 
