@@ -26,7 +26,7 @@ def team(turn: Turn) -> str:
     if not living:
         return f"{turn.me} hears nobody: what runs here is not protected."
     return (
-        f"{turn.me} and {', '.join(living)} protect each other: whoever is silent for {_silence_ms(turn)} ms is replaced; "
+        f"{turn.me} and {', '.join(living)} protect each other: whoever is silent for {_silence(turn)} is replaced; "
         "a total cut between two that live can run a component twice, except where when_alone is freeze."
     )
 
@@ -40,7 +40,7 @@ def _elected(turn: Turn, heard: int) -> str:
         )
     return (
         f"{turn.me} hears {heard} of {voters} that vote, itself among them, and {quorum} are a majority: no component acts at "
-        f"two robots at once; whoever is silent for {_silence_ms(turn)} ms is replaced when a majority agrees."
+        f"two robots at once; whoever is silent for {_silence(turn)} is replaced when a majority agrees."
     )
 
 
@@ -60,11 +60,11 @@ def one(component: Component, turn: Turn, protection: Protection) -> str:
         return f"If {turn.me} is lost, {component.standby} gives its newest checkpoint to the first robot that can run it."
     if component.elects:
         return (
-            f"If {turn.me} is silent for {_silence_ms(turn)} ms and a majority agrees, {component.standby} runs it; "
+            f"If {turn.me} is silent for {_silence(turn)} and a majority agrees, {component.standby} runs it; "
             "it stands still here first."
         )
     alone = "stands still here first" if component.freezes else "may run twice if both live on and cannot hear each other"
-    return f"If {turn.me} is silent for {_silence_ms(turn)} ms, {component.standby} runs it; it {alone}."
+    return f"If {turn.me} is silent for {_silence(turn)}, {component.standby} runs it; it {alone}."
 
 
 def differs(component: Component, turn: Turn) -> bool:
@@ -90,5 +90,5 @@ def _standing_by(component: Component, turn: Turn) -> str:
     return f"{turn.me} keeps its checkpoints for {whose}."
 
 
-def _silence_ms(turn: Turn) -> int:
-    return turn.config.loyalty_ns // MS
+def _silence(turn: Turn) -> str:
+    return f"{turn.config.loyalty_ns // MS} ms (up to {turn.config.loyalty_ns_max // MS} where beats come late)"

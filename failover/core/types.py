@@ -311,6 +311,11 @@ class Config:
         return self.lease_ns + max(self.margin_ms_min * MS, self.lease_ns * self.margin_percent // 100)
 
     @property
+    def loyalty_ns_max(self) -> int:
+        """The same for a peer whose beats come late: see `failover.core.membership.Membership.loyal_until_ns`."""
+        return max(self.loyalty_ns, 2 * self.lease_ns)
+
+    @property
     def grace_ns(self) -> int:
         """How long a peer that was never heard in this life may be on its way; never less than the loyalty."""
         return max(self.grace_ms * MS, self.loyalty_ns)

@@ -85,7 +85,7 @@ def kept_aside_at(robots: list[str]) -> Watcher:
 
 def test_whoever_is_silent_is_replaced() -> None:
     two = team()
-    assert "whoever is silent for 170 ms is replaced" in two.says("robot1")
+    assert "whoever is silent for 170 ms (up to 300 where beats come late) is replaced" in two.says("robot1")
     two.world.power_off("robot1")
     assert two.after(160) == []
     assert two.after(200) == ["robot2"]
@@ -131,14 +131,17 @@ def test_the_team_of_two_says_its_rule_and_its_promise_in_one_sentence_each() ->
     assert status.rule == "pair" and status.promise.count(".") == 1 and status.promise.endswith(".")
     promises = [one.promise for one in status.components]
     assert promises == [
-        "If robot1 is silent for 170 ms, robot2 runs it; it may run twice if both live on and cannot hear each other."
+        "If robot1 is silent for 170 ms (up to 300 where beats come late), robot2 runs it; "
+        "it may run twice if both live on and cannot hear each other."
     ]
 
 
 def test_except_where_when_alone_is_freeze_there_it_stands_still_here_first() -> None:
     two = team(alone=WhenAlone.FREEZE)
     assert "except where when_alone is freeze" in two.says("robot1")
-    assert two.says_of_it("robot1") == "If robot1 is silent for 170 ms, robot2 runs it; it stands still here first."
+    assert two.says_of_it("robot1") == (
+        "If robot1 is silent for 170 ms (up to 300 where beats come late), robot2 runs it; it stands still here first."
+    )
     two.cut("robot1", "robot2")
     seen = [two.after(5) for _ in range(100)]
     stood = seen.index([])

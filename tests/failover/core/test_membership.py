@@ -34,7 +34,7 @@ def test_beats_that_come_in_time_ask_for_the_least_margin_only() -> None:
 
 def test_beats_that_come_late_widen_the_margin_and_never_beyond_another_lease() -> None:
     assert patience_ms(heard(10, 20, 70)) == 100 + 2 * 40
-    assert patience_ms(heard(10, 20, 130)) == 200
+    assert patience_ms(heard(10, 20, 130)) == PAIR.loyalty_ns_max // MS == 200
 
 
 def test_a_lateness_that_is_not_seen_again_is_forgotten() -> None:
