@@ -154,10 +154,13 @@ class Membership:
         return news
 
     def _time(self, peer: Peer, beat: Beat, now_ns: int) -> None:
-        """Learn how late its beats come. A silence of two loyalties was no lateness: it was away."""
+        """Learn how late its beats come, as far as that widens the margin: more of it would only be forgotten later.
+
+        A silence of two loyalties was no lateness: it was away.
+        """
         silent_ns = now_ns - peer.heard_ns
         if beat.boot == peer.boot and beat.counter > peer.counter and silent_ns < AWAY_LOYALTIES * self._loyalty_ns:
-            peer.timed(silent_ns - self._config.beat_ns)
+            peer.timed(min(silent_ns - self._config.beat_ns, self._config.lease_ns // UNSTEADY_FACTOR))
 
     def _left_ns(self, counter: int) -> int:
         """When our beat of that number left, or the one before it; 0 if that is forgotten."""

@@ -42,6 +42,16 @@ def test_a_lateness_that_is_not_seen_again_is_forgotten() -> None:
     assert patience_ms(heard(*late, *steady)) == LOYALTY_MS
 
 
+def test_the_longest_lateness_is_forgotten_as_soon_as_one_that_widens_the_margin_as_much() -> None:
+    last = heard(10, 20, 80), heard(10, 20, 20 + 2 * LOYALTY_MS - 1)
+    assert [patience_ms(team) for team in last] == [200, 200]
+    for team in last:
+        at_ms = team.peers["robot2"].heard_ns // MS
+        for number in range(1, UNSTEADY_BEATS):
+            team.hear(beat(3 + number), "eth0", (at_ms + 10 * number) * MS)
+    assert patience_ms(last[0]) == patience_ms(last[1]) < 150
+
+
 def test_a_robot_that_was_away_is_not_late() -> None:
     assert patience_ms(heard(10, 20, 10_000)) == LOYALTY_MS
 
