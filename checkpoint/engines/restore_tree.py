@@ -166,7 +166,8 @@ class TreeRestore:
         resources = _first_told(views)
         objects = dict(_grouped(vmas, restore_memory.is_object_mapping))
         wanted = (one.number for view in views for one in rebuild.descriptors_of(view))
-        numbers = itertools.count(max(max(wanted, default=2), len(streams.STANDARD) + len(resources)) + 1)
+        made_first = len(streams.STANDARD) + 2 * len(resources) + len(objects) + len(self._nameless)  # at the lowest numbers
+        numbers = itertools.count(max(max(wanted, default=2), made_first) + 1)
         estate = Estate(
             base=base,
             size=size,

@@ -222,6 +222,39 @@ print("ok", flush=True)
 """
 
 
+MAPPED_ALONE = """
+import ctypes
+libc = ctypes.CDLL(None)
+libc.mmap.restype, libc.mmap.argtypes = ctypes.c_void_p, [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
+
+def mapped(number):
+    file = os.memfd_create(f"of {number}")
+    os.ftruncate(file, 4096)
+    place = libc.mmap(None, 4096, 3, 1, file, 0)
+    os.close(file)
+    ctypes.memset(place, 65 + number, 1)
+    return place
+
+places = [mapped(number) for number in range(8)]
+
+def work():
+    wait_for_go()
+    for number, place in enumerate(places):
+        ctypes.memset(place + 1, 97 + number, 1)
+
+child = born(work)
+is_ready()
+expect_child(child)
+found = [ctypes.string_at(place, 3) for place in places]
+expect("what each file holds", found, [bytes((65 + number, 97 + number, 0)) for number in range(8)])
+print("ok", flush=True)
+"""
+
+
+def test_memory_files_that_processes_have_mapped_and_not_open_stay_each_its_own(tmp_path: Path) -> None:
+    goes_through_three_lives(MAPPED_ALONE, tmp_path)
+
+
 ON_THEIR_WAY = """
 import socket
 ours, theirs = socket.socketpair()
