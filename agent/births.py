@@ -410,7 +410,7 @@ def check_rights(name: str, outline: Snapshot, owner: int, groups: frozenset[int
 
     Raises:
         MismatchError: it has become another user or group, as a set-user-id or set-group-id program does; or it has filters of
-            seccomp(2) that a set-user-id program would run under.
+            seccomp(2) that a set-user-id program would run under, or a root directory of its own, whose files that would trust.
         FormatError: it does not tell them as we know it.
     """
     if owner == ROOT or os.geteuid() != ROOT:
@@ -419,6 +419,8 @@ def check_rights(name: str, outline: Snapshot, owner: int, groups: frozenset[int
         reason = f"it runs with other rights than those of its owner, uid {owner}"
     elif rights.could_gain(outline):
         reason = "it is under a seccomp filter, but may gain rights by what it executes (no_new_privs is off)"
+    elif {outline.process.root_directory, *(one.process.root_directory for one in outline.members)} != {"/"}:
+        reason = "it has a root directory of its own (chroot), by whose files it may gain rights"
     else:
         return
     reason += ": only a program of root may; start it as root"

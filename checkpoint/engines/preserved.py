@@ -15,7 +15,7 @@ CAPABILITIES: Final = (
     preserved(
         Area.PROCESS,
         "a root directory of its own (chroot)",
-        "entered again, by who may (CAP_SYS_CHROOT); the directory must be there",
+        "entered again, by who may (CAP_SYS_CHROOT), under an agent of root that is a program of root; it must be there",
     ),
     refused(
         Area.THERE,

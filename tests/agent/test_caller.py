@@ -193,6 +193,17 @@ def test_a_filter_under_which_rights_could_be_gained_is_roots_alone() -> None:
 
 
 @as_root
+def test_a_root_directory_in_which_rights_could_be_gained_is_roots_alone() -> None:
+    outline, child = running_as(credentials(SOMEBODY)), a_member(credentials(SOMEBODY))
+    caged = replace(outline, process=replace(outline.process, root_directory="/home/somebody/cage"))
+    of_child = replace(outline, members=(replace(child, process=replace(child.process, root_directory="/home/somebody/cage")),))
+    for one in (caged, of_child):
+        check_rights("/lab/r1/mapper", one, 0, None)
+        with pytest.raises(MismatchError, match=r"a root directory of its own .*: only a program of root may"):
+            check_rights("/lab/r1/mapper", one, SOMEBODY, None)
+
+
+@as_root
 @pytest.mark.parametrize(
     ("kind", "threads"),
     [
