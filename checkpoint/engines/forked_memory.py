@@ -13,8 +13,7 @@ Source: fork(2); mmap(2).
 from __future__ import annotations
 
 import os
-from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -25,6 +24,7 @@ from checkpoint import pages
 from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.memory import Memory
+from checkpoint.linux.tracking import MEMORY_PLACE
 from checkpoint.model import Snapshot, Vma, VmaKind
 from checkpoint.pages import Words
 
@@ -119,8 +119,18 @@ class _Known:
     is_common: NDArray[np.bool_]
 
 
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """A process as its snapshot tells of it, and the addresses of the pages that are carried."""
+
+    view: Snapshot
+    addresses: Words
+
+
 FilePlace = tuple[str, int, int, int]
 """Path, device and inode of a file, and the address at which its first byte would lie."""
+Mapped = Mapping[int, Sequence[Vma]]
+"""Mappings of one sort, by the process, in the order of these."""
 
 
 def of(views: Sequence[Snapshot], taken: Words, elsewhere: Collection[str] = ()) -> Inheritance:
@@ -130,13 +140,13 @@ def of(views: Sequence[Snapshot], taken: Words, elsewhere: Collection[str] = ())
         taken: where the vessel has something mapped.
         elsewhere: paths of files that are not this machine's own.
     """
-    addresses = [pages.addresses_of(pages.extents(view.runs), abi.PAGE_SIZE) for view in views]
-    anonymous = _alike(views, addresses, taken, _is_plain)
+    told = [_Told(view, pages.addresses_of(pages.extents(view.runs), abi.PAGE_SIZE)) for view in views]
+    anonymous = _alike(told, taken, {index: list(filter(_is_plain, view.vmas)) for index, view in enumerate(views)})
     taken = pages.union(taken, anonymous.regions)
     parts, of_files = [anonymous], []
-    for place in _files_of_several(views):
-        if place[0] not in elsewhere:
-            part = _alike(views, addresses, taken, lambda vma, place=place: _file_of(vma) == place)  # type: ignore[misc]
+    for place, mapped in _files_of_several(told):
+        if place[0] not in elsewhere and not place[0].startswith(MEMORY_PLACE):  # which may have to be made first
+            part = _alike(told, taken, mapped)
             taken = pages.union(taken, part.regions)
             parts.append(part)
             of_files.append((place, part.regions))
@@ -144,22 +154,18 @@ def of(views: Sequence[Snapshot], taken: Words, elsewhere: Collection[str] = ())
         anonymous.regions,
         tuple((place, regions) for place, regions in of_files if len(regions)),
         tuple(source for part in parts for source in part.sources),
-        tuple(map(_joined, zip(*(part.legacies for part in parts), strict=True))),
+        tuple(_joined([part.legacies[index] for part in parts if index in part.legacies]) for index in range(len(views))),
     )
 
 
-def _files_of_several(views: Sequence[Snapshot]) -> list[FilePlace]:
+def _files_of_several(told: Sequence[_Told]) -> Iterator[tuple[FilePlace, Mapped]]:
     """Where several processes have the same file mapped, and pages of their own in it."""
-    counts: Counter[FilePlace] = Counter()
-    for view in views:
-        starts, ends = pages.extents(view.runs).T
-        counts.update({place for vma in view.vmas if (place := _file_of(vma)) and _is_within(vma, starts, ends)})
-    return [place for place, count in counts.items() if count > 1]
-
-
-def _is_within(vma: Vma, starts: Words, ends: Words) -> bool:
-    index = int(np.searchsorted(ends, np.uint64(vma.start), side="right"))
-    return index < len(starts) and int(starts[index]) < vma.end
+    found: dict[FilePlace, dict[int, list[Vma]]] = {}
+    for index, one in enumerate(told):
+        for vma in one.view.vmas:
+            if (place := _file_of(vma)) and len(_within(one, pages.extents([vma]))):
+                found.setdefault(place, {}).setdefault(index, []).append(vma)
+    return ((place, mapped) for place, mapped in found.items() if len(mapped) > 1)
 
 
 def _file_of(vma: Vma) -> FilePlace | None:
@@ -173,37 +179,43 @@ def _file_of(vma: Vma) -> FilePlace | None:
 
 
 def _joined(legacies: Sequence[Legacy]) -> Legacy:
-    kept, there, stale = NO_PAGES, NO_PAGES, NO_PAGES
-    for one in legacies:
-        kept, there, stale = pages.union(kept, one.kept), pages.union(there, one.there), pages.union(stale, one.stale)
-    return Legacy(kept, there, stale)
+    return Legacy(*(_whole(parts) for parts in zip(*((one.kept, one.there, one.stale) for one in legacies), strict=True)))
+
+
+def _whole(parts: Iterable[Words]) -> Words:
+    """Sets that have nothing in common as one."""
+    every = np.concatenate([NO_PAGES, *parts])
+    every = every[np.argsort(every[:, 0])]
+    begins = np.ones(len(every), np.bool_)
+    begins[1:] = every[1:, 0] != every[:-1, 1]
+    return np.stack((every[begins, 0], every[np.roll(begins, -1), 1]), axis=1)
 
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """Of one sort of memory: see `Inheritance`."""
+    """Of one sort of memory: see `Inheritance`; legacies by the process."""
 
     regions: Words
     sources: tuple[tuple[Snapshot, NDArray[np.intp], Words], ...]
-    legacies: tuple[Legacy, ...]
+    legacies: Mapping[int, Legacy]
 
 
-def _alike(views: Sequence[Snapshot], all_addresses: Sequence[Words], taken: Words, counts: Callable[[Vma], bool]) -> _Part:
-    """What is common of the mappings that count."""
+def _alike(told: Sequence[_Told], taken: Words, mapped: Mapped) -> _Part:
+    """What is common in mappings of one sort."""
     known = _Known(np.empty(0, np.uint64), np.empty(0, np.intp), np.empty(0, np.intp), np.empty(0, np.bool_))
-    plain = [pages.difference(pages.extents(vma for vma in view.vmas if counts(vma)), taken) for view in views]
-    equal = [_compared(known, views, index, plain[index], all_addresses[index]) for index in range(len(views))]
+    plain = {index: pages.difference(pages.extents(vmas), taken) for index, vmas in mapped.items()}
+    equal = {index: _compared(known, told, index, plain[index]) for index in mapped}
     common = known.addresses[known.is_common]
-    regions = _regions(views, plain, known, counts)
-    legacies = tuple(
-        _legacy(view, pages.intersection(regions, ours), addresses, known, common, index)
-        for index, (view, ours, addresses) in enumerate(zip(views, plain, equal, strict=True))
-    )
+    regions = _regions(plain, known, mapped)
+    legacies = {
+        index: _legacy(told[index], pages.intersection(regions, plain[index]), equal[index], known, common, index)
+        for index in mapped
+    }
     sources = []
-    for index, view in enumerate(views):
+    for index in mapped:
         mine = known.is_common & (known.views == index)
         if mine.any():
-            sources.append((view, known.rows[mine], known.addresses[mine]))
+            sources.append((told[index].view, known.rows[mine], known.addresses[mine]))
     return _Part(regions, tuple(sources), legacies)
 
 
@@ -216,18 +228,24 @@ def _rows(view: Snapshot) -> NDArray[np.uint8]:
     return np.frombuffer(view.contents, np.uint8).reshape(-1, abi.PAGE_SIZE)
 
 
-def _compared(known: _Known, views: Sequence[Snapshot], index: int, plain: Words, all_addresses: Words) -> Words:
+def _within(one: _Told, some: Words) -> NDArray[np.intp]:
+    """The places of the pages that lie in a set, among all that are carried."""
+    bounds = np.searchsorted(one.addresses, some).tolist()
+    return np.concatenate([np.arange(first, last, dtype=np.intp) for first, last in bounds] or [np.empty(0, np.intp)])
+
+
+def _compared(known: _Known, told: Sequence[_Told], index: int, plain: Words) -> Words:
     """Where a process has what is known, by address; what nobody has had before is known from then on."""
-    rows = np.flatnonzero(pages.covered(plain, all_addresses)) if len(plain) else np.empty(0, np.intp)
-    addresses = all_addresses[rows]
+    rows = _within(told[index], plain)
+    addresses = told[index].addresses[rows]
     _, theirs, ours = np.intersect1d(known.addresses, addresses, assume_unique=True, return_indices=True)
     is_equal = np.zeros(len(ours), np.bool_)
     for view in np.unique(known.views[theirs]).tolist():
         of_view = np.flatnonzero(known.views[theirs] == view)
         for first in range(0, len(of_view), COMPARED_AT_ONCE):
             some = of_view[first : first + COMPARED_AT_ONCE]
-            left = _rows(views[view])[known.rows[theirs[some]]]
-            is_equal[some] = (left == _rows(views[index])[rows[ours[some]]]).all(axis=1)
+            left = _rows(told[view].view)[known.rows[theirs[some]]]
+            is_equal[some] = (left == _rows(told[index].view)[rows[ours[some]]]).all(axis=1)
     known.is_common[theirs[is_equal]] = True
     fresh = np.ones(len(addresses), np.bool_)
     fresh[ours] = False
@@ -244,22 +262,23 @@ def _add(known: _Known, addresses: Words, rows: NDArray[np.intp], index: int) ->
     known.is_common = np.concatenate((known.is_common, np.zeros(len(addresses), np.bool_)))[order]
 
 
-def _regions(views: Sequence[Snapshot], plain: Sequence[Words], known: _Known, counts: Callable[[Vma], bool]) -> Words:
+def _regions(plain: Mapping[int, Words], known: _Known, mapped: Mapped) -> Words:
     """The whole mappings in which something is common."""
     found = NO_PAGES
-    for index, view in enumerate(views):
+    for index, vmas in mapped.items():
         addresses = known.addresses[known.is_common & (known.views == index)]
         if not len(addresses):
             continue
-        for vma in filter(counts, view.vmas):
+        for vma in vmas:
             first, last = np.searchsorted(addresses, np.array([vma.start, vma.end], np.uint64)).tolist()
             if first < last:
                 found = pages.union(found, pages.intersection(pages.extents([vma]), plain[index]))
     return found
 
 
-def _legacy(view: Snapshot, kept: Words, equal: Words, known: _Known, common: Words, index: int) -> Legacy:
+def _legacy(one: _Told, kept: Words, equal: Words, known: _Known, common: Words, index: int) -> Legacy:
     mine = known.addresses[known.is_common & (known.views == index)]
     there = pages.extents_of_addresses(np.union1d(equal, mine), abi.PAGE_SIZE)
-    inside = pages.intersection(pages.extents_of_addresses(common, abi.PAGE_SIZE), kept)
-    return Legacy(kept, there, pages.difference(inside, pages.extents(view.runs)))
+    inside = common[pages.covered(kept, common)]
+    is_there, _ = pages.found_among(one.addresses, inside)
+    return Legacy(kept, there, pages.extents_of_addresses(inside[~is_there], abi.PAGE_SIZE))
