@@ -3,7 +3,7 @@
 A name is what bind(2) was told, and stays so when the directory has changed or the file has another name or none. The file that
 its predecessor has left is replaced, one that somebody listens to is not. A socket whose file is gone (a *ghost*) is bound, and
 its file removed again; where it was bound by a relative name, in a directory that is made for it. So is one by a whole name that
-leads to something else by now: that directory is its root directory for the while.
+leads to something else by now, or that began at a root directory of its own: that directory is its root for the while.
 
 Facts of unix sockets that are told here: ``path`` of its name, "" if that is no file's; ``mode`` and ``file_owner`` of that file,
 mode -1 if it is gone; ``directory`` in which it was bound by a relative name, "" if it was not, or if that is the program's own;
@@ -53,6 +53,8 @@ CAPABILITIES: Final = (
 )
 
 DELETED: Final = " (deleted)"
+HIDDEN: Final = "failover-socket-"
+"""How directories begin that are made for the while that a name takes."""
 GONE: Final = -1
 FREED_S: Final = 1.0
 """How long the kernel may take to find sockets that nobody can reach any more."""
@@ -91,9 +93,19 @@ def observe(held: OpenFile, looked: socket.socket, name: bytes) -> dict[str, Fac
         "mode": mode,
         "file_owner": list(owner),
         "directory": "" if directory == working else directory,
-        "root": root if path == root + told else "",
+        "root": root if _began_at(root, told, path) and not _leads_to_it(held.pid, told, path, about) else "",
         "covered": is_covered,
     }
+
+
+def _began_at(root: str, told: str, path: str) -> bool:
+    """Whether a whole name may have been given below a root directory, where its file lies; "" is the machine's."""
+    return bool(root) and os.path.isabs(told) and path.startswith(root + "/")
+
+
+def _leads_to_it(pid: int, told: str, path: str, about: os.stat_result | None) -> bool:
+    """Whether it leads from the machine's root to its file: it was given before its process got another one."""
+    return told == path or (about is not None and _leads_to(f"{procfs.outlook(pid)}{told}", about))
 
 
 def _leads_to(path: str, about: os.stat_result) -> bool:
@@ -141,6 +153,7 @@ def mismatches(held: Resource) -> Iterator[str]:
     """Why it could not have its name here."""
     path, name = str(held.facts["path"]), held.facts["name"]
     assert isinstance(name, bytes)
+    path = _told(name) if is_ghost(held) else path  # where that is bound for the while
     has_own = held.facts["type"] == socket.SOCK_DGRAM or held.facts["state"] != ESTABLISHED  # no accepted end has
     if name[:1] == b"\0" and has_own and not _is_free(name, number_of(held.facts["type"])):
         yield f"the abstract name {_told(name)!r} of the unix socket {held.name} is another process's here: end that first"
@@ -202,11 +215,13 @@ def is_ghost(held: Resource) -> bool:
 
 
 def _is_hidden(held: Resource) -> bool:
-    """Whether it is bound where nobody looks: a ghost by a relative name, or by one that leads to something else."""
+    """Whether it is bound where nobody looks: a ghost by a relative name, or by one that leads elsewhere from where we look.
+
+    One that was so once stays so: it lay in a directory of ours, which does not tell where its name began.
+    """
     told = _told(held.facts["name"])
-    return is_ghost(held) and (
-        not os.path.isabs(told) or bool(held.facts.get("covered")) or _is_something_else(_root_of(held) + told)
-    )
+    is_elsewhere = bool(held.facts.get("covered") or _root_of(held)) or f"/{HIDDEN}" in str(held.facts["path"])
+    return is_ghost(held) and (not os.path.isabs(told) or is_elsewhere or _is_something_else(told))
 
 
 # --- Restore -----------------------------------------------------------------------------------------------------------
@@ -281,17 +296,19 @@ class Naming:
         """Bind it, keep hold of its file, and remove that; directories that are made for it go again."""
         table, told = self._table, _told(one.facts["name"])
         is_whole = os.path.isabs(told)
-        is_free = is_whole and not one.facts.get("covered") and not _is_something_else(_root_of(one) + told)
-        root = "" if is_free else tempfile.mkdtemp(prefix="failover-socket-")
+        root = tempfile.mkdtemp(prefix=HIDDEN) if _is_hidden(one) else ""
         if root:
             os.rmdir(root)  # its name is ours: the vessel makes it, with its program's rights
-        path = os.path.join(root, told.lstrip("/")) if root else _root_of(one) + told
-        directories = _missing([root] if root else [], os.path.dirname(path))
+        if root and is_whole:
+            directories, path = _led_through(root, told)
+        else:
+            path = os.path.join(root, told)
+            directories = _missing([root] if root else [], os.path.dirname(path))
         for directory in directories:
             table.call(f"make the directory {directory}", "mkdirat", AT_FDCWD, table.place_path(directory), 0o700)
         if not root:
             table.attempt("", "unlinkat", AT_FDCWD, table.place_path(path), 0)
-        with self._inside("" if is_whole else root), self._below(root if root and is_whole else _root_of(one)):
+        with self._inside("" if is_whole else root), self._below(root if is_whole else ""):
             self._bind(one, made)
         self._keep(one, path)
         table.call(f"unlink {path}", "unlinkat", AT_FDCWD, table.place_path(path), 0)
@@ -333,6 +350,19 @@ def _root_of(one: Resource) -> str:
 def packed(name: bytes) -> bytes:
     """A name as bind(2) and connect(2) take it."""
     return socket.AF_UNIX.to_bytes(2, "little") + name
+
+
+def _led_through(root: str, told: str) -> tuple[list[str], str]:
+    """The directories that a whole name leads through below one that is its root, that first; and where it ends."""
+    place, directories = [root], {root: None}
+    *names, last = [name for name in told.split("/") if name not in ("", ".")]
+    for name in names:
+        if name != "..":
+            place.append(name)
+            directories["/".join(place)] = None
+        elif len(place) > 1:  # nothing lies above a root
+            place.pop()
+    return list(directories), "/".join((*place, last))
 
 
 def _missing(made: list[str], directory: str) -> list[str]:

@@ -133,7 +133,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
 
 def _is_below(root: str, path: str) -> bool:
     """Whether a program with this root directory has a name for a path of ours."""
-    return root == "/" or path.startswith(root + "/")
+    return root == "/" or path == root or path.startswith(root + "/")
 
 
 def _watches(held: OpenFile) -> Iterator[tuple[int, str, int]]:
@@ -239,7 +239,8 @@ def settle(table: CallTable, held: Resource, descriptor: int, root: str) -> None
     """
     last, unread, buffer = 0, 0, 0
     for number, path, mask in _listed(held):
-        place, what = table.place_path(path if root == "/" else path.removeprefix(root)), f"watch {path} by {held.name}"
+        inside = path if root == "/" else path.removeprefix(root) or "/"
+        place, what = table.place_path(inside), f"watch {path} by {held.name}"
         for between in range(last + 1, number):
             buffer = buffer or table.place(bytes(EVENT_SIZE * EVENTS_AT_ONCE))
             table.call(what, "inotify_add_watch", descriptor, place, IN_DELETE_SELF, least=between, most=between)

@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.compiler, pytest.mark.root]
 Compiled = Callable[..., Path]
 
 
-@pytest.mark.parametrize("case", ["inside", "across", "sockets", "watch", "user"])
+@pytest.mark.parametrize("case", ["inside", "across", "sockets", "linked", "watch", "user"])
 def test_a_program_in_a_chroot_stays_there_over_three_lives(case: str, compiled: Compiled, tmp_path: Path) -> None:
     expect_three_lives(start_tracee(compiled("chroots"), tmp_path, case), tmp_path)
 

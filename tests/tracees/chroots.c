@@ -100,10 +100,36 @@ static void named_sockets(void) { /* a listener and a connection to it, by a nam
     EXPECT(access("/work/lost", F_OK), "the name that was gone is back");
 }
 
+static void linked_sockets(void) { /* a listener, and one that is gone, by names that lead through a link, which begins at the root */
+    enter("/");
+    if (symlink("/work", "/link") && errno != EEXIST) cannot("make a link");
+    struct sockaddr_un address = {.sun_family = AF_UNIX, .sun_path = "/link/door"}, gone = {.sun_family = AF_UNIX};
+    strcpy(gone.sun_path, "/link/../work/./lost");
+    int listener = socket(AF_UNIX, SOCK_STREAM, 0), lost = socket(AF_UNIX, SOCK_DGRAM, 0), sender = socket(AF_UNIX, SOCK_DGRAM, 0);
+    unlink("/work/door");
+    if (bind(listener, (void *)&address, sizeof address) || listen(listener, 4)) cannot("listen");
+    if (bind(lost, (void *)&gone, sizeof gone) || connect(sender, (void *)&gone, sizeof gone)) cannot("bind");
+    unlink("/work/lost");
+    wait_here();
+    char found[20] = "";
+    int client = connected("/work/door"), server = client < 0 ? -1 : accept(listener, NULL, NULL);
+    EXPECT(server >= 0 && write(client, "after", 5) == 5 && read(server, found, 20) == 5, "nobody answers at its name");
+    EXPECT(write(sender, "gone", 4) == 4 && read(lost, found, 20) == 4, "the one without a file hears nothing");
+    EXPECT(access("/work/lost", F_OK), "the name that was gone is back");
+    for (int index = 0; index < 2; index++) {
+        struct sockaddr_un now = {0};
+        socklen_t size = sizeof now;
+        getsockname(index ? lost : listener, (void *)&now, &size);
+        EXPECT(!strcmp(now.sun_path, (index ? gone : address).sun_path), "it is named %s", now.sun_path);
+    }
+}
+
 static void watch(void) {
     enter("/");
     int notices = inotify_init1(IN_NONBLOCK), number = inotify_add_watch(notices, "/work", IN_CREATE);
+    int of_root = inotify_add_watch(notices, "/", IN_DELETE_SELF);
     wait_here();
+    EXPECT(of_root != number && inotify_add_watch(notices, "/", IN_DELETE_SELF) == of_root, "its root is not watched");
     char found[200] = "";
     close(open("/work/new", O_CREAT | O_WRONLY, 0600));
     struct inotify_event *event = (void *)found;
@@ -170,7 +196,7 @@ int main(int count, char **words) {
     static const struct {
         const char *name;
         void (*run)(void);
-    } all[] = {{"inside", inside}, {"across", across}, {"sockets", named_sockets}, {"watch", watch},
+    } all[] = {{"inside", inside}, {"across", across}, {"sockets", named_sockets}, {"watch", watch}, {"linked", linked_sockets},
                {"watch_outside", watch_outside}, {"user", user}, {"child", child}, {"common", common}};
     go = words[1];
     for (size_t index = 0; count > 2 && index < sizeof all / sizeof *all; index++)
