@@ -37,6 +37,11 @@ PLACE_COUNT: Final = 1 << 24
 """Stretches: more than there are entries in any tree."""
 NO_PLACE: Final = -1
 
+PATHS: Final = ("path", "directory", "root")
+"""Facts of resources that are paths."""
+LISTED: Final = ("watches", "threads")
+"""Facts that are lists of lists, the second item of which is a path where it is a text."""
+
 OWN_PREFIX: Final = b".failover-"
 """How names of our own begin, beside a carried path or in it: they are never carried."""
 
@@ -169,8 +174,20 @@ def relocated(state: Snapshot, places: Mapping[str, str]) -> Snapshot:
 def _resource_at(held: Resource, here: Callable[[str], str]) -> Resource:
     if held.kind == KIND:
         return replace(held, name=here(held.name))
-    path = held.facts.get("path")
-    return replace(held, facts={**held.facts, "path": here(path)}) if isinstance(path, str) else held
+    return replace(held, facts={name: _fact_at(name, fact, here) for name, fact in held.facts.items()})
+
+
+def _fact_at(name: str, fact: Fact, here: Callable[[str], str]) -> Fact:
+    if name in PATHS and isinstance(fact, str):
+        return here(fact)
+    return [_listed_at(one, here) for one in fact] if name in LISTED and isinstance(fact, list) else fact
+
+
+def _listed_at(one: Fact, here: Callable[[str], str]) -> Fact:
+    match one:
+        case [first, str() as path, *rest]:
+            return [first, here(path), *rest]
+    return one
 
 
 def size_of(state: Snapshot) -> int:

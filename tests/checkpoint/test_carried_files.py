@@ -23,7 +23,7 @@ from checkpoint import carried
 from checkpoint.engine import CaptureOrder, Carry, ProtectOrder, Session, Terms
 from checkpoint.errors import MismatchError, RestoreError, UnsupportedError
 from checkpoint.linux.eyes import Eyes
-from checkpoint.model import Snapshot
+from checkpoint.model import Resource, Snapshot
 from checkpoint.resources import carried_trees, giving, laying, moves
 from checkpoint.resources.carried_trees import CarriedTrees
 from tests.checkpoint import round_trip, snapshots
@@ -636,3 +636,18 @@ def test_files_are_laid_down_at_another_path_where_the_robot_wants_them(tmp_path
         assert os.readlink(f"/proc/{program.pid}/cwd") == str(here)
         assert (here / "a").read_bytes() > bytes(8)
         assert (there / "a").read_bytes() == left
+
+
+def test_whatever_else_leads_below_a_carried_path_follows_to_where_it_is_laid_down() -> None:
+    """Where single threads work, what is watched, where a socket's name begins."""
+    told = (
+        Resource(carried.KIND, "/kept", {"entries": [], "size": 0}),
+        Resource("thread_tables", "", {"descriptors": [], "threads": [[7, "/kept/of_thread", 18, 0], [8, "", 0, [[3, 4, 1]]]]}),
+        Resource("watches", "fd 3", {"descriptors": [[3, 0]], "watches": [[1, "/kept", 2], [2, "/keptnot", 2]]}),
+        Resource("unix_sockets", "fd 4", {"descriptors": [], "path": "/kept/cage/x", "root": "/kept/cage", "directory": ""}),
+    )
+    state = replace(snapshots.snapshot({}), resources=told)
+    _, threads, watches, names = carried.relocated(state, {"/kept": "/here"}).resources
+    assert threads.facts["threads"] == [[7, "/here/of_thread", 18, 0], [8, "", 0, [[3, 4, 1]]]]
+    assert watches.facts["watches"] == [[1, "/here", 2], [2, "/keptnot", 2]]
+    assert names.facts == {"descriptors": [], "path": "/here/cage/x", "root": "/here/cage", "directory": ""}
