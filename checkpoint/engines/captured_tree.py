@@ -500,7 +500,8 @@ def _told_of(process: CapturedProcess, look: Look, seen: SeenOthers, around: Sur
     held = sorted_into_kinds(look.standing.opened, around)
     named = f"its process {process.pid} ({look.standing.status.name})"
     shared = _joint(look, seen)
-    refused = joint.refuse(shared, process.pid)
+    unopened = process.unopened(look)
+    refused = joint.refuse(shared, process.pid, unopened)
     reasons = [*held.reasons, *process.reasons(look, seen.pids), *refused, *_of_namespaces(process.pid, seen)]
     return SeenProcess(
         captured=process,
@@ -509,7 +510,7 @@ def _told_of(process: CapturedProcess, look: Look, seen: SeenOthers, around: Sur
         threads=process.thread_states(look),
         vmas=process.mappings(look, is_kin=True),
         held=held,
-        unopened=(*process.unopened(look), *shared, *stops.describe(stopped_by, look.standing.stat.exit_code)),
+        unopened=(*unopened, *shared, *stops.describe(stopped_by, look.standing.stat.exit_code)),
         reasons=tuple(f"{named}: {reason}" for reason in reasons),
     )
 

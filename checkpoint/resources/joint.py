@@ -17,6 +17,7 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import ProcessGoneError
 from checkpoint.linux import abi, procfs
 from checkpoint.model import Resource, Snapshot
+from checkpoint.resources import thread_tables
 from checkpoint.resources.rebuilding import number_of
 
 KIND: Final = "joint"
@@ -30,9 +31,11 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.PROCESS,
-        "a root directory (chroot) that two processes share by CLONE_FS",
+        "a root directory (chroot) that two processes share by CLONE_FS; a thread with a table of descriptors of its own in a "
+        "process that shares its table with another (CLONE_FILES)",
         "have the child make it its own (unshare), or run it without the chroot",
         "it has its directories in common with its parent",
+        "it has its open files in common with its parent",
     ),
 )
 _KINDS: Final = ((abi.KCMP_FILES, CLONE_FILES), (abi.KCMP_FS, CLONE_FS))
@@ -53,9 +56,12 @@ def describe(pid: int, parent: int) -> tuple[Resource, ...]:
     return (Resource(KIND, "shared with its parent", {"descriptors": [], "flags": flags}),) if flags else ()
 
 
-def refuse(shared: Iterable[Resource], pid: int) -> Iterator[str]:
-    """Why what it shares with its parent cannot be kept: who enters a root directory first
-    takes the other along, which still opens files.
+def refuse(shared: Iterable[Resource], pid: int, of_threads: Iterable[Resource]) -> Iterator[str]:
+    """Why what it shares with its parent cannot be kept: who enters a root directory first takes the other along, which still
+    opens files; and its threads are born before its parent has filled the table that they take theirs from.
+
+    Args:
+        of_threads: among them what its threads have for themselves.
 
     Raises:
         ProcessGoneError: it has ended.
@@ -63,6 +69,8 @@ def refuse(shared: Iterable[Resource], pid: int) -> Iterator[str]:
     root = procfs.read_link(pid, "root")
     if root != "/" and flags_of(shared) & CLONE_FS:
         yield f"it has its directories in common with its parent, in the root directory {root} (chroot), which is not kept yet"
+    if flags_of(shared) & CLONE_FILES and thread_tables.has_own_table(of_threads):
+        yield "it has its open files in common with its parent, and a thread of it has others, which is not kept yet"
 
 
 def flags_of(resources: Iterable[Resource]) -> int:

@@ -159,6 +159,7 @@ def findings_of_all(resources: Sequence[Resource], *, standing: bool) -> tuple[F
         *netlink_sockets.findings(resources),
         *packet_sockets.findings(resources),
         *files.findings(resources),
+        *pidfds.findings(resources),
     )
 
 

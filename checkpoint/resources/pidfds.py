@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
+from checkpoint.engine import REFUSED, Finding
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
@@ -32,8 +33,8 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.PIPES,
-        "a pidfd of another program, of a thread that has ended or that an epoll instance watches; one of a living process that "
-        "several share",
+        "a pidfd of another program, of a thread that has ended, or that an epoll instance watches, or that is on its way in a "
+        "unix socket; one of a living process that several share",
         "let the program close them, or wait by number",
         "is a pidfd of {}, which is not kept",
     ),
@@ -108,6 +109,23 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     if held.description:
         whom += " that several processes share"
     return f"{held.name} is a pidfd of {whom}, which is not kept yet: let the program close it, or wait by number"
+
+
+def findings(held: Sequence[Resource]) -> Iterator[Finding]:
+    """Those of threads that are on their way in a socket, too: what is sent before threads are born stands for the process."""
+    messages = [numbers for one in held for numbers in _list(one.facts.get("passed", []))]
+    passed = {number for numbers in messages for number in _list(numbers)}
+    for one in held:
+        thread = number_of(one.facts.get("thread", 0)) if one.kind == KIND else 0
+        if thread and passed & {_list(pair)[0] for pair in _list(one.facts["descriptors"])}:
+            whom = f"the single thread {thread} that is on its way in a unix socket, too"
+            text = f"{one.name} is a pidfd of {whom}, which is not kept yet: it is kept as soon as that is received"
+            yield Finding(KIND, one.name, REFUSED, text)
+
+
+def _list(fact: Fact) -> list[Fact]:
+    assert isinstance(fact, list)
+    return fact
 
 
 def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:

@@ -217,6 +217,11 @@ def _has_record_lock(held: Descriptor) -> bool:
     return any(line.startswith("lock:") and " POSIX " in line for line in held.text.splitlines())
 
 
+def has_own_table(resources: Iterable[Resource]) -> bool:
+    """Whether a thread has a table of descriptors for itself."""
+    return any(files is not None for _, _, _, files in _threads(resources))
+
+
 # --- The restore -----------------------------------------------------------------------------------------------------
 
 
