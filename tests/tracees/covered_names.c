@@ -44,17 +44,25 @@ static void covered_pipe(void) {
     EXPECT_EQUAL("flags", fcntl(both, F_GETFL) & O_NONBLOCK, O_NONBLOCK);
 }
 
-static void accepted(void) { /* both ends of a connection by a relative name */
+static void accepted_by(const char *name) { /* both ends of a connection */
     char found[20] = "";
-    struct sockaddr_un address = named("place/door");
-    int door = listener("place/door"), client = socket(AF_UNIX, SOCK_STREAM, 0);
+    struct sockaddr_un address = named(name);
+    int door = listener(name), client = socket(AF_UNIX, SOCK_STREAM, 0);
     if (connect(client, (void *)&address, sizeof address)) cannot("connect");
     int server = accept(door, NULL, NULL);
     close(door);
     wait_here();
     EXPECT(write(client, "hello", 5) == 5 && read(server, found, 20) == 5, "they are not connected");
-    expect_name(server, "place/door");
+    expect_name(server, name);
     EXPECT(access("place/door", F_OK), "the name is in what was mounted");
+}
+
+static void accepted(void) { accepted_by("place/door"); }
+
+static void accepted_whole(void) {
+    char name[100];
+    if (!getcwd(name, sizeof name - 20)) cannot("tell the directory");
+    accepted_by(strcat(name, "/place/door"));
 }
 
 static void listening(void) {
@@ -82,7 +90,7 @@ int main(int count, char **words) {
     static const struct {
         const char *name;
         void (*run)(void);
-    } all[] = {{"pipe", covered_pipe}, {"accepted", accepted}, {"listening", listening}, {"replaced", replaced}};
+    } all[] = {{"pipe", covered_pipe}, {"accepted", accepted}, {"accepted_whole", accepted_whole}, {"listening", listening}, {"replaced", replaced}};
     go = words[1];
     if (mkdir("place", 0700) && errno != EEXIST) cannot("make a directory");
     for (size_t index = 0; count > 2 && index < sizeof all / sizeof *all; index++)
