@@ -15,6 +15,7 @@ Source: unshare(2), kcmp(2), proc_pid_task(5).
 from __future__ import annotations
 
 import fcntl
+import functools
 import itertools
 import os
 from collections.abc import Iterable, Iterator, Mapping
@@ -46,7 +47,7 @@ CAPABILITIES: Final = (
         "which its first thread has not",
         "a root directory of its own",
         "a working directory of its own that",
-        "two of its threads share, but not all",
+        "has directories or open files {}",
         "a record lock of its own",
     ),
     refused(Area.THERE, "the working directory of a single thread is missing", "make it", "in which its thread"),
@@ -55,10 +56,13 @@ CAPABILITIES: Final = (
 CLONE_FS: Final = 0x200
 CLONE_FILES: Final = 0x400
 SAME: Final = 0
+LESS: Final = 1
 """Of kcmp(2)."""
 KINDS: Final = (abi.KCMP_FS, abi.KCMP_FILES)
 SHARED_TABLE: Final = 0
 """In place of a thread's descriptors: they are the first one's."""
+
+OF_TWINS: Final = "that two of its threads share, but not all, which is not kept yet"
 
 Own = frozenset[int]
 """What of `KINDS` a thread has for itself."""
@@ -78,6 +82,7 @@ def refuse(pid: int, tid: int, kinds: Own) -> Iterator[str]:
     """Why what a thread has for itself cannot be kept."""
     _, reasons = _look_at(pid, tid, kinds)
     yield from reasons
+    yield from _against_twins(pid, tid, kinds)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +133,10 @@ class ThreadTables:
                 raise CaptureError(f"thread {tid} of pid {self._pid} has just got files of its own (unshare); capture it again")
         if not self._told:
             return ()
-        if reasons := [reason for told in self._told.values() for reason in told.reasons]:
+        reasons = [reason for told in self._told.values() for reason in told.reasons]
+        if any(_are_twins([tid for tid, kinds in now.items() if kind in kinds], kind) for kind in KINDS):
+            reasons.append(f"it has directories or open files {OF_TWINS}")
+        if reasons:
             raise CaptureError(f"cannot capture pid {self._pid} at this moment: {'; '.join(reasons)}")
         threads: list[Fact] = [told.fact for told in self._told.values()]
         return (Resource(KIND, "what threads have for themselves", {"descriptors": [], "threads": threads}),)
@@ -161,7 +169,6 @@ def _look_at(pid: int, tid: int, kinds: Own) -> tuple[list[Fact], list[str]]:
         pairs, against = _pairs(pid, tid, named)
         fact[3] = pairs
         reasons += against
-    reasons += _against_twins(pid, tid, kinds, named)
     return fact, reasons
 
 
@@ -176,12 +183,26 @@ def _against_directory(pid: int, tid: int, directory: str, named: str) -> Iterat
         yield f"{named} has a working directory of its own that is one of /proc, which is not kept yet"
 
 
-def _against_twins(pid: int, tid: int, kinds: Own, named: str) -> Iterator[str]:
+def _against_twins(pid: int, tid: int, kinds: Own) -> Iterator[str]:
     """Another thread that shares with this one what it does not share with the first."""
     for other in thread_ids(pid)[1:]:
         if other != tid and any(abi.kcmp(tid, other, kind) == SAME for kind in kinds):
-            yield f"{named} has directories or open files that two of its threads share, but not all, which is not kept yet"
+            yield f"its thread {tid} has directories or open files {OF_TWINS}"
             return
+
+
+def _are_twins(owners: Iterable[int], kind: int) -> bool:
+    """Whether two of these threads share something; the kernel's order of what they have makes them neighbours."""
+
+    def by_what_they_have(one: int, other: int) -> int:
+        return _order(one, other, kind)
+
+    ordered = sorted(owners, key=functools.cmp_to_key(by_what_they_have))
+    return any(_order(one, other, kind) == 0 for one, other in itertools.pairwise(ordered))
+
+
+def _order(one: int, other: int, kind: int) -> int:
+    return {LESS: -1, SAME: 0}.get(abi.kcmp(one, other, kind) or SAME, 1)
 
 
 def _pairs(pid: int, tid: int, named: str) -> tuple[list[Fact], list[str]]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import socket
+import threading
 from pathlib import Path
 
 import pytest
 
+from checkpoint.errors import CaptureError
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import joint, pidfds, thread_tables, unix_names
 from checkpoint.resources.kinds import reasons_of_all
@@ -41,3 +44,36 @@ def test_who_has_the_name_of_a_socket_whose_file_is_gone_is_looked_for_where_it_
         others.bind(told)
         assert ["is another process's here" in one for one in unix_names.mismatches(Resource("", "fd 3", facts))] == [True]
     assert not list(unix_names.mismatches(Resource("", "fd 3", facts)))
+
+
+@pytest.mark.parametrize("is_together", [False, True])
+def test_threads_that_share_what_the_first_has_not_are_told_from_those_that_have_it_alone(is_together: bool) -> None:
+    """Who is born of a thread with a directory of its own shares that, until it takes its own."""
+    born, done = threading.Barrier(3), threading.Event()
+
+    def live(*, takes_own: bool, has_child: bool) -> None:
+        assert not takes_own or ctypes.CDLL(None).unshare(thread_tables.CLONE_FS) == 0
+        child = threading.Thread(target=live, kwargs={"takes_own": not is_together, "has_child": False})
+        if has_child:
+            child.start()
+        born.wait()
+        done.wait()
+        if has_child:
+            child.join()
+
+    mother = threading.Thread(target=live, kwargs={"takes_own": True, "has_child": True})
+    mother.start()
+    born.wait()
+    tables = thread_tables.ThreadTables(os.getpid())
+    try:
+        tables.prepare()
+        tables.look()
+        if is_together:
+            with pytest.raises(CaptureError, match="that two of its threads share, but not all"):
+                tables.describe()
+        else:
+            (told,) = tables.describe()
+            assert len(list(thread_tables._threads([told]))) == 2
+    finally:
+        done.set()
+        mother.join()
