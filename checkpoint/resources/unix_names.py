@@ -53,6 +53,8 @@ CAPABILITIES: Final = (
 )
 
 DELETED: Final = " (deleted)"
+LOOKS: Final = 3
+"""After so many in vain it is a mount that hides a name."""
 HIDDEN: Final = "failover-socket-"
 """How directories begin that are made for the while that a name takes."""
 GONE: Final = -1
@@ -76,17 +78,14 @@ def observe(held: OpenFile, looked: socket.socket, name: bytes) -> dict[str, Fac
     opened = bound_file(looked)
     if opened is None:  # we may not ask the socket: then the name counts, as the program would look for it now
         path = root + told if os.path.isabs(told) else os.path.join(working, told)
-        about = _socket_at(f"{procfs.outlook(held.pid)}{path}")
+        about, is_covered = _socket_at(f"{procfs.outlook(held.pid)}{path}"), False
     else:
         try:
-            path, about = os.readlink(f"/proc/self/fd/{opened}"), os.fstat(opened)
+            path, about, is_covered = _place_of(held.pid, opened)
         finally:
             os.close(opened)
-        path = path.removesuffix(DELETED) if not about.st_nlink else path
-    is_covered = about is not None and about.st_nlink > 0 and not _leads_to(f"{procfs.outlook(held.pid)}{path}", about)
-    mode, owner = (
-        (GONE, []) if about is None or not about.st_nlink or is_covered else (about.st_mode, [about.st_uid, about.st_gid])
-    )
+    is_there = about is not None and about.st_nlink > 0 and not is_covered
+    mode, owner = (about.st_mode, [about.st_uid, about.st_gid]) if about is not None and is_there else (GONE, [])
     directory = "" if os.path.isabs(told) else os.path.normpath(path).removesuffix(f"/{os.path.normpath(told)}") or "/"
     return {
         "path": path,
@@ -96,6 +95,20 @@ def observe(held: OpenFile, looked: socket.socket, name: bytes) -> dict[str, Fac
         "root": root if _began_at(root, told, path) and not _leads_to_it(held.pid, told, path, about) else "",
         "covered": is_covered,
     }
+
+
+def _place_of(pid: int, opened: int) -> tuple[str, os.stat_result, bool]:
+    """Where a file lies, or lay if it is gone; and whether it lies below a mount.
+
+    A program that runs may move or remove it while we look: then we look again.
+    """
+    for _ in range(LOOKS):
+        path, about = os.readlink(f"/proc/self/fd/{opened}"), os.fstat(opened)
+        if not about.st_nlink:
+            return path.removesuffix(DELETED), about, False
+        if _leads_to(f"{procfs.outlook(pid)}{path}", about):
+            return path, about, False
+    return path, about, True
 
 
 def _began_at(root: str, told: str, path: str) -> bool:

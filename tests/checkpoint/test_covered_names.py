@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+import socket
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import restore_checks
 from checkpoint.errors import MismatchError, UnsupportedError
+from checkpoint.resources import OpenFile, unix_names
 from tests.checkpoint.round_trip import (
     captured,
     captured_and_killed,
@@ -75,3 +78,22 @@ def test_a_named_pipe_that_is_not_below_the_mount_here_is_named(compiled: Compil
     (tmp_path / "place" / "pipe").unlink()
     with pytest.raises(MismatchError, match="which a mount covers, is not on this machine"):
         restored(snapshot, tmp_path)
+
+
+@pytest.mark.parametrize("act", [Path.unlink, lambda path: path.rename(path.with_name("moved"))], ids=["removed", "moved"])
+def test_a_socket_whose_file_goes_away_while_it_is_looked_at_is_below_no_mount(
+    act: Callable[[Path], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks, leads_to = [0], unix_names._leads_to
+
+    def look(path: str, about: os.stat_result) -> bool:
+        if not looks[0]:
+            act(tmp_path / "name")
+        looks[0] += 1
+        return leads_to(path, about)
+
+    monkeypatch.setattr(unix_names, "_leads_to", look)
+    with socket.socket(socket.AF_UNIX) as made:
+        made.bind(str(tmp_path / "name"))
+        seen = unix_names.observe(OpenFile(os.getpid(), ()), made, os.fsencode(made.getsockname()) + b"\0")
+    assert (seen["covered"], seen["mode"] == unix_names.GONE) == (False, act is Path.unlink)
