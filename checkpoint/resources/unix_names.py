@@ -325,6 +325,8 @@ class Naming:
             self._bind(one, made)
         self._keep(one, path)
         table.call(f"unlink {path}", "unlinkat", AT_FDCWD, table.place_path(path), 0)
+        itself = f"/proc/self/fd/{self._files[number_of(one.facts['socket'])]}"  # nobody else reaches it any more
+        table.attempt("", "fchmodat", AT_FDCWD, table.place_path(itself), 0o777)  # whoever connected to it may again
         for directory in reversed(directories):
             table.attempt("", "unlinkat", AT_FDCWD, table.place_path(directory), REMOVE_DIRECTORY)
 

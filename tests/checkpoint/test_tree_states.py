@@ -332,6 +332,40 @@ def test_named_pipes_that_two_processes_have_opened_are_filled_once(tmp_path: Pa
     goes_through_three_lives(NAMED_PIPES, tmp_path)
 
 
+CONNECTED_AS_NOBODY = """
+import socket, tempfile
+os.setgroups([])
+os.setresgid(65534, 65534, 65534)
+os.setresuid(65534, 65534, 65534)
+os.umask(0o77)
+place = tempfile.mkdtemp()
+listener = socket.socket(socket.AF_UNIX)
+listener.bind(place + "/name")
+listener.listen()
+
+def work():
+    client = socket.socket(socket.AF_UNIX)
+    client.connect(place + "/name")
+    wait_for_go()
+    client.sendall(b"through")
+
+child = born(work)
+accepted, _ = listener.accept()
+os.unlink(place + "/name")
+is_ready()
+expect("what comes through", accepted.recv(100), b"through")
+expect_child(child)
+os.rmdir(place)
+print("ok", flush=True)
+"""
+
+
+def test_an_ordinary_user_s_connection_to_a_name_that_is_gone_is_made_again(tmp_path: Path) -> None:
+    """Its file is made by who restores; whoever had connected to it may connect to that."""
+    tmp_path.chmod(0o755)
+    goes_through_three_lives(CONNECTED_AS_NOBODY, tmp_path)
+
+
 OWNERS = """
 import fcntl
 heard = []
