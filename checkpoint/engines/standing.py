@@ -15,7 +15,7 @@ from checkpoint.engines.confinements import Confinements
 from checkpoint.engines.entering import Entered, where_it_stands
 from checkpoint.engines.inquiry import Inquiry, Told, rearmed
 from checkpoint.engines.outputs import Outputs
-from checkpoint.engines.standing_threads import ThreadOnlooker, ThreadPlace, ThreadStanding
+from checkpoint.engines.standing_threads import Read, ThreadOnlooker, ThreadPlace, ThreadStanding
 from checkpoint.errors import CaptureError
 from checkpoint.linux import confinement, procfs
 from checkpoint.linux.confinement import FREE, Confinement
@@ -25,7 +25,6 @@ from checkpoint.linux.readings import Reading, Readings
 from checkpoint.linux.remote import Answers
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.timers import parse_timers
-from checkpoint.model import Rseq
 from checkpoint.resources import Kept, Opened, OpenFile, gather, with_contents
 from checkpoint.resources.recollection import Recollection
 from checkpoint.resources.thread_rights import ThreadRights
@@ -36,7 +35,7 @@ NOTHING_WRITTEN: Final[Totals] = (0, 0)
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class Place(Read):
     """Where the first thread stands, and the others.
 
     Attributes:
@@ -51,21 +50,6 @@ class Place:
     status_text: bytes
     others: tuple[ThreadPlace, ...] = ()
     confinement: Confinement = FREE
-
-    @property
-    def mask(self) -> int:
-        """The program's own."""
-        return self.reading.mask
-
-    @property
-    def pending(self) -> tuple[bytes, ...]:
-        """Signals sent to this very thread."""
-        return self.reading.pending
-
-    @property
-    def rseq(self) -> Rseq | None:
-        """Its registration for restartable sequences."""
-        return self.reading.rseq
 
     def every_pending(self) -> tuple[bytes, ...]:
         """Whatever is pending anywhere."""

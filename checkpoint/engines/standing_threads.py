@@ -29,23 +29,12 @@ from checkpoint.linux.tracee import Tracee
 from checkpoint.model import Rseq
 
 
-@dataclass(frozen=True, slots=True)
-class ThreadPlace:
-    """Where a thread stands.
+class Read:
+    """What was read of any thread that stands, the first one or another."""
 
-    Attributes:
-        registers: that it is given back.
-        inner_tid: its id as it sees it itself.
-        confinement: by seccomp(2); suspended as long as it stands.
-    """
+    __slots__ = ()
 
-    tracee: Tracee
-    life: Life
-    inner_tid: int
-    stat_text: bytes
-    registers: Registers
     reading: Reading
-    confinement: Confinement = FREE
 
     @property
     def mask(self) -> int:
@@ -61,6 +50,25 @@ class ThreadPlace:
     def rseq(self) -> Rseq | None:
         """Its registration for restartable sequences."""
         return self.reading.rseq
+
+
+@dataclass(frozen=True, slots=True)
+class ThreadPlace(Read):
+    """Where a thread stands.
+
+    Attributes:
+        registers: that it is given back.
+        inner_tid: its id as it sees it itself.
+        confinement: by seccomp(2); suspended as long as it stands.
+    """
+
+    tracee: Tracee
+    life: Life
+    inner_tid: int
+    stat_text: bytes
+    registers: Registers
+    reading: Reading
+    confinement: Confinement = FREE
 
 
 @dataclass(frozen=True)
