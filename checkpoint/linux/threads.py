@@ -341,7 +341,10 @@ class Threads:
             self._look_for_heir(tracee)
             return True
         if stop is None:
-            return not tracee.interrupt_if_ours()  # (8): nobody may have asked it yet under this id
+            if tracee.interrupt_if_ours():
+                return False  # (8): nobody may have asked it yet under this id
+            self._look_for_heir(tracee)
+            return True
         try:
             tracee.detach(stop.signal if stop.is_delivery else 0)
         except ProcessGoneError:

@@ -19,6 +19,9 @@ pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
 Compiled = Callable[..., Path]
 
+OTHERS = 4
+"""Threads of executes.c besides the one that executes."""
+
 
 def have_it_execute(tracee: Program) -> None:
     """Until it has executed its program, or waits inside the kernel for us to take note of the others' ends, or stands still."""
@@ -35,6 +38,13 @@ def state(pid: int, tid: int) -> str:
         return procfs.thread_stat(pid, tid).state
     except ProcessGoneError:
         return ""
+
+
+def see_all_others_stand(tracee: Program) -> None:
+    """Who stands is let go at once; no note is taken of the stops, which are for the tracer."""
+    deadline = time.monotonic() + PATIENCE_S
+    while states(tracee.pid).count("t") < OTHERS:
+        assert time.monotonic() < deadline, f"not all others stand: {states(tracee.pid)}"
 
 
 def freeze_until_it_stands(threads: Threads) -> None:
@@ -104,6 +114,42 @@ def test_a_thread_that_did_not_stop_and_executes_a_program_instead_is_let_go(
             threads.freeze()
         tracee.wait_until((tmp_path / "go").exists, "the first thread to be let go, which may not have stopped yet either")
         monkeypatch.undo()
+        expect_unharmed(tracee, threads)
+
+
+def test_a_thread_that_executes_a_program_between_two_looks_at_it_is_let_go(
+    compiled: Compiled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It had not stopped under its own id, and by the time it is asked once more that id is gone."""
+    ask, reported = Tracee.ask_to_stop, Tracee.reported
+    looked_at: list[int] = []
+
+    with ended(start_tracee(compiled("executes", "-O2", "-pthread"), tmp_path)) as tracee:
+        executes = max(thread_ids(tracee.pid))
+
+        def ask_all_but_one(self: Tracee) -> Stop | None:
+            if self.pid == executes:
+                tracee.wait_until(
+                    lambda: states(tracee.pid).count("t") == OTHERS, "all others to stand, who are let go at once then"
+                )
+                raise no_stop(executes, 0.0)
+            return ask(self)
+
+        def report_then_execute(self: Tracee) -> Stop | None:
+            stop = reported(self)
+            if self.pid == executes and stop is None:
+                looked_at.append(executes)
+                tracee.tell()
+                tracee.wait_for_line("executed")
+            return stop
+
+        threads = Threads(Tracee(tracee.pid))
+        monkeypatch.setattr(Tracee, "ask_to_stop", ask_all_but_one)
+        monkeypatch.setattr(Tracee, "reported", report_then_execute)
+        with pytest.raises(CaptureError, match="did not stop"):
+            threads.freeze()
+        monkeypatch.undo()
+        assert looked_at
         expect_unharmed(tracee, threads)
 
 
