@@ -129,9 +129,7 @@ def test_a_thread_that_executes_a_program_between_two_looks_at_it_is_let_go(
 
         def ask_all_but_one(self: Tracee) -> Stop | None:
             if self.pid == executes:
-                tracee.wait_until(
-                    lambda: states(tracee.pid).count("t") == OTHERS, "all others to stand, who are let go at once then"
-                )
+                see_all_others_stand(tracee)
                 raise no_stop(executes, 0.0)
             return ask(self)
 
