@@ -22,6 +22,7 @@ from checkpoint import chain, format
 from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import CaptureOrder, ProtectOrder, RestoreOptions, Session, Terms, engine_named
 from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
+from checkpoint.linux import abi
 from checkpoint.linux.namespaces import prctl
 from checkpoint.linux.vessel import Birth, Born, discard, spawn_program, spawn_vessel
 from checkpoint.model import Snapshot
@@ -75,11 +76,14 @@ class Program:
         return (self.directory / "err").read_text(errors="replace")
 
     def poll(self) -> int | None:
-        """Its exit code if it has ended, negative for a signal."""
+        """Its exit code if it has ended, negative for a signal.
+
+        Where we trace it a stop is told, once, to whoever waits for ends only: it is looked first what there is to take note of.
+        """
         if self.status is None:
-            pid, status = os.waitpid(self.pid, os.WNOHANG)
-            if pid:
-                self.status = os.waitstatus_to_exitcode(status)
+            found = os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+            if found is not None and found.si_code in abi.ENDS:
+                self.status = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
         return self.status
 
     def wait_until(self, condition: Callable[[], bool], what: str) -> None:

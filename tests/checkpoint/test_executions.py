@@ -151,6 +151,18 @@ def test_a_thread_that_executes_a_program_between_two_looks_at_it_is_let_go(
         expect_unharmed(tracee, threads)
 
 
+def test_who_looks_whether_a_program_has_ended_takes_no_note_of_its_stops(compiled: Compiled, tmp_path: Path) -> None:
+    """They are for the tracer, who is told once; each wait in these tests looks."""
+    with ended(start_tracee(compiled("executes", "-O2", "-pthread"), tmp_path)) as tracee:
+        leader = Tracee(tracee.pid)
+        leader.seize()
+        leader.interrupt()
+        tracee.wait_until(lambda: state(tracee.pid, tracee.pid) == "t", "the first thread to stand")
+        assert tracee.poll() is None
+        assert leader.reported() is not None
+        leader.detach()
+
+
 def expect_unharmed(tracee: Program, threads: Threads) -> None:
     """It has executed its program, nobody traces that, and it can be stopped like any other."""
     tracee.wait_for_line("executed")
