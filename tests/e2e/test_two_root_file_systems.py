@@ -1,7 +1,8 @@
 """Two robots of two releases: each has a root file system, a C library and programs of its own, and runs the other's.
 
-Asked for by FAILOVER_OTHER_ROOT, the root of another release than this machine's: ``debootstrap noble DIRECTORY`` (or any other
-suite) makes one. Nothing in it is changed: robot2 has it below an overlay.
+Asked for by FAILOVER_OTHER_ROOT, the root of another release than this machine's, with what our Python needs:
+``debootstrap --include=perl,python3,libffi8,libssl3t64 trixie DIRECTORY`` makes one. Nothing in it is changed: robot2 has it
+below an overlay.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ OTHER_ROOT = os.environ.get("FAILOVER_OTHER_ROOT", "")
 
 pytestmark = [
     pytest.mark.root,
-    pytest.mark.skipif(not OTHER_ROOT, reason="needs FAILOVER_OTHER_ROOT: debootstrap noble DIRECTORY makes one"),
+    pytest.mark.skipif(not OTHER_ROOT, reason="needs FAILOVER_OTHER_ROOT: debootstrap makes one"),
 ]
 
 CHECKOUT = Path(__file__).resolve().parents[2]
