@@ -30,7 +30,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError
-from checkpoint.linux import procfs
+from checkpoint.linux import procfs, second_stops
 from checkpoint.linux.burial import Burial, bury
 from checkpoint.linux.tracee import STOP_TIMEOUT_S, Tracee, no_stop, rest
 
@@ -158,6 +158,8 @@ class Threads:
         self._require_none_loose()
         try:
             self._freeze()
+            if any(tracee.stopped_by for tracee in self._held.values()):
+                second_stops.take_away(self._held.values())
         except BaseException:
             self.thaw()
             raise
