@@ -20,6 +20,7 @@ import msgspec
 from blake3 import blake3
 
 from agent.errors import LaneError
+from agent.mistake import end_lanes_on_mistake
 from checkpoint.errors import StoreError
 from failover.core.messages import (
     CHUNK_SIZE_MAX,
@@ -243,6 +244,7 @@ class Receiver:
             return
         transfer = self._incoming[peer, offer.transfer] = _Incoming(offer, asyncio.Queue(WINDOW_CHUNKS))
         transfer.task = asyncio.create_task(self._receive(peer, transfer))
+        transfer.task.add_done_callback(end_lanes_on_mistake)
 
     def chunk(self, peer: str, chunk: Chunk) -> None:
         """Take one chunk in; one without credit ends its transfer."""

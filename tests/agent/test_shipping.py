@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from agent import shipping
+from agent import mistake, shipping
 from agent.errors import LaneError
 from agent.shipping import Receiver, Refusal, Shipper, digest_of
 from checkpoint.model import Position
@@ -46,6 +46,7 @@ class Desk:
     def __init__(self, refusal: str = "") -> None:
         self.refusal = refusal
         self.taken: list[bytes] = []
+        self.failed: list[str] = []
 
     def admits(self, peer: str, offer: Offer) -> None:
         if self.refusal:
@@ -58,7 +59,7 @@ class Desk:
         self.room = size
 
     def not_taken(self, peer: str, offer: Offer, why: str) -> None:
-        raise AssertionError(why)
+        self.failed.append(why)
 
 
 class Two:
@@ -191,6 +192,7 @@ def test_a_full_disk_is_said_by_name(tmp_path: Path, content: Path, monkeypatch:
         with pytest.raises(LaneError, match="No space left on device"):
             await ship(two, content)
         assert two.desk.taken == []
+        assert two.desk.failed == ["cannot write it there: No space left on device"]
 
     run(body())
 
@@ -226,3 +228,25 @@ def test_a_chunk_without_credit_ends_its_transfer(tmp_path: Path) -> None:
         assert any(isinstance(message, Refuse) and "credit" in message.reason for message in two.back.said)
 
     run(body())
+
+
+def test_a_mistake_in_taking_a_snapshot_in_is_not_passed_over(
+    tmp_path: Path, content: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Mistaken(Desk):
+        async def take(self, peer: str, offer: Offer, descriptor: int) -> None:
+            raise ZeroDivisionError
+
+    ended: list[int] = []
+    monkeypatch.setattr(os, "_exit", ended.append)
+    monkeypatch.setattr(shipping, "PATIENCE_S", BOUND_S)
+
+    async def body() -> None:
+        two = Two(tmp_path, Mistaken())
+        await ship(two, content)
+        async with asyncio.timeout(BOUND_S):
+            while not ended:
+                await asyncio.sleep(0)
+
+    run(body())
+    assert ended == [mistake.STATUS]
