@@ -223,6 +223,8 @@ class Store:
                 self._add(snapshot.component, _entry_of(final, snapshot, size))
             if proved is not None:
                 self._proofs.keep(snapshot.component, proved)
+            else:  # what comes from here is not proved: what was remembered while it came from elsewhere is of no use
+                self._proofs.forget(snapshot.component)
         return replace(snapshot, runs=(), cleared=(), copies=(), differences=(), contents=b"")
 
     @contextmanager

@@ -191,6 +191,18 @@ def test_a_dropped_component_leaves_no_page_table(tmp_path: Path) -> None:
             put(store, delta)
 
 
+def test_a_former_standby_remembers_no_pages_of_what_it_runs_now(tmp_path: Path) -> None:
+    first, second, third, fourth = history(4)
+    with opened(tmp_path / "store") as store:
+        put(store, first)
+        put(store, second)
+        assert store._proofs._proved
+        put(store, third, prove=False)
+        assert not store._proofs._proved
+        put(store, fourth)  # a standby again
+        assert store.newest(COMPONENT) == fourth.position
+
+
 def test_what_is_older_than_wanted_is_forgotten(tmp_path: Path) -> None:
     made = history(5)
     later = snapshot({1: page("later")}, generation=2)
