@@ -8,6 +8,7 @@ from __future__ import annotations
 import struct
 from typing import Final
 
+from checkpoint.errors import CaptureError
 from checkpoint.linux import sock_diag
 
 _REQUEST: Final = struct.Struct("<BBBxI48x")
@@ -24,6 +25,9 @@ def shut_down(family: int, protocol: int) -> dict[int, int]:
     """Sockets of a protocol, of our network namespace, that were shut down: 1 what they read, 2 what they send, by inode number.
 
     Those that are bound to no port are not listed; nor is any where the kernel does not tell (CONFIG_INET_UDP_DIAG).
+
+    Raises:
+        CaptureError: the list changed each time while it was read.
     """
     found: dict[int, int] = {}
     if (family, protocol) in _WITHOUT:
@@ -34,6 +38,8 @@ def shut_down(family: int, protocol: int) -> dict[int, int]:
                 found[int.from_bytes(answer[_INODE_AT : _INODE_AT + 4], "little")] = how
     except sock_diag.UnknownError:
         _WITHOUT.add((family, protocol))
+    except sock_diag.ChangedError as error:
+        raise CaptureError(f"cannot tell which sockets were shut down: {error.strerror}; capture it again") from error
     except OSError:
         return {}
     return found

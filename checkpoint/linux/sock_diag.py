@@ -13,6 +13,9 @@ SOCK_DIAG_BY_FAMILY: Final = 20
 NLM_F_REQUEST: Final = 1
 NLM_F_ACK: Final = 4
 NLM_F_DUMP: Final = 0x300
+NLM_F_DUMP_INTR: Final = 0x10
+"""In an answer: what is listed has changed in the middle of the list."""
+TRIES: Final = 5
 ROOM: Final = 1 << 18
 """Bytes of one part of a list; the kernel fills 32 KiB at most."""
 HEADER: Final = struct.Struct("<IHHII")
@@ -21,6 +24,10 @@ _ATTRIBUTE: Final = struct.Struct("<HH")
 
 class UnknownError(OSError):
     """This kernel has no list of such sockets, and has just looked for the module that would make it."""
+
+
+class ChangedError(OSError):
+    """What was to be listed changed in the middle of the list, every time."""
 
 
 def opened() -> socket.socket:
@@ -33,23 +40,36 @@ def message(request: bytes, order: int = SOCK_DIAG_BY_FAMILY, flags: int = 0) ->
     return HEADER.pack(HEADER.size + len(request), order, NLM_F_REQUEST | flags, 1, 0) + request
 
 
-def listed(request: bytes) -> Iterator[bytes]:
-    """Every answer to a request for a list, without its header.
+def listed(request: bytes) -> list[bytes]:
+    """Every answer to a request for a list, without its header; a list that was interrupted is asked for again.
 
     Raises:
         OSError: the kernel does not tell.
         UnknownError: and is not to be asked again.
+        ChangedError: no list was whole.
     """
+    for _ in range(TRIES):
+        answers, is_whole = _list(request)
+        if is_whole:
+            return answers
+    raise ChangedError(errno.EINTR, f"the kernel's list of sockets changed {TRIES} times while it was read")
+
+
+def _list(request: bytes) -> tuple[list[bytes], bool]:
+    """The answers of one list, and whether it is of one instant as far as the kernel can tell."""
+    answers: list[bytes] = []
+    is_whole = True
     with opened() as asked:
         asked.send(message(request, flags=NLM_F_DUMP))
         while True:
             packed = asked.recv(ROOM)
             while packed:
-                size, kind, *_ = HEADER.unpack_from(packed)
+                size, kind, flags, *_ = HEADER.unpack_from(packed)
+                is_whole = is_whole and not flags & NLM_F_DUMP_INTR
                 if kind != SOCK_DIAG_BY_FAMILY:  # the list's end, or an error
                     _require_known(packed)
-                    return
-                yield packed[HEADER.size : size]
+                    return answers, is_whole
+                answers.append(packed[HEADER.size : size])
                 packed = packed[-(-size // 4) * 4 :]
 
 

@@ -167,8 +167,9 @@ def _ask_state(plan: _Plan, subject: Subject) -> int:
         plan.option(STATE, socket.SOL_SOCKET, SO_PEERNAME, bytes(size))
     if subject.type == socket.SOCK_STREAM:
         plan.ask(STATE, "ioctl", (0, termios.FIONREAD, 0), {3: (STATE, plan.room(STATE, bytes(4)))})
-    level = socket.IPPROTO_IPV6 if subject.family == socket.AF_INET6 else socket.IPPROTO_IP
     for interface, address in subject.groups:
+        is_six = int.from_bytes(address[:2], "little") == socket.AF_INET6
+        level = socket.IPPROTO_IPV6 if is_six else socket.IPPROTO_IP  # a socket of AF_INET6 may be in groups of both
         asked = struct.pack("<I4x128sII", interface, address, 0, 0)
         plan.option(STATE, level, _MCAST_MSFILTER, asked)
     return info

@@ -166,8 +166,8 @@ def _unpacked(packed: bytes) -> list[Fact]:
 
 def _groups(looked: socket.socket, known: Sequence[Group]) -> Iterator[list[Fact]]:
     """Those of the known multicast groups that a socket has joined."""
-    level = socket.IPPROTO_IP if looked.family == socket.AF_INET else socket.IPPROTO_IPV6
     for interface, group in known:
+        level = level_of(group)
         packed = bytearray(
             _FILTER.pack(interface, sockaddr([group, 0, 0, 0]), 0, SOURCES_MAX) + bytes(ADDRESS_SIZE * SOURCES_MAX)
         )
@@ -177,6 +177,11 @@ def _groups(looked: socket.socket, known: Sequence[Group]) -> Iterator[list[Fact
             count = _FILTER.unpack_from(packed)[3]
             with contextlib.suppress(OSError):  # the interface has just gone
                 yield [socket.if_indextoname(interface), group, bytes(packed[: _FILTER.size + ADDRESS_SIZE * count])]
+
+
+def level_of(group: str) -> int:
+    """By which a multicast group is joined, whatever the socket's family."""
+    return socket.IPPROTO_IPV6 if ":" in group else socket.IPPROTO_IP
 
 
 def sockaddr(address: Sequence[Fact]) -> bytes:
@@ -340,14 +345,13 @@ def _place(table: CallTable, one: Resource, made: int) -> None:
         _allow(table, made, socket.SO_REUSEADDR, 0)
     for interface, group, packed in _joined(one):
         index = socket.if_nametoindex(interface)
-        level = socket.IPPROTO_IPV6 if ":" in group else socket.IPPROTO_IP
         request = struct.pack("<I4x", index) + sockaddr([group, 0, 0, 0])
         what = f"let {one.name} join the group {group} at {interface}"
-        table.call(what, "setsockopt", made, level, MCAST_JOIN_GROUP, table.place(request), len(request))
+        table.call(what, "setsockopt", made, level_of(group), MCAST_JOIN_GROUP, table.place(request), len(request))
         _, _, mode, count = _FILTER.unpack_from(packed)
         if mode != EXCLUDE or count:
             request = struct.pack("<I", index) + packed[4:]
-            table.call(what, "setsockopt", made, level, MCAST_MSFILTER, table.place(request), len(request))
+            table.call(what, "setsockopt", made, level_of(group), MCAST_MSFILTER, table.place(request), len(request))
 
 
 def _allow(table: CallTable, made: int, option: int, value: int, level: int = socket.SOL_SOCKET) -> None:

@@ -34,7 +34,7 @@ class Listings:
         self._packet_sockets: Mapping[int, PacketSocket] | None = None
 
     def groups(self, pid: int, family: int) -> tuple[Group, ...]:
-        """All multicast groups that anybody has joined."""
+        """All multicast groups that anybody has joined, and a socket of a family may be in: one of AF_INET6 may be in any."""
         if family not in self._groups:
             self._groups[family] = tuple(_listed_groups(pid, family))
         return self._groups[family]
@@ -92,7 +92,6 @@ def _listed_groups(pid: int, family: int) -> Iterator[Group]:
         for line in procfs.read_text(pid, "net/igmp6").splitlines():
             words = line.split()
             yield int(words[0]), socket.inet_ntop(socket.AF_INET6, bytes.fromhex(words[2]))
-        return
     interface = 0
     for line in procfs.read_text(pid, "net/igmp").splitlines()[1:]:
         words = line.split()

@@ -56,7 +56,7 @@ CASES = {
         "pair_stream pair_datagram pair_packets pair_much pair_options pair_half_closed rights_stream "
         "rights_datagram pair_orphan listener_path "
         "listener_abstract unix_with_itself unix_datagrams unix_fresh tcp_listener_4 tcp_listener_6 tcp_fresh udp_queue "
-        "udp_options udp_group filtered tcp_shared_port"
+        "udp_options udp_group udp_group_of_other_family filtered tcp_shared_port"
     ),
     "unix_sockets": (
         "ghost_left ghost_directory name_taken_again waiting_stream waiting_packets named_senders named_pair makers travelling"

@@ -11,13 +11,16 @@ from pathlib import Path
 import pytest
 
 from checkpoint.engine import RestoreOptions
-from checkpoint.linux import internet_sockets, procfs
+from checkpoint.errors import CaptureError
+from checkpoint.linux import internet_sockets, procfs, sock_diag
 from checkpoint.linux.vessel import Birth, discard, spawn_vessel
 from checkpoint.model import Snapshot
 from checkpoint.resources import gather, with_contents
 from tests.checkpoint.round_trip import ENGINE, Program, captured_and_killed, ended, expect_ok, start_tracee
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
+
+NLMSG_DONE = 3
 
 Compiled = Callable[..., Path]
 
@@ -59,6 +62,34 @@ def test_a_list_that_the_kernel_does_not_have_is_asked_for_once() -> None:
     for _ in range(2):
         assert internet_sockets.shut_down(*unassigned) == {}
         assert unassigned in internet_sockets._WITHOUT
+
+
+def answers_in_turn(monkeypatch: pytest.MonkeyPatch, lists: list[tuple[bytes, int]]) -> None:
+    """Have the kernel answer questions with lists of one entry each, of this content and with these flags."""
+    done = sock_diag.HEADER.pack(sock_diag.HEADER.size + 4, NLMSG_DONE, 2, 1, 0) + bytes(4)
+
+    def opened() -> socket.socket:
+        ours, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        content, flags = lists.pop(0)
+        size = sock_diag.HEADER.size + len(content)
+        other.send(sock_diag.HEADER.pack(size, sock_diag.SOCK_DIAG_BY_FAMILY, 2 | flags, 1, 0) + content)
+        other.send(done)
+        others.append(other)
+        return ours
+
+    others: list[socket.socket] = []
+    monkeypatch.setattr(sock_diag, "opened", opened)
+
+
+def test_a_list_that_was_interrupted_is_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers_in_turn(monkeypatch, [(b"torn", sock_diag.NLM_F_DUMP_INTR), (b"torn", sock_diag.NLM_F_DUMP_INTR), (b"good", 0)])
+    assert list(sock_diag.listed(b"")) == [b"good"]
+
+
+def test_a_list_that_is_interrupted_each_time_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers_in_turn(monkeypatch, [(b"torn", sock_diag.NLM_F_DUMP_INTR)] * sock_diag.TRIES)
+    with pytest.raises(CaptureError, match="changed 5 times while it was read"):
+        internet_sockets.shut_down(socket.AF_INET, socket.IPPROTO_UDP)
 
 
 def test_the_kernels_lists_are_read_once_however_many_sockets_there_are(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -353,6 +353,18 @@ static void udp_group(void) {
     EXPECT(setsockopt(file, IPPROTO_IP, IP_ADD_MEMBERSHIP, &request, sizeof request) == -1 && errno == EADDRINUSE, "it joins anew");
 }
 
+/* A socket of IPv6 that is in a group of IPv4. */
+static void udp_group_of_other_family(void) {
+    struct sockaddr_storage address;
+    int file = bound(AF_INET6, SOCK_DGRAM, "::", 0, &address);
+    struct ip_mreqn request = {.imr_ifindex = if_nametoindex("lo")};
+    inet_aton("239.255.77.79", &request.imr_multiaddr);
+    if (setsockopt(file, IPPROTO_IP, IP_ADD_MEMBERSHIP, &request, sizeof request)) cannot("join a group");
+    wait_here();
+    EXPECT(is_member(file, "239.255.77.79"), "the group is left");
+    EXPECT(setsockopt(file, IPPROTO_IP, IP_ADD_MEMBERSHIP, &request, sizeof request) == -1 && errno == EADDRINUSE, "it joins anew");
+}
+
 int main(int count, char **arguments) {
     static const struct socket_case cases[] = {
         {"pair_stream", pair_stream},
@@ -377,6 +389,7 @@ int main(int count, char **arguments) {
         {"udp_options", udp_options},
         {"filtered", filtered},
         {"udp_group", udp_group},
+        {"udp_group_of_other_family", udp_group_of_other_family},
     };
     return run_case(count, arguments, cases, sizeof cases / sizeof *cases);
 }
