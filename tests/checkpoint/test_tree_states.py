@@ -82,7 +82,8 @@ for child, number in ((untold, signal.SIGSTOP), (told, signal.SIGSTOP), (by_term
     os.setpgid(child, child)
     os.kill(child, number)
     os.waitid(os.P_PID, child, os.WSTOPPED | (0 if child == told else os.WNOWAIT))
-signal.sigtimedwait([signal.SIGCHLD], 1)
+while signal.sigtimedwait([signal.SIGCHLD], 0.5):  # a stop can be waited for a moment before the kernel sends the signal for it
+    pass
 is_ready()
 expect("signals of the restore", signal.sigtimedwait([signal.SIGCHLD], 0), None)
 for child, status in ((untold, signal.SIGSTOP), (by_terminal, signal.SIGTSTP)):
@@ -480,6 +481,7 @@ if os.getsid(0) != os.getpid():
 def lead():
     os.setsid()
     os.waitpid(born(leave_behind), 0)
+    Path("led").touch()
     wait_for_go()
 
 def leave_behind():
@@ -494,7 +496,7 @@ def live_alone():
 
 os.waitpid(born(leave_behind), 0)
 leader = born(lead)
-while len(list(Path(".").glob("alone*"))) < 2:
+while len(list(Path(".").glob("alone*"))) < 2 or not Path("led").exists():
     time.sleep(0.01)
 is_ready()
 expect_child(leader)

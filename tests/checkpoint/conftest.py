@@ -1,0 +1,20 @@
+"""What tests of captures in their own process stand on: programs that wait for their tracer for longer than in service."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from checkpoint.arch import cpu as arch
+
+PATIENT_NS = 900_000_000
+"""A busy machine may leave a test no processor for the 100 ms of the service; as the part of a second it must be less than one."""
+
+
+@pytest.fixture(autouse=True)
+def _patient_programs() -> Iterator[None]:
+    """A program does not go on by itself while it is looked at because this process had to wait for a processor."""
+    with pytest.MonkeyPatch.context() as patience:
+        patience.setattr(arch, "ENTRY_TIMEOUT_NS", PATIENT_NS)
+        yield
