@@ -9,7 +9,7 @@ import pytest
 from checkpoint.arch import cpu as arch
 
 PATIENT_NS = 900_000_000
-"""A busy machine may leave a test no processor for the 100 ms of the service; as the part of a second it must be less than one."""
+"""A busy machine may leave a test no processor for the 100 ms of the service. It is given as a part of a second."""
 
 
 @pytest.fixture(autouse=True)
