@@ -4,7 +4,8 @@ A child is born into the session of its parent, and into its group; a session ca
 So a leader makes its session when those of its children are born that have an older one, and before the others. Whoever has lost
 its parent, and whoever lives in a session or group whose leader has ended, is born with the help of a *stand-in*: a process that
 ends again when it has done its part, as the one that it stands for has. So is whoever was given to another parent, one that asks
-for orphans: it is born below that one and given to it once more.
+for orphans: it is born below that one and given to it once more. Where that leads nowhere, places are searched for all of them
+(`birth_places`): everybody is born first, and all that have stand-ins are given to their parents then, the deepest first.
 
 Pure: no process is touched here. Sources: fork(2), setsid(2), setpgid(2), credentials(7); PR_SET_CHILD_SUBREAPER of prctl(2).
 """
@@ -18,6 +19,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
+from checkpoint.engines import birth_places
+from checkpoint.engines.birth_places import Places, Wanted
 from checkpoint.errors import RestoreError
 from checkpoint.linux.procfs import Status
 from checkpoint.model import Member, ProcessState, Snapshot, Zombie
@@ -198,7 +201,24 @@ def steps(
         numbers: ids that no stand-in may take, besides those of the processes.
     """
     _require_few_generations({one.pid: one.ppid for one in others})
-    return _Plan(first, others, numbers, is_taken).made()
+    try:
+        return _Plan(first, others, numbers, is_taken).made()
+    except NoWayError:
+        places = birth_places.found(_wanted(first), {one.pid: one for one in _wanted_of(first, others)})
+        if places is None:
+            raise
+        return _Plan(first, others, numbers, is_taken).made_at(places)
+
+
+def _wanted(person: Person) -> Wanted:
+    return Wanted(person.pid, person.ppid, person.sid)
+
+
+def _wanted_of(first: Person, others: Sequence[Person]) -> Iterator[Wanted]:
+    """Of all but the first, and of leaders that have ended."""
+    yield from map(_wanted, others)
+    there = {first.sid, first.pid, *(one.pid for one in others)}
+    yield from (Wanted(session, 0, session) for session in sorted({one.sid for one in others} - there))
 
 
 def _require_few_generations(parents: Mapping[int, int]) -> None:
@@ -230,14 +250,11 @@ class _Plan:
     standins: dict[int, int] = field(default_factory=dict)
 
     def made(self) -> list[Step]:
-        everybody = {person.pid: person for person in (self.first, *self.others)}
-        self._everybody = everybody
         for person in self.others:
             self._children[person.ppid].append(person)
-        self._spare = self._free(max((*everybody, *self.numbers, *(one.sid for one in self.others))))
-        self.session[self.first.pid] = self.first.sid
+        self._begin()
         self._grow(self.first)
-        for orphan in [one for one in self.others if one.ppid not in everybody]:
+        for orphan in [one for one in self.others if one.ppid not in self._everybody]:
             self._bear_orphan(orphan)
         self._give_all()
         for person in self.others:
@@ -246,6 +263,11 @@ class _Plan:
         for pid, parent in reversed(self.standins.items()):
             self.steps.append(End(parent, pid))
         return self.steps
+
+    def _begin(self) -> None:
+        self._everybody = {person.pid: person for person in (self.first, *self.others)}
+        self._spare = self._free(max((*self._everybody, *self.numbers, *(one.sid for one in self.others))))
+        self.session[self.first.pid] = self.first.sid
 
     _everybody: dict[int, Person] = field(default_factory=dict)
     _spare: Iterator[int] = field(default_factory=itertools.count)
@@ -382,17 +404,78 @@ class _Plan:
             raise NoWayError(f"session {session} has lost its leader in a way that is not kept yet")
         return session
 
+    # At places
+
+    def made_at(self, places: Places) -> list[Step]:
+        """As `made`, with everybody born at a place, and given to its parent when all are born.
+
+        Raises:
+            NoWayError: a place is of no use: its number is taken, or who is born there shares something with its parent.
+        """
+        self._begin()
+        below = defaultdict(list)
+        for pid, place in places.items():
+            below[place.below].append(pid)
+        ends: list[Step] = []
+        self._grow_at(self.first.pid, below, places, ends)
+        born = dict(self.standins)
+        self._group()
+        for pid in reversed([pid for pid in self.standins if pid not in born]):
+            self.steps.append(End(self.standins[pid], pid))
+        self.steps += ends
+        return self.steps
+
+    def _grow_at(self, pid: int, below: Mapping[int, list[int]], places: Places, ends: list[Step]) -> None:
+        """Have one that is born give birth to all that are born below it, before it makes its session and afterwards."""
+        leads = pid != self.first.pid and (pid not in self._everybody or self._everybody[pid].sid == pid)
+        earlier = [one for one in below[pid] if leads and places[one].session == self.session[pid]]
+        for child in earlier:
+            self._bear_at(pid, child, below, places, ends)
+        if leads:
+            self.steps.append(NewSession(pid))
+            self.session[pid] = pid
+        for child in below[pid]:
+            if child not in earlier:
+                self._bear_at(pid, child, below, places, ends)
+
+    def _bear_at(self, source: int, pid: int, below: Mapping[int, list[int]], places: Places, ends: list[Step]) -> None:
+        """Whoever is borne by a stand-in is given to its parent at the end, when all below it have been."""
+        person = self._everybody.get(pid)
+        if person is None:
+            if self.is_taken(pid):
+                raise NoWayError(f"session {pid} is that of another program, which has its number: start both as one")
+            self._birth(source, pid, 0)
+            self.standins[pid] = source
+            self._grow_at(pid, below, places, ends)
+            ends.append(End(source, pid))
+            return
+        if person.ppid == source:
+            self._birth(source, pid, person.exit_signal, person.flags)
+            self._grow_at(pid, below, places, ends)
+            return
+        if person.flags:
+            raise NoWayError(f"process {pid} shares its open files or directory with a parent that it was given to later")
+        between = next(self._spare)
+        self._birth(source, between, 0)
+        self._birth(between, pid, person.exit_signal)
+        self._grow_at(pid, below, places, ends)
+        end = End(source, between)
+        ends += [Reaper(person.ppid, True), end, Reaper(person.ppid, False)] if person.ppid in self._everybody else [end]
+
     # Groups
 
     def _group(self) -> None:
         """Everybody to its group, whose leader makes it first."""
         ours = {self.first.pid: self.session[self.first.pid], **self.session}
         waiting = []
+        left = {person.pgid for person in self.others} & {one.pid for one in self.others if one.pgid != one.pid}
         for person in self.others:
-            if person.pgid == person.pid and person.sid != person.pid:
+            makes_group = person.pgid == person.pid and person.sid != person.pid
+            if makes_group or person.pid in left:
                 self.steps.append(Join(person.pid, person.pid))
-            elif person.pgid not in (person.pid, self._inherited(person)):
+            if person.pid in left or (not makes_group and person.pgid not in (person.pid, self._inherited(person))):
                 waiting.append(person)
+        waiting.sort(key=lambda one: one.pid in left)  # who has left the group that it made goes last
         for person in waiting:
             if person.pgid not in self._everybody and person.pgid not in self.standins:
                 source = self._in_session(ours[person.pid])
