@@ -24,6 +24,9 @@ from failover.core.types import State
 SIGHT_PATIENCE_S: Final = 0.5
 """How long a status waits for the other robots' own."""
 
+LIVING: Final = ("live", "suspect")
+"""States of peers that are asked: on a busy machine three beats may be late at any time."""
+
 WORK: Final = ("run", "protect", "logs", "handover", "failback", "prefer", "promote", "release", "stop")
 """What takes a program, its output, or a word that others obey."""
 
@@ -100,7 +103,7 @@ class Questions:
     async def _reachable(self) -> list[str]:
         """The robots that live and can be asked."""
         peers = self._lines.picture(await self._lines.ask("status"))["peers"]
-        return [peer["name"] for peer in peers if peer["state"] == "live" and not self._lines.hindrance(peer["name"])]
+        return [peer["name"] for peer in peers if peer["state"] in LIVING and not self._lines.hindrance(peer["name"])]
 
     async def _asked(self, peer: str, question: str, arguments: dict[str, Any]) -> dict[str, Any]:
         """A peer's answer; empty when it does not come soon."""
