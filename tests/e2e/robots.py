@@ -217,7 +217,10 @@ def host_pid(robot: RobotMachine, inner: int) -> int:
     """The process that the robot itself calls ``inner``."""
     own_pids = int(means().own_pids)
     for pid in robot.processes():
-        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        try:
+            lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        except (FileNotFoundError, ProcessLookupError):
+            continue  # it has ended
         named = next(line for line in lines if line.startswith("NSpid:")).split()[1:]
         if len(named) > own_pids and int(named[own_pids]) == inner:
             return pid
