@@ -63,14 +63,15 @@ def _list(request: bytes) -> tuple[list[bytes], bool]:
         asked.send(message(request, flags=NLM_F_DUMP))
         while True:
             packed = asked.recv(ROOM)
-            while packed:
-                size, kind, flags, *_ = HEADER.unpack_from(packed)
+            place = 0
+            while place < len(packed):
+                size, kind, flags, *_ = HEADER.unpack_from(packed, place)
                 is_whole = is_whole and not flags & NLM_F_DUMP_INTR
                 if kind != SOCK_DIAG_BY_FAMILY:  # the list's end, or an error
-                    _require_known(packed)
+                    _require_known(packed[place:])
                     return answers, is_whole
-                answers.append(packed[HEADER.size : size])
-                packed = packed[-(-size // 4) * 4 :]
+                answers.append(packed[place + HEADER.size : place + size])
+                place += -(-size // 4) * 4
 
 
 def _require_known(ending: bytes) -> None:

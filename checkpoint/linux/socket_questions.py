@@ -20,10 +20,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from checkpoint.linux.own_calls import FIRST_ARGUMENT, OwnCalls, row
+from checkpoint.linux.own_calls import FIRST_ARGUMENT, ROW, OwnCalls, row
 
 Option = tuple[int, int, int]
 """Level, number and size of an option."""
+Told = tuple[bytes, bytes]
+"""Of a socket what the program has set, and what has become of it otherwise; the last two bytes are what poll(2) says."""
 
 OPTION_SIZE: Final = 64
 NUMBER_SIZE: Final = 8
@@ -197,51 +199,68 @@ def _laid_out(plan: _Plan, buffers: slice, locked: int, info: int, polled: int) 
 
 
 class Asking:
-    """The questions to sockets of one kind, with memory for the answers of the one that was asked last."""
+    """The questions to sockets of one kind, with memory for the answers of those that were asked last."""
 
     def __init__(self, subject: Subject) -> None:
         self.subject = subject
         self._questions = questions(subject)
-        self._memory = self._questions.image.copy()
-        self._told = self._memory.data
-        self._table = OwnCalls(len(self._questions.words))
-        self._table.entries[:] = self._questions.words + self._questions.moved * np.uint64(self._memory.ctypes.data)
-        self._always = len(self._table.entries) - BUFFERS
-        self._descriptors = self._table.entries[: self._always - 1, FIRST_ARGUMENT]
-        self._of_buffers = self._table.entries[self._always :, FIRST_ARGUMENT]
-        self._polled = self._memory[self._questions.polled : self._questions.polled + 4].view(np.int32)
+        self._always = len(self._questions.words) - BUFFERS
+        self._capacity = 0
+        self.reserve(1)
 
-    def ask(self, descriptor: int) -> None:
+    def reserve(self, capacity: int) -> None:
+        """Have room for the answers of so many at once."""
+        if capacity <= self._capacity:
+            return
+        asked = self._questions
+        self._capacity = capacity
+        self._memory = np.zeros((capacity, len(asked.image)), dtype=np.uint8)
+        starts = int(self._memory.ctypes.data) + np.arange(capacity, dtype=np.uint64) * np.uint64(len(asked.image))
+        words = asked.words + asked.moved * starts[:, None, None]
+        self._table, self._of_buffers = OwnCalls(capacity * self._always), OwnCalls(capacity * BUFFERS)
+        self._table.entries[:] = words[:, : self._always].reshape(-1, ROW)
+        self._of_buffers.entries[:] = words[:, self._always :].reshape(-1, ROW)
+        self._descriptors = self._table.entries.reshape(capacity, self._always, ROW)[:, :-1, FIRST_ARGUMENT]
+        self._descriptors_of_buffers = self._of_buffers.entries.reshape(capacity, BUFFERS, ROW)[:, :, FIRST_ARGUMENT]
+        self._polled = self._memory.reshape(-1).view(np.int32).reshape(capacity, -1)[:, asked.polled // 4]
+
+    def ask(self, descriptor: int) -> Told:
         """Ask everything, through a descriptor of ours."""
-        self._memory[:] = self._questions.image
-        self._descriptors[:] = descriptor
-        self._polled[0] = descriptor
-        self._table.run(0, self._always)
-        if self._has_chosen_buffers():
-            self._of_buffers[:] = descriptor
-            self._table.run(self._always)
+        return self.ask_each([descriptor])[0]
 
-    def _has_chosen_buffers(self) -> bool:
-        """Whether the program has chosen the size of a buffer, or the kernel does not say; else it changes by itself."""
-        place = self._questions.locked
-        return bool(self._told[place] or self._told[place + RESULT_AT])
+    def ask_each(self, descriptors: Sequence[int]) -> list[Told]:
+        """The same of many, in one go."""
+        count, numbers = len(descriptors), np.array(descriptors, dtype=np.int64)
+        self.reserve(count)
+        self._memory[:count] = self._questions.image
+        self._descriptors[:count] = numbers[:, None]
+        self._polled[:count] = numbers
+        self._table.run(0, count * self._always)
+        chosen = self._have_chosen_buffers(count)
+        for index in chosen:
+            self._descriptors_of_buffers[index] = descriptors[index]
+            self._of_buffers.run(index * BUFFERS, (index + 1) * BUFFERS)
+        return self._told(count, chosen)
 
-    @property
-    def settings(self) -> bytes:
-        """What the program has set."""
-        told = bytes(self._told[: self._questions.ends[SETTINGS]])
-        return told + bytes(self._told[self._questions.buffers]) if self._has_chosen_buffers() else told
+    def _have_chosen_buffers(self, count: int) -> list[int]:
+        """Where the program has chosen the size of a buffer, or the kernel does not say; else it changes by itself."""
+        locked, place = self._memory[:count], self._questions.locked
+        found: list[int] = np.flatnonzero(locked[:, place] | locked[:, place + RESULT_AT]).tolist()
+        return found
 
-    @property
-    def state(self) -> bytes:
-        """What has become of it otherwise; its last two bytes are what poll(2) says."""
-        told, asked = self._told, self._questions
-        seen = bytes(told[asked.polled + 6 : asked.polled + 8])
-        state = bytes(told[asked.ends[SETTINGS] : asked.ends[STATE]])
-        if asked.info < 0:
-            return state + seen
-        info = bytes(told[asked.info : asked.info + _TCP_INFO_SIZE])
-        return state + b"".join([info[first:last] for first, last in _TCP_INFO_TOLD]) + seen
+    def _told(self, count: int, chosen: Sequence[int]) -> list[Told]:
+        """Of each what the program has set, and what has become of it otherwise."""
+        asked, memory = self._questions, self._memory[:count]
+        parts = [memory[:, : asked.ends[STATE]]]
+        if asked.info >= 0:
+            parts += [memory[:, asked.info + first : asked.info + last] for first, last in _TCP_INFO_TOLD]
+        parts.append(memory[:, asked.polled + 6 : asked.polled + 8])
+        size, end, every = sum(part.shape[1] for part in parts), asked.ends[SETTINGS], np.concatenate(parts, axis=1).tobytes()
+        found = [(every[at : at + end], every[at + end : at + size]) for at in range(0, count * size, size)]
+        for index in chosen:
+            settings, state = found[index]
+            found[index] = settings + memory[index, asked.buffers].tobytes(), state
+        return found
 
 
 def events(state: bytes) -> int:

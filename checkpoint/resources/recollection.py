@@ -9,15 +9,17 @@ What waits in a socket is not asked that way, so one in which something waits is
 
 from __future__ import annotations
 
+import operator
 import select
 import socket
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from checkpoint.linux import socket_questions
 from checkpoint.linux.descriptors import copies_of, copy_of
-from checkpoint.linux.socket_questions import Asking, Subject, events
+from checkpoint.linux.socket_questions import Asking, Subject, Told, events
 from checkpoint.model import Fact
 from checkpoint.resources import Opened, OpenFile, Recalled, internet_sockets, pipes, sockets, tcp_connections, unix_sockets
 from checkpoint.resources.listings import Group
@@ -40,6 +42,7 @@ class _Known:
         listed: what the kernel's lists say of it.
         facts: what that means.
         seen: the open file, and the same with all that was observed.
+        again: what is told of it where it answers as before; None if that must be worked out.
     """
 
     inode: int
@@ -50,6 +53,29 @@ class _Known:
     state: bytes | None = None
     listed: object = None
     seen: tuple[OpenFile, OpenFile] | None = None
+    again: Recalled | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Round:
+    """Who is asked, as long as the open files are the very same.
+
+    Attributes:
+        opened: all open files.
+        numbers: descriptors of sockets among them.
+        groups: multicast groups of the machine, by process and family.
+    """
+
+    opened: tuple[OpenFile, ...] = ()
+    numbers: frozenset[int] = frozenset()
+    asked: tuple[tuple[OpenFile, _Known], ...] = ()
+    groups: Mapping[tuple[int, int], tuple[Group, ...]] = field(default_factory=dict)
+
+    def holds(self, opened: Opened) -> bool:
+        """Whether nothing has come, gone or changed its form."""
+        if len(opened) != len(self.opened) or not all(map(operator.is_, opened, self.opened)):
+            return False
+        return all(opened.listings.groups(*key) == groups for key, groups in self.groups.items())
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +92,7 @@ class Recollection:
         self._known: dict[int, _Known] = {}
         self._pipes: dict[int, OpenFile] = {}
         self._askings: dict[Subject, Asking] = {}
+        self._round: _Round | None = None
 
     def prepare(self) -> None:
         """Do what need not be done while the program stands still."""
@@ -76,8 +103,11 @@ class Recollection:
                     subject = _subject(known.facts, known.groups)
                 except OSError:  # we have no descriptor left: it is looked into, and that says why not
                     continue
+                self._round = None
                 known.asking = wanted.get(subject) or self._askings.get(subject) or Asking(subject)
             wanted[known.asking.subject] = known.asking
+        for asking, count in Counter(known.asking for known in self._known.values() if known.asking).items():
+            asking.reserve(min(count, COPIES_MAX))
         self._askings = wanted  # a machine may have other multicast groups every minute
 
     def recall(self, opened: Opened) -> dict[int, _Answer]:
@@ -86,18 +116,28 @@ class Recollection:
         Returns:
             What those answered that have something new to say, for `remember`.
         """
-        held = [one for one in opened if sockets.is_socket(one.first) and not one.is_echo]
-        asked = [(one, known) for one in held if (known := self._asked_of(one, opened)) is not None]
+        if self._round is None or not self._round.holds(opened):
+            self._round = self._round_of(opened)
+        asked = self._round.asked
         changed: dict[int, _Answer] = {}
         for first in range(0, len(asked), COPIES_MAX):
             some = asked[first : first + COPIES_MAX]
             with copies_of(some[0][0].pid, [one.first.number for one, _ in some]) as copies:
-                for (one, known), copy in zip(some, copies, strict=True):
-                    if copy >= 0 and (answer := _recalled(one, known, copy, opened)) is not None:
+                for (one, known), told in zip(some, _told([known for _, known in some], copies), strict=True):
+                    if told is not None and (answer := _recalled(one, known, told, opened)) is not None:
                         changed[one.first.number] = answer
-        numbers = {one.first.number for one in held}
-        self._known = {number: known for number, known in self._known.items() if number in numbers}
+        if len(self._known) > len(asked):
+            self._known = {number: known for number, known in self._known.items() if number in self._round.numbers}
         return changed
+
+    def _round_of(self, opened: Opened) -> _Round:
+        """Whom to ask now; what was told of them is worked out anew, for it may have followed from others."""
+        held = [one for one in opened if sockets.is_socket(one.first) and not one.is_echo]
+        asked = tuple((one, known) for one in held if (known := self._asked_of(one, opened)) is not None)
+        for _, known in asked:
+            known.again = None
+        groups = {(one.pid, number_of(known.facts["family"])): known.groups for one, known in asked if _may_join(known.facts)}
+        return _Round(tuple(opened), frozenset(one.first.number for one in held), asked, groups)
 
     def empty_pipes(self, opened: Iterable[OpenFile]) -> dict[int, OpenFile]:
         """Pipes in which nothing waits, with all that must be known of them, by their first descriptors."""
@@ -135,18 +175,35 @@ class Recollection:
                 if "family" in one.observed:
                     groups = _groups_of(one, one.observed, opened)
                     self._known[one.first.number] = _Known(one.first.inode, one.observed, groups)
+                    self._round = None
                 continue
-            known.facts, known.listed = one.observed, answer.listed
+            if any(known.facts.get(name) != one.observed.get(name) for name in ("family", "type")):
+                self._round = None
+            known.facts, known.listed, known.again = one.observed, answer.listed, None
             known.settings = None if "filter" in one.observed else answer.settings  # of which the length alone was asked
             known.state = answer.state if _is_quiet(one.observed) and _answers_again(one, known.asking, answer) else None
 
 
-def _recalled(one: OpenFile, known: _Known, copy: int, opened: Opened) -> _Answer | None:
-    """Ask one; what it answers, unless that is known."""
-    assert known.asking is not None
-    known.asking.ask(copy)
-    settings, state = known.asking.settings, known.asking.state
+def _told(every: Sequence[_Known], copies: Sequence[int]) -> list[Told | None]:
+    """Ask all, those of a kind in one go; None of one that cannot be asked."""
+    by_kind: dict[Asking, list[int]] = {}
+    for index, (known, copy) in enumerate(zip(every, copies, strict=True)):
+        if copy >= 0 and known.asking is not None:
+            by_kind.setdefault(known.asking, []).append(index)
+    found: list[Told | None] = [None] * len(every)
+    for asking, places in by_kind.items():
+        for index, told in zip(places, asking.ask_each([copies[index] for index in places]), strict=True):
+            found[index] = told
+    return found
+
+
+def _recalled(one: OpenFile, known: _Known, told: Told, opened: Opened) -> _Answer | None:
+    """What a socket answers, unless that is known."""
+    settings, state = told
     listed = _listed(one, known.facts, opened)
+    if known.again is not None and told == (known.settings, known.state) and listed == known.listed:
+        opened.recalled[one.first.number] = known.again
+        return None
     if settings != known.settings:
         return _Answer(settings, state, listed)
     if state != known.state or listed != known.listed or _may_hold_something(state, known.facts):
@@ -160,8 +217,15 @@ def _recalled(one: OpenFile, known: _Known, copy: int, opened: Opened) -> _Answe
             return _Answer(settings, state, listed)
     if known.seen is None or known.seen[0] is not one or facts is not known.seen[1].observed:
         known.seen = one, replace(one, observed=facts)
-    opened.recalled[one.first.number] = Recalled(facts, known.seen[1])
+    recalled = opened.recalled[one.first.number] = Recalled(facts, known.seen[1])
+    known.again = recalled if _has_no_path(facts) else None
     return None
+
+
+def _has_no_path(facts: Mapping[str, Fact]) -> bool:
+    """Whether a socket has no name, or an abstract one: a path may lead elsewhere by now."""
+    name = facts.get("name", b"")
+    return isinstance(name, bytes) and name[:1] in (b"", b"\0")
 
 
 def _subject(facts: Mapping[str, Fact], groups: Sequence[Group]) -> Subject:
@@ -173,9 +237,14 @@ def _subject(facts: Mapping[str, Fact], groups: Sequence[Group]) -> Subject:
 
 def _groups_of(one: OpenFile, facts: Mapping[str, Fact], opened: Opened) -> tuple[Group, ...]:
     """Multicast groups that it may be in."""
-    if facts["family"] not in internet_sockets.FAMILIES or facts["type"] == socket.SOCK_STREAM:
+    if not _may_join(facts):
         return ()
     return opened.listings.groups(one.pid, number_of(facts["family"]))
+
+
+def _may_join(facts: Mapping[str, Fact]) -> bool:
+    """Whether it may be in multicast groups."""
+    return facts["family"] in internet_sockets.FAMILIES and facts["type"] != socket.SOCK_STREAM
 
 
 def _listed(one: OpenFile, facts: Mapping[str, Fact], opened: Opened) -> object:
@@ -212,7 +281,6 @@ def _answers_again(one: OpenFile, asking: Asking, answer: _Answer) -> bool:
     """Whether nothing has come from outside since it was asked: then what was found since goes with what it had answered."""
     try:
         with copy_of(one.pid, one.first.number) as copy:
-            asking.ask(copy)
+            return asking.ask(copy) == (answer.settings, answer.state)
     except OSError:
         return False
-    return bool((asking.settings, asking.state) == (answer.settings, answer.state))

@@ -18,7 +18,7 @@ import pytest
 from checkpoint.linux.descriptors import NOT_YET, copies_of, lending
 from checkpoint.linux.socket_questions import SO_ATTACH_FILTER, Asking, Subject
 from checkpoint.model import Fact
-from checkpoint.resources import Opened, gather, unix_sockets, with_contents
+from checkpoint.resources import Opened, OpenFile, gather, unix_sockets, with_contents
 from checkpoint.resources import sockets as kinds_of_sockets
 from checkpoint.resources.recollection import Recollection
 from checkpoint.resources.tcp_connections import FIN_WAIT_2
@@ -33,15 +33,20 @@ PASS_SOME = struct.pack("HBBI", 6, 0, 0, 0xFFFF)
 
 
 class Onlooker:
-    """Looks at the sockets of this process, again and again."""
+    """Looks at the sockets of this process, again and again; those whose descriptors are the same it has as the same objects."""
 
     def __init__(self) -> None:
         self.recollection = Recollection()
+        self._sockets: dict[int, OpenFile] = {}
 
     def look(self) -> tuple[dict[int, dict[str, Fact]], Opened]:
         """What is said of each, by number, and what was recalled."""
         self.recollection.prepare()
-        opened = gather(os.getpid())
+        found = [one for one in gather(os.getpid()) if kinds_of_sockets.is_socket(one.first)]
+        before = self._sockets
+        same = [before[one.first.number] if before.get(one.first.number) == one else one for one in found]
+        self._sockets = {one.first.number: one for one in same}
+        opened = Opened(same)
         with lending(os.getpid()):
             found = with_contents(opened, None, (), self.recollection)
         return {held.first.number: dict(held.observed) for held in found if "family" in held.observed}, opened
@@ -108,6 +113,9 @@ def test_sockets_that_are_as_they_were_are_known(sockets: Sockets) -> None:
         facts, opened = onlooker.look()
     known = {number for number, recalled in opened.recalled.items() if recalled.whole is not None}
     assert {one.fileno() for one in sockets.every()} <= known
+    _, again = onlooker.look()
+    told_again = {number for number, recalled in again.recalled.items() if recalled is opened.recalled.get(number)}
+    assert told_again >= {one.fileno() for one in sockets.every() if one is not sockets.named}, "worked out anew"
     assert facts == anew()
 
 
@@ -257,10 +265,10 @@ def test_what_was_changed_and_changed_back_is_known_again(sockets: Sockets) -> N
 
 def test_a_connection_of_ipv4_says_whom_it_is_with_where_it_has_ended_too(sockets: Sockets) -> None:
     asking = Asking(Subject(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP, ()))
-    asking.ask(sockets.client.fileno())
+    _, state = asking.ask(sockets.client.fileno())
     host, port = sockets.client.getpeername()
     by_name_and_by_option = 2
-    assert asking.state.count(struct.pack(">H", port) + socket.inet_aton(host)) == by_name_and_by_option
+    assert state.count(struct.pack(">H", port) + socket.inet_aton(host)) == by_name_and_by_option
 
 
 def test_a_socket_whose_name_cannot_be_looked_up_just_now_is_looked_into(
