@@ -21,7 +21,7 @@ from checkpoint.linux import abi, procfs
 STREAMS: Final = (0, 1, 2)
 LEFT_BEHIND_MAX: Final = 4096
 """Strangers of which it is remembered whether they belong to the component: there are new ones as long as a machine runs."""
-CHILDREN_SIZE: Final = 1 << 16
+CHILDREN_SIZE: Final = 1 << 12
 NEARLY_A_PAGE: Final = 4000
 """Bytes: the kernel gives a list in pieces of a page at most, so what is shorter is the end.
 

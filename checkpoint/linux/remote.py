@@ -30,6 +30,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
+import operator
 import struct
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -65,7 +66,9 @@ ENDED: Final = 2
 ABANDONED: Final = 3
 
 _HEAD: Final = struct.Struct("<32sQQQQQQQQ")  # magic, state, done, serial, mask, timeout (2 words), empty set, resume
-_HEAD_SIZE: Final = _HEAD.size + 8 * len(arch.CLOBBERED)
+_CLOBBERED: Final = struct.Struct(f"<{len(arch.CLOBBERED)}Q")
+_of_clobbered: Final = operator.itemgetter(*arch.CLOBBERED)
+_HEAD_SIZE: Final = _HEAD.size + _CLOBBERED.size
 _OUTPUT_ALIGNMENT: Final = 16
 _STATE_OFFSET: Final = 32
 _IDLE_WORD: Final = struct.pack("<Q", IDLE)
@@ -73,7 +76,7 @@ _NOTE: Final = struct.Struct("<Ii")
 """At the end of the large desk's table: a descriptor and one more (0: there is no note), and a number."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Plan:
     """Where the parts of a desk's table begin: head, then results, then what the calls write.
 
@@ -85,12 +88,12 @@ class Plan:
     size: int
     call_limit: int
 
-    @property
+    @functools.cached_property
     def results(self) -> int:
         """Offset of the results."""
         return -(-_HEAD_SIZE // _OUTPUT_ALIGNMENT) * _OUTPUT_ALIGNMENT
 
-    @property
+    @functools.cached_property
     def outputs(self) -> int:
         """Offset of the outputs, which end before the note."""
         return self.results + -(-8 * self.call_limit // _OUTPUT_ALIGNMENT) * _OUTPUT_ALIGNMENT
@@ -221,7 +224,7 @@ class Desk:
         resume = resumed(registers)
         return _HEAD.pack(
             MAGIC, ARMED, 0, self._serial, mask, 0, arch.ENTRY_TIMEOUT_NS, 0, resume[arch.INSTRUCTION_POINTER]
-        ) + struct.pack(f"<{len(arch.CLOBBERED)}Q", *(resume[name] for name in arch.CLOBBERED))
+        ) + _CLOBBERED.pack(*_of_clobbered(resume))
 
     def is_done(self, table: bytes) -> bool:
         """Whether the calls have been made, by the table's bytes."""

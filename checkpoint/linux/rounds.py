@@ -17,7 +17,7 @@ from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import Registers
 from checkpoint.linux import abi
 from checkpoint.linux.own_calls import FIRST_ARGUMENT, ROW, OwnCalls, row
-from checkpoint.linux.tracee import SPIN_S, Tracee, rest
+from checkpoint.linux.tracee import PLAIN_STOP, SPIN_S, Tracee, rest
 
 WORD: Final = 8
 REGISTERS_ROOM: Final = 512
@@ -27,6 +27,11 @@ START, LOOK, INTERRUPT, STAND, GIVE_BACK = range(5)
 """Groups of calls, each made about all threads in one go."""
 CALLS: Final = (3, 1, 1, 2, 2)
 """Of each group about one thread."""
+
+
+_POINTER: Final = arch.REGISTER_NAMES.index(arch.INSTRUCTION_POINTER)
+_NUMBER: Final = arch.REGISTER_NAMES.index(arch.CALL_NUMBER)
+"""Their places among the registers, in words."""
 
 
 class _Layout:
@@ -78,12 +83,15 @@ class Round:
             registers, masks: that each stands with; `give_back` sets them again.
         """
         self._address([tracee.pid for tracee in tracees])
-        for index, (tracee, code, found, mask) in enumerate(zip(tracees, codes, registers, masks, strict=True)):
+        for index, (tracee, found) in enumerate(zip(tracees, registers, strict=True)):
             tracee.is_as_found = False
-            there = {**found, arch.INSTRUCTION_POINTER: code, arch.CALL_NUMBER: arch.NO_CALL}
-            self._put(index, _Layout.there, arch.encode_registers(there))
-            self._put(index, _Layout.back, arch.encode_registers(found))
-            self._words[index, _Layout.mask // WORD] = mask
+            back = arch.encode_registers(found)
+            self._put(index, _Layout.back, back)
+            self._put(index, _Layout.there, back)
+        count = len(tracees)
+        self._words[:count, _Layout.there // WORD + _POINTER] = np.array(codes, dtype=np.uint64)
+        self._words[:count, _Layout.there // WORD + _NUMBER] = arch.NO_CALL
+        self._words[:count, _Layout.mask // WORD] = np.array(masks, dtype=np.uint64)
         return not any(self._run(START))
 
     def ask_to_stop(self) -> list[bool] | None:
@@ -102,7 +110,10 @@ class Round:
             results = self._run(STAND)[::2]
             for index in [index for index in waiting if results[index] == tracees[index].pid]:
                 status = int(self._words[index, _Layout.status // WORD]) & 0xFFFFFFFF
-                if not os.WIFSTOPPED(status):
+                if status == PLAIN_STOP:
+                    tracees[index].stopped_by, stand[index] = 0, True
+                    waiting.remove(index)
+                elif not os.WIFSTOPPED(status):
                     waiting.remove(index)  # it has ended
                 elif (stop := tracees[index].stop_of(status)).is_delivery:
                     tracees[index].cont(stop.signal)
@@ -118,11 +129,8 @@ class Round:
         """Set all who were started where they stood; they stand. False when one was killed, or has left our code by itself."""
         if any(self._results[self._firsts[STAND] + 1 :][: 2 * len(self._tids) : 2]):
             return False
-        for index in range(len(self._tids)):
-            place = index * _Layout.size + _Layout.found
-            found = arch.decode_registers(bytes(self._view[place : place + arch.REGISTERS_SIZE]))
-            if not is_ours(found[arch.INSTRUCTION_POINTER]):
-                return False
+        if not all(map(is_ours, self._words[: len(self._tids), _Layout.found // WORD + _POINTER].tolist())):
+            return False
         return not any(self._run(GIVE_BACK))
 
     def _put(self, index: int, place: int, content: bytes) -> None:

@@ -26,6 +26,8 @@ from checkpoint.linux.memory import Memory
 from checkpoint.model import Rseq
 
 PTRACE_EVENT_STOP: Final = 128
+PLAIN_STOP: Final = PTRACE_EVENT_STOP << 16 | signal.SIGTRAP << 8 | 0x7F
+"""Wait status of a thread that was asked to stop, and stands for no other reason. Source: wait(2), ptrace(2)."""
 REGISTERS_SIZE: Final = 4096
 """Bytes offered for the general registers: more than any processor has."""
 XSTATE_SIZE: Final = 16384
