@@ -58,6 +58,7 @@ class Captured:
         size: bytes of it.
         commit, age_ns: of a program that keeps its state: number of the commit that it holds, and how old that was.
         known_bytes: of its pages, those whose last content was remembered.
+        frozen_bytes: of its pages, those that were copied while the program stood still.
     """
 
     position: Position
@@ -70,6 +71,7 @@ class Captured:
     commit: int = 0
     age_ns: int = 0
     known_bytes: int = 0
+    frozen_bytes: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,6 +308,7 @@ class Component:
             captured.commit,
             captured.age_ns,
             captured.known_bytes,
+            captured.frozen_bytes,
         )
 
     async def acknowledge(self, position: Position, *, is_safe: bool = True) -> None:

@@ -84,6 +84,8 @@ class ComponentConfig:
         standby: the robot that keeps its snapshots; "" lets the team choose.
         prefer: the robot that should run it; "" for wherever it is.
         snapshot_period_ms: 0 for the agent's own.
+        freeze_budget_ms: how long it may stand still for a snapshot here, as far as that depends on what is copied; 0: as short
+            as can be.
         portable: a level of processors that it must be able to go on at, see ``checkpoint.portable``; true for the usual one;
             "" for the agent's own.
         warm: a program that keeps its state itself is started here in advance, where this robot is its standby, and waits.
@@ -106,6 +108,7 @@ class ComponentConfig:
     standby: str = ""
     prefer: str = ""
     snapshot_period_ms: int = 0
+    freeze_budget_ms: float = 0
     portable: Portable = ""
     warm: bool = True
     ready_copy: bool = False
@@ -310,6 +313,10 @@ def _check_components(path: Path, config: Config, members: Team) -> None:
         if not 0 <= component.snapshot_period_ms <= PERIOD_MS_MAX:
             raise ConfigError(
                 f"{where}: snapshot_period_ms is {component.snapshot_period_ms}; at most {PERIOD_MS_MAX}; 0 means the agent's own"
+            )
+        if not 0 <= component.freeze_budget_ms <= PERIOD_MS_MAX:
+            raise ConfigError(
+                f"{where}: freeze_budget_ms is {component.freeze_budget_ms:g}; at most {PERIOD_MS_MAX}; 0: as short as can be"
             )
         _check_command(where, component)
         _check_carry(where, component)

@@ -87,6 +87,38 @@ class CopyFigures:
 
 
 @dataclass(slots=True)
+class Budget:
+    """How snapshots of one component kept to its `freeze_budget_ms`.
+
+    Attributes:
+        kept, missed: snapshots.
+        last_us, last_bytes: the last one that missed it: how long the program stood still, and how much was copied meanwhile.
+    """
+
+    kept: int = 0
+    missed: int = 0
+    last_us: int = 0
+    last_bytes: int = 0
+
+    def note(self, captured: Captured, budget_ms: float) -> None:
+        """Count one."""
+        if captured.freeze_us <= budget_ms * 1_000:
+            self.kept += 1
+        else:
+            self.missed += 1
+            self.last_us, self.last_bytes = captured.freeze_us, captured.frozen_bytes
+
+    def remark(self, budget_ms: float) -> str:
+        """What there is to say of those that missed it; "" for nothing."""
+        if not self.missed:
+            return ""
+        return (
+            f"it stood still for longer than its freeze_budget_ms of {budget_ms:g} in {self.missed} of {self.missed + self.kept} "
+            f"snapshots, last for {self.last_us / 1_000:.1f} ms, in which {self.last_bytes / 1e6:.1f} MB were copied"
+        )
+
+
+@dataclass(slots=True)
 class Figures:
     """What ``failover status`` shows of one component on this robot; None where it is not known."""
 
@@ -95,6 +127,7 @@ class Figures:
     crashes: int = 0
     freeze_us: int | None = None
     freeze_us_max: int | None = None
+    budget: Budget = field(default_factory=Budget)
     snapshot_size: int | None = None
     dirty_bytes: int | None = None
     written_bytes: int = 0
@@ -126,8 +159,10 @@ class Figures:
         """Which part of what deltas carried could be told as a difference; None before the first one."""
         return self.known_bytes / self.written_bytes if self.written_bytes else None
 
-    def captured(self, captured: Captured) -> None:
-        """Count one snapshot that was taken here."""
+    def captured(self, captured: Captured, budget_ms: float = 0) -> None:
+        """Count one snapshot that was taken here; ``budget_ms``: the component's `freeze_budget_ms`."""
+        if budget_ms:
+            self.budget.note(captured, budget_ms)
         self.snapshots += 1
         self.freeze_us = captured.freeze_us
         self.freeze_us_max = max(self.freeze_us_max or 0, captured.freeze_us)

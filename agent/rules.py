@@ -80,9 +80,11 @@ def terms_here(launch: Launch | None, component: ComponentConfig) -> Terms:
     Which files it carries its snapshots say.
     """
     carry = Carry(size_max=size_bytes(component.carry_limit), places=tuple(component.carry_at.items()))
+    budget_ns = round(component.freeze_budget_ms * 1_000_000)
     if launch is None:
-        return Terms(carry, component.device_rules())
-    return Terms(carry, merged(arrived(launch.devices), component.device_rules()), launch.connections == CARRY)
+        return Terms(carry, component.device_rules(), freeze_budget_ns=budget_ns)
+    devices = merged(arrived(launch.devices), component.device_rules())
+    return Terms(carry, devices, launch.connections == CARRY, budget_ns)
 
 
 def begun_on(launch: Launch, component: ComponentConfig) -> Terms:

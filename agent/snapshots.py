@@ -49,7 +49,7 @@ class Snapshots:
             await asyncio.to_thread(self.around.store.put, captured.snapshot, prove=False)
         finally:
             os.close(captured.snapshot)
-        self.figures.captured(captured)
+        self.figures.captured(captured, self.around.here(self.name).freeze_budget_ms)
         self.around.tell(
             events.Captured(
                 self.name,

@@ -120,6 +120,13 @@ def _own_notes(view: ComponentView, figures: Figures | None) -> tuple[str, ...]:
     return (*figures.notes, *_overdue(view, figures), *figures.hooks.values(), *figures.bringing.values())
 
 
+def _over_budget(view: ComponentView, figures: Figures | None, settings: Settings) -> tuple[str, ...]:
+    """Where its snapshots do not keep to what its operator allows them."""
+    budget_ms = settings.component(view.name).freeze_budget_ms
+    remark = figures.budget.remark(budget_ms) if figures is not None and budget_ms else ""
+    return (remark,) if remark else ()
+
+
 def _lacks(view: ComponentView, figures: Figures | None) -> tuple[str, ...] | None:
     """What this robot, a standby, would refuse in a takeover, while there is time to do something about it; None: not known."""
     return figures.lacks if figures is not None and view.state is State.STANDBY else None
@@ -187,6 +194,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, s
         **_commits(view, figures),
         "freeze_us": figures.freeze_us if figures else view.freeze_us or None,
         "freeze_us_max": figures.freeze_us_max if figures else None,
+        "freeze_budget_missed": figures.budget.missed if figures else 0,
         "snapshot_size": figures.snapshot_size if figures else None,
         "dirty_bytes": figures.dirty_bytes if figures else None,
         "xor_hit_rate": figures.xor_hit_rate if figures else None,
@@ -212,6 +220,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, s
             *told_lacks(view, charge, settings.config.robot),
             *_copy_notes(view, figures, settings.config.robot),
             *_own_notes(view, figures),
+            *_over_budget(view, figures, settings),
             *_hung_up_devices(view, figures, settings),
             *_waiting_output(view, waiting),
         ],

@@ -380,6 +380,7 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
         size: bytes of the encoded snapshot.
         dirty_bytes: of the pages that it carries, before compression.
         known_bytes: of those whose last content was remembered.
+        frozen_bytes: of those that were copied while the program stood still.
         totals: bytes that the component had written to standard output and standard error at the freeze, or the commit.
         commit: its number, of a cooperative snapshot; ``age_ns``: how old it was by then.
     """
@@ -394,6 +395,7 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
     commit: int = 0
     age_ns: int = 0
     known_bytes: int = 0
+    frozen_bytes: int = 0
 
 
 class Unchanged(msgspec.Struct, frozen=True, tag=True):

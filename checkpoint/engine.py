@@ -121,11 +121,14 @@ class Terms:
         carry: its files that travel with it.
         devices: what becomes of devices that it has open.
         connections: TCP connections with others go along where it goes on from the state in which it stood still for good.
+        freeze_budget_ns: how long it may stand still for a snapshot, so that what is left to copy then is copied beforehand as
+            far as needed; 0: as short as can be.
     """
 
     carry: Carry = NOTHING_CARRIED
     devices: tuple[DeviceRule, ...] = ()
     connections: bool = False
+    freeze_budget_ns: int = 0
 
 
 NO_TERMS: Final = Terms()
@@ -214,6 +217,11 @@ class Session(Protocol):
     @property
     def totals(self) -> tuple[int, int]:
         """Bytes that the component had written to its standard output and error at the last capture."""
+        ...
+
+    @property
+    def frozen_size(self) -> int:
+        """Bytes of pages that the last capture copied while the program stood still."""
         ...
 
     notes: tuple[str, ...]

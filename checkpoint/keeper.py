@@ -136,6 +136,7 @@ class Keeper:
             commit=commit,
             age_ns=age_ns,
             known_bytes=known_bytes,
+            frozen_bytes=session.frozen_size,
         )
         return answer, (encoded,)
 

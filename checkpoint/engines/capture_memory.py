@@ -15,6 +15,7 @@ What is still to be copied is known before (`RunningCopy.owed`), and what a snap
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -43,6 +44,10 @@ LARGE_COUNT: Final = 256
 """Pages that are worth another pass: they take 0.4 ms to copy, as long as everything else about them."""
 PASS_LIMIT: Final = 3
 """Passes after the first: a program that writes faster than we copy is not caught up with by more of them."""
+BUDGET_PASS_LIMIT: Final = 12
+"""The same where what is left shall fit a budget."""
+CATCHING_UP: Final = 0.8
+"""Of what the pass before copied: a pass that copies more does not catch up."""
 VDSO: Final = "[vdso]"
 UNACKNOWLEDGED_LIMIT: Final = 64
 """Scans that are remembered one by one. Beyond, the oldest two become one, and the older position can be acknowledged no more: a
@@ -163,18 +168,28 @@ class MemoryCapture:
 
     # While the program runs
 
-    def copy_running(self, *, base: bool) -> RunningCopy:
-        """Copy beforehand what is worth it, so that little is left for the freeze."""
+    def copy_running(self, *, base: bool, enough: int = 0) -> RunningCopy:
+        """Copy beforehand what is worth it, so that little is left for the freeze.
+
+        Args:
+            enough: the pages that may be left, which are copied down to however many passes that takes as long as they catch up
+                with the program; 0: as few as is worth it.
+        """
         self.refresh()
         copied = RunningCopy()
         if base:
             self._copy_everything(copied)
-        for turn in range(PASS_LIMIT):
-            if not self._is_behind(copied, LARGE_COUNT if turn or base else WORTH_COUNT, base=base):
+        last = 0
+        for turn in range(BUDGET_PASS_LIMIT if enough else PASS_LIMIT):
+            if not self._is_behind(copied, enough or (LARGE_COUNT if turn or base else WORTH_COUNT), base=base):
                 break
             self._catch_up(copied)
-            self._read_into(copied, self._missing(copied, base=base))
+            missing = self._missing(copied, base=base)
+            self._read_into(copied, missing)
             self.refresh()
+            last, before = pages.total_size(missing), last
+            if turn >= PASS_LIMIT and last > CATCHING_UP * before:
+                break
         copied.owed = pages.difference(self._since_acknowledged(base=base)[0], copied.valid)
         return copied
 
@@ -249,7 +264,9 @@ class MemoryCapture:
         missing = pages.difference(pages.union(owed, scan.written), guards)
         if base:
             missing = pages.union(missing, self._vdso)  # for a machine whose kernel has another one
+        began = time.perf_counter_ns()
         content = memoryview(self._memory.read_pages(missing, self._buffer))[: pages.total_size(missing)]
+        copy_ns = time.perf_counter_ns() - began
         self._left_out = guards
         return Taken(
             lines=self.lines,
@@ -259,6 +276,7 @@ class MemoryCapture:
             scans=tuple(self._unacknowledged),
             valid=copied.valid,
             copies=(*copied.copies, Copy(missing, content)),
+            copy_ns=copy_ns,
             untouched=self._untouched(),
         )
 

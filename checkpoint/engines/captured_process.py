@@ -140,14 +140,14 @@ class CapturedProcess:
 
     # Before the freeze
 
-    def copy_running(self, *, base: bool) -> RunningCopy:
-        """Do beforehand what is worth it; for a base the files are looked at before, too, for that takes long."""
+    def copy_running(self, *, base: bool, enough: int = 0) -> RunningCopy:
+        """As `MemoryCapture.copy_running`; for a base the files are looked at before, too, for that takes long."""
         self.onlooker.prepare()
         if base:
             self.memory.refresh()
             self._flags.refresh(self.memory.lines, anew=True)
             self.identities.vmas(self.memory.lines, self._flags.flags, NONE)
-        copied = self.memory.copy_running(base=base)
+        copied = self.memory.copy_running(base=base, enough=enough)
         if base:  # which takes long: a thread may have confined itself since
             self.onlooker.rights.prepare()
             self.onlooker.tables.prepare()

@@ -291,13 +291,14 @@ class CapturedTree:
             self._refuse((reason,))
         return slot
 
-    def copy_running(self, *, base: bool) -> None:
-        """See `MemoryCapture.copy_running`."""
+    def copy_running(self, *, base: bool, enough: int) -> None:
+        """As `MemoryCapture.copy_running`, with as many pages left of each of them."""
         self._copied.clear()
         for pid, process in tuple(self._known.items()):
             try:
                 with _gone_if_ended(pid):
-                    self._copied[pid] = process.copy_running(base=base or process.memory.acknowledged is None)
+                    is_base = base or process.memory.acknowledged is None
+                    self._copied[pid] = process.copy_running(base=is_base, enough=enough)
             except ProcessGoneError:  # or it has executed another program
                 self._forget(pid)
             except CaptureError as error:

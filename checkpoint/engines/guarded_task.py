@@ -69,6 +69,11 @@ class GuardedTask:
             session.program = (program,) if program is not None else ()
         return session.capture(order)
 
+    @property
+    def frozen_size(self) -> int:
+        """Nothing is copied while it stands still: it never does."""
+        return 0
+
     def unchanged(self) -> Position | None:
         """The newest acknowledged position, if a capture would say nothing new; None: capture."""
         if self._session is None or self._session.reader.is_superseded or procfs.status(self.pid).state in "ZX":

@@ -32,6 +32,7 @@ from checkpoint.engines.capture_memory import RunningCopy
 from checkpoint.engines.captured_pages import Pages, joined, with_parcel
 from checkpoint.engines.captured_process import CapturedProcess, Look, Met
 from checkpoint.engines.captured_tree import CapturedTree, MovedError, SeenOthers
+from checkpoint.engines.freeze_budget import FreezeBudget
 from checkpoint.engines.outputs import Outputs
 from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import abi, kinship, procfs
@@ -104,6 +105,7 @@ class PtraceSession:
         self._held = False
         self._collects = False
         self._precedence = Precedence()
+        self._budget = FreezeBudget(order.terms.freeze_budget_ns)
         self._closed = False
 
     # Opening and closing
@@ -205,8 +207,9 @@ class PtraceSession:
                 self._tree.admit(held=self._held)
                 if base and (others := self._tree.processes()):
                     self._refuse(room.refuse_capture((self.pid, *(process.pid for process in others))))
-                copied = self._first.copy_running(base=base)
-                self._tree.copy_running(base=base)
+                enough = self._enough()
+                copied = self._first.copy_running(base=base, enough=enough)
+                self._tree.copy_running(base=base, enough=enough)
                 frozen = self._frozen_look(copied, base=base, hold=order.hold)
                 if frozen.others:
                     frozen.others.describe()
@@ -215,6 +218,10 @@ class PtraceSession:
                 if time.monotonic() > deadline:
                     raise
                 time.sleep(MOVED_PAUSE_S)
+
+    def _enough(self) -> int:
+        """Pages that each process may leave for the freeze; 0 where nobody has set a budget."""
+        return max(1, self._budget.page_count // (1 + len(self._tree.processes()))) if self._budget else 0
 
     def _look_from_outside(self) -> None:
         """What was refused once is looked at without stopping it: a program that has an epoll for a week is left in peace."""
@@ -331,6 +338,7 @@ class PtraceSession:
         looks = [(self._first, first), *(others.looks() if others else ())]
         taken = joined(looks, is_base=parent is None)
         self.frozen_size = taken.frozen_size
+        self._budget.note(frozen.freeze_us * NS_PER_US, sum(look.taken.copy_ns for _, look in looks), taken.frozen_size)
         totals = first.standing.totals
         snapshot = replace(
             self._with_pages(self._outline(order, parent, frozen, parcel), with_parcel(taken, parcel, is_base=parent is None)),

@@ -37,6 +37,7 @@ class Taken:
         valid: pages of ``copies`` that only the last scan may have named since.
         copies: oldest first; the last one was made while the program stood still, in a buffer that the next one uses again.
         untouched: see `checkpoint.resources.untouched`.
+        copy_ns: how long that last copy took.
     """
 
     lines: tuple[MapsLine, ...]
@@ -47,6 +48,7 @@ class Taken:
     valid: Words
     copies: tuple[Copy, ...]
     untouched: Words = field(default_factory=lambda: NONE)
+    copy_ns: int = 0
 
     @functools.cached_property
     def _named(self) -> tuple[Words, Words]:

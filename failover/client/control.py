@@ -64,9 +64,10 @@ peers: [{name, role, state, last_heard_ms, hears_us, load, beats_lost, links, la
     lane: connected | connecting | refused | down
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
-    freeze_us_max, snapshot_size, dirty_bytes, xor_hit_rate, snapshots, restores, crashes, outage_ms, exit_status, promise,
-    promise_differs, kept, unstored, lacks, prepared_first, owner, reasons,
+    freeze_us_max, freeze_budget_missed, snapshot_size, dirty_bytes, xor_hit_rate, snapshots, restores, crashes, outage_ms,
+    exit_status, promise, promise_differs, kept, unstored, lacks, prepared_first, owner, reasons,
     output, output_waiting, notes, elsewhere, warm, cold, ready, ready_copy}]
+    freeze_budget_missed: its snapshots that took longer than the freeze_budget_ms of its table in agent.toml; notes say more
     snapshot_size, dirty_bytes: of the newest one: bytes on the wire, and of pages; xor_hit_rate: which part of what the
         deltas of this life carried was in the cache of last contents (xor_cache of agent.toml); None before the first one
     output: immediate | committed (--output); output_waiting: bytes that wait until another robot holds them

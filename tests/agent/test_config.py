@@ -97,6 +97,8 @@ def test_the_level_of_processors_is_the_callers_then_the_components_then_the_rob
         (("beat_ms = 100_000",), 4, "at most 10000"),
         (("beat_ms = 100", "lease_ms = 200"), 5, "one lost beat would count as a death"),
         (("# fine", "snapshot_period_ms = 0"), 5, "must be at least 1"),
+        (('[components."/lab/a"]', "freeze_budget_ms = -1"), 4, "0: as short as can be"),
+        (('[components."/lab/a"]', "freeze_budget_ms = nan"), 4, "freeze_budget_ms is nan"),
         (("link_mbit_s = -1",), 4, "0 means no cap"),
         (("keep_checkpoints = -1",), 4, "0 keeps none"),
         (("# fine", 'keep_for = "a week"'), 5, "'a week' is no span of time; write 90s, 10min, 2h or 3d"),

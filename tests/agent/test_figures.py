@@ -48,3 +48,16 @@ def test_the_hit_rate_of_the_cache_counts_deltas_alone() -> None:
     figures.captured(Captured(delta, base, -1, 300, 500, 8192, (), known_bytes=4096))
     figures.captured(Captured(delta, base, -1, 100, 500, 8192, (), known_bytes=8192))
     assert figures.xor_hit_rate == 0.75
+
+
+def test_what_misses_its_budget_is_told_with_how_much_was_copied() -> None:
+    figures, base = Figures(), Position(1, 1, bytes(16))
+    figures.captured(Captured(base, None, -1, 900, 4_999, 8192, ()), budget_ms=5)
+    assert not figures.budget.remark(5)
+    figures.captured(Captured(base, None, -1, 900, 14_200, 8192, (), frozen_bytes=3_200_000), budget_ms=5)
+    figures.captured(Captured(base, None, -1, 900, 300, 8192, ()), budget_ms=5)
+    assert figures.budget.remark(5) == (
+        "it stood still for longer than its freeze_budget_ms of 5 in 1 of 3 snapshots, "
+        "last for 14.2 ms, in which 3.2 MB were copied"
+    )
+    assert figures.budget.missed == 1
