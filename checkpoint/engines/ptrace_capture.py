@@ -211,6 +211,8 @@ class PtraceSession:
                 copied = self._first.copy_running(base=base, enough=enough)
                 self._tree.copy_running(base=base, enough=enough)
                 frozen = self._frozen_look(copied, base=base, hold=order.hold)
+                if not order.hold:
+                    self._require_owners_asked(frozen.first, frozen.others)
                 if frozen.others:
                     frozen.others.describe()
                 return frozen
@@ -259,6 +261,8 @@ class PtraceSession:
             if others:
                 self._tree.look(others, first, self._surroundings, base=base)
             seen = self._carried.look(self._shared_inodes(first, others)) if self._carried else Seen()
+            if hold:
+                self._require_owners_asked(first, others)
             if hold and self._surroundings.connections:
                 self._departing = carried_connections.depart(self._opened(first, others))
         except BaseException:
@@ -269,6 +273,18 @@ class PtraceSession:
         else:
             self._thaw()
         return Frozen(first, others, (time.perf_counter_ns() - began) // NS_PER_US, seen, self._departing)
+
+    def _require_owners_asked(self, first: Look, others: SeenOthers | None) -> None:
+        """Whatever has an owner of its signals was asked for it while it stood still.
+
+        Raises:
+            MovedError: one was not: it is known now.
+        """
+        for process, seen in ((self._first, first), *(others.looks() if others else ())):
+            if held := process.onlooker.overlooked(seen.standing.opened):
+                raise MovedError(
+                    f"{held.name} of pid {process.pid} was given an owner of its signals (F_SETOWN); capture it again"
+                )
 
     @staticmethod
     def _opened(first: Look, others: SeenOthers | None) -> list[OpenFile]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -25,7 +26,7 @@ from checkpoint.linux.readings import Reading, Readings
 from checkpoint.linux.remote import Answers
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.timers import parse_timers
-from checkpoint.resources import Kept, Opened, OpenFile, gather, with_contents
+from checkpoint.resources import Kept, Opened, OpenFile, gather, owners, with_contents
 from checkpoint.resources.recollection import Recollection
 from checkpoint.resources.thread_rights import ThreadRights
 from checkpoint.resources.thread_tables import ThreadTables
@@ -121,6 +122,10 @@ class Onlooker:
         """What it has open; for an exact picture it stands still."""
         return gather(self._tracee.pid, self._kept)
 
+    def overlooked(self, opened: Sequence[OpenFile]) -> OpenFile | None:
+        """See `checkpoint.resources.owners.overlooked`."""
+        return owners.overlooked(opened, self._kept.owners)
+
     def _with_contents(self, opened: Opened) -> tuple[OpenFile, ...]:
         with lending(self._tracee.pid):
             return with_contents(opened, self._borrowed.noted, self._devices, self._recollection)
@@ -141,7 +146,9 @@ class Onlooker:
             special, _, _ = procfs.signal_sets(procfs.read_bytes(self._tracee.pid, "status"))
             self._questions(special)
             with contextlib.suppress(CaptureError):  # it runs: one of its threads has just closed something
-                with_contents(self.gather(), None, self._devices)
+                opened = self.gather()
+                self.overlooked(opened)
+                with_contents(opened, None, self._devices)
             self._kept.texts.forget()
             if self._threads.is_one_of_many:  # what all of them have open is read for all of them, not by what stays open
                 self._kept.texts.close()

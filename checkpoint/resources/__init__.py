@@ -24,9 +24,13 @@ from checkpoint.resources.grouping import Grouping
 from checkpoint.resources.listings import Listings
 
 if TYPE_CHECKING:
+    from checkpoint.resources.owners import Signals
     from checkpoint.resources.recollection import Recollection
     from checkpoint.resources.sockets import Noted
     from checkpoint.resources.travelling import Lent
+
+Owners = set[tuple[int, int]]
+"""Number and inode of the open files that had an owner at the last look; see `checkpoint.resources.owners`."""
 
 STREAM_NUMBERS: Final = (1, 2)
 GLANCES_MORE: Final = 3
@@ -66,6 +70,8 @@ class OpenFile:
         description: the number of an open file that several processes of a component share (`sharing`); 0: it is this one's.
         is_echo: another process of the component has told of it already.
         lent: through which it is looked at, if it is on its way to the program (`travelling`); ``pid`` is ours then.
+        owners: what is known of who has owners, of a process that is looked at again and again.
+        signals: what it sends, to whom, if that was asked while the process stood still; else none, or it is asked now.
     """
 
     pid: int
@@ -78,6 +84,8 @@ class OpenFile:
     description: int = 0
     is_echo: bool = False
     lent: Lent | None = None
+    owners: Owners | None = None
+    signals: Signals | None = None
 
     @property
     def first(self) -> Descriptor:
@@ -175,13 +183,14 @@ class Kept:
     def __init__(self, pid: int) -> None:
         self.texts = KeptTexts(pid)
         self.grouping = Grouping(pid)
+        self.owners: Owners = set()
         self._groups: tuple[tuple[Descriptor, ...], ...] = ()
         self._opened: tuple[OpenFile, ...] = ()
 
     def opened(self, groups: tuple[tuple[Descriptor, ...], ...], pid: int) -> tuple[OpenFile, ...]:
         """The open files; the very same where they have not changed."""
         if groups is not self._groups:
-            self._groups, self._opened = groups, _opened_of(groups, pid)
+            self._groups, self._opened = groups, _opened_of(groups, pid, self.owners)
         return self._opened
 
 
@@ -198,11 +207,12 @@ def gather(pid: int, kept: Kept | None = None) -> Opened:
     return Opened(kept.opened(groups, pid) if kept else _opened_of(groups, pid))
 
 
-def _opened_of(groups: Sequence[tuple[Descriptor, ...]], pid: int) -> tuple[OpenFile, ...]:
+def _opened_of(groups: Sequence[tuple[Descriptor, ...]], pid: int, owners: Owners | None = None) -> tuple[OpenFile, ...]:
     ends = {(group[0].target, group[0].flags & os.O_ACCMODE) for group in groups}
     other = {os.O_RDONLY: os.O_WRONLY, os.O_WRONLY: os.O_RDONLY}
     return tuple(
-        OpenFile(pid, group, both_ends=(group[0].target, other.get(group[0].flags & os.O_ACCMODE)) in ends) for group in groups
+        OpenFile(pid, group, both_ends=(group[0].target, other.get(group[0].flags & os.O_ACCMODE)) in ends, owners=owners)
+        for group in groups
     )
 
 
@@ -219,7 +229,7 @@ def with_contents(
     Raises:
         CaptureError: one of them cannot be looked into.
     """
-    from checkpoint.resources import attached_devices, files, kinds, pipes
+    from checkpoint.resources import attached_devices, files, kinds, owners, pipes
 
     found = []
     empty = recollection.empty_pipes(opened) if recollection and not rules else {}
@@ -238,7 +248,7 @@ def with_contents(
             capacity, pieces = pipes.look_into(held)
             held = pipes.with_content(held, capacity, pieces)
         found.append(held)
-    return tuple(found)
+    return owners.asked(found) if noted is not None else tuple(found)
 
 
 def _with_travelling(opened: Opened, noted: Noted | None, recollection: Recollection | None = None) -> list[OpenFile]:

@@ -10,19 +10,17 @@ Source: fcntl_dirnotify() in fs/notify/dnotify/dnotify.c.
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import os
 import stat
-import struct
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
-from checkpoint.linux.descriptors import copy_of
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile
+from checkpoint.resources import OpenFile, owners
+from checkpoint.resources.owners import O_PATH, OWNER
 from checkpoint.resources.rebuilding import number_of
 
 CAPABILITIES: Final = (
@@ -41,29 +39,25 @@ CAPABILITIES: Final = (
 )
 
 F_SETOWN_EX: Final = 15
-F_GETOWN_EX: Final = 16
 F_OWNER_TID: Final = 0
 F_OWNER_PID: Final = 1
 F_OWNER_PGRP: Final = 2
 THE_PROCESS: Final = 1
 ITS_FIRST_THREAD: Final = 2
 _OWNERS: Final = {F_OWNER_PID: THE_PROCESS, F_OWNER_TID: ITS_FIRST_THREAD}
-_OWNER: Final = struct.Struct("<ii")
-O_PATH: Final = 0o10000000
 SETTABLE: Final = os.O_APPEND | os.O_ASYNC | os.O_DIRECT | os.O_NOATIME | os.O_NONBLOCK
 """What F_SETFL changes; it ignores the rest."""
 
 
 def describe(held: OpenFile) -> dict[str, Fact]:
     """The facts of one open file; none where nothing was set."""
-    asked = _asked(held)
-    if asked is None:
+    sent = owners.of(held)
+    if not sent:
         return {}
-    signal, kind, owner = asked
-    if not _is_of_ours(held, owner):
-        return {"signal": signal, "owner": 0}
-    facts: dict[str, Fact] = {"signal": signal, "owner": _OWNERS.get(kind, 0)}
-    return facts | ({"owner_pid": procfs.status(owner).pids[-1]} if held.kin.pids else {})
+    if not _is_of_ours(held, sent.owner):
+        return {"signal": sent.signal, "owner": 0}
+    facts: dict[str, Fact] = {"signal": sent.signal, "owner": _OWNERS.get(sent.kind, 0)}
+    return facts | ({"owner_pid": procfs.status(sent.owner).pids[-1]} if held.kin.pids else {})
 
 
 def _is_of_ours(held: OpenFile, owner: int) -> bool:
@@ -73,12 +67,12 @@ def _is_of_ours(held: OpenFile, owner: int) -> bool:
 
 def refuse(held: OpenFile) -> str | None:
     """Why its signals cannot be kept: they go to somebody else."""
-    asked = _asked(held)
-    if asked is None or asked[2] == 0:
+    sent = owners.of(held)
+    if not sent.owner:
         return None
     if stat.S_ISDIR(held.first.mode):
         return f"{held.name} is a directory whose changes are told by a signal (F_NOTIFY), which is not kept: use inotify"
-    _, kind, owner = asked
+    kind, owner = sent.kind, sent.owner
     if _is_of_ours(held, owner) and kind in _OWNERS:
         return None
     whom = {F_OWNER_TID: f"thread {owner} alone", F_OWNER_PGRP: f"process group {owner}"}.get(kind, str(owner))
@@ -109,21 +103,10 @@ def settle(table: CallTable, descriptor: int, held: Resource) -> None:
 
 def _own(table: CallTable, descriptor: int, held: Resource, pid: int) -> None:
     kind = F_OWNER_TID if held.facts["owner"] == ITS_FIRST_THREAD else F_OWNER_PID
-    place = table.place(_OWNER.pack(kind, pid))
+    place = table.place(OWNER.pack(kind, pid))
     table.call(f"own the signals of {held.name}", "fcntl", descriptor, F_SETOWN_EX, place)
 
 
 def disown(table: CallTable, descriptor: int) -> None:
     """Have nobody own them for now."""
     table.call("disown the signals of a descriptor", "fcntl", descriptor, fcntl.F_SETOWN, 0)
-
-
-def _asked(held: OpenFile) -> tuple[int, int, int] | None:
-    """(signal, kind of owner, owner) if anything was set, asked through a copy of the descriptor; None where there is none."""
-    if held.first.flags & O_PATH:
-        return None
-    with contextlib.suppress(OSError), copy_of(held.pid, held.first.number) as descriptor:
-        signal = fcntl.fcntl(descriptor, fcntl.F_GETSIG)
-        kind, owner = _OWNER.unpack(fcntl.fcntl(descriptor, F_GETOWN_EX, bytes(_OWNER.size)))
-        return (signal, kind, owner) if signal or owner else None
-    return None
