@@ -4,6 +4,8 @@ What they have in common since a fork is there once while it runs, and once in a
 snapshot, or brings it back, has it once for each of them for a moment. Where that is more than the machine can give, the kernel
 would end somebody; so it is refused beforehand.
 
+What a control group around this process allows (memory.max) counts as the machine's own.
+
 Source: proc_meminfo(5), proc_pid_status(5).
 """
 
@@ -16,7 +18,7 @@ from typing import Final
 
 from checkpoint.capability import Area, refused
 from checkpoint.errors import ProcessGoneError
-from checkpoint.linux import procfs
+from checkpoint.linux import memory_groups, procfs
 from checkpoint.model import Snapshot
 
 CAPABILITIES: Final = (
@@ -35,12 +37,14 @@ COPIES: Final = 2
 GB: Final = 10**9
 _KIB: Final = 1024
 _FREE: Final = re.compile(r"^(?:MemAvailable|SwapFree):\s+(\d+) kB$", re.MULTILINE)
+_SWAP: Final = re.compile(r"^SwapFree:\s+(\d+) kB$", re.MULTILINE)
 _COPIED: Final = re.compile(r"^(?:RssAnon|VmSwap):\s+(\d+) kB$", re.MULTILINE)
 
 
 def free() -> int:
-    """Bytes that programs can still have here, those of the swap included."""
-    return _added(_FREE, Path("/proc/meminfo").read_text())
+    """Bytes that programs can still have here, those of the swap included; control groups of this process may leave it less."""
+    told = Path("/proc/meminfo").read_text()
+    return min(_added(_FREE, told), memory_groups.left(_added(_SWAP, told)))
 
 
 def held(pid: int) -> int:
@@ -66,7 +70,7 @@ def refuse_capture(pids: Iterable[int]) -> tuple[str, ...]:
     told = size / GB, COPIES * size / GB, room / GB
     return (
         f"its processes hold {told[0]:.1f} GB together, and copying them takes {told[1]:.1f} GB; {told[2]:.1f} GB are free: "
-        "start fewer, or give this machine memory or swap",
+        "start fewer, or give this machine, or the agent's control group, memory or swap",
     )
 
 
@@ -79,5 +83,5 @@ def refuse_restore(state: Snapshot) -> tuple[str, ...]:
         return ()
     return (
         f"its processes hold {size / GB:.1f} GB where each has its own, and this machine has {room / GB:.1f} GB free for that: "
-        "end something here, or give it memory or swap",
+        "end something here, or give it, or the agent's control group, memory or swap",
     )
