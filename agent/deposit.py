@@ -10,7 +10,7 @@ from agent.config import ComponentConfig
 from agent.places import Places, complete_logs, log_directory
 from agent.shipping import Refusal
 from agent.streams import OutputLogs
-from checkpoint import carried, format
+from checkpoint import carried, foreign, format
 from checkpoint.channel import close_all
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import ChainError, CheckpointError, FormatError, StoreError
@@ -106,6 +106,11 @@ class Deposit:
                 log.warning("a snapshot of %s from %s was not kept: %s", offer.component, peer, error)
                 needs_base = isinstance(error, ChainError)
                 self._tell(StoreFailed(offer.component, offer.epoch, peer, str(error), needs_base))
+                return
+            except foreign.NOT_UNDERSTOOD as error:  # the sender is known, and still its word is its own
+                why = foreign.sentence(f"keep a snapshot of {offer.component} from {peer}", error)
+                log.warning("%s", why, exc_info=error)
+                self._tell(StoreFailed(offer.component, offer.epoch, peer, why, needs_base=False))
                 return
         self._kept(offer, snapshot)
         keeps_state = snapshot.engine == COOPERATIVE

@@ -19,11 +19,11 @@ from typing import Final
 
 import msgspec
 
-from checkpoint import carried, chain, channel, engine, format
+from checkpoint import carried, chain, channel, engine, foreign, format
 from checkpoint.channel import Channel, ChannelClosedError, ChannelError, Failed, Reply, Request
 from checkpoint.digests_of_files import DigestsOfFiles
 from checkpoint.engine import CaptureOrder, Copy, Engine, ProtectOrder, Restored, RestoreOptions, Session, Streams
-from checkpoint.errors import CaptureError, CheckpointError, RestoreError
+from checkpoint.errors import CaptureError, CheckpointError, FormatError, RestoreError
 from checkpoint.hot_pages import Sender
 from checkpoint.linux.address import address_of
 from checkpoint.model import Position, Snapshot
@@ -153,12 +153,14 @@ class Keeper:
         try:
             if self._is_busy:
                 raise RestoreError(f"cannot restore into pid {request.pid}: this keeper follows a process already")
-            state = carried.relocated(folded(files), dict(request.terms.carry.places))
+            with foreign.facts(f"restore {request.component}"):
+                state = carried.relocated(folded(files), dict(request.terms.carry.places))
+                names = names_of_contents(needs(state), request.contents) if request.robot else None
         finally:
             channel.close_all(files)
-        self._restored = self._tracer.restore(request.pid, state, _options(request))
-        self._revived = request, ends
-        self._names = names_of_contents(needs(state), request.contents) if request.robot else None
+        with foreign.facts(f"restore {request.component}"):
+            self._restored = self._tracer.restore(request.pid, state, _options(request))
+        self._revived, self._names = (request, ends), names
         return channel.Restored(self._restored.pid, self._restored.position, self._restored.notes), ()
 
     def _lay(self, request: channel.Lay, descriptors: Descriptors) -> Answer:
@@ -166,7 +168,8 @@ class Keeper:
             if self._is_busy:
                 raise RestoreError(f"cannot lay a ready copy in pid {request.pid}: this keeper follows a process already")
             options = RestoreOptions(own_eyes=request.own_eyes, contents=request.contents, terms=request.terms)
-            self._copy = self._tracer.lay(request.pid, format.decode(descriptors[0]), options)
+            with foreign.facts(f"lay a ready copy of {request.component}"):
+                self._copy = self._tracer.lay(request.pid, format.decode(descriptors[0]), options)
             return self._brought_on(self._copy, descriptors[1:], request.elapsed_ns)
         finally:
             channel.close_all(descriptors)
@@ -182,8 +185,9 @@ class Keeper:
     def _brought_on(self, copy: Copy, deltas: Descriptors, elapsed_ns: int) -> Answer:
         """Apply deltas to the copy, each as soon as it is verified; what does not come as far as the last is ended."""
         try:
-            for delta in deltas:
-                copy.advance(format.decode(delta))
+            with foreign.facts("bring a ready copy on"):
+                for delta in deltas:
+                    copy.advance(format.decode(delta))
             copy.require_clocks(elapsed_ns)
             return channel.Laid(copy.position, copy.size), ()
         except CheckpointError:
@@ -197,32 +201,42 @@ class Keeper:
             if copy is not None:
                 copy.end()
             raise RestoreError(f"cannot make {request.order.component} of a ready copy: this keeper has none of that position")
-        needed = needs(copy.state)
-        self._restored = copy.finish(_options(request.order))
+        try:
+            with foreign.facts(f"restore {request.order.component}"):
+                needed = needs(copy.state)
+        except FormatError:
+            copy.end()
+            raise
+        with foreign.facts(f"restore {request.order.component}"):
+            self._restored = copy.finish(_options(request.order))
         self._revived = request.order, None
         self._names = names_of_contents(needed, request.order.contents) if request.order.robot else None
         return channel.Restored(self._restored.pid, self._restored.position, self._restored.notes), ()
 
     def _fill(self, request: channel.Fill, descriptors: Descriptors) -> Answer:
         try:
-            state = carried.relocated(folded(descriptors), dict(request.places))
+            with foreign.facts(f"fill the state of {request.component}"):
+                state = carried.relocated(folded(descriptors), dict(request.places))
         finally:
             channel.close_all(descriptors)
         from checkpoint.engines.cooperative import fill_segment
         from checkpoint.resources import laying
 
-        segment = fill_segment(state)
-        laid = laying.lay_down_for(state, os.getpid(), own_eyes=request.own_eyes)
+        with foreign.facts(f"fill the state of {request.component}"):
+            segment = fill_segment(state)
+            laid = laying.lay_down_for(state, os.getpid(), own_eyes=request.own_eyes)
         return channel.Filled(state.position, laid.notes), (segment.descriptor,)
 
     def _compare(self, request: channel.Compare, descriptors: Descriptors) -> Answer:
         try:
-            outline = carried.relocated(format.read_outline(descriptors[-1]), dict(request.terms.carry.places))
+            with foreign.facts("compare a snapshot with what is here"):
+                outline = carried.relocated(format.read_outline(descriptors[-1]), dict(request.terms.carry.places))
         finally:
             channel.close_all(descriptors)
         chosen = self._tracer if outline.engine == self._tracer.name else engine.engine_named(outline.engine)
         digests = DigestsOfFiles(request.known)
-        found = chosen.lacks(outline, RestoreOptions(contents=request.contents, terms=request.terms), digests.of)
+        with foreign.facts(f"compare {outline.component} with what is here"):
+            found = chosen.lacks(outline, RestoreOptions(contents=request.contents, terms=request.terms), digests.of)
         return channel.Compared(found, tuple(digests.used.values())), ()
 
     def _open_file(self, request: channel.OpenFile, _: Descriptors) -> Answer:

@@ -12,6 +12,7 @@ from agent.places import Places
 from checkpoint.errors import StoreError
 from checkpoint.model import Position
 from failover.core.acts import Admit
+from failover.core.events import StoreFailed
 from failover.core.messages import Offer
 from failover.core.types import ComponentSpec
 
@@ -68,3 +69,24 @@ def test_whose_snapshots_they_were_is_known_after_the_claim_that_ends_their_admi
     deposit.admit(Admit(NAME, 1, "robot1"))
     deposit.admit(Admit(NAME, 2, ""))
     assert deposit.last_sender(NAME) == "robot1"
+
+
+def test_a_snapshot_whose_facts_are_no_facts_is_refused_by_name(tmp_path: Path) -> None:
+    """From a peer that may send it; the lanes go on."""
+    told: list[Any] = []
+
+    class Reading(Deposit):
+        def _put(self, offer: Offer, descriptor: int) -> Any:
+            return {}["flags"]
+
+    async def run() -> None:
+        none = cast(Any, None)
+        deposit = Reading(none, Places(tmp_path, tmp_path, cast(Any, Nursery())), told.append, none)
+        deposit.admit(Admit(NAME, 1, "robot1"))
+        await deposit.take("robot1", Offer(1, NAME, 1, Position(64, 1, b"d"), None, 1, b"", ComponentSpec(NAME)), -1)
+
+    asyncio.run(run())
+    (failed,) = told
+    assert isinstance(failed, StoreFailed)
+    assert failed.sender == "robot1"
+    assert f"cannot keep a snapshot of {NAME} from robot1: its snapshot says something" in failed.message

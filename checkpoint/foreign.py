@@ -1,0 +1,57 @@
+"""What a snapshot says is another's word: facts of any kind may be missing, of another type, or out of every range.
+
+Each kind of resource reads its own facts as they are meant. Where that goes wrong because they are not, the error is of whatever
+class Python has for it; here it becomes one that says so, so that a snapshot is refused and nobody ends because of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import struct
+from collections.abc import Iterator
+from typing import Final
+
+from checkpoint.errors import CheckpointError, FormatError
+
+NOT_UNDERSTOOD: Final = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    LookupError,
+    OSError,
+    RecursionError,
+    TypeError,
+    ValueError,
+    struct.error,
+)
+"""What comes of a fact that is not what it is taken for."""
+
+log = logging.getLogger("failover.foreign")
+
+
+@contextlib.contextmanager
+def facts(what: str) -> Iterator[None]:
+    """Read, and act upon, what a snapshot says.
+
+    Args:
+        what: is done with it, for a sentence: "restore /lab/a".
+
+    Raises:
+        FormatError: it says something that is not understood. Perhaps that is our mistake: where it happened is logged.
+    """
+    try:
+        yield
+    except CheckpointError:
+        raise
+    except NOT_UNDERSTOOD as error:
+        log.warning("cannot %s", what, exc_info=error)
+        raise FormatError(sentence(what, error)) from error
+
+
+def sentence(what: str, error: Exception) -> str:
+    """That something cannot be done, and why."""
+    return (
+        f"cannot {what}: its snapshot says something that this version does not understand ({type(error).__name__}: {error}); "
+        "use the version that captured it, or take a new snapshot"
+    )

@@ -1,0 +1,75 @@
+"""A snapshot whose facts are not what they should be: it is refused in words, and the keeper that was to restore it lives on."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import pytest
+
+from checkpoint import channel, foreign
+from checkpoint.chain import position_of
+from checkpoint.channel import memfd_holding
+from checkpoint.errors import FormatError, MismatchError
+from checkpoint.format import encode_bytes
+from checkpoint.linux.vessel import Birth, discard, spawn_vessel
+from checkpoint.model import Fact, Snapshot
+from tests.checkpoint.round_trip import captured_and_killed, ended, start
+from tests.checkpoint.test_keeper_death import keeping
+
+pytestmark = pytest.mark.root
+
+Facts = Mapping[str, Fact]
+SPOILT: Mapping[str, Callable[[Facts], Facts]] = {
+    "a fact that is missing": lambda facts: {name: value for name, value in facts.items() if name != "flags"},
+    "flags that are a text": lambda facts: {**facts, "flags": "many"},
+    "an offset without end": lambda facts: {**facts, "offset": 1 << 62, "size": -1},
+    "a path with an end in it": lambda facts: {**facts, "path": "/tmp/a\0b"},
+    "descriptors that are none": lambda facts: {**facts, "descriptors": [["x", None]]},
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Snapshot:
+    directory = tmp_path_factory.mktemp("facts")
+    (directory / "read").write_text("something")
+    code = "import time; held = open('read'); print('ready', flush=True); time.sleep(1000)"
+    with ended(start([sys.executable, "-S", "-c", code], directory)) as program:
+        program.wait_for_line("ready")
+        return captured_and_killed(program)
+
+
+@pytest.mark.parametrize("spoil", SPOILT)
+def test_a_snapshot_with_hostile_facts_is_refused_and_the_keeper_lives_on(spoil: str, whole: Snapshot) -> None:
+    place = next(index for index, held in enumerate(whole.resources) if str(held.facts.get("path")).endswith("/read"))
+    held = whole.resources[place]
+    resources = list(whole.resources)
+    resources[place] = replace(held, facts=dict(SPOILT[spoil](held.facts)))
+    spoilt = replace(whole, resources=tuple(resources))
+    spoilt = replace(spoilt, position=position_of(spoilt, 1, 1))  # whoever made it up knows how to name it
+    null = os.open(os.devnull, os.O_RDWR)
+    snapshot = memfd_holding(encode_bytes(spoilt), "snapshot")
+    born = spawn_vessel(Birth(inner_pid=whole.process.pid, stdio=(null, null, null)))
+    try:
+        with keeping() as keeper:
+            answer, _ = keeper.ask(channel.Restore(born.pid, "/test/spoilt"), (snapshot,))
+            assert isinstance(answer, channel.Failed), answer
+            assert "cannot restore" in answer.message, answer
+            told, _ = keeper.ask(channel.Compare(), (snapshot,))
+            assert isinstance(told, channel.Failed | channel.Compared), told
+            assert isinstance(keeper.ask(channel.Probe(os.getpid()), ())[0], channel.Probed | channel.Failed)
+    finally:
+        discard(born)
+        os.close(snapshot)
+        os.close(null)
+
+
+def test_what_is_refused_in_words_already_stays_as_it_is(caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(MismatchError, match="not here"), foreign.facts("restore /lab/a"):
+        raise MismatchError("it is not here")
+    assert not caplog.records
+    with pytest.raises(FormatError, match=r"cannot restore /lab/a: .* \(KeyError: 'flags'\)"), foreign.facts("restore /lab/a"):
+        raise KeyError("flags")
+    assert caplog.records[0].exc_info
