@@ -140,7 +140,7 @@ def test_the_first_commit_is_told_at_once_and_captured(tmp_path: Path) -> None:
         async with gone_afterwards(await started(places, script)) as component:
             told = asyncio.Event()
             component.committed = told.set
-            await until(lambda: output(component) == b"begun\n", "it to begin")
+            await until(lambda: output(component) == b"begun\n" and component.task_pid, "the agent to hear that it keeps a state")
             captures = Captures(component)
             with pytest.raises(NothingCommittedError, match="has committed nothing yet"):
                 await captures.take()

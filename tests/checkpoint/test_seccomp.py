@@ -126,10 +126,10 @@ def test_one_thread_that_confines_itself_while_everything_is_copied_is_known_to_
             first = session._first
             copy = first.memory.copy_running
 
-            def slowly(*, base: bool) -> RunningCopy:
+            def slowly(*, base: bool, enough: int) -> RunningCopy:
                 (tmp_path / "confine").touch()
                 tracee.wait_for_line("confined")
-                return copy(base=base)
+                return copy(base=base, enough=enough)
 
             monkeypatch.setattr(first.memory, "copy_running", slowly)
             captured_at_last(session, CaptureOrder())
