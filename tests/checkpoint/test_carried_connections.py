@@ -29,8 +29,10 @@ ROOT = Path(__file__).resolve().parents[2]
 HOLD = """
 import os, signal
 from checkpoint.engine import CaptureOrder, ProtectOrder, Terms, engine_named
-session = engine_named("ptrace").protect({pid}, ProtectOrder("/test/talks", terms=Terms(connections=True)))
-session.capture(CaptureOrder(hold=True))
+from tests.checkpoint.round_trip import at_last, captured_at_last
+order = ProtectOrder("/test/talks", terms=Terms(connections=True))
+session = at_last(lambda: engine_named("ptrace").protect({pid}, order))
+captured_at_last(session, CaptureOrder(hold=True))
 os.kill(os.getpid(), signal.SIGKILL)
 """
 """A keeper that dies while a program stands still for it."""

@@ -106,5 +106,5 @@ def _die_in_the_middle(program: Program) -> NoReturn:
 
     sockets._peeked = killed
     with contextlib.suppress(BaseException), protected(program) as session:
-        session.capture(CaptureOrder())
+        captured_at_last(session, CaptureOrder())
     os._exit(1)

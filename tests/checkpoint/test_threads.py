@@ -149,7 +149,7 @@ def test_a_program_killed_while_it_is_held_ends_for_its_parent(compiled: Compile
 def capture_for_ever(session: Session) -> None:
     """One after the other."""
     for sequence in itertools.count(1):
-        session.capture(CaptureOrder(sequence=sequence))
+        captured_at_last(session, CaptureOrder(sequence=sequence))
 
 
 def test_a_program_that_ends_while_it_is_captured_ends(compiled: Compiled, tmp_path: Path) -> None:
