@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from agent import guard_messages
+from agent.bounds import check_rights
 from agent.caller import ROOT
 from agent.clock import Laps, now_ns
 from agent.component import Component, Prepared
@@ -23,14 +24,14 @@ from agent.guest import Guest
 from agent.nursery import KeeperLink, connect
 from agent.places import Places, complete_logs, log_directory
 from agent.streams import discard, total_of
-from checkpoint import channel, epoch_variable, format, rights
+from checkpoint import channel, epoch_variable, format
 from checkpoint.carried import paths_of
 from checkpoint.channel import Laid
 from checkpoint.engine import COOPERATIVE, COPY_CLOCKS_AHEAD_NS, NO_TERMS, PTRACE, Terms
 from checkpoint.engines.cooperative import age_ns as commit_age_ns
 from checkpoint.errors import ChainError, CheckpointError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
-from checkpoint.model import Credentials, Snapshot
+from checkpoint.model import Snapshot
 from checkpoint.needs import names_of_contents, needs
 from checkpoint.task_channel import Origin
 
@@ -119,7 +120,7 @@ async def restore(
     *,
     outage_ns: int,
     owner: int | None = None,
-    groups: frozenset[int] | None = None,
+    started: Inheritance | None = None,
     laps: Laps | None = None,
     task: guard_messages.Task | None = None,
     epoch: int = 0,
@@ -135,7 +136,7 @@ async def restore(
         outage_ns: added to the program's monotonic and boot time: how long ago the newest snapshot was taken.
         task: for a program that may still say that it keeps its state.
         owner: uid; None: whoever it ran as. What is not root's opens its files with its owner's rights, and gets no others.
-        groups: that it was started with; None: not known.
+        started: what it was started with; None: not known.
         terms: this robot's.
         stood_still: nothing of it has run since the newest snapshot.
 
@@ -146,7 +147,7 @@ async def restore(
     outline = await asyncio.to_thread(format.read_outline, chain[-1])
     theirs = outline.process.credentials
     owner = theirs.uids[0] if owner is None else owner
-    check_rights(name, outline, owner, groups)
+    check_rights(name, outline, owner, started)
     await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
     laps.lap("reading the newest")
     component = Component(name, await places.nursery.guard(), places)
@@ -206,13 +207,13 @@ def _vessel_for(
 
 
 async def lay(
-    name: str, chain: Sequence[int], places: Places, *, age_ns: int, owner: int, groups: frozenset[int] | None, terms: Terms
+    name: str, chain: Sequence[int], places: Places, *, age_ns: int, owner: int, started: Inheritance | None, terms: Terms
 ) -> tuple[Component, Laid]:
     """Make a ready copy of a component from a chain: a vessel with its mappings and memory, which ends with this agent.
 
     Args:
         age_ns: of the newest snapshot.
-        groups: that it was started with; None: not known.
+        started: what it was started with; None: not known.
         terms: this robot's.
 
     Raises:
@@ -221,7 +222,7 @@ async def lay(
     """
     counted_ns = now_ns()
     outline = await asyncio.to_thread(format.read_outline, chain[-1])
-    check_rights(name, outline, owner, groups)
+    check_rights(name, outline, owner, started)
     component = Component(name, await places.nursery.guard(), places)
     component.keeper.terms = terms_of(outline, terms)
     request = _vessel_for(name, outline, places, age_ns + COPY_CLOCKS_AHEAD_NS, None, counted_ns=counted_ns)
@@ -248,7 +249,7 @@ async def finish(
     *,
     outage_ns: int,
     owner: int | None,
-    groups: frozenset[int] | None,
+    started: Inheritance | None,
     task: guard_messages.Task | None,
     epoch: int,
     terms: Terms,
@@ -265,7 +266,7 @@ async def finish(
     name, theirs = component.name, outline.process.credentials
     owner = theirs.uids[0] if owner is None else owner
     try:
-        check_rights(name, outline, owner, groups)
+        check_rights(name, outline, owner, started)
         component.engine_wanted = task.engine if task is not None else PTRACE
         component.keeper.terms = terms_of(outline, terms)
         component.keeper.names = names_of_contents(needs(outline), places.contents)
@@ -322,7 +323,7 @@ async def begin_again(
     outline = await asyncio.to_thread(format.read_outline, chain[-1])
     _check_owner(name, program, owner)
     try:
-        check_rights(name, outline, owner, groups_of(program.inheritance))  # its carried files are laid down with them
+        check_rights(name, outline, owner, program.inheritance)  # its carried files are laid down with them
     except CheckpointError:
         if waiting is not None:
             await waiting.undo()
@@ -395,43 +396,6 @@ async def reconnect(socket_path: Path, places: Places) -> Component:
     if described.state == "ended" and not component.ended.done():
         component.ended.set_result(described.exit_status)
     return component
-
-
-def groups_of(inheritance: Inheritance | None) -> frozenset[int] | None:
-    """The groups that a program was started with; None where nobody told."""
-    return frozenset((inheritance.gid, *inheritance.groups)) if inheritance is not None else None
-
-
-def check_rights(name: str, outline: Snapshot, owner: int, groups: frozenset[int] | None) -> None:
-    """Let a snapshot come back with the rights of its owner, and no more: all threads of all of its processes.
-
-    Args:
-        groups: those that it was started with; None: not known, it may have one and call it by all four of its names.
-
-    Raises:
-        MismatchError: it has become another user or group, as a set-user-id or set-group-id program does; or it has filters of
-            seccomp(2) that a set-user-id program would run under, or a root directory of its own, whose files that would trust.
-        FormatError: it does not tell them as we know it.
-    """
-    if owner == ROOT or os.geteuid() != ROOT:
-        return  # root may; where we are not root, there is nothing to be gained
-    if not all(_are_no_more(one, owner, groups) for one in rights.everybodys(outline)):
-        reason = f"it runs with other rights than those of its owner, uid {owner}"
-    elif rights.could_gain(outline):
-        reason = "it is under a seccomp filter, but may gain rights by what it executes (no_new_privs is off)"
-    elif {outline.process.root_directory, *(one.process.root_directory for one in outline.members)} != {"/"}:
-        reason = "it has a root directory of its own (chroot), by whose files it may gain rights"
-    else:
-        return
-    reason += ": only a program of root may; start it as root"
-    raise MismatchError(f"cannot restore {name}: {reason}", (reason,))
-
-
-def _are_no_more(theirs: Credentials, owner: int, groups: frozenset[int] | None) -> bool:
-    _, permitted, effective, _, ambient = theirs.capabilities
-    if set(theirs.uids) != {owner} or permitted | effective | ambient:
-        return False
-    return len(set(theirs.gids)) == 1 if groups is None else groups.issuperset((*theirs.gids, *theirs.groups))
 
 
 async def _vessel(component: Component, request: guard_messages.MakeVessel, keeper: KeeperLink) -> None:

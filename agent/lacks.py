@@ -10,7 +10,7 @@ import logging
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from agent.births import check_rights, groups_of
+from agent.bounds import check_rights
 from agent.charge import Charge
 from agent.errands import Errands
 from agent.errors import TROUBLE, RefusedError
@@ -81,7 +81,7 @@ async def _compared(around: Surroundings, charge: Charge, keeper: KeeperLink) ->
     charge.figures.digests = reply.known
     try:
         if spec is not None:
-            check_rights(name, outline, spec.owner, groups_of(program_of(spec.launch).inheritance))
+            check_rights(name, outline, spec.owner, program_of(spec.launch).inheritance)
     except MismatchError as mismatch:
         return (*mismatch.reasons, *reply.lacks)
     return reply.lacks

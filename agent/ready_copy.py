@@ -154,9 +154,9 @@ class ReadyCopy:
         chain = await asyncio.to_thread(self._around.store.open_chain, self._name)
         try:
             age_ns, outline = clock.age_ns(chain[-1]), await asyncio.to_thread(format.read_outline, chain[-1])
-            groups = births.groups_of(program_of(spec.launch).inheritance)
+            started = program_of(spec.launch).inheritance
             laying = asyncio.create_task(
-                births.lay(self._name, chain, self._around.places, age_ns=age_ns, owner=spec.owner, groups=groups, terms=terms)
+                births.lay(self._name, chain, self._around.places, age_ns=age_ns, owner=spec.owner, started=started, terms=terms)
             )
             try:
                 component, laid = await asyncio.shield(laying)

@@ -12,11 +12,12 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from agent import caller
-from agent.births import check_rights
+from agent.bounds import check_rights
 from agent.caller import NOBODY, caller_of, check_right, inheritance_for, may, owner_of
 from agent.errors import RefusedError
 from checkpoint.errors import FormatError, MismatchError
@@ -166,14 +167,14 @@ def test_somebody_elses_process_is_not_ones_own() -> None:
     ],
 )
 def test_a_snapshot_comes_back_with_the_rights_of_its_owner_or_not_at_all(found: Credentials, owner: int, allowed: bool) -> None:
-    groups, good = frozenset((SOMEBODY, GIVEN)), credentials(SOMEBODY)
+    started, good = Inheritance(SOMEBODY, SOMEBODY, (GIVEN,), policy=os.SCHED_RR, priority=99, nice=-20), credentials(SOMEBODY)
     of_one, of_all = running_as(found), running_as(good, found)
     for outline in (of_one, of_all, replace(running_as(good), members=(a_member(found),))):
         if allowed:
-            check_rights("/lab/r1/mapper", outline, owner, groups)
+            check_rights("/lab/r1/mapper", outline, owner, started)
         else:
             with pytest.raises(MismatchError, match="other rights than those of its owner"):
-                check_rights("/lab/r1/mapper", outline, owner, groups)
+                check_rights("/lab/r1/mapper", outline, owner, started)
 
 
 def confined(found: Credentials, threads: list[Fact]) -> Snapshot:
@@ -190,6 +191,64 @@ def test_a_filter_under_which_rights_could_be_gained_is_roots_alone() -> None:
     check_rights("/lab/r1/mapper", confined(free, [[tid, False, [0]]]), 0, None)
     with pytest.raises(MismatchError, match="no_new_privs is off"):
         check_rights("/lab/r1/mapper", confined(free, [[tid, False, [0]]]), SOMEBODY, None)
+
+
+STARTED = Inheritance(SOMEBODY, SOMEBODY, limits={7: (1024, 4096), 13: (20, 25), 14: (0, 10)}, nice=0)
+"""With nice values down to -5, and real-time priorities up to 10."""
+
+
+def scheduled(**changes: Any) -> Snapshot:
+    """A program whose second thread is scheduled in some way, and with the limits that it was started with."""
+    outline = running_as(credentials(SOMEBODY))
+    ordinary = replace(outline.threads[0], policy=os.SCHED_OTHER, priority=0, nice=0)
+    threads = (ordinary, replace(ordinary, tid=ordinary.tid + 1, **changes))
+    return replace(outline, process=replace(outline.process, limits=dict(STARTED.limits)), threads=threads)
+
+
+def limited(**changes: tuple[int, int]) -> Snapshot:
+    outline = scheduled()
+    limits = {**STARTED.limits, **{int(number[1:]): pair for number, pair in changes.items()}}
+    return replace(outline, process=replace(outline.process, limits=limits))
+
+
+@as_root
+@pytest.mark.parametrize(
+    ("outline", "said"),
+    [
+        (scheduled(), ""),
+        (scheduled(policy=os.SCHED_FIFO, priority=10), ""),
+        (scheduled(policy=os.SCHED_FIFO, priority=11), "has the real-time priority 11"),
+        (scheduled(policy=os.SCHED_RR | os.SCHED_RESET_ON_FORK, priority=99), "has the real-time priority 99"),
+        (scheduled(policy=6), "is scheduled by deadlines"),
+        (scheduled(nice=-5), ""),
+        (scheduled(nice=-6), "has the nice value -6"),
+        (scheduled(nice=19), ""),
+        (limited(_7=(4096, 4096)), ""),
+        (limited(_7=(1024, 4097)), r"its limit 7 \(RLIMIT\) is 4097"),
+        (limited(_7=(1024, -1)), r"its limit 7 \(RLIMIT\) is none"),
+        (limited(_0=(-1, -1)), ""),
+    ],
+)
+def test_more_of_the_machine_than_it_was_started_with_is_roots_alone(outline: Snapshot, said: str) -> None:
+    check_rights("/lab/r1/mapper", outline, 0, STARTED)
+    check_rights("/lab/r1/mapper", outline, SOMEBODY, None)
+    if not said:
+        check_rights("/lab/r1/mapper", outline, SOMEBODY, STARTED)
+        return
+    with pytest.raises(MismatchError, match=said + ", which is more than what uid 7001 started it with allows"):
+        check_rights("/lab/r1/mapper", outline, SOMEBODY, STARTED)
+
+
+@as_root
+@pytest.mark.parametrize(("bits", "allowed"), [(0, True), (1 << 4, True), (1 << 2, False), (0b1111, False)])
+def test_securebits_are_roots_alone(bits: int, allowed: bool) -> None:
+    outline = running_as(replace(credentials(SOMEBODY), securebits=bits))
+    check_rights("/lab/r1/mapper", outline, 0, None)
+    if allowed:
+        check_rights("/lab/r1/mapper", outline, SOMEBODY, None)
+        return
+    with pytest.raises(MismatchError, match="it has securebits"):
+        check_rights("/lab/r1/mapper", outline, SOMEBODY, None)
 
 
 @as_root
