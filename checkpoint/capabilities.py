@@ -28,6 +28,7 @@ from checkpoint.resources import (
     joint,
     kernel_files,
     locks,
+    logins,
     memory_files,
     memory_locks,
     namespace_files,
@@ -62,6 +63,7 @@ from checkpoint.resources import (
 
 CARRIERS: Final[tuple[ModuleType, ...]] = (
     preserved,
+    logins,
     births,
     room,
     stops,

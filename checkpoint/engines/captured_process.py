@@ -34,6 +34,7 @@ from checkpoint.resources import (
     aio_rings,
     deadlines,
     gather,
+    logins,
     memory_locks,
     seccomp,
     stops,
@@ -231,6 +232,7 @@ class CapturedProcess:
             *untouched.describe(look.taken.lines, look.taken.untouched, look.standing.opened),
             *self._limits(look.standing),
             *deadlines.describe(self.pid),
+            *logins.describe(self.pid),
             *self.onlooker.tables.describe(),
         )
 

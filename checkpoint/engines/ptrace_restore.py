@@ -59,6 +59,7 @@ from checkpoint.resources import (
     files,
     joint,
     laying,
+    logins,
     memory_locks,
     pidfds,
     remembered,
@@ -499,6 +500,7 @@ class ProcessRestore:
         restore_process.memory_layout(
             table, process, with_executable=vessel.may_choose_executable, brought=self._executable
         )  # before the program's own descriptors take their numbers
+        self.notes += logins.rebuild(table, self._state.resources, vessel.pid)
         if self.has_table_of_parent:
             for number in set(self._objects.values()) - self._inherited():
                 table.close(number)

@@ -122,7 +122,7 @@ PORTRAITS = cases(
     "plain name umask nice limits personality dumpable parent_death_signal subreaper huge_pages_off "
     "huge_pages_advised timer_slack affinity "
     "batch idle realtime io_priority io_priority_best no_tsc mdwe memory_merge store_bypass mce_kill membarrier directory oom "
-    "coredump_filter arguments user setuid groups effective fsuid capabilities securebits keep_caps no_new_privs",
+    "coredump_filter login arguments user setuid groups effective fsuid capabilities securebits keep_caps no_new_privs",
 )
 
 FILES = cases(

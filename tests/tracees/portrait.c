@@ -30,7 +30,8 @@ static void add_file(int when, const char *path) {
     int file = open(path, O_RDONLY), size = file < 0 ? -1 : (int)read(file, bytes, sizeof bytes);
     uint64_t sum = 0;
     for (int index = 0; index < size; index++) sum = mix(sum ^ bytes[index]);
-    add(when, "%s: %d bytes, sum %llx, starts %.60s", path, size, (unsigned long long)sum, size > 0 ? (char *)bytes : "");
+    add(when, "%s: %d bytes, sum %llx, starts %.*s", path, size, (unsigned long long)sum,
+        size < 0 ? 0 : size < 60 ? size : 60, (char *)bytes);
     if (file >= 0) close(file);
 }
 
@@ -74,6 +75,7 @@ static void paint(int when) {
     add_file(when, "/proc/self/timerslack_ns");
     add_file(when, "/proc/self/personality");
     add_file(when, "/proc/self/coredump_filter");
+    if (!access("/proc/self/loginuid", R_OK)) add_file(when, "/proc/self/loginuid");
     add_status(when);
     add_layout(when);
     prctl(PR_GET_NAME, name);
@@ -195,6 +197,7 @@ int main(int count, char **arguments) {
     drop(what);
     if (!strcmp(what, "oom")) write_word("/proc/self/oom_score_adj", "321");
     if (!strcmp(what, "coredump_filter")) write_word("/proc/self/coredump_filter", "0x71");
+    if (!strcmp(what, "login")) write_word("/proc/self/loginuid", "4321");
     if (!strcmp(what, "arguments")) { /* as setproctitle does: the words in place are overwritten */
         memset(arguments[2], 'x', strlen(arguments[2]));
         setenv("LATER", "set", 1);
