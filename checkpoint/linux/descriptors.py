@@ -81,8 +81,7 @@ def descriptors(pid: int, kept: KeptTexts | None = None) -> tuple[Descriptor, ..
     with _opened(pid, "fd") as links, _opened(pid, "fdinfo") as texts:
         if kept is None:
             return tuple(found for number in numbers if (found := _descriptor(number, links, texts)) is not None)
-        kept.ask(numbers)
-        return tuple(found for number in numbers if (found := kept.read(number, links, texts)) is not None)
+        return kept.every(numbers, links, texts)
 
 
 def descriptors_to(pid: int, target: str) -> tuple[Descriptor, ...]:

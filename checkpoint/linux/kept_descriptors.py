@@ -77,6 +77,11 @@ class _Column:
         """Ask about all."""
         self._table.run(0, len(self._places))
 
+    def heard(self) -> bytes:
+        """All answers as they are: the same bytes, of the same descriptors, mean the same."""
+        count = len(self._places)
+        return self._results[:count].tobytes() + self._answers[: count * self._size].tobytes()
+
     def told(self, number: int) -> bytes | None:
         """What was answered about one; None for nothing, an error, and what is too long."""
         place = self._places.get(number)
@@ -118,6 +123,23 @@ class KeptTexts:
         self._abouts = _Column("newfstatat", STAT_SIZE)
         self._directory = -1
         """/proc/PID/fd."""
+        self._is_known = False
+        self._last: tuple[list[int], tuple[bytes, ...], tuple[Descriptor, ...]] | None = None
+
+    def every(self, numbers: list[int], links: int, texts: int) -> tuple[Descriptor, ...]:
+        """All that have these numbers: the very same tuple where the kernel answers about all of them as at the last look.
+
+        Args:
+            links, texts: see `read`.
+        """
+        self.ask(numbers)
+        heard = self._texts.heard(), self._links.heard(), self._abouts.heard()
+        if self._last is not None and self._last[0] == numbers and self._last[1] == heard:
+            return self._last[2]
+        self._is_known = True
+        found = tuple(found for number in numbers if (found := self.read(number, links, texts)) is not None)
+        self._last = (numbers, heard, found) if self._is_known else None
+        return found
 
     def ask(self, numbers: Collection[int]) -> None:
         """Ask the kernel about all of them, as far as they were there before; forget the others."""
@@ -148,6 +170,7 @@ class KeptTexts:
     def _anew(self, number: int, links: int, texts: int, link: bytes | None, about: bytes | None) -> Descriptor | None:
         """Understand it; it is known from then on if just what must be asked of it was asked at this look, and answered."""
         self._known.pop(number, None)
+        self._is_known = False
         standing = standing_of(number, links, texts)
         if standing is None:
             return None
@@ -178,6 +201,7 @@ class KeptTexts:
     def forget(self) -> None:
         """Take nothing of the last look for granted: the process ran, and may have changed things in the middle of it."""
         self._known.clear()
+        self._last = None
 
     def _forget(self, number: int) -> None:
         self._known.pop(number, None)

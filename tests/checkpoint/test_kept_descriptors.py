@@ -205,3 +205,14 @@ def test_what_is_known_is_not_compared_one_by_one(holder: Holder, monkeypatch: p
         holder.look()
     monkeypatch.setattr(grouping, "_place_among", None)
     assert holder.look()
+
+
+@pytest.mark.root
+def test_descriptors_that_all_answer_as_before_are_not_told_one_by_one(holder: Holder, monkeypatch: pytest.MonkeyPatch) -> None:
+    for _ in range(LOOKS_UNTIL_KNOWN):
+        before = holder.look()
+    with monkeypatch.context() as changed:
+        changed.setattr(KeptTexts, "read", None)
+        assert holder.look() == before
+    holder.tell(CHANGES["an offset"])
+    assert holder.look() != before
