@@ -14,7 +14,7 @@ import select
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Final, Literal, Protocol
 
@@ -26,6 +26,9 @@ STANDING: Final = frozenset("TZX")
 """States of /proc/PID/stat in which a process runs nothing, whoever lives or dies."""
 HELD: Final = STANDING | {"t"}
 """The same, with a tracer that holds it now: once SIGSTOP is pending, it stands also when that tracer dies."""
+
+THREADS: Final = 17
+"""Where in what `_stat` gives the number of threads is; the state is 0. Source: proc_pid_stat(5)."""
 
 
 class Freezer(Protocol):
@@ -258,21 +261,36 @@ def _children() -> dict[int, list[int]]:
     table: dict[int, list[int]] = {}
     for entry in os.listdir("/proc"):
         if entry.isdigit():
-            fields = _stat(int(entry))
+            fields = _stat(entry)
             if len(fields) > 1:
                 table.setdefault(int(fields[1]), []).append(int(entry))
     return table
 
 
 def _state(pid: int) -> str:
-    """The state letter of a process; "" if it is gone."""
-    return (_stat(pid) or [""])[0]
+    """The state letter of a process; "" if it is gone. Of one whose first thread has ended while others live, one of theirs."""
+    fields = _stat(str(pid)) or [""]
+    if fields[0] == "Z" and int(fields[THREADS]) > 1:
+        return _state_of_others(pid)
+    return fields[0]
 
 
-def _stat(pid: int) -> list[str]:
-    """What follows the name in /proc/PID/stat: state, parent …; nothing if the process is gone."""
+def _state_of_others(pid: int) -> str:
+    """The state of a thread that runs, if any does; "Z" once all have ended."""
+    found = "Z"
+    with suppress(FileNotFoundError, ProcessLookupError):
+        for tid in os.listdir(f"/proc/{pid}/task"):
+            state = (_stat(f"{pid}/task/{tid}") or ["Z"])[0]
+            if state not in HELD:
+                return state
+            found = state if state not in "ZX" else found
+    return found
+
+
+def _stat(whose: str) -> list[str]:
+    """What follows the name in /proc/PID/stat, or that of a thread: state, parent …; nothing if it is gone."""
     try:
-        with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:
+        with open(f"/proc/{whose}/stat", encoding="utf-8", errors="replace") as file:
             return file.read().rpartition(")")[2].split()
     except (FileNotFoundError, ProcessLookupError):
         return []

@@ -108,6 +108,7 @@ SYSTEM_CALLS: Final = {
     "epoll_ctl": 233,
     "eventfd2": 290,
     "execve": 59,
+    "exit": 60,
     "exit_group": 231,
     "fallocate": 285,
     "fchmod": 91,

@@ -72,7 +72,7 @@ def process_state(pid: int, standing: Standing, identities: Identities) -> Proce
     """The process as a whole."""
     status, told = standing.status, standing.told
     return ProcessState(
-        pid=status.pids[-1],
+        pid=status.tgids[-1],
         ppid=status.ppid if len(status.pids) == 1 else 0,
         pgid=status.pgids[-1] if status.pgids else 0,
         sid=status.sids[-1] if status.sids else 0,
@@ -104,5 +104,6 @@ def process_state(pid: int, standing: Standing, identities: Identities) -> Proce
 def _timers(standing: Standing) -> tuple[PosixTimer, ...]:
     """Those of timer_create(2), each naming the thread that it signals as the program does; /proc names it as we do."""
     inner = {other.place.tracee.pid: other.place.inner_tid for other in standing.others}
-    inner |= {standing.status.pids[0]: standing.status.pids[-1]}
+    status = standing.status
+    inner |= {status.pids[0]: status.pids[-1], status.tgid: status.tgids[-1]}
     return tuple(replace(timer, tid=inner.get(timer.tid, timer.tid)) for timer in standing.told.posix_timers)

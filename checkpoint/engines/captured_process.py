@@ -15,6 +15,7 @@ from checkpoint.engine import ProtectOrder
 from checkpoint.engines import entering, waits
 from checkpoint.engines.capture_memory import MemoryCapture, RunningCopy, SharedPlaces
 from checkpoint.engines.capture_process import process_state, thread_states
+from checkpoint.engines.ended_first import EndedFirst
 from checkpoint.engines.entering import Entered
 from checkpoint.engines.identities import Identities
 from checkpoint.engines.outputs import Outputs
@@ -24,6 +25,7 @@ from checkpoint.engines.taken_memory import Taken
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.procfs import MapsLine
+from checkpoint.linux.spokesman import spokesman_of
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.tracking import NONE, NOT_CARRIED
@@ -82,11 +84,21 @@ class Met:
         interruptions = Interruptions(makes_again=waits.makes_calls_again(pid))
         return cls(Threads(Tracee(pid), interruptions.mend), interruptions, procfs.stat(pid).start_time)
 
+    @classmethod
+    def by_its_spokesman(cls, pid: int) -> Met:
+        """As `of`, also where the first thread has ended and others live."""
+        spokesman = spokesman_of(pid)
+        interruptions = Interruptions(makes_again=waits.makes_calls_again(spokesman))
+        threads = Threads(Tracee(spokesman), interruptions.mend, process=pid)
+        return cls(threads, interruptions, procfs.stat(spokesman).start_time)
+
 
 class CapturedProcess:
     """One process, followed from the entering to `close`.
 
     Attributes:
+        pid: by which it is looked at: its own, or its spokesman's, where its first thread has ended.
+        ended_first: who tells of that; None where the first thread lives.
         slot: see ``checkpoint.tree``.
         born: when it began, which tells it from a later process with its pid.
         is_new: no snapshot tells of it yet.
@@ -96,6 +108,7 @@ class CapturedProcess:
         self.pid = threads.pid
         self.slot = slot
         self.threads = threads
+        self.ended_first = EndedFirst(threads.process, self.pid, threads.leader.memory) if self.pid != threads.process else None
         self.notes = entered.notes
         self.born = born
         self.is_new = True
@@ -113,6 +126,31 @@ class CapturedProcess:
     def entered(cls, met: Met, order: ProtectOrder, slot: int = 0) -> CapturedProcess:
         """Enter a process that runs."""
         return cls(met.threads, entering.enter(met.threads, met.interruptions), order, slot, met.born)
+
+    @classmethod
+    def entered_first(cls, pid: int, order: ProtectOrder) -> CapturedProcess:
+        """Enter the first process of a component; by another thread, where its first one has ended, or does so meanwhile."""
+        while True:
+            met = Met.by_its_spokesman(pid)
+            try:
+                return cls.entered(met, order)
+            except ProcessGoneError:
+                if spokesman_of(pid) == met.threads.pid:
+                    raise
+
+    def has_lost_its_voice(self) -> bool:
+        """Whether the thread by which it is looked at has ended, and another lives by which it could be.
+
+        Raises:
+            ProcessGoneError: all of it has ended.
+        """
+        return not self._is_there() and spokesman_of(self.threads.process) != self.pid
+
+    def _is_there(self) -> bool:
+        try:
+            return procfs.stat(self.pid).state not in "ZX"
+        except ProcessGoneError:
+            return False
 
     @classmethod
     def entered_standing(cls, met: Met, order: ProtectOrder, slot: int) -> CapturedProcess:
@@ -182,7 +220,10 @@ class CapturedProcess:
 
     def thread_states(self, look: Look) -> tuple[ThreadState, ...]:
         """Its threads, the first one first."""
-        return thread_states(self.pid, look.standing)
+        living = thread_states(self.pid, look.standing)
+        if self.ended_first is None:
+            return living
+        return (self.ended_first.state(living[0], look.standing.status.tgids[-1], look.taken.lines), *living)
 
     def mappings(self, look: Look, *, is_kin: bool = False) -> tuple[Vma, ...]:
         """Its mappings.

@@ -209,6 +209,10 @@ class CapturedTree:
             process.close()
         self._known.clear()
 
+    def follow(self, first: CapturedProcess) -> None:
+        """The first process is looked at anew."""
+        self._first = first
+
     def processes(self) -> tuple[CapturedProcess, ...]:
         """Those that are followed."""
         return tuple(self._known.values())

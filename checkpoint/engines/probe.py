@@ -17,6 +17,7 @@ from checkpoint.engines.lasting import lasting
 from checkpoint.errors import CheckpointError, ProbeError, ProcessGoneError
 from checkpoint.linux import dirty, kinship, processor, procfs, vm_flags
 from checkpoint.linux.procfs import Status
+from checkpoint.linux.spokesman import told_by_spokesman
 from checkpoint.resources import (
     Held,
     Kin,
@@ -54,28 +55,27 @@ def probe(pid: int, surroundings: Surroundings | None = None, *, files_kept: boo
         ProbeError: there is no such process, it is no program, somebody traces it, or we may not look.
     """
     try:
-        return _probe(pid, surroundings or surroundings_of(pid, None), files_kept)
+        around = surroundings or surroundings_of(pid, None)
+        unsupported.require_traceable(pid, procfs.status(pid))
+        return told_by_spokesman(pid, functools.partial(_probe, pid, around, files_kept))
     except ProcessGoneError as error:
         raise ProbeError(f"cannot look at pid {pid}: there is no such process (any more)") from error
 
 
-def _probe(pid: int, surroundings: Surroundings, files_kept: bool) -> Report:
-    if not 0 < pid <= _largest_pid():
-        raise ProbeError(f"cannot look at pid {pid}: that is not the number of a process")
-    status = procfs.status(pid)
-    unsupported.require_traceable(pid, status)
-    _require_permission(pid, status)
-    kin, opened = _all_opened(pid, is_guarded=bool(surroundings.pipes))
-    looked = _looked(opened, pid, surroundings)
+def _probe(pid: int, surroundings: Surroundings, files_kept: bool, first: int) -> Report:
+    status = procfs.status(first)
+    _require_permission(first, status)
+    kin, opened = _all_opened(pid, first, is_guarded=bool(surroundings.pipes))
+    looked = _looked(opened, first, surroundings)
     findings = (
-        *_process_findings(pid, status, kin, files_kept),
-        *_processor_findings(pid),
-        *_memory_findings(pid, opened[pid]),
-        *looked[pid].findings,
+        *_process_findings(first, status, kin, files_kept),
+        *_processor_findings(first),
+        *_memory_findings(first, opened[first]),
+        *looked[first].findings,
         *kinds.findings_of_all([held for one in looked.values() for held in one.resources], standing=False),
-        *_others_findings(opened, pid, looked),
+        *_others_findings(opened, pid, first, looked),
     )
-    return Report(pid, _command(pid, status), status.resident_size, dirty.best_tracking(), findings)
+    return Report(pid, _command(first, status), status.resident_size, dirty.best_tracking(), findings)
 
 
 def reasons_of(pid: int, surroundings: Surroundings, *, files_kept: bool = False) -> tuple[str, ...]:
@@ -84,22 +84,30 @@ def reasons_of(pid: int, surroundings: Surroundings, *, files_kept: bool = False
     Raises:
         ProbeError, ProcessGoneError: it cannot be looked at.
     """
-    kin, opened = _all_opened(pid, is_guarded=bool(surroundings.pipes))
-    looked = _looked(opened, pid, surroundings)
-    others = [found.text for found in _others_findings(opened, pid, looked) if found.verdict == REFUSED]
-    of_first = unsupported.refuse_process(pid, procfs.status(pid), kin, files_kept=files_kept)
-    return (*looked[pid].reasons, *of_first, *others)
+    return told_by_spokesman(pid, functools.partial(_reasons_of, pid, surroundings, files_kept))
 
 
-def _all_opened(pid: int, *, is_guarded: bool) -> tuple[tuple[int, ...], sharing.OpenedByAll]:
-    """The processes of a component that live, and what they have open; again where some came or went meanwhile."""
+def _reasons_of(pid: int, surroundings: Surroundings, files_kept: bool, first: int) -> tuple[str, ...]:
+    kin, opened = _all_opened(pid, first, is_guarded=bool(surroundings.pipes))
+    looked = _looked(opened, first, surroundings)
+    others = [found.text for found in _others_findings(opened, pid, first, looked) if found.verdict == REFUSED]
+    of_first = unsupported.refuse_process(first, procfs.status(first), kin, files_kept=files_kept)
+    return (*looked[first].reasons, *of_first, *others)
+
+
+def _all_opened(pid: int, first: int, *, is_guarded: bool) -> tuple[tuple[int, ...], sharing.OpenedByAll]:
+    """The processes of a component that live, and what they have open; again where some came or went meanwhile.
+
+    Args:
+        first: by which that of ``pid`` is looked at; it stands for it.
+    """
     stubborn: set[int] | None = None
     for _ in range(LOOKS):
-        kin = _kin(pid, is_guarded=is_guarded)
+        kin = _kin(pid, first, is_guarded=is_guarded)
         opened = _opened(kin)
         young = set(filter(_has_still_to_execute, kin[1:]))
         stubborn = young if stubborn is None else stubborn & young
-        if kin == _kin(pid, is_guarded=is_guarded) and not young:
+        if kin == _kin(pid, first, is_guarded=is_guarded) and not young:
             break
         time.sleep(LOOK_PAUSE_S)
     about_to = young - (stubborn or set())  # they will be what they are to be when somebody stops them
@@ -131,9 +139,9 @@ def _gathered(pid: int) -> tuple[OpenFile, ...]:
     return ()
 
 
-def _kin(pid: int, *, is_guarded: bool) -> tuple[int, ...]:
+def _kin(pid: int, first: int, *, is_guarded: bool) -> tuple[int, ...]:
     """The processes of a component that live, the first one first."""
-    found = [pid]
+    found = [first]
     for other in kinship.others(pid, kinship.reaper_of(pid, is_guarded=is_guarded)):
         with contextlib.suppress(CheckpointError):
             if procfs.stat(other).state not in "ZX":
@@ -147,13 +155,15 @@ def _looked(opened: sharing.OpenedByAll, first: int, surroundings: Surroundings)
     return {pid: look(held, surroundings if pid == first else around) for pid, held in opened.items()}
 
 
-def _others_findings(opened: sharing.OpenedByAll, first: int, looked: Mapping[int, Held]) -> Iterator[Finding]:
+def _others_findings(opened: sharing.OpenedByAll, process: int, first: int, looked: Mapping[int, Held]) -> Iterator[Finding]:
     """What stands against the processes besides the first; one that ends meanwhile does not."""
+    if first != process and len(opened) > 1:
+        yield Finding("process", "threads", REFUSED, refused_threads.OF_SEVERAL)
     for pid, held in looked.items():
         if pid != first:
             for reason in (*_named(pid, held.reasons), *lasting(functools.partial(_against, pid, opened))):
                 yield Finding("process", f"pid {pid}", REFUSED, reason)
-    for reason in lasting(functools.partial(_births_refused, first)):
+    for reason in lasting(functools.partial(_births_refused, process)):
         yield Finding("process", "births", REFUSED, reason)
 
 

@@ -30,7 +30,7 @@ from checkpoint.engines import description
 from checkpoint.engines import probe as probing
 from checkpoint.engines.capture_memory import RunningCopy
 from checkpoint.engines.captured_pages import Pages, joined, with_parcel
-from checkpoint.engines.captured_process import CapturedProcess, Look, Met
+from checkpoint.engines.captured_process import CapturedProcess, Look
 from checkpoint.engines.captured_tree import CapturedTree, MovedError, SeenOthers
 from checkpoint.engines.freeze_budget import FreezeBudget
 from checkpoint.engines.outputs import Outputs
@@ -38,9 +38,10 @@ from checkpoint.errors import CaptureError, CheckpointError, ProbeError, Process
 from checkpoint.linux import abi, kinship, procfs
 from checkpoint.linux.kinship import Kinship
 from checkpoint.linux.precedence import Precedence
+from checkpoint.linux.spokesman import told_by_spokesman
 from checkpoint.model import Position, Snapshot
 from checkpoint.pages import PageTable
-from checkpoint.resources import OpenFile, Surroundings, carried_connections, carried_trees, glance, kinds, look
+from checkpoint.resources import OpenFile, Surroundings, carried_connections, carried_trees, glance, kinds, look, refused_threads
 from checkpoint.resources.carried_connections import Departing
 from checkpoint.resources.carried_trees import NO_PARCEL, CarriedTrees, Parcel, Seen
 from checkpoint.stream_counts import Totals
@@ -87,13 +88,13 @@ class PtraceSession:
         surroundings: Surroundings,
         trees: CarriedTrees | None = None,
     ) -> None:
-        self.pid = first.pid
+        self.pid = first.threads.process
         self.component = order.component
         self.notes = first.notes
         self.totals: Totals = (0, 0)
         self.frozen_size = 0
         self._surroundings = surroundings
-        self._level = portable.level_in(procfs.read_bytes(first.pid, "environ"))
+        self._level = portable.level_in(told_by_spokesman(self.pid, lambda tid: procfs.read_bytes(tid, "environ")))
         self._first = first
         self._tree = CapturedTree(first, kin)
         self._outputs: Outputs | None = None
@@ -118,14 +119,14 @@ class PtraceSession:
         try:
             surroundings = probing.surroundings_of(pid, order.streams, order.terms)
             report = probing.probe(pid, surroundings, files_kept=order.names is not None)
-            trees = carried_trees.followed(pid, order.terms.carry)
+            trees = told_by_spokesman(pid, lambda tid: carried_trees.followed(tid, order.terms.carry))
             reasons = (*report.reasons, *(trees.refuse() if trees else ()))
             if reasons:
                 raise UnsupportedError(f"cannot protect pid {pid} ({report.command}): {'; '.join(reasons)}", reasons)
             if surroundings.connections:
-                carried_connections.heard_again(glance(pid))
+                carried_connections.heard_again(told_by_spokesman(pid, glance))
             kin = Kinship(pid, kinship.reaper_of(pid, is_guarded=order.streams is not None))
-            first = CapturedProcess.entered(Met.of(pid), order)
+            first = CapturedProcess.entered_first(pid, order)
             try:
                 session = cls(order, first, kin, surroundings, trees)
             except BaseException:
@@ -184,9 +185,11 @@ class PtraceSession:
             self._look_from_outside()
         try:
             if self._carried:
-                self._carried.prepare(carried_trees.mapped_shared(self.pid))
+                self._carried.prepare(carried_trees.mapped_shared(self._first.pid))
             frozen = self._frozen(order, base=parent is None)
         except CaptureError as error:
+            if self._speaks_by_another():
+                return self.capture(order)
             explained = self._explained(error)
             if explained is error:
                 raise
@@ -198,6 +201,21 @@ class PtraceSession:
             raise self._explained(gone) from error
         except ProcessGoneError as error:  # a child that it has a pidfd of, for one
             raise self._explained(error) from error
+
+    def _speaks_by_another(self) -> bool:
+        """Where the thread has ended by which the first process is looked at, enter it by another: the next capture is a base."""
+        try:
+            if self._held or not self._first.has_lost_its_voice():
+                return False
+        except ProcessGoneError:
+            return False
+        first = CapturedProcess.entered_first(self.pid, self._first.order)
+        self._first.close()
+        self._first = first
+        self._tree.follow(first)
+        if self._carried:
+            self._carried.pid = first.pid
+        return True
 
     def _frozen(self, order: CaptureOrder, *, base: bool) -> Frozen:
         """One freeze; again where processes came and went in the middle of it."""
@@ -239,7 +257,7 @@ class PtraceSession:
     def _explained(self, error: CaptureError) -> CaptureError:
         """A process that executed another program is not the one that was protected; one that has lost a thread is."""
         with contextlib.suppress(ProcessGoneError, ProbeError):
-            if procfs.status(self.pid).state in "ZX":
+            if procfs.status(self.pid).has_ended:
                 return error
             if not self._first.onlooker.is_entered():
                 self._first.memory.start_over()
@@ -256,8 +274,9 @@ class PtraceSession:
         try:
             others = None
             if self._tree.stand_still():
+                self._refuse(refused_threads.refuse_kin(self._first.threads))
                 others = self._tree.begin_look()
-            first = self._first.look(copied, self._outputs, base=base, opened=others.opened[self.pid] if others else None)
+            first = self._first.look(copied, self._outputs, base=base, opened=others.opened[self._first.pid] if others else None)
             if others:
                 self._tree.look(others, first, self._surroundings, base=base)
             seen = self._carried.look(self._shared_inodes(first, others)) if self._carried else Seen()
@@ -321,7 +340,7 @@ class PtraceSession:
         self._tree.hold()
 
     def _thaw(self) -> None:
-        self._departing.stay(self.pid)
+        self._departing.stay(self._first.pid)
         self._departing = carried_connections.NOBODY
         self._held = False
         try:

@@ -24,7 +24,8 @@ from checkpoint.linux.kept_descriptors import TEXTS_KEPT
 from checkpoint.linux.procfs import Stat
 from checkpoint.linux.readings import NO_FILE, Reading
 from checkpoint.linux.remote import SMALL, Answers, Batch, Desk, Guest
-from checkpoint.linux.threads import Threads, thread_ids
+from checkpoint.linux.tasks import thread_ids
+from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Tracee
 from checkpoint.model import Rseq
 

@@ -23,7 +23,7 @@ from typing import Final
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.filter_code import returned_constants
-from checkpoint.linux.threads import thread_count, thread_ids
+from checkpoint.linux.tasks import thread_count, thread_ids
 from checkpoint.linux.tracee import Tracee
 
 STRICT: Final = 1

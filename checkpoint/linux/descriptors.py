@@ -17,6 +17,7 @@ from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import abi
 from checkpoint.linux.own_calls import FIRST_ARGUMENT, RESULT_TO, OwnCalls, row
 from checkpoint.linux.procfs import READ_SIZE, parse_fields
+from checkpoint.linux.spokesman import pidfd_of
 
 if TYPE_CHECKING:
     from checkpoint.linux.kept_descriptors import KeptTexts
@@ -274,7 +275,7 @@ def lending(pid: int) -> Iterator[None]:
 def _lent(pid: int) -> int:
     """The pidfd that is lent for a process."""
     if _LENT[pid] == NOT_YET:
-        _LENT[pid] = os.pidfd_open(pid)
+        _LENT[pid] = pidfd_of(pid)
     return _LENT[pid]
 
 

@@ -36,6 +36,7 @@ from checkpoint.linux.remote import (
     give_back,
     resumed,
 )
+from checkpoint.linux.spokesman import pidfd_of
 from checkpoint.linux.tracee import Tracee, rest
 
 FAULTS_FLAGS: Final = abi.O_CLOEXEC | abi.O_NONBLOCK
@@ -138,7 +139,7 @@ def _wait_in_call(pid: int, name: str) -> None:
 
 
 def _taken(pid: int, inside: int) -> int:
-    pidfd = os.pidfd_open(pid)
+    pidfd = pidfd_of(pid)
     try:
         return abi.pidfd_getfd(pidfd, inside)
     finally:

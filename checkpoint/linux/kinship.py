@@ -17,6 +17,7 @@ from typing import Final
 
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import abi, procfs
+from checkpoint.linux.spokesman import spokesman_of
 
 STREAMS: Final = (0, 1, 2)
 LEFT_BEHIND_MAX: Final = 4096
@@ -120,19 +121,20 @@ class Kinship:
             session = os.getsid(pid)
             if session in _circles((self._pid, *(one.pid for one in self._of_ancestors))) or _exists(session):
                 return False
-            born = procfs.stat(pid).start_time
+            born, first = procfs.stat(pid).start_time, spokesman_of(self._pid)
             if (pid, born) not in self._left_behind:
                 if len(self._left_behind) >= LEFT_BEHIND_MAX:
                     self._left_behind.clear()
                 streams = procfs.stat(self._pid).start_time <= born and self._streams_of_first()
-                self._left_behind[pid, born] = any(abi.kcmp(self._pid, pid, abi.KCMP_FILE, n, n) == 0 for n in streams or ())
+                self._left_behind[pid, born] = any(abi.kcmp(first, pid, abi.KCMP_FILE, n, n) == 0 for n in streams or ())
             return self._left_behind[pid, born]
         return False
 
     def _streams_of_first(self) -> list[int]:
         """The standard streams of the first process that it has not from its ancestors."""
+        first = spokesman_of(self._pid)
         theirs = [(one.pid, number) for one in self._of_ancestors for number in _descriptors_of(one.pid)]
-        return [n for n in STREAMS if not any(abi.kcmp(self._pid, pid, abi.KCMP_FILE, n, number) == 0 for pid, number in theirs)]
+        return [n for n in STREAMS if not any(abi.kcmp(first, pid, abi.KCMP_FILE, n, number) == 0 for pid, number in theirs)]
 
     @staticmethod
     def _walk(waiting: list[int], known: Iterable[int]) -> Iterator[int]:

@@ -251,7 +251,8 @@ class Status:
 
     Attributes:
         state: one letter: R, S, D, T, t, Z, X.
-        pids, pgids, sids: from our namespace inwards.
+        tgid: of its process.
+        tgids, pids, pgids, sids: from our namespace inwards; pids are those of the very thread that was asked about.
         capabilities: inheritable, permitted, effective, bounding, ambient.
     """
 
@@ -259,6 +260,7 @@ class Status:
     state: str
     umask: int
     tgid: int
+    tgids: tuple[int, ...]
     ppid: int
     tracer: int
     uids: tuple[int, int, int, int]
@@ -274,6 +276,11 @@ class Status:
     capabilities: tuple[int, int, int, int, int]
     no_new_privs: bool
     seccomp: int
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether all of it has: a first thread that has ended while others live has not ended its process."""
+        return self.state in "ZX" and self.threads <= 1
 
 
 def parse_status(text: str) -> Status:
@@ -291,6 +298,7 @@ def parse_status(text: str) -> Status:
         state=fields.get("State", "?")[:1],
         umask=int(fields.get("Umask", "0"), 8),
         tgid=int(fields["Tgid"]),
+        tgids=numbers("NStgid") or (int(fields["Tgid"]),),
         ppid=int(fields["PPid"]),
         tracer=int(fields["TracerPid"]),
         uids=_four(numbers("Uid")),

@@ -32,6 +32,7 @@ from typing import Any, Final
 from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError
 from checkpoint.linux import procfs, second_stops
 from checkpoint.linux.burial import Burial, bury
+from checkpoint.linux.tasks import thread_count, thread_ids
 from checkpoint.linux.tracee import STOP_TIMEOUT_S, Tracee, no_stop, rest
 
 GLANCE_S: Final = 0.02
@@ -40,27 +41,6 @@ PATIENCE_S: Final = 1.0
 """How long we wait for threads that do not stop where no signal can tell us (in a thread of ours that is not the first)."""
 SEIZINGS: Final = 30
 """How often a thread is seized before it is believed that we may not; the kernel has one word for that and for one that ends."""
-FIRST_LINKS: Final = 2
-"""Links of an empty /proc/PID/task: its own, and its parent's. Each thread is one more."""
-
-
-def thread_count(pid: int) -> int:
-    """How many threads a process has, those included that are about to end.
-
-    Source: proc_task_getattr() in fs/proc/base.c.
-    """
-    try:
-        return os.stat(f"/proc/{pid}/task").st_nlink - FIRST_LINKS
-    except (FileNotFoundError, ProcessLookupError) as error:
-        raise ProcessGoneError(f"there is no process {pid} any more") from error
-
-
-def thread_ids(pid: int) -> list[int]:
-    """The ids of its threads, the first one first."""
-    try:
-        return sorted(map(int, os.listdir(f"/proc/{pid}/task")), key=lambda tid: (tid != pid, tid))
-    except (FileNotFoundError, ProcessLookupError) as error:
-        raise ProcessGoneError(f"there is no process {pid} any more") from error
 
 
 def _seized_at_last(tracee: Tracee) -> None:
@@ -115,16 +95,19 @@ class Threads:
     Invariants: between `thaw` and `freeze` nobody is seized, but for threads in ``_loose``, which had not stopped.
 
     Attributes:
-        leader: the first thread, whose id is the process's.
+        leader: the first thread, whose id is the process's; or, where that has ended, its spokesman.
+        process: the process's id.
         is_one_of_many: other processes stand still meanwhile: one that waits inside the kernel (for a child of vfork, for one) is
             not waited for.
 
     Args:
         mend: what is done to each thread that is let go as it was found, of which nothing else was asked.
+        process: where it is not the leader's.
     """
 
-    def __init__(self, leader: Tracee, mend: Callable[[Tracee], None] | None = None) -> None:
+    def __init__(self, leader: Tracee, mend: Callable[[Tracee], None] | None = None, process: int = 0) -> None:
         self.leader = leader
+        self.process = process or leader.pid
         self._mend = mend
         self._known: dict[int, Tracee] = {leader.pid: leader}
         self._held: dict[int, Tracee] = {}
@@ -137,8 +120,12 @@ class Threads:
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """By which the process is looked at (`checkpoint.linux.spokesman`)."""
         return self.leader.pid
+
+    def _count(self) -> int:
+        """Of threads that can be stopped: a first one that has ended is counted until all have."""
+        return thread_count(self.pid) - (self.process != self.pid)
 
     @property
     def others(self) -> tuple[Tracee, ...]:
@@ -171,10 +158,10 @@ class Threads:
         ended: set[int] = set()
         self._moving.clear()
         self._have_ended = False
-        fresh = [self.pid] if thread_count(self.pid) == 1 else thread_ids(self.pid)
+        fresh = [self.pid] if self._count() == 1 else thread_ids(self.pid)
         while fresh:
             ended |= self._stop(fresh, deadline)
-            if thread_count(self.pid) == len(self._held):
+            if self._count() == len(self._held):
                 return
             fresh = [tid for tid in thread_ids(self.pid) if tid not in self._held and tid not in ended]
             if fresh and time.perf_counter() > deadline:
@@ -269,7 +256,7 @@ class Threads:
         for tid in [tid for tid in self._held if tid not in self._moving and tid != self.pid and bury(tid)]:
             ended.add(tid)
             self._forget(tid)
-        is_alone = thread_count(self.pid) == 1 and not self.is_one_of_many
+        is_alone = self._count() == 1 and not self.is_one_of_many
         for tid in () if is_alone else sorted(self._moving):
             with contextlib.suppress(ProcessGoneError):
                 if procfs.thread_stat(self.pid, tid).state == "D":
@@ -279,7 +266,10 @@ class Threads:
 
     def _glance_at_first(self) -> None:
         """The first thread may be another one than we have seized, or than we have asked (8)."""
-        if procfs.status(self.pid).tracer != threading.get_native_id():
+        status = procfs.status(self.pid)
+        if status.state in "ZX":  # of which nobody is told while others live
+            raise ProcessGoneError(f"the first thread of pid {self.pid} has ended")
+        if status.tracer != threading.get_native_id():
             raise ProcessGoneError(f"pid {self.pid} has become another program (exec)")
         if self._have_ended:
             self.leader.interrupt()  # the same one could stop twice: not without need
@@ -355,13 +345,14 @@ class Threads:
 
     def _look_for_heir(self, gone: Tracee) -> None:
         """A thread whose id is gone may have its process's by now (8), and have stopped before anybody looked for it there."""
-        if gone is not self.leader and self.pid not in self._held and self.leader.interrupt_if_ours():
-            self._loose[self.pid] = self.leader
-            if self._is_let_go(self.leader):
-                self._loose.pop(self.pid, None)
+        heir = self.leader if self.process == self.pid else Tracee(self.process, self.leader.memory)
+        if gone.pid != heir.pid and heir.pid not in self._held and not heir.is_dead() and heir.interrupt_if_ours():
+            self._loose[heir.pid] = heir
+            if self._is_let_go(heir):
+                self._loose.pop(heir.pid, None)
 
     def _is_our_child(self, tracee: Tracee) -> bool:
-        if tracee is not self.leader:
+        if tracee is not self.leader or self.process != self.pid:
             return False
         try:
             return procfs.status(self.pid).ppid == os.getpid()

@@ -20,7 +20,7 @@ from checkpoint.capability import Area, preserved
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
-from checkpoint.linux.threads import thread_ids
+from checkpoint.linux.tasks import thread_ids
 from checkpoint.model import Fact, Resource
 from checkpoint.resources.rebuilding import number_of
 

@@ -101,7 +101,7 @@ def _path_of(held: OpenFile) -> str:
         return target
     if _has_ended(held, match[1]):
         return ENDED + (match[2] or "").replace(f"/task/{match[1]}", "/task/{ended}")
-    if int(match[1]) != procfs.status(held.pid).pids[-1]:
+    if int(match[1]) != procfs.status(held.pid).tgids[-1]:
         return target
     return OWN + target.removeprefix(f"/proc/{match[1]}").replace(f"/task/{match[1]}", "/task/{pid}")
 

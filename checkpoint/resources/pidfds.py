@@ -53,7 +53,7 @@ def is_of_ended(one: Descriptor) -> bool:
 def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
     """Of one that stands for a single thread of its process: the id by which the program knows that, and who watches it."""
     tid = _target(held)
-    if tid in (NOBODY, held.pid) or not held.first.flags & os.O_EXCL:
+    if tid in (NOBODY, _process(held)) or not held.first.flags & os.O_EXCL:
         return {}
     try:
         inner = procfs.parse_status(procfs.read_text(held.pid, f"task/{tid}/status")).pids[-1]
@@ -77,7 +77,7 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
     if pid == NOBODY:
         facts: dict[str, Fact] = {"descriptors": held.numbers, "flags": held.first.flags & ~os.O_CLOEXEC, "pid": 0}
         return Resource(KIND, held.name, {**facts, "ended": held.first.inode})
-    inner = procfs.status(pid).pids[-1] if pid in held.kin.pids and pid != held.pid else 0
+    inner = procfs.status(pid).pids[-1] if pid in held.kin.pids and pid != _process(held) else 0
     flags = held.first.flags & ~os.O_CLOEXEC
     thread: dict[str, Fact] = {"thread": held.observed["thread"]} if "thread" in held.observed else {}
     return Resource(KIND, held.name, {"descriptors": held.numbers, "flags": flags, "pid": inner, **thread})
@@ -85,6 +85,11 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
 
 def _target(held: OpenFile) -> int:
     return _pid_in(held.first)
+
+
+def _process(held: OpenFile) -> int:
+    """Who has it, as pidfds name a process: `OpenFile.pid` may be its spokesman's."""
+    return procfs.status(held.pid).tgid
 
 
 def _pid_in(one: Descriptor) -> int:
@@ -99,7 +104,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     is_of_thread = bool(held.first.flags & os.O_EXCL)
     if is_of_ended(held.first):
         return elsewhere.refuse(held, "a pidfd")
-    is_kept = pid == held.pid or pid in held.kin.pids or ("thread" in held.observed and not held.observed["is_watched"])
+    is_kept = pid == _process(held) or pid in held.kin.pids or ("thread" in held.observed and not held.observed["is_watched"])
     if is_kept and not held.description:
         return elsewhere.refuse(held, "a pidfd")
     whom = f"pid {pid}"

@@ -17,7 +17,9 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import abi, confinement, procfs
 from checkpoint.linux.procfs import Status
-from checkpoint.linux.threads import thread_ids
+from checkpoint.linux.spokesman import can_look_through
+from checkpoint.linux.tasks import thread_ids
+from checkpoint.linux.threads import Threads
 from checkpoint.linux.timers import parse_timers
 from checkpoint.resources import seccomp, thread_tables
 
@@ -27,10 +29,21 @@ CAPABILITIES: Final = (
         "all threads of the program, up to 4,096",
         "frozen together; with ids, names, registers, signals, stacks, robust lists, rseq, scheduling, processors",
     ),
+    preserved(
+        Area.THREADS,
+        "threads that outlive the first one (pthread_exit in main)",
+        "the first one has ended again, with its status; Linux 6.9",
+    ),
+    refused(
+        Area.THREADS,
+        "threads that outlive the first one, before Linux 6.9",
+        "let the first one wait for them",
+        "this kernel lends no descriptors",
+    ),
     refused(Area.THREADS, "more than 4,096 threads", "let it start fewer", "threads; the limit is"),
     refused(
         Area.THREADS,
-        "threads that outlive the first one (pthread_exit in main)",
+        "threads that outlive the first one (pthread_exit in main) in a program of several processes",
         "let the first one wait for them",
         "its first thread has ended while",
     ),
@@ -66,6 +79,10 @@ THREAD_LIMIT: Final = 4096
 """Threads of one program: the state of each takes 3 to 12 KB, of 32 MiB."""
 
 CLOCK_THREAD_CPUTIME: Final = 3
+OF_SEVERAL: Final = (
+    "its first thread has ended while others live, and its component has other processes, which is not kept yet: "
+    "let the first one wait for the other threads"
+)
 _NAMESPACES: Final = ("net", "ipc", "uts", "cgroup", "mnt", "user", "pid_for_children", "time_for_children")
 
 
@@ -79,6 +96,8 @@ def refuse(pid: int, status: Status, kin: Collection[int] = ()) -> Iterator[str]
     yield from refuse_shared_memory(pid, status)
     if status.threads == 1:
         return
+    if pid != status.tgid and not can_look_through(pid):
+        yield "its first thread has ended while others live, and this kernel lends no descriptors through another: Linux 6.9 does"
     if status.threads > THREAD_LIMIT:
         yield f"it has {status.threads} threads; the limit is {THREAD_LIMIT}: let it start fewer"
         return
@@ -100,6 +119,11 @@ def refuse_ended_first(status: Status) -> Iterator[str]:
     """Why a process whose first thread has ended cannot be captured; nothing stands against one that has ended as a whole."""
     if status.state in "ZX" and status.threads > 1:
         yield f"its first thread has ended while {status.threads - 1} others live, which is not kept yet: let it wait for them"
+
+
+def refuse_kin(threads: Threads) -> tuple[str, ...]:
+    """Why a process that has children, or others in its component, cannot be captured: by its first thread they know it."""
+    return (OF_SEVERAL,) if threads.process != threads.pid else ()
 
 
 def refuse_shared_memory(pid: int, status: Status) -> Iterator[str]:

@@ -62,7 +62,7 @@ def describe(held: OpenFile) -> dict[str, Fact]:
 
 def _is_of_ours(held: OpenFile, owner: int) -> bool:
     """Whether the owner is the process itself, or another one of its component."""
-    return owner == held.pid or owner in held.kin.pids
+    return owner == procfs.status(held.pid).tgid or owner in held.kin.pids
 
 
 def refuse(held: OpenFile) -> str | None:

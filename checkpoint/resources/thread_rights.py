@@ -19,7 +19,7 @@ from checkpoint.capability import Area, preserved
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.procfs import Status
-from checkpoint.linux.threads import thread_count, thread_ids
+from checkpoint.linux.tasks import thread_count, thread_ids
 from checkpoint.model import Credentials, Fact, Resource
 from checkpoint.rights import KIND
 

@@ -105,7 +105,6 @@ CAPABILITIES: Final = (
         "name a program that runs, and end the debugger",
         "it is a thread of process",
         "it is a kernel thread",
-        "its first thread has ended while",
         "it has ended and is a zombie",
         "a process cannot trace itself",
         "is its tracer already",
@@ -269,12 +268,7 @@ def require_traceable(pid: int, status: Status) -> None:
         raise ProbeError(f"cannot protect {pid}: it is a thread of process {status.tgid}; name that one")
     if procfs.stat(pid).flags & procfs.PF_KTHREAD:
         raise ProbeError(f"cannot protect pid {pid} ({status.name}): it is a kernel thread; choose a program")
-    if status.state in "ZX" and status.threads > 1:
-        raise ProbeError(
-            f"cannot protect pid {pid} ({status.name}): its first thread has ended while {status.threads - 1} others live, which "
-            "is not kept yet: let the first one wait for them"
-        )
-    if status.state in "ZX":
+    if status.has_ended:
         raise ProbeError(f"cannot protect pid {pid} ({status.name}): it has ended and is a zombie, waiting for its parent")
     if pid == os.getpid():
         raise ProbeError(f"cannot protect pid {pid}: a process cannot trace itself; run failover from another one")

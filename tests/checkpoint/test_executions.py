@@ -10,7 +10,8 @@ import pytest
 
 from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
 from checkpoint.linux import procfs
-from checkpoint.linux.threads import Threads, thread_ids
+from checkpoint.linux.tasks import thread_ids
+from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee, no_stop
 from tests.checkpoint.round_trip import PATIENCE_S, Program, ended, expect_ok, start_tracee
 from tests.checkpoint.test_threads import open_descriptors, states, tracers

@@ -119,16 +119,6 @@ def _is_in_the_table(reason: str) -> bool:
     return row is not None and row.verdict == Verdict.REFUSED
 
 
-def test_a_program_whose_first_thread_has_ended_is_refused_by_name(compiled: Compiled, tmp_path: Path) -> None:
-    with ended(start_tracee(compiled("refused", "-O2"), tmp_path, "dead_leader")) as tracee:
-        tracee.wait_until(lambda: _state(tracee.pid) == "Z", "the first thread's end")
-        for look in (ENGINE.probe, lambda pid: ENGINE.protect(pid, ProtectOrder("/test/tracee"))):
-            with pytest.raises(ProbeError, match="first thread has ended while 1 others live"):
-                look(tracee.pid)
-        tracee.tell()
-        expect_ok(tracee)
-
-
 def test_a_program_that_handles_its_system_calls_itself_is_refused_and_hears_nothing_of_it(
     compiled: Compiled, tmp_path: Path
 ) -> None:

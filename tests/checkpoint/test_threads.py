@@ -15,7 +15,7 @@ import pytest
 from checkpoint.engine import CaptureOrder, ProtectOrder, RestoreOptions, Session
 from checkpoint.errors import CaptureError, MismatchError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import procfs
-from checkpoint.linux.threads import thread_ids
+from checkpoint.linux.tasks import thread_ids
 from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.vessel import Birth, discard, spawn_vessel
 from checkpoint.model import Snapshot

@@ -62,18 +62,6 @@ static void take_thread_files(void) { take_unlike_thread(unshare_files); }
 static void take_thread_root(void) { take_unlike_thread(unshare_root); }
 static void take_thread_namespace(void) { take_unlike_thread(unshare_names); }
 
-static void *end_the_process(void *unused) {
-    nap_along(unused);
-    exit(finish());
-}
-
-static void take_dead_leader(void) {
-    pthread_t thread;
-    if (pthread_create(&thread, NULL, end_the_process, NULL)) cannot("start a thread");
-    ready();
-    pthread_exit(NULL);
-}
-
 static int sleep_beside(void *unused) {
     (void)unused;
     while (!is_told(go)) usleep(2000);
@@ -369,7 +357,6 @@ static const struct kind {
              {"thread_root", take_thread_root},
              {"thread_namespace", take_thread_namespace},
              {"namespace_of_children", take_namespace_of_children},
-             {"dead_leader", take_dead_leader},
              {"child_in_the_same_memory", take_child_in_the_same_memory},
              {"child_of_thread", take_child_of_thread},
              {"child", take_child},

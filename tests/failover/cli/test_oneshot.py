@@ -20,7 +20,7 @@ from checkpoint import capabilities
 from checkpoint.channel import Restore, Restored
 from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import kinship, procfs
-from checkpoint.linux.threads import thread_ids
+from checkpoint.linux.tasks import thread_ids
 from checkpoint.linux.vessel import Birth, spawn_vessel
 from failover.cli import oneshot
 from failover.cli.keeper import Keeper
