@@ -47,6 +47,8 @@ from checkpoint.resources.carried_trees import NO_PARCEL, CarriedTrees, Parcel, 
 from checkpoint.stream_counts import Totals
 
 NS_PER_US: Final = 1000
+SPOKESMEN_MAX: Final = 8
+"""How many threads may end, one after the other, by which the first process is looked at in one capture."""
 MOVED_S: Final = 2.0
 """How long a capture is made again because processes came and went in the middle of it."""
 MOVED_PAUSE_S: Final = 0.005
@@ -180,6 +182,15 @@ class PtraceSession:
 
     def capture(self, order: CaptureOrder) -> Snapshot:
         """See ``checkpoint.engine.Session.capture``."""
+        for _ in range(SPOKESMEN_MAX):
+            try:
+                return self._captured(order)
+            except CaptureError:
+                if not self._speaks_by_another():
+                    raise
+        raise CaptureError(f"cannot capture {self.component} (pid {self.pid}): its threads end while it is looked at; try again")
+
+    def _captured(self, order: CaptureOrder) -> Snapshot:
         parent = None if order.base else self._first.memory.acknowledged
         if self._refused:
             self._look_from_outside()
@@ -188,8 +199,6 @@ class PtraceSession:
                 self._carried.prepare(carried_trees.mapped_shared(self._first.pid))
             frozen = self._frozen(order, base=parent is None)
         except CaptureError as error:
-            if self._speaks_by_another():
-                return self.capture(order)
             explained = self._explained(error)
             if explained is error:
                 raise
