@@ -84,7 +84,7 @@ class OpenFile:
     description: int = 0
     is_echo: bool = False
     lent: Lent | None = None
-    owners: Owners | None = None
+    owners: Owners | None = field(default=None, compare=False)
     signals: Signals | None = None
 
     @property
