@@ -47,6 +47,9 @@ CHUNK: Final = 1 << 16
 LINE_MAX: Final = 300
 """Characters of the last line that ``failover why`` shows."""
 
+REST_S: Final = 0.5
+"""How long the rest of what a hook said is waited for once it has ended: another process may have its output open for ever."""
+
 END_S: Final = 2.0
 """How long the end of a hook that took too long is waited for."""
 
@@ -133,25 +136,27 @@ class Hooks:
         """Run one and wait for its end."""
         name = secrets.token_hex(4)
         try:
-            process = await self._begun(name, hook, occasion.environment(kind))
+            running = await self._begun(name, hook, occasion.environment(kind))
         except (OSError, ValueError) as error:  # a command that came from another robot may hold a zero byte
             return self._told(kind, hook, occasion, f"cannot be started: {error}")
         try:
-            said = await asyncio.wait_for(_last_said(process), hook.limit_s + (SYSTEMD_S if self.starter else 0))
+            said = await asyncio.wait_for(running.last_said(), hook.limit_s + (SYSTEMD_S if self.starter else 0))
         except TimeoutError:
-            await _end(process)
+            await _end(running.process)
             return self._told(kind, hook, occasion, f"took longer than {hook.limit_s:g} s and was ended")
+        finally:
+            running.output.close()
         last_line = _log_output(kind, occasion, said)
-        if not process.returncode:
+        if not running.process.returncode:
             return Outcome(last_line=last_line)
-        return self._told(kind, hook, occasion, self._failure(name, process.returncode), last_line)
+        return self._told(kind, hook, occasion, self._failure(name, running.process.returncode), last_line)
 
     def _failure(self, name: str, status: int) -> str:
         if self.starter:
             return f"journalctl --unit failover-hook-{name} tells how"
         return f"exit status {status}" if status > 0 else f"signal {-status}"
 
-    async def _begun(self, name: str, hook: Hook, environment: Mapping[str, str]) -> asyncio.subprocess.Process:
+    async def _begun(self, name: str, hook: Hook, environment: Mapping[str, str]) -> _Running:
         wanted = _user_of(hook.user)
         command, variables = list(hook.command), dict(environment)
         if self.starter:
@@ -160,16 +165,27 @@ class Hooks:
             options += [f"--uid={wanted['user']}", f"--gid={wanted['group']}"] if wanted else []
             way = in_a_unit(self.starter, "hook", name)
             command, variables, wanted = [*way[:-1], *options, "--", *command], dict(os.environ), {}
-        return await asyncio.create_subprocess_exec(
-            *command,
-            env=variables,
-            cwd="/",
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.STDOUT,
-            start_new_session=True,
-            **wanted,
-        )
+        reading, writing = os.pipe()
+        try:
+            process = await asyncio.create_subprocess_exec(
+                *command,
+                env=variables,
+                cwd="/",
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=writing,
+                stderr=asyncio.subprocess.STDOUT,
+                start_new_session=True,
+                **wanted,
+            )
+        except BaseException:
+            os.close(reading)
+            raise
+        finally:
+            os.close(writing)
+        reader = asyncio.StreamReader()
+        protocol = asyncio.StreamReaderProtocol(reader)
+        output, _ = await asyncio.get_running_loop().connect_read_pipe(lambda: protocol, os.fdopen(reading, "rb", buffering=0))
+        return _Running(process, reader, output)
 
     def _told(self, kind: Kind, hook: Hook, occasion: Occasion, why: str, last_line: str = "") -> Outcome:
         sentence = f"{kind} ({' '.join(hook.command)}) failed on {occasion.robot}, {occasion.why}: {why}"
@@ -177,14 +193,35 @@ class Hooks:
         return Outcome(sentence, last_line)
 
 
-async def _last_said(process: asyncio.subprocess.Process) -> bytes:
-    """Wait for the end of a hook; of what it said, which may be without end, the last bytes."""
-    assert process.stdout is not None, "it was begun with a pipe"
-    said = b""
-    while piece := await process.stdout.read(CHUNK):
-        said = (said + piece)[-OUTPUT_MAX:]
-    await process.wait()
-    return said
+@dataclass(slots=True)
+class _Running:
+    """A hook that was begun.
+
+    Attributes:
+        reader, output: of what it says; closed by whoever began it. The pipe is ours, not asyncio's, which would take a hook for
+            running as long as any process has the other end: one that puts itself in the background keeps it.
+    """
+
+    process: asyncio.subprocess.Process
+    reader: asyncio.StreamReader
+    output: asyncio.ReadTransport
+    said: bytes = b""
+
+    async def last_said(self) -> bytes:
+        """Wait for the end of the hook; of what it said, which may be without end, the last bytes."""
+        reading = asyncio.create_task(self._read())
+        try:
+            await self.process.wait()
+            done, _ = await asyncio.wait((reading,), timeout=REST_S)
+        finally:
+            reading.cancel()
+        if not done:
+            log.info("a process that hook %d has left behind has its output open; what it says is not heard", self.process.pid)
+        return self.said
+
+    async def _read(self) -> None:
+        while piece := await self.reader.read(CHUNK):
+            self.said = (self.said + piece)[-OUTPUT_MAX:]
 
 
 def _user_of(user: Inheritance | None) -> dict[str, Any]:

@@ -71,3 +71,26 @@ def is_alive(pid: int) -> bool:
     with contextlib.suppress(OSError):
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
     return False
+
+
+def test_a_hook_that_leaves_a_process_behind_has_ended_all_the_same(tmp_path: Path) -> None:
+    """As daemons do whose author forgot to close what they had been given."""
+    note = tmp_path / "child"
+    leaves = (
+        "import os, sys, time\n"
+        "if child := os.fork(): print('in the background', flush=True); sys.exit(0)\n"
+        "open(sys.argv[1] + '.part', 'w').write(str(os.getpid())); os.rename(sys.argv[1] + '.part', sys.argv[1])\n"
+        "time.sleep(1000)\n"
+    )
+    hook = Hook((sys.executable, "-S", "-c", leaves, str(note)), PATIENCE_S)
+    outcome = asyncio.run(Hooks().run("before_start", hook, Occasion("/lab/x", "robot1", 1, 64, STARTED)))
+    deadline = time.monotonic() + PATIENCE_S
+    while not note.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    child = int(note.read_text())
+    try:
+        assert (outcome.failure, outcome.last_line) == ("", "in the background")
+        assert is_alive(child)
+    finally:
+        os.kill(child, signal.SIGKILL)
