@@ -250,7 +250,7 @@ ENTRY_REGISTERS: Final = ("r12", "r13", "r14")
 """Where the entry keeps its results, and gives them back: the code pages, the table pages, the userfaultfd."""
 
 
-def entry_code(address: int, calls: EntryCalls, registers: Registers, mask: int) -> bytes:
+def entry_code(address: int, calls: EntryCalls, registers: Registers, mask: int, patience_ns: int) -> bytes:
     """The first entry, for a place where nothing of ours is mapped yet: constants only, nothing stored.
 
     It waits with three results in `ENTRY_REGISTERS`, where a tracer sees them. If none comes it closes the descriptor, gives
@@ -259,6 +259,7 @@ def entry_code(address: int, calls: EntryCalls, registers: Registers, mask: int)
     Args:
         registers: what the program goes on with; ``rip`` is where.
         mask: the program's signal mask.
+        patience_ns: how long it waits for the tracer.
     """
     code = _Code(address + ENTRY_CODE_OFFSET)
     code.call(SYSCALLS[calls.code_pages.name], calls.code_pages.arguments)
@@ -276,7 +277,7 @@ def entry_code(address: int, calls: EntryCalls, registers: Registers, mask: int)
     for register in (*ENTRY_REGISTERS, *CLOBBERED):
         code.set(register, registers[register])
     code.jump_through(address + 32)
-    return struct.pack("<QQQQQ", 0, ENTRY_TIMEOUT_NS, 0, mask, registers["rip"]) + bytes(code.content)
+    return struct.pack("<QQQQQ", *divmod(patience_ns, 10**9), 0, mask, registers["rip"]) + bytes(code.content)
 
 
 ENTRY_CODE_OFFSET: Final = 40

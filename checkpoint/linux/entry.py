@@ -34,6 +34,7 @@ from checkpoint.linux.remote import (
     Batch,
     BorrowedPages,
     give_back,
+    patience_ns,
     resumed,
 )
 from checkpoint.linux.spokesman import pidfd_of
@@ -82,7 +83,7 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
     """
     place, room = vdso_tail(tracee.memory, maps)
     hole = largest_hole(maps)
-    stub = arch.entry_code(place, _entry_calls(hole), resumed(arch.decode_registers(registers)), mask)
+    stub = arch.entry_code(place, _entry_calls(hole), resumed(arch.decode_registers(registers)), mask, patience_ns(tracee))
     if len(stub) > room:
         raise CaptureError(
             f"cannot enter pid {tracee.pid}: its vdso has only {room} spare bytes of {len(stub)}; upgrade the kernel"

@@ -57,6 +57,8 @@ MAGIC: Final = b"failover borrows these pages; 2\0"
 """Stands at the end of the code pages, and at the beginning of the table."""
 BATCH_TIMEOUT_S: Final = 1.0
 """How long a batch may take: its calls never wait, so only a machine that does not run the program at all exceeds this."""
+STOPPED_TIMEOUT_NS: Final = 10_000_000_000
+"""How long a program waits for us that somebody has stopped: that we are late is no reason for it to run."""
 CALL_LIMIT: Final = 200
 """Calls in one batch; ``LARGE_DESK`` holds 220 of the longest."""
 
@@ -185,6 +187,14 @@ class Guest:
     mask: int
 
 
+def patience_ns(tracee: Tracee) -> int:
+    """How long a thread waits in our code for us before it goes on by itself.
+
+    Source: __ptrace_unlink() in kernel/ptrace.c: whose tracer dies stops again where its process is stopped.
+    """
+    return STOPPED_TIMEOUT_NS if tracee.stopped_by else arch.ENTRY_TIMEOUT_NS
+
+
 class Desk:
     """A place in the borrowed pages at which one thread makes the calls of a batch.
 
@@ -211,7 +221,7 @@ class Desk:
         """Write it."""
         self._memory.write(self._places.state, struct.pack("<Q", state))
 
-    def armed(self, batch: Batch, registers: Registers, mask: int) -> bytes:
+    def armed(self, batch: Batch, guest: Guest) -> bytes:
         """Step 1: lay the code; the head of the table, to be laid, too: what a thread needs that goes on by itself."""
         key = tuple(batch.calls)
         if key != self._code_key:
@@ -221,9 +231,10 @@ class Desk:
             self._code_key = key
         self._serial += 1
         self.is_known_idle = False
-        resume = resumed(registers)
+        resume = resumed(guest.registers)
+        patience = divmod(patience_ns(guest.tracee), 10**9)
         return _HEAD.pack(
-            MAGIC, ARMED, 0, self._serial, mask, 0, arch.ENTRY_TIMEOUT_NS, 0, resume[arch.INSTRUCTION_POINTER]
+            MAGIC, ARMED, 0, self._serial, guest.mask, *patience, 0, resume[arch.INSTRUCTION_POINTER]
         ) + _CLOBBERED.pack(*_of_clobbered(resume))
 
     def is_done(self, table: bytes) -> bool:
@@ -332,7 +343,7 @@ class BorrowedPages:
     def _run_at(self, desks: Sequence[Desk], batches: Sequence[Batch], guests: Sequence[Guest]) -> list[Answers]:
         places = list(zip(desks, batches, guests, strict=False))
         self._require_free([desk for desk, _, _ in places])
-        heads = [(desk.table, desk.armed(batch, guest.registers, guest.mask)) for desk, batch, guest in places]
+        heads = [(desk.table, desk.armed(batch, guest)) for desk, batch, guest in places]
         self._memory.write_each(heads)
         tracees = [guest.tracee for guest in guests]
         sent = self._of_small if desks is self.desks else self._of_large

@@ -6,15 +6,17 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import random
+import signal
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pytest
 
@@ -23,7 +25,7 @@ from checkpoint.arch import cpu
 from checkpoint.channel import Channel, ChannelError, Reply
 from checkpoint.engine import CaptureOrder, ProtectOrder
 from checkpoint.errors import CaptureError
-from checkpoint.linux import entry, remote
+from checkpoint.linux import entry, procfs, remote
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.remote import Desk
 from checkpoint.linux.vessel import Birth, Born, spawn_vessel
@@ -41,6 +43,9 @@ from tests.checkpoint.round_trip import (
 )
 
 Wanted = TypeVar("Wanted")
+
+LATE_S = 0.05
+"""By so much a keeper is late on purpose, where a program that runs waits for less."""
 
 KILLS = int(os.environ.get("FAILOVER_KILLS", "20"))
 
@@ -215,6 +220,60 @@ def test_a_keeper_that_is_late_with_its_first_entry_does_no_harm_either(worker: 
     with protected(worker) as session:
         captured_at_last(session, CaptureOrder(base=True, generation=1, sequence=1))
     expect_undisturbed(worker)
+
+
+def test_a_program_that_is_stopped_does_not_run_because_a_keeper_is_late(
+    worker: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one whose lease is over: whoever has stopped it relies on that."""
+
+    def late(genuine: Callable[..., Any]) -> Callable[..., Any]:
+        def act(*arguments: Any) -> Any:
+            answer = genuine(*arguments)
+            time.sleep(LATE_S)
+            return answer
+
+        return act
+
+    os.kill(worker.pid, signal.SIGSTOP)
+    worker.wait_until(lambda: procfs.stat(worker.pid).state == "T", "it to be stopped")
+    turn = (worker.directory / "turn").read_bytes()
+    monkeypatch.setattr(cpu, "ENTRY_TIMEOUT_NS", 1_000_000)
+    monkeypatch.setattr(entry, "_wait_in_call", late(entry._wait_in_call))
+    monkeypatch.setattr(remote, "_tables_when_done", late(remote._tables_when_done))
+    session = ENGINE.protect(worker.pid, ProtectOrder("/test/worker"))
+    session.capture(CaptureOrder(base=True, generation=1, sequence=1))
+    session.close()
+    monkeypatch.undo()
+    assert (procfs.stat(worker.pid).state, (worker.directory / "turn").read_bytes()) == ("T", turn)
+    os.kill(worker.pid, signal.SIGCONT)
+    expect_undisturbed(worker)
+
+
+def test_a_program_that_is_stopped_stays_so_when_its_keeper_dies_until_it_is_continued(
+    worker: Program,
+) -> None:
+    """It stands in the code of its keeper, in a wait that was to be long."""
+    os.kill(worker.pid, signal.SIGSTOP)
+    worker.wait_until(lambda: procfs.stat(worker.pid).state == "T", "it to be stopped")
+    keeper = os.fork()
+    if not keeper:
+        entry._wait_in_call = functools.partial(_wait_and_die, entry._wait_in_call)
+        with contextlib.suppress(BaseException):
+            ENGINE.protect(worker.pid, ProtectOrder("/test/worker"))
+        os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(keeper, 0)[1]) == -signal.SIGKILL
+    worker.wait_until(lambda: procfs.stat(worker.pid).state == "T", "it to be stopped as it was")
+    os.kill(worker.pid, signal.SIGCONT)
+    assert goes_on(worker)
+    with protected(worker) as session:
+        captured_at_last(session, CaptureOrder(base=True, generation=1, sequence=1))
+    expect_undisturbed(worker)
+
+
+def _wait_and_die(wait: Callable[[int, str], None], pid: int, name: str) -> None:
+    wait(pid, name)
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 @pytest.mark.compiler
