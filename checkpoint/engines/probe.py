@@ -220,6 +220,8 @@ def _require_permission(pid: int, status: Status) -> None:
     try:
         procfs.read_bytes(pid, "auxv")
         os.stat(f"/proc/{pid}/exe")
+    except (FileNotFoundError, ProcessLookupError) as error:
+        raise ProcessGoneError(f"pid {pid} ({status.name}) has ended, or becomes another program") from error
     except (ProbeError, PermissionError) as error:
         raise ProbeError(
             f"cannot look at pid {pid} ({status.name}) of uid {status.uids[0]}: not permitted; run as that user or as root"

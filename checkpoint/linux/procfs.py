@@ -130,6 +130,22 @@ def read_link(pid: int, name: str) -> str:
         ) from error
 
 
+def head_of_program(pid: int, size: int) -> bytes:
+    """The first bytes of the program file of a process.
+
+    Raises:
+        ProcessGoneError: it has ended, or is about to become another program.
+        ProbeError: we may not read it.
+    """
+    try:
+        with open(f"/proc/{pid}/exe", "rb", buffering=0) as file:
+            return file.read(size)
+    except (FileNotFoundError, ProcessLookupError) as error:
+        raise ProcessGoneError(f"cannot read the program file of pid {pid}: it has ended, or becomes another program") from error
+    except PermissionError as error:
+        raise ProbeError(f"cannot read the program file of pid {pid}: not permitted; run as the same user or as root") from error
+
+
 def outlook(pid: int) -> str:
     """What to put before an absolute path that the kernel tells of a process, so that we find there what it finds.
 

@@ -307,9 +307,8 @@ def _refuse_image(pid: int, files_kept: bool) -> Iterator[str]:
     if executable.endswith(procfs.DELETED) and not files_kept:
         yield f"its program file {executable} is no longer there: restart the program, then protect it"
         return
-    with open(f"/proc/{pid}/exe", "rb") as file:
-        if file.read(5)[4:] != b"\x02":
-            yield f"it is a program of 32 bits ({executable}), which is not supported: use a 64-bit build"
+    if procfs.head_of_program(pid, 5)[4:] != b"\x02":
+        yield f"it is a program of 32 bits ({executable}), which is not supported: use a 64-bit build"
 
 
 def _refuse_memory(pid: int) -> Iterator[str]:

@@ -1,0 +1,39 @@
+"""What cannot be read of a process because that has ended, or is becoming another program, is told as such."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from checkpoint.engines import probe
+from checkpoint.errors import ProcessGoneError
+from checkpoint.linux import procfs
+
+
+@contextmanager
+def zombie() -> Iterator[int]:
+    """A process that has ended, which still has its place: its program's file is gone before it is, as in an execution."""
+    pid = os.posix_spawn("/bin/true", ["true"], {})
+    os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+    try:
+        yield pid
+    finally:
+        os.waitpid(pid, 0)
+
+
+def test_the_program_of_who_has_ended_cannot_be_read() -> None:
+    assert procfs.head_of_program(os.getpid(), 5) == b"\x7fELF\x02"
+    with zombie() as pid, pytest.raises(ProcessGoneError, match=f"program file of pid {pid}"):
+        procfs.head_of_program(pid, 5)
+
+
+def test_who_ends_in_the_middle_of_a_look_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All that was asked before was still answered."""
+    with zombie() as pid:
+        status = procfs.status(pid)
+        monkeypatch.setattr(procfs, "read_bytes", lambda *_: b"")
+        with pytest.raises(ProcessGoneError, match="becomes another program"):
+            probe._require_permission(pid, status)
