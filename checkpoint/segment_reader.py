@@ -91,7 +91,8 @@ class SegmentReader:
         2. The bank is locked for reading: from here on it is not written. Where the lock is taken, the word names another
            bank by now: look again.
         3. Its record says which commit it holds: that one, or a later one, since the word was read before the lock. 0 is a
-           bank whose writer was killed while it wrote; the word names another one by then.
+           bank whose writer was killed while it wrote; the word names another one by then. A later one counts once the word
+           names it: should its writer be killed before that, an older one would be read next.
 
         Raises:
             SegmentBusyError: the bank was locked at every look.
@@ -112,7 +113,7 @@ class SegmentReader:
     def _read_bank(self, bank: int, at_least: int, since: int) -> Committed | None:
         before = self._exactly(RECORD_SIZE, RECORDS_OFFSET + bank * RECORD_SIZE)
         number, realtime, monotonic, boottime, counted, first, second = RECORD.unpack_from(before)
-        if number < at_least:
+        if number < at_least or number > max(at_least, self.newest()):
             return None
         pages = self._changed(bank, number, since)
         contents = self._contents(bank, pages)

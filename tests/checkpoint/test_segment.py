@@ -184,6 +184,29 @@ def test_a_bank_that_was_torn_between_the_look_and_the_lock_is_not_read(monkeypa
         assert found is not None and number_read(found) == 2
 
 
+def test_a_commit_that_is_not_named_yet_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The writer comes round to the bank that the reader has looked at, has written it, and is killed before it says so."""
+    state = Telling()
+    with opened(layout()) as (writer, reader):
+        writer.commit(state.sources(1))
+        honest = SegmentReader._held
+
+        def overtaken(self: SegmentReader, bank: int) -> contextlib.AbstractContextManager[bool]:
+            monkeypatch.undo()
+            for number in range(2, BANKS + 1):
+                writer.commit(state.sources(number))
+            named = reader._word(NEWEST_OFFSET)
+            writer.commit(state.sources(BANKS + 1))
+            assert reader._word(NEWEST_OFFSET) % 256 == bank, "it has come round"
+            writer._words[NEWEST_OFFSET // 8] = named
+            return honest(self, bank)
+
+        monkeypatch.setattr(SegmentReader, "_held", overtaken)
+        for _ in range(2):
+            found = reader.read()
+            assert found is not None and number_read(found) == found.number == BANKS
+
+
 def test_a_writer_killed_at_any_instant_leaves_one_whole_commit_no_older_than_what_was_read() -> None:
     dice = random.Random(SEED)
     print(f"FAILOVER_SEED={SEED}")
