@@ -38,6 +38,7 @@ from checkpoint.linux.threads import Threads
 from checkpoint.model import Member, Position, ProcessState, Resource, ThreadState, Vma, Zombie
 from checkpoint.resources import (
     Held,
+    Owners,
     Surroundings,
     elsewhere,
     gather,
@@ -371,11 +372,16 @@ class CapturedTree:
         """What all have open, and who has ended."""
         pids = [self._first.pid, *self._standing]
         try:
-            opened = sharing.together({pid: gather(pid) for pid in pids})
+            opened = sharing.together({pid: gather(pid, owners=self._owners_of(pid)) for pid in pids})
             ended = tuple(found for pid in self._ended if (found := _end_of(pid)) is not None)
         except ProcessGoneError as error:
             raise MovedError(str(error)) from error
         return SeenOthers(opened, ended)
+
+    def _owners_of(self, pid: int) -> Owners | None:
+        """What is known of who has owners there; None of a process that was never looked at."""
+        known = self._first if pid == self._first.pid else self._known.get(pid)
+        return known.onlooker.owners if known else None
 
     def look(self, seen: SeenOthers, first: Look, surroundings: Surroundings, *, base: bool) -> None:
         """Everything that needs them to stand still.

@@ -26,7 +26,7 @@ from checkpoint.linux.readings import Reading, Readings
 from checkpoint.linux.remote import Answers
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.timers import parse_timers
-from checkpoint.resources import Kept, Opened, OpenFile, gather, owners, with_contents
+from checkpoint.resources import Kept, Opened, OpenFile, Owners, gather, owners, with_contents
 from checkpoint.resources.recollection import Recollection
 from checkpoint.resources.thread_rights import ThreadRights
 from checkpoint.resources.thread_tables import ThreadTables
@@ -121,6 +121,11 @@ class Onlooker:
     def gather(self) -> Opened:
         """What it has open; for an exact picture it stands still."""
         return gather(self._tracee.pid, self._kept)
+
+    @property
+    def owners(self) -> Owners:
+        """What is known of who has owners of its signals."""
+        return self._kept.owners
 
     def overlooked(self, opened: Sequence[OpenFile]) -> OpenFile | None:
         """See `checkpoint.resources.owners.overlooked`."""

@@ -194,17 +194,18 @@ class Kept:
         return self._opened
 
 
-def gather(pid: int, kept: Kept | None = None) -> Opened:
+def gather(pid: int, kept: Kept | None = None, owners: Owners | None = None) -> Opened:
     """Read every descriptor, and which of them share an open file. For an exact picture the process stands still.
 
     Args:
         kept: of a process that is looked at again and again.
+        owners: of such a process where all else is read anew, see `OpenFile`.
     """
     found = descriptors(pid, kept.texts if kept else None)
     if any(map(entry.is_left_open, found)):  # ours, and closed when it is entered
         found = tuple(one for one in found if not entry.is_left_open(one))
     groups = (kept.grouping if kept else Grouping(pid)).of(found)
-    return Opened(kept.opened(groups, pid) if kept else _opened_of(groups, pid))
+    return Opened(kept.opened(groups, pid) if kept else _opened_of(groups, pid, owners))
 
 
 def _opened_of(groups: Sequence[tuple[Descriptor, ...]], pid: int, owners: Owners | None = None) -> tuple[OpenFile, ...]:
