@@ -81,6 +81,7 @@ def _beyond(outline: Snapshot, started: Inheritance) -> Iterator[str]:
                 yield f"its limit {number} (RLIMIT) is {'none' if hard == resource.RLIM_INFINITY else hard}"
         for thread in one.threads:
             yield from _beyond_priority(thread, started)
+        yield from _beyond_deadlines(one, started)
 
 
 def _beyond_priority(thread: ThreadState, started: Inheritance) -> Iterator[str]:
@@ -91,8 +92,21 @@ def _beyond_priority(thread: ThreadState, started: Inheritance) -> Iterator[str]
     allowed = _allowed(started, RLIMIT_RTPRIO)
     if policy in REAL_TIME and thread.priority > max(allowed, started.priority if started.policy in REAL_TIME else 0):
         yield f"{named} has the real-time priority {thread.priority}"
-    if thread.nice < min(LEAST_NICE_FROM - _allowed(started, RLIMIT_NICE), started.nice):
+    if thread.nice < _least_nice(started):
         yield f"{named} has the nice value {thread.nice}"
+
+
+def _beyond_deadlines(one: Snapshot | Member, started: Inheritance) -> Iterator[str]:
+    """The same of what is told of deadlines and slices, which is set whatever else is said of a thread."""
+    for tid, policy, nice in rights.slices(one.resources):
+        if policy == SCHED_DEADLINE and started.policy != SCHED_DEADLINE:
+            yield f"its thread {tid} is scheduled by deadlines"
+        if nice < _least_nice(started):
+            yield f"its thread {tid} has the nice value {nice}"
+
+
+def _least_nice(started: Inheritance) -> float:
+    return min(LEAST_NICE_FROM - _allowed(started, RLIMIT_NICE), started.nice)
 
 
 def _allowed(started: Inheritance, number: int) -> float:
@@ -101,4 +115,5 @@ def _allowed(started: Inheritance, number: int) -> float:
 
 
 def _unbounded(limit: int) -> float:
-    return float("inf") if limit == resource.RLIM_INFINITY else limit
+    """A limit as the kernel takes it: any negative number is about the largest there is."""
+    return float("inf") if limit < 0 else limit

@@ -24,7 +24,7 @@ from checkpoint.errors import FormatError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.linux.vessel import Birth, spawn_program
 from checkpoint.model import Credentials, Fact, Member, Resource, Snapshot
-from checkpoint.rights import CONFINED, KIND
+from checkpoint.rights import CONFINED, KIND, SLICED
 from tests.samples.make import sample, tree_sample
 
 SOMEBODY = 7001
@@ -211,6 +211,13 @@ def limited(**changes: tuple[int, int]) -> Snapshot:
     return replace(outline, process=replace(outline.process, limits=limits))
 
 
+def sliced(policy: int, nice: int) -> Snapshot:
+    """One whose thread is told to have a deadline, or slices, of its own, whatever is said of it otherwise."""
+    outline = scheduled()
+    told: list[Fact] = [[outline.threads[0].tid, policy, nice, 1_000_000, 10_000_000, 10_000_000]]
+    return replace(outline, resources=(Resource(SLICED, "deadlines and slices", {"descriptors": [], "threads": told}),))
+
+
 @as_root
 @pytest.mark.parametrize(
     ("outline", "said"),
@@ -226,7 +233,11 @@ def limited(**changes: tuple[int, int]) -> Snapshot:
         (limited(_7=(4096, 4096)), ""),
         (limited(_7=(1024, 4097)), r"its limit 7 \(RLIMIT\) is 4097"),
         (limited(_7=(1024, -1)), r"its limit 7 \(RLIMIT\) is none"),
+        (limited(_7=(1024, -2)), r"its limit 7 \(RLIMIT\) is -2"),
         (limited(_0=(-1, -1)), ""),
+        (sliced(os.SCHED_OTHER, -5), ""),
+        (sliced(os.SCHED_OTHER, -6), "has the nice value -6"),
+        (sliced(6, 0), "is scheduled by deadlines"),
     ],
 )
 def test_more_of_the_machine_than_it_was_started_with_is_roots_alone(outline: Snapshot, said: str) -> None:
@@ -237,6 +248,14 @@ def test_more_of_the_machine_than_it_was_started_with_is_roots_alone(outline: Sn
         return
     with pytest.raises(MismatchError, match=said + ", which is more than what uid 7001 started it with allows"):
         check_rights("/lab/r1/mapper", outline, SOMEBODY, STARTED)
+
+
+@as_root
+def test_deadlines_that_are_told_as_nobody_knows_them_are_refused() -> None:
+    outline = scheduled()
+    strange = Resource(SLICED, "deadlines and slices", {"descriptors": [], "threads": [[outline.threads[0].tid, "6"]]})
+    with pytest.raises(FormatError, match="told in a way that this version does not know"):
+        check_rights("/lab/r1/mapper", replace(outline, resources=(strange,)), SOMEBODY, STARTED)
 
 
 @as_root
