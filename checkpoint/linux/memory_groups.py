@@ -46,8 +46,13 @@ def left(free_swap: int, proc: Path = Path("/proc/self")) -> int:
     return max(min(limits), 0)
 
 
+def _lines(text: str) -> list[str]:
+    """As the kernel ends them: in a path, which whoever mounts something may choose, `str.splitlines` sees ends of its own."""
+    return [line for line in text.split("\n") if line]
+
+
 def _hierarchies(mounts: str) -> Iterator[_Hierarchy]:
-    for line in mounts.splitlines():
+    for line in _lines(mounts):
         before, _, after = line.partition(" - ")
         _, _, _, root, point, *_ = before.split(" ")
         kind, _, options = after.split(" ", 2)
@@ -59,7 +64,7 @@ def _hierarchies(mounts: str) -> Iterator[_Hierarchy]:
 
 def _groups(hierarchy: _Hierarchy, groups: str) -> Iterator[Path]:
     """The directories of our group and of those around it that can be seen, from the inside out."""
-    for line in groups.splitlines():
+    for line in _lines(groups):
         _, controllers, path = line.split(":", 2)
         if (hierarchy.version == 2) if not controllers else (hierarchy.version == 1 and "memory" in controllers.split(",")):
             inside = os.path.relpath(path, hierarchy.root)

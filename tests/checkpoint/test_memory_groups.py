@@ -81,6 +81,16 @@ def test_where_no_group_limits_the_machine_does(tmp_path: Path) -> None:
     assert memory_groups.left(0, place) == memory_groups.UNLIMITED
 
 
+def test_odd_names_of_mounts_and_groups_are_no_ends_of_lines(tmp_path: Path) -> None:
+    """Somebody without rights can mount a file system of his own below any name."""
+    place = version_2(tmp_path)
+    mounts, groups = (place / "mountinfo").read_text(), (place / "cgroup").read_text()
+    odd = "36 31 0:50 / /home/a\x0bb\x1c\u2028c rw,nosuid - fuse.x x rw\n"
+    (place / "mountinfo").write_text(odd + mounts)
+    (place / "cgroup").write_text("5:cpu:/a\x0bb\n" + groups)
+    assert memory_groups.left(0, place) == 80 * MIB
+
+
 def test_what_is_free_here_is_what_the_groups_leave(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 0 < room.free() < PLENTY
     monkeypatch.setattr(memory_groups, "left", lambda _: 3 * MIB)
