@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Callable, Mapping
@@ -73,3 +74,9 @@ def test_what_is_refused_in_words_already_stays_as_it_is(caplog: pytest.LogCaptu
     with pytest.raises(FormatError, match=r"cannot restore /lab/a: .* \(KeyError: 'flags'\)"), foreign.facts("restore /lab/a"):
         raise KeyError("flags")
     assert caplog.records[0].exc_info
+
+
+def test_what_this_machine_lacks_is_not_said_to_be_the_snapshots_fault() -> None:
+    with pytest.raises(FormatError, match=r"^cannot restore /lab/a: \[Errno 28\] No space left on device; if this machine lacks"):
+        with foreign.facts("restore /lab/a"):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
