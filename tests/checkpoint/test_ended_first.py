@@ -12,7 +12,8 @@ import pytest
 from agent.freezer import SignalFreezer
 from checkpoint.engine import CaptureOrder, ProtectOrder
 from checkpoint.errors import UnsupportedError
-from checkpoint.linux.spokesman import spokesman_of
+from checkpoint.linux.spokesman import PIDFD_THREAD, spokesman_of
+from checkpoint.resources import refused_threads
 from tests.checkpoint.round_trip import (
     ENGINE,
     LIVES,
@@ -36,6 +37,18 @@ pytestmark = [pytest.mark.compiler, pytest.mark.root]
 Compiled = Callable[..., Path]
 
 
+def lends_through_threads() -> bool:
+    """Whether this kernel is of Linux 6.9 or later, as far as that matters here."""
+    try:
+        os.close(os.pidfd_open(os.getpid(), PIDFD_THREAD))
+    except OSError:
+        return False
+    return True
+
+
+needs_lending = pytest.mark.skipif(not lends_through_threads(), reason="this kernel lends no descriptors through a thread")
+
+
 def started(compiled: Compiled, directory: Path, *mode: str, isolate: bool = False) -> Program:
     """The tracee, its first thread gone."""
     return start_tracee(compiled("ended_first", "-O2", "-pthread"), directory, *mode, isolate=isolate)
@@ -46,6 +59,7 @@ def first_has_ended(program: Program) -> bool:
     return Path(f"/proc/{program.pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
 
 
+@needs_lending
 @pytest.mark.parametrize("isolate", [False, True])
 def test_it_is_the_same_after_three_lives(compiled: Compiled, tmp_path: Path, isolate: bool) -> None:
     tracee = started(compiled, tmp_path, isolate=isolate)
@@ -53,6 +67,7 @@ def test_it_is_the_same_after_three_lives(compiled: Compiled, tmp_path: Path, is
     expect_three_lives(tracee, tmp_path)
 
 
+@needs_lending
 def test_its_status_is_what_it_would_have_been_in_every_life(compiled: Compiled, tmp_path: Path) -> None:
     """Its threads end one by one: older kernels tell the status of the first of them, newer ones that of the last."""
     with ended(started(compiled, tmp_path, "status")) as never_captured:
@@ -72,6 +87,7 @@ def test_its_status_is_what_it_would_have_been_in_every_life(compiled: Compiled,
         assert (tracee.finish(), tracee.output.splitlines()[-1:]) == (status, ["ok"]), tracee.output
 
 
+@needs_lending
 def test_a_first_thread_that_ends_under_protection_makes_the_next_capture_a_base(compiled: Compiled, tmp_path: Path) -> None:
     tracee = started(compiled, tmp_path, "late")
     with ended(tracee), protected(tracee) as session:
@@ -93,6 +109,7 @@ def test_a_first_thread_that_ends_under_protection_makes_the_next_capture_a_base
         expect_ok(again)
 
 
+@needs_lending
 def test_a_spokesman_that_ends_is_followed_by_another(compiled: Compiled, tmp_path: Path) -> None:
     tracee = started(compiled, tmp_path, "brief")
     with ended(tracee), protected(tracee) as session:
@@ -106,6 +123,7 @@ def test_a_spokesman_that_ends_is_followed_by_another(compiled: Compiled, tmp_pa
     expect_three_lives(restored(snapshot, tmp_path), tmp_path)
 
 
+@needs_lending
 def test_one_that_is_killed_while_it_is_held_ends_for_its_parent(compiled: Compiled, tmp_path: Path) -> None:
     tracee = started(compiled, tmp_path)
     with ended(tracee), protected(tracee) as session:
@@ -120,6 +138,18 @@ def test_one_that_has_children_is_refused_by_name_and_goes_on(compiled: Compiled
         report = ENGINE.probe(tracee.pid)
         assert any("its first thread has ended while others live" in reason for reason in report.reasons)
         with pytest.raises(UnsupportedError, match="its first thread has ended while others live"):
+            ENGINE.protect(tracee.pid, ProtectOrder("/test/tracee"))
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_where_the_kernel_lends_no_descriptors_it_is_refused_by_name_and_goes_on(
+    compiled: Compiled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(refused_threads, "can_look_through", lambda _: False)
+    tracee = started(compiled, tmp_path)
+    with ended(tracee):
+        with pytest.raises(UnsupportedError, match="this kernel lends no descriptors through another"):
             ENGINE.protect(tracee.pid, ProtectOrder("/test/tracee"))
         tracee.tell()
         expect_ok(tracee)
@@ -141,6 +171,7 @@ def test_sigstop_holds_one_until_it_is_thawed(compiled: Compiled, tmp_path: Path
         expect_ok(tracee)
 
 
+@needs_lending
 def test_an_ordinary_user_can_do_it_too(compiled: Compiled, tmp_path: Path) -> None:
     program = compiled("ended_first", "-O2", "-pthread")
     let_nobody_in(tmp_path, program)
