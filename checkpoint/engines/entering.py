@@ -27,7 +27,7 @@ from checkpoint.model import Rseq
 from checkpoint.resources import refused_threads, sockets, unkept
 
 LEAVE_TIMEOUT_S: Final = 0.5
-"""How long a program may take to leave the code of a tracer that died in the middle: that waits 100 ms at most."""
+"""How long a program may take to leave the code of a tracer that died in the middle: unless it is stopped, that waits 100 ms."""
 LEAVE_PAUSE_S: Final = 0.01
 
 

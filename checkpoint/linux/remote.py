@@ -12,7 +12,8 @@ A batch, and why a SIGKILL of the tracer at any instant leaves the program unhar
    the mask and registers back by itself, and jumps to where the program stood.
 3. Mask: every signal blocked, so that no handler runs with its return address in a page that a snapshot does not hold.
    *Killed here:* as before; the batch's last call sets the program's mask.
-4. The thread runs the batch, says done and waits (rt_sigtimedwait of no signal, 100 ms at most; it leaves a restart block alone).
+4. The thread runs the batch, says done and waits (rt_sigtimedwait of no signal; it leaves a restart block alone): 100 ms at
+   most, of a program that somebody has stopped 10 s (`patience_ns`).
 5. The tracer stops it there: mask back, then registers back, as they were at the first stop, orig_rax and all, so that the
    kernel itself restarts or ends the interrupted call as signals then demand. *Killed between or before:* the wait ends and
    the batch goes on as in 2. A signal that comes just then may run its handler on top of the batch; such pages are marked
