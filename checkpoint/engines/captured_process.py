@@ -25,7 +25,7 @@ from checkpoint.engines.taken_memory import Taken
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.procfs import MapsLine
-from checkpoint.linux.spokesman import spokesman_of
+from checkpoint.linux.spokesman import SPOKESMEN_MAX, spokesman_of
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.tracking import NONE, NOT_CARRIED
@@ -130,25 +130,28 @@ class CapturedProcess:
     @classmethod
     def entered_first(cls, pid: int, order: ProtectOrder) -> CapturedProcess:
         """Enter the first process of a component; by another thread, where its first one has ended, or does so meanwhile."""
-        while True:
+        for _ in range(SPOKESMEN_MAX):
             met = Met.by_its_spokesman(pid)
             try:
                 return cls.entered(met, order)
             except ProcessGoneError:
                 if spokesman_of(pid) == met.threads.pid:
                     raise
+        raise CaptureError(f"cannot enter pid {pid}: its threads end while it is looked at; try again")
 
     def has_lost_its_voice(self) -> bool:
         """Whether the thread by which it is looked at has ended, and another lives by which it could be.
 
+        Where the first thread lives again, a spokesman has executed another program under its process's id.
+
         Raises:
             ProcessGoneError: all of it has ended.
         """
-        return not self._is_there() and spokesman_of(self.threads.process) != self.pid
+        return not self._is_there() and spokesman_of(self.threads.process) not in (self.pid, self.threads.process)
 
     def _is_there(self) -> bool:
         try:
-            return procfs.stat(self.pid).state not in "ZX"
+            return procfs.thread_stat(self.threads.process, self.pid).state not in "ZX"  # its id may be a stranger's by now
         except ProcessGoneError:
             return False
 

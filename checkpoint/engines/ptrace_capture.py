@@ -38,7 +38,7 @@ from checkpoint.errors import CaptureError, CheckpointError, ProbeError, Process
 from checkpoint.linux import abi, kinship, procfs
 from checkpoint.linux.kinship import Kinship
 from checkpoint.linux.precedence import Precedence
-from checkpoint.linux.spokesman import told_by_spokesman
+from checkpoint.linux.spokesman import SPOKESMEN_MAX, told_by_spokesman
 from checkpoint.model import Position, Snapshot
 from checkpoint.pages import PageTable
 from checkpoint.resources import OpenFile, Surroundings, carried_connections, carried_trees, glance, kinds, look, refused_threads
@@ -47,8 +47,6 @@ from checkpoint.resources.carried_trees import NO_PARCEL, CarriedTrees, Parcel, 
 from checkpoint.stream_counts import Totals
 
 NS_PER_US: Final = 1000
-SPOKESMEN_MAX: Final = 8
-"""How many threads may end, one after the other, by which the first process is looked at in one capture."""
 MOVED_S: Final = 2.0
 """How long a capture is made again because processes came and went in the middle of it."""
 MOVED_PAUSE_S: Final = 0.005
@@ -212,12 +210,17 @@ class PtraceSession:
             raise self._explained(error) from error
 
     def _speaks_by_another(self) -> bool:
-        """Where the thread has ended by which the first process is looked at, enter it by another: the next capture is a base."""
+        """Where the thread has ended by which the first process is looked at, enter it by another: the next capture is a base.
+
+        Raises:
+            UnsupportedError: it cannot be kept so (before Linux 6.9, or one of several processes); nothing was touched.
+        """
         try:
             if self._held or not self._first.has_lost_its_voice():
                 return False
         except ProcessGoneError:
             return False
+        self._refuse(probing.reasons_of(self.pid, self._surroundings, files_kept=self._first.files_kept))
         first = CapturedProcess.entered_first(self.pid, self._first.order)
         self._first.close()
         self._first = first

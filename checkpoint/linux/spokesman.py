@@ -16,12 +16,14 @@ import os
 from collections.abc import Callable
 from typing import Final, TypeVar
 
-from checkpoint.errors import CheckpointError, ProcessGoneError
+from checkpoint.errors import CheckpointError, ProbeError, ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.tasks import thread_ids
 
 Answer = TypeVar("Answer")
 PIDFD_THREAD: Final = os.O_EXCL
+SPOKESMEN_MAX: Final = 8
+"""How many threads may end, one after the other, by which a process is looked at in one look."""
 _NOT_A_PROCESS: Final = (errno.EINVAL, errno.ENOENT)
 """What pidfd_open(2) answers to a thread that is not the first one."""
 
@@ -46,8 +48,9 @@ def told_by_spokesman(pid: int, question: Callable[[int], Answer]) -> Answer:
 
     Raises:
         CheckpointError: what the question does.
+        ProbeError: one spokesman ends after the other.
     """
-    while True:
+    for _ in range(SPOKESMEN_MAX):
         spokesman = spokesman_of(pid)
         try:
             answer = question(spokesman)
@@ -57,6 +60,7 @@ def told_by_spokesman(pid: int, question: Callable[[int], Answer]) -> Answer:
         else:
             if spokesman_of(pid) == spokesman:
                 return answer
+    raise ProbeError(f"cannot look at pid {pid}: its threads end while it is looked at; try again")
 
 
 def _ends(stat: procfs.Stat) -> bool:

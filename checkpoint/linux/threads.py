@@ -158,6 +158,8 @@ class Threads:
         ended: set[int] = set()
         self._moving.clear()
         self._have_ended = False
+        if self.process != self.pid:
+            self._await_end_of_first(deadline)
         fresh = [self.pid] if self._count() == 1 else thread_ids(self.pid)
         while fresh:
             ended |= self._stop(fresh, deadline)
@@ -169,6 +171,28 @@ class Threads:
                     f"pid {self.pid} did not come to stand still within {STOP_TIMEOUT_S:g} s: it starts threads all the time, "
                     "or the machine leaves it no processor; capture it again"
                 )
+
+    def _await_end_of_first(self, deadline: float) -> None:
+        """See that its spokesman is of the process still, and that its first thread has done all that it does at its end.
+
+        Until that is a zombie it may still write to the memory (robust futexes, and where those wait who join it).
+
+        Raises:
+            ProcessGoneError: the spokesman's id is nobody's any more, or a stranger's; or the first thread lives (8).
+            CaptureError: it does not come to its end.
+        """
+        began = now = time.perf_counter()
+        while True:
+            procfs.thread_stat(self.process, self.pid)
+            first = procfs.thread_stat(self.process, self.process)
+            if first.state in "ZX":
+                return
+            if not first.flags & procfs.PF_EXITING:
+                raise ProcessGoneError(f"pid {self.process} has become another program (exec)")
+            if now > deadline:
+                raise CaptureError(f"the first thread of pid {self.process} does not come to its end; capture it again")
+            rest(now - began)
+            now = time.perf_counter()
 
     def _stop(self, tids: list[int], deadline: float) -> set[int]:
         """Stop these; those that have ended instead."""

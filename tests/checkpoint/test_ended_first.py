@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import errno
+import itertools
 import os
 import signal
+import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from agent.freezer import SignalFreezer
 from checkpoint.engine import CaptureOrder, ProtectOrder
-from checkpoint.errors import UnsupportedError
-from checkpoint.linux.spokesman import PIDFD_THREAD, spokesman_of
+from checkpoint.errors import ProbeError, ProcessGoneError, UnsupportedError
+from checkpoint.linux import procfs
+from checkpoint.linux.procfs import Stat
+from checkpoint.linux.spokesman import PIDFD_THREAD, SPOKESMEN_MAX, spokesman_of, told_by_spokesman
+from checkpoint.linux.tasks import thread_ids
+from checkpoint.linux.threads import Threads
+from checkpoint.linux.tracee import Tracee
 from checkpoint.resources import refused_threads
 from tests.checkpoint.round_trip import (
     ENGINE,
@@ -121,6 +130,102 @@ def test_a_spokesman_that_ends_is_followed_by_another(compiled: Compiled, tmp_pa
         assert len(snapshot.threads) == 4
         tracee.kill()
     expect_three_lives(restored(snapshot, tmp_path), tmp_path)
+
+
+@needs_lending
+def test_a_spokesman_that_executes_another_program_is_followed_by_nobody(compiled: Compiled, tmp_path: Path) -> None:
+    tracee = started(compiled, tmp_path, "exec")
+    with ended(tracee), protected(tracee) as session:
+        captured_at_last(session, CaptureOrder())
+        (tmp_path / "hush").touch()
+        tracee.wait_until(lambda: not first_has_ended(tracee), "the other program")
+        with pytest.raises(ProcessGoneError, match=r"another program \(exec\)"):
+            captured_at_last(session, CaptureOrder(sequence=1))
+
+
+def test_a_kernel_that_lends_nothing_by_a_spokesman_is_named_and_nothing_is_left_in_the_program(
+    compiled: Compiled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its first thread ends under protection, when it had been looked at by that."""
+    opened = os.pidfd_open
+
+    def of_processes_alone(pid: int, flags: int = 0) -> int:
+        if flags & PIDFD_THREAD:
+            raise OSError(errno.EINVAL, "as before Linux 6.9")
+        return opened(pid, flags)
+
+    monkeypatch.setattr(os, "pidfd_open", of_processes_alone)
+    tracee = started(compiled, tmp_path, "late")
+    with ended(tracee), protected(tracee) as session:
+        captured_at_last(session, CaptureOrder())
+        (tmp_path / "leave").touch()
+        tracee.wait_until(lambda: first_has_ended(tracee), "the first thread's end")
+        before = os.listdir(f"/proc/{spokesman_of(tracee.pid)}/fd")
+        for sequence in (1, 2):
+            with pytest.raises(UnsupportedError, match="this kernel lends no descriptors"):
+                captured_at_last(session, CaptureOrder(sequence=sequence))
+        assert os.listdir(f"/proc/{spokesman_of(tracee.pid)}/fd") == before
+        tracee.tell()
+        expect_ok(tracee)
+
+
+def test_a_stranger_who_has_the_id_of_a_spokesman_by_now_is_left_in_peace(compiled: Compiled, tmp_path: Path) -> None:
+    stranger = subprocess.Popen(["sleep", "1000"])
+    try:
+        with ended(started(compiled, tmp_path)) as tracee:
+            threads = Threads(Tracee(stranger.pid), process=tracee.pid)
+            with pytest.raises(ProcessGoneError):
+                threads.freeze()
+    finally:
+        stranger.kill()
+        stranger.wait()
+
+
+def test_nobody_speaks_for_a_process_whose_first_thread_lives(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(started(compiled, tmp_path, "late")) as tracee:
+        with pytest.raises(ProcessGoneError, match="another program"):
+            Threads(Tracee(max(thread_ids(tracee.pid))), process=tracee.pid).freeze()
+
+
+def test_a_first_thread_comes_to_its_end_before_the_others_are_stopped(
+    compiled: Compiled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Until it is a zombie it may still write where those wait who join it."""
+    seen: list[str] = []
+    read, seize = procfs.thread_stat, Tracee.seize
+
+    def about_to_end(pid: int, tid: int) -> Stat:
+        stat = read(pid, tid)
+        if pid != tid or seen.count("ends") >= 3:
+            return stat
+        seen.append("ends")
+        return replace(stat, state="R", flags=stat.flags | procfs.PF_EXITING)
+
+    def noted(tracee: Tracee, options: int = 0) -> None:
+        seen.append("seized")
+        seize(tracee, options)
+
+    with ended(started(compiled, tmp_path)) as tracee:
+        threads = Threads(Tracee(spokesman_of(tracee.pid)), process=tracee.pid)
+        monkeypatch.setattr(procfs, "thread_stat", about_to_end)
+        monkeypatch.setattr(Tracee, "seize", noted)
+        threads.freeze()
+        threads.thaw()
+        threads.close()
+    assert seen == ["ends"] * 3 + ["seized"] * 4
+
+
+def test_spokesmen_that_end_one_after_the_other_are_not_followed_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    ids = itertools.count(2)
+    asked: list[int] = []
+    monkeypatch.setattr("checkpoint.linux.spokesman.spokesman_of", lambda _: next(ids))
+
+    def question(tid: int) -> None:
+        asked.append(tid)
+        assert len(asked) <= SPOKESMEN_MAX, "for ever"
+
+    with pytest.raises(ProbeError, match="its threads end while it is looked at"):
+        told_by_spokesman(1, question)
 
 
 @needs_lending

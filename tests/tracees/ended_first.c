@@ -1,7 +1,7 @@
 /* Its first thread has ended; the others go on, and must find it ended in every life.
  *
  * Second argument: nothing; "late": the first thread ends when there is a file "leave"; "brief": the eldest of the others ends
- * when there is a file "hush"; "status": at the end all end one by one, each with another status;
+ * when there is a file "hush"; "exec": that one executes another program then; "status": at the end all end one by one, each with another status;
  * "child": it has one.
  */
 #include "tracee.h"
@@ -84,6 +84,10 @@ static void *work(void *argument) {
     if (number == 0 && is("brief")) {
         while (!is_told("hush")) usleep(2000);
         return NULL;
+    }
+    if (number == 0 && is("exec")) {
+        while (!is_told("hush")) usleep(2000);
+        execl("/bin/sleep", "sleep", "1000", NULL);
     }
     while (number == 1 && !is("late") && state_of_first() != 'Z') usleep(1000);
     if (number == 1) ready();
