@@ -123,7 +123,9 @@ def _own_notes(view: ComponentView, figures: Figures | None) -> tuple[str, ...]:
 def _over_budget(view: ComponentView, figures: Figures | None, settings: Settings) -> tuple[str, ...]:
     """Where its snapshots do not keep to what its operator allows them."""
     budget_ms = settings.component(view.name).freeze_budget_ms
-    remark = figures.budget.remark(budget_ms) if figures is not None and budget_ms else ""
+    if figures is None or not budget_ms or view.state not in PRIMARY_STATES:
+        return ()
+    remark = figures.budget.remark(budget_ms)
     return (remark,) if remark else ()
 
 

@@ -14,8 +14,6 @@ from checkpoint.model import Credentials, Fact, Member, Resource, Snapshot
 KIND: Final = "thread_rights"
 CONFINED: Final = "seccomp"
 """The kind of resource of `checkpoint.resources.seccomp`."""
-SLICED: Final = "deadlines"
-"""The kind of resource of `checkpoint.resources.deadlines`."""
 MALFORMED: Final = "the rights of its threads are told in a way that this version does not know: use the version that captured it"
 
 
@@ -42,21 +40,6 @@ def could_gain(outline: Snapshot) -> bool:
         for one in processes
         for tid in _filtered(one.resources)
     )
-
-
-def slices(resources: Iterable[Resource]) -> Iterator[tuple[int, int, int]]:
-    """Thread, policy and nice value of each that has a deadline, or time slices, of its own.
-
-    Raises:
-        FormatError: they are told in another way than we know.
-    """
-    for held in resources:
-        for fact in _listed(held.facts.get("threads")) if held.kind == SLICED else ():
-            match _listed(fact):
-                case [int(tid), int(policy), int(nice), *_]:
-                    yield tid, policy, nice
-                case _:
-                    raise FormatError(MALFORMED)
 
 
 def _filtered(resources: Iterable[Resource]) -> Iterator[int]:

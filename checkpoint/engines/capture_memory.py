@@ -188,7 +188,7 @@ class MemoryCapture:
             self._read_into(copied, missing)
             self.refresh()
             last, before = pages.total_size(missing), last
-            if turn >= PASS_LIMIT and last > CATCHING_UP * before:
+            if turn >= PASS_LIMIT and last >= CATCHING_UP * before:
                 break
         copied.owed = pages.difference(self._since_acknowledged(base=base)[0], copied.valid)
         return copied

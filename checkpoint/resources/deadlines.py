@@ -23,9 +23,8 @@ from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.tasks import thread_ids
 from checkpoint.model import Fact, Resource
 from checkpoint.resources.rebuilding import number_of
-from checkpoint.rights import SLICED
 
-KIND: Final = SLICED
+KIND: Final = "deadlines"
 
 CAPABILITIES: Final = (
     preserved(

@@ -12,7 +12,6 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -24,7 +23,7 @@ from checkpoint.errors import FormatError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.linux.vessel import Birth, spawn_program
 from checkpoint.model import Credentials, Fact, Member, Resource, Snapshot
-from checkpoint.rights import CONFINED, KIND, SLICED
+from checkpoint.rights import CONFINED, KIND
 from tests.samples.make import sample, tree_sample
 
 SOMEBODY = 7001
@@ -193,72 +192,6 @@ def test_a_filter_under_which_rights_could_be_gained_is_roots_alone() -> None:
         check_rights("/lab/r1/mapper", confined(free, [[tid, False, [0]]]), SOMEBODY, None)
 
 
-STARTED = Inheritance(SOMEBODY, SOMEBODY, limits={7: (1024, 4096), 13: (20, 25), 14: (0, 10)}, nice=0)
-"""With nice values down to -5, and real-time priorities up to 10."""
-
-
-def scheduled(**changes: Any) -> Snapshot:
-    """A program whose second thread is scheduled in some way, and with the limits that it was started with."""
-    outline = running_as(credentials(SOMEBODY))
-    ordinary = replace(outline.threads[0], policy=os.SCHED_OTHER, priority=0, nice=0)
-    threads = (ordinary, replace(ordinary, tid=ordinary.tid + 1, **changes))
-    return replace(outline, process=replace(outline.process, limits=dict(STARTED.limits)), threads=threads)
-
-
-def limited(**changes: tuple[int, int]) -> Snapshot:
-    outline = scheduled()
-    limits = {**STARTED.limits, **{int(number[1:]): pair for number, pair in changes.items()}}
-    return replace(outline, process=replace(outline.process, limits=limits))
-
-
-def sliced(policy: int, nice: int) -> Snapshot:
-    """One whose thread is told to have a deadline, or slices, of its own, whatever is said of it otherwise."""
-    outline = scheduled()
-    told: list[Fact] = [[outline.threads[0].tid, policy, nice, 1_000_000, 10_000_000, 10_000_000]]
-    return replace(outline, resources=(Resource(SLICED, "deadlines and slices", {"descriptors": [], "threads": told}),))
-
-
-@as_root
-@pytest.mark.parametrize(
-    ("outline", "said"),
-    [
-        (scheduled(), ""),
-        (scheduled(policy=os.SCHED_FIFO, priority=10), ""),
-        (scheduled(policy=os.SCHED_FIFO, priority=11), "has the real-time priority 11"),
-        (scheduled(policy=os.SCHED_RR | os.SCHED_RESET_ON_FORK, priority=99), "has the real-time priority 99"),
-        (scheduled(policy=6), "is scheduled by deadlines"),
-        (scheduled(nice=-5), ""),
-        (scheduled(nice=-6), "has the nice value -6"),
-        (scheduled(nice=19), ""),
-        (limited(_7=(4096, 4096)), ""),
-        (limited(_7=(1024, 4097)), r"its limit 7 \(RLIMIT\) is 4097"),
-        (limited(_7=(1024, -1)), r"its limit 7 \(RLIMIT\) is none"),
-        (limited(_7=(1024, -2)), r"its limit 7 \(RLIMIT\) is -2"),
-        (limited(_0=(-1, -1)), ""),
-        (sliced(os.SCHED_OTHER, -5), ""),
-        (sliced(os.SCHED_OTHER, -6), "has the nice value -6"),
-        (sliced(6, 0), "is scheduled by deadlines"),
-    ],
-)
-def test_more_of_the_machine_than_it_was_started_with_is_roots_alone(outline: Snapshot, said: str) -> None:
-    check_rights("/lab/r1/mapper", outline, 0, STARTED)
-    check_rights("/lab/r1/mapper", outline, SOMEBODY, None)
-    if not said:
-        check_rights("/lab/r1/mapper", outline, SOMEBODY, STARTED)
-        return
-    with pytest.raises(MismatchError, match=said + ", which is more than what uid 7001 started it with allows"):
-        check_rights("/lab/r1/mapper", outline, SOMEBODY, STARTED)
-
-
-@as_root
-def test_deadlines_that_are_told_as_nobody_knows_them_are_refused() -> None:
-    outline = scheduled()
-    strange = Resource(SLICED, "deadlines and slices", {"descriptors": [], "threads": [[outline.threads[0].tid, "6"]]})
-    with pytest.raises(FormatError, match="told in a way that this version does not know"):
-        check_rights("/lab/r1/mapper", replace(outline, resources=(strange,)), SOMEBODY, STARTED)
-
-
-@as_root
 @pytest.mark.parametrize(("bits", "allowed"), [(0, True), (1 << 4, True), (1 << 2, False), (0b1111, False)])
 def test_securebits_are_roots_alone(bits: int, allowed: bool) -> None:
     outline = running_as(replace(credentials(SOMEBODY), securebits=bits))
