@@ -125,7 +125,11 @@ class CapturedProcess:
     @classmethod
     def entered(cls, met: Met, order: ProtectOrder, slot: int = 0) -> CapturedProcess:
         """Enter a process that runs."""
-        return cls(met.threads, entering.enter(met.threads, met.interruptions), order, slot, met.born)
+        try:
+            return cls(met.threads, entering.enter(met.threads, met.interruptions), order, slot, met.born)
+        except BaseException:
+            met.threads.close()
+            raise
 
     @classmethod
     def entered_first(cls, pid: int, order: ProtectOrder) -> CapturedProcess:

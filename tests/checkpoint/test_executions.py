@@ -8,12 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from checkpoint.engine import ProtectOrder
+from checkpoint.engines import entering
 from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.tasks import thread_ids
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee, no_stop
-from tests.checkpoint.round_trip import PATIENCE_S, Program, ended, expect_ok, start_tracee
+from tests.checkpoint.round_trip import ENGINE, PATIENCE_S, Program, ended, expect_ok, start_tracee
 from tests.checkpoint.test_threads import open_descriptors, states, tracers
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
@@ -162,6 +164,22 @@ def test_who_looks_whether_a_program_has_ended_takes_no_note_of_its_stops(compil
         assert tracee.poll() is None
         assert leader.reported() is not None
         leader.detach()
+
+
+def test_a_protection_that_fails_leaves_nothing_open_however_long_its_error_is_kept(
+    compiled: Compiled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def give_up(threads: Threads, _: object) -> None:
+        threads.freeze()
+        threads.thaw()
+        raise CaptureError("it has become another program")
+
+    with ended(start_tracee(compiled("executes", "-O2", "-pthread"), tmp_path)) as tracee:
+        ours = open_descriptors()
+        monkeypatch.setattr(entering, "enter", give_up)
+        with pytest.raises(CaptureError, match="another program") as kept:
+            ENGINE.protect(tracee.pid, ProtectOrder("/test/tracee"))
+        assert open_descriptors() == ours, kept
 
 
 def expect_unharmed(tracee: Program, threads: Threads) -> None:
