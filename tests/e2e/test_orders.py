@@ -128,7 +128,9 @@ def test_a_released_program_outlives_an_agent_restart_and_a_namesake(pair: Pair)
     protected_count(pair)
     inner = robots.component(first, "count")["pid"]
     released = robots.host_pid(first, inner)
+    assert list(first.directory.rglob("*.running"))
     order(first, "release", name="count")
+    robots.until(lambda: not list(first.directory.rglob("*.running")), "its guard, too, to be told, and its record to go")
     lanes = first.status()["lanes_pid"]
     os.kill(robots.host_pid(first, lanes), signal.SIGKILL)
     robots.until(lambda: robots.answers(first) and first.status()["lanes_pid"] != lanes, "the agent's other half to be back")
