@@ -11,12 +11,12 @@ from __future__ import annotations
 import os
 from typing import Final
 
+from agent.caller import ROOT
 from checkpoint import rights
 from checkpoint.errors import MismatchError
 from checkpoint.linux.inheritance import Inheritance
-from checkpoint.model import Credentials, Member, Snapshot
+from checkpoint.model import Credentials, Snapshot
 
-ROOT: Final = 0
 SECBIT_KEEP_CAPS: Final = 1 << 4
 """The one of the securebits that anybody may set; execve(2) takes it back."""
 
@@ -40,7 +40,7 @@ def check_rights(name: str, outline: Snapshot, owner: int, started: Inheritance 
         reason = f"it runs with other rights than those of its owner, uid {owner}"
     elif rights.could_gain(outline):
         reason = "it is under a seccomp filter, but may gain rights by what it executes (no_new_privs is off)"
-    elif {one.process.root_directory for one in _processes(outline)} != {"/"}:
+    elif {one.process.root_directory for one in outline.processes} != {"/"}:
         reason = "it has a root directory of its own (chroot), by whose files it may gain rights"
     elif any(one.securebits & ~SECBIT_KEEP_CAPS for one in rights.everybodys(outline)):
         reason = "it has securebits, under which a set-user-id program may keep rights that it gives up"
@@ -48,10 +48,6 @@ def check_rights(name: str, outline: Snapshot, owner: int, started: Inheritance 
         return
     reason += ": only a program of root may; start it as root"
     raise MismatchError(f"cannot restore {name}: {reason}", (reason,))
-
-
-def _processes(outline: Snapshot) -> tuple[Snapshot | Member, ...]:
-    return outline, *outline.members
 
 
 def _are_no_more(theirs: Credentials, owner: int, groups: frozenset[int] | None) -> bool:

@@ -437,6 +437,11 @@ class Snapshot:
         return self.parent is None
 
     @property
+    def processes(self) -> tuple[Snapshot | Member, ...]:
+        """Each process of the component, as the first one and its members are told, the first one first."""
+        return self, *self.members
+
+    @property
     def is_tree(self) -> bool:
         """Whether it is of several processes."""
         return bool(self.members or self.zombies)

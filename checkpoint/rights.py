@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from typing import Final
 
 from checkpoint.errors import FormatError
-from checkpoint.model import Credentials, Fact, Member, Resource, Snapshot
+from checkpoint.model import Credentials, Fact, Resource, Snapshot
 
 KIND: Final = "thread_rights"
 CONFINED: Final = "seccomp"
@@ -19,8 +19,7 @@ MALFORMED: Final = "the rights of its threads are told in a way that this versio
 
 def everybodys(outline: Snapshot) -> Iterator[Credentials]:
     """The rights of every thread of every process."""
-    processes: tuple[Snapshot | Member, ...] = (outline, *outline.members)
-    for one in processes:
+    for one in outline.processes:
         first = one.process.credentials
         yield first
         yield from (of_thread(one.resources, thread.tid, first) for thread in one.threads)
@@ -34,10 +33,9 @@ def could_gain(outline: Snapshot) -> bool:
     Raises:
         FormatError: as `of_thread`.
     """
-    processes: tuple[Snapshot | Member, ...] = (outline, *outline.members)
     return any(
         not of_thread(one.resources, tid, one.process.credentials).no_new_privs
-        for one in processes
+        for one in outline.processes
         for tid in _filtered(one.resources)
     )
 

@@ -201,8 +201,7 @@ class Estate:
 
 def options_for(state: Snapshot) -> int:
     """Those with which a vessel is traced; whoever is born of it is traced with the same."""
-    everybodys = (state.resources, *(member.resources for member in state.members))
-    confined = any(map(seccomp.is_confined, everybodys))
+    confined = any(seccomp.is_confined(one.resources) for one in state.processes)
     return OPTIONS | (abi.PTRACE_O_SUSPEND_SECCOMP if confined else 0)
 
 

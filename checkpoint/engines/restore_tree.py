@@ -94,8 +94,7 @@ class TreeRestore:
 
     def pids(self) -> list[int]:
         """Theirs, as we see them, the first process first."""
-        processes = (self._state.process, *(member.process for member in self._state.members))
-        return [self._born[process.pid].pid for process in processes]
+        return [self._born[one.process.pid].pid for one in self._state.processes]
 
     def notes(self) -> tuple[str, ...]:
         """What differs, each once."""

@@ -255,8 +255,8 @@ def arriving(state: Snapshot, *, wanted: bool) -> tuple[Arriving, Snapshot]:
     lost: dict[int, str] = {}
     arrivals = []
     ended = []
-    for process, resources in enumerate((state.resources, *(member.resources for member in state.members))):
-        for held in resources:
+    for process, told in enumerate(state.processes):
+        for held in told.resources:
             if held.kind == KIND and not wanted and tcp_connections.is_carriable(held.facts):
                 ended.append(_connection(held.facts))
             if held.kind == KIND and TAKEN in held.facts:

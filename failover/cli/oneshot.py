@@ -21,7 +21,7 @@ from checkpoint.engine import Terms
 from checkpoint.errors import CaptureError, CheckpointError, NothingCommittedError, ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import kinship, namespaces, procfs, vessel
 from checkpoint.linux.vessel import Birth, Born
-from checkpoint.model import Member, Snapshot
+from checkpoint.model import Snapshot
 from failover.cli import picture, render
 from failover.cli.components import exit_like
 from failover.cli.keeper import Keeper
@@ -210,8 +210,7 @@ def _lacks_its_ids(outline: Snapshot) -> bool:
 
     Ids of what has just ended are waited for, for a while: its parent, or init, has yet to take note of that.
     """
-    processes: tuple[Snapshot | Member, ...] = (outline, *outline.members)
-    ids = {thread.tid for one in processes for thread in one.threads} | {zombie.pid for zombie in outline.zombies}
+    ids = {thread.tid for one in outline.processes for thread in one.threads} | {zombie.pid for zombie in outline.zombies}
     if len(ids) == 1 or not namespaces.may_choose_pids():
         return len(ids) > 1
     deadline = time.monotonic() + IDS_TIMEOUT_S
