@@ -98,6 +98,12 @@ def until_protected(robot: RobotMachine, name: str = "count") -> None:
     until(lambda: component(robot, name).get("protection") == "protected", "a checkpoint at the standby")
 
 
+def until_taken_over(robot: RobotMachine, name: str = "count") -> None:
+    """The robot has resumed the program: it is the primary a moment earlier, and the program may write before this is counted."""
+    until(lambda: component(robot, name).get("role") == "primary", f"{robot.name} to take {name} over")
+    until(lambda: component(robot, name).get("restores"), f"{robot.name} to resume {name}")
+
+
 def until_status(robot: RobotMachine, returncode: int, *words: str) -> str:
     """What `failover status` shows there, once it ends with this exit status and says all the words."""
     shown: subprocess.CompletedProcess[str] | None = None

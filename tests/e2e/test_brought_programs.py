@@ -69,7 +69,7 @@ def goes_on(robot: RobotMachine, act: Callable[[], object], name: str = "count")
     """The count has no gap after what is done to its robot."""
     before = len(robots.numbers(robot, name))
     act()
-    robots.until(lambda: robots.component(robot, name).get("role") == "primary", f"{robot.name} to take over")
+    robots.until_taken_over(robot, name)
     robots.until(lambda: len(robots.numbers(robot, name)) > before + 20, "the count to go on")
     counted = robots.numbers(robot, name)
     assert counted == list(range(len(counted)))

@@ -105,7 +105,7 @@ def test_a_program_that_keeps_its_state_outlives_its_robot(pair: tuple[RobotMach
     assert shown(second)["engine"] == "cooperative"
     assert not list(tmp_path.glob("*.state")), "no file beside a program that has an agent"
     first.cut_power()
-    robots.until(lambda: shown(second).get("role") == "primary", "robot2 to take over")
+    robots.until_taken_over(second)
     went_on(second, before, "taken-over")
     assert (shown(second)["restores"], shown(second)["epoch"]) == (1, 2)
     assert origins(second)[0].split()[2] == "2", "the program knows the epoch that it runs in"

@@ -137,7 +137,7 @@ def test_a_program_that_is_taken_over_before_it_says_so_can_still_say_it(
     start(first, tmp_path, WAITS + COUNTS)
     robots.until(lambda: captured_by(second, "ptrace"), "a checkpoint from outside")
     first.cut_power()
-    robots.until(lambda: shown(second).get("role") == "primary", "robot2 to take over")
+    robots.until_taken_over(second)
     (tmp_path / "go").touch()
     robots.until(lambda: shown(second)["engine"] == "cooperative" and len(lines(second)) > 20, "it to keep its state here")
     assert not list(tmp_path.glob("*.state")), "no file beside a program that has an agent"

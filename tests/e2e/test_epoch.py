@@ -53,7 +53,7 @@ def test_the_epoch_of_a_program_grows_with_a_handover_and_a_takeover(pair: Pair)
         robots.until_protected(there, "token")
         robots.until(lambda there=there: newest(there) == epoch(there), "the next epoch to be told")  # type: ignore[misc]
     first.cut_power()
-    robots.until(lambda: robots.component(second, "token").get("role") == "primary", "robot2 to take over")
+    robots.until_taken_over(second, "token")
     robots.until(lambda: newest(second) == epoch(second), "the last epoch to be told")
     told = robots.numbers(second, "token")
     assert told == sorted(told) and len(set(told)) == 4

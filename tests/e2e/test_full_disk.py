@@ -81,7 +81,7 @@ def test_a_full_standby_takes_over_from_what_it_holds(pair: Pair) -> None:
         robots.until_status(second, 1, "No space left on device")
         kept = len(robots.numbers(second))
         first.cut_power()
-        robots.until(lambda: robots.component(second, "count").get("role") == "primary", "robot2 to take over")
+        robots.until_taken_over(second)
         robots.until(lambda: robots.component(second, "count").get("pid") is not None, "the program to run")
     robots.until(lambda: len(robots.numbers(second)) > kept, "its output, once there is room for it")
     counted = robots.numbers(second)

@@ -59,7 +59,7 @@ def test_a_takeover_that_goes_on_from_this_robots_own_checkpoint_is_called_one(t
             robots.cable(robot, "down")  # snapshots travel over this one alone
         for pid in heart:
             os.kill(pid, signal.SIGSTOP)
-        robots.until(lambda: robots.component(second, "count").get("role") == "primary", "robot2 to take over")
+        robots.until_taken_over(second)
         told(second, "taken-over")
         for pid in heart:
             os.kill(pid, signal.SIGCONT)

@@ -23,7 +23,7 @@ def until_ready(standby: RobotMachine) -> dict[str, Any]:
 
 
 def count_goes_on(robot: RobotMachine) -> None:
-    robots.until(lambda: robots.component(robot, "count").get("role") == "primary", f"{robot.name} to take over")
+    robots.until_taken_over(robot)
     before = len(numbers(robots.output(robot, "count")))
     robots.until(lambda: len(numbers(robots.output(robot, "count"))) > before + 20, "the count to go on")
     counted = numbers(robots.output(robot, "count"))

@@ -36,7 +36,7 @@ def test_a_program_outlives_its_robot_and_its_output_has_no_gap(pair: tuple[Robo
     robots.until(lambda: robots.checkpoints(second, "count") >= SNAPSHOTS, "checkpoints at robot2")
     before = len(numbers(robots.output(second, "count")))
     first.cut_power()
-    robots.until(lambda: robots.component(second, "count").get("role") == "primary", "robot2 to take over")
+    robots.until_taken_over(second)
     robots.until(lambda: len(numbers(robots.output(second, "count"))) > before + 20, "the count to go on")
     counted = numbers(robots.output(second, "count"))
     assert counted == list(range(len(counted)))

@@ -44,7 +44,7 @@ def test_all_processes_of_a_program_go_on_at_the_other_robot(command: tuple[str,
         robots.until_protected(first)
         robots.until(lambda: len(robots.numbers(first)) > 30, "some numbers")
         first.cut_power()
-        robots.until(lambda: robots.component(second, "count").get("role") == "primary", "robot2 to take over")
+        robots.until_taken_over(second)
         before = len(robots.numbers(second))
         robots.until(lambda: len(robots.numbers(second)) > before + 30, "it to go on")
         counted = robots.numbers(second)

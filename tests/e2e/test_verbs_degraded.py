@@ -72,7 +72,7 @@ def test_a_takeover_from_an_old_checkpoint_says_how_old_it_is(pair: Pair, flag: 
     robots.until(lambda: robots.component(first, "count").get("state") == "degraded", "robot1 to notice")
     robots.until(lambda: robots.component(first, "count")["lag_ms"] > 2_500, "the checkpoint to grow old")
     first.cut_power()
-    robots.until(lambda: robots.component(second, "count").get("role") == "primary", "robot2 to take over")
+    robots.until_taken_over(second)
     robots.until_status(second, 1, "from a checkpoint that was ", " s old")
     told = robots.failover(second, "why", "count").stdout
     assert "s old, at robot2" in told, told

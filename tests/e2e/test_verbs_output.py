@@ -60,7 +60,7 @@ def test_whoever_watches_from_the_standby_sees_every_byte_once_across_a_takeover
     try:
         robots.until(lambda: len(lines(out)) > 20, "the output to be seen at robot2")
         first.cut_power()
-        robots.until(lambda: robots.component(second, "both").get("role") == "primary", "robot2 to take over")
+        robots.until_taken_over(second, "both")
         seen = len(lines(out))
         robots.until(lambda: len(lines(out)) > seen + 50 and len(lines(err)) > seen + 50, "the output to go on")
     finally:

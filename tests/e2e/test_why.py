@@ -43,7 +43,7 @@ def lines(robot: RobotMachine, words: str, *arguments: str) -> list[dict[str, An
 def test_a_takeover_is_told_with_what_was_seen_and_what_it_cost_and_outlives_the_agent(pair: Pair) -> None:
     first, second = pair
     first.cut_power()
-    robots.until(lambda: robots.component(second, "count").get("role") == "primary", "robot2 to take over")
+    robots.until_taken_over(second)
     robots.until(lambda: bool(lines(second, "goes on from checkpoint")), "the story to be told")
     (claim,) = lines(second, "claims epoch", "--robot", "robot2")
     (seen,) = claim["seen"]
@@ -111,7 +111,7 @@ def test_both_robots_tell_one_story_in_order_though_a_clock_is_wrong_by_five_sec
     robots.until_protected(first)
     agent = robots.host_pid(first, first.status()["pid"])
     os.kill(agent, signal.SIGSTOP)
-    robots.until(lambda: robots.component(second, "count").get("role") == "primary", "robot2 to take over")
+    robots.until_taken_over(second)
     os.kill(agent, signal.SIGCONT)
     robots.until(lambda: robots.component(first, "count").get("role") == "standby", "robot1 to follow")
     robots.until(lambda: bool(lines(first, "is told stale")), "the story to be told")
