@@ -38,6 +38,9 @@ SLOW_REPETITIONS: Final = 3
 
 SLOW_S: Final = 0.3
 
+LEVELS: Final = (-1, 1, 3)
+"""zstd's: ours, and two slower ones that a slow link might want."""
+
 Pages = dict[int, bytes]
 
 
@@ -121,10 +124,9 @@ def _ours(snapshot: Snapshot) -> Way:
 
 def _of_pages(pages: bytes) -> list[Way]:
     """The bare tools on the bare pages."""
-    packer, unpacker = zstandard.ZstdCompressor(level=-1), zstandard.ZstdDecompressor()
     lz4 = _lz4()
     return [
-        Way("zstd −1", lambda: packer.compress(pages), unpacker.decompress),
+        *(_zstd(level, pages) for level in LEVELS),
         *([Way("lz4", lambda: lz4.pack(pages), lambda packed: lz4.unpack(packed, len(pages)))] if lz4 else []),
         Way("zlib, level 1", lambda: zlib.compress(pages, 1), zlib.decompress),
         Way(
@@ -133,6 +135,12 @@ def _of_pages(pages: bytes) -> list[Way]:
             lambda packed: pickle.loads(gzip.decompress(packed)),
         ),
     ]
+
+
+def _zstd(level: int, pages: bytes) -> Way:
+    """zstd at one of its levels."""
+    packer, unpacker = zstandard.ZstdCompressor(level=level), zstandard.ZstdDecompressor()
+    return Way(f"zstd {level}".replace("-", "−"), lambda: packer.compress(pages), unpacker.decompress)
 
 
 def _changes_only(delta: Snapshot, before: Pages) -> Way:
