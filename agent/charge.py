@@ -61,7 +61,8 @@ class Charge:
     copy: ReadyCopy = field(init=False)
     _snapshots: Snapshots = field(init=False)
     _occasions: Occasions = field(init=False)
-    _queue: asyncio.Queue[Act] = field(default_factory=asyncio.Queue)
+    _queue: asyncio.Queue[Act | asyncio.Future[None]] = field(default_factory=asyncio.Queue)
+    """A future is done once everything before it has been carried out, or was in vain."""
     _tasks: set[asyncio.Task[None]] = field(default_factory=set)
     _stopping: bool = False
     _coming: Component | None = None
@@ -72,6 +73,8 @@ class Charge:
     """Whether the core wants it to stand still, whatever is still in the queue."""
     _is_thaw_owed: bool = False
     """A thaw was refused, for its lease was over by then; the next lease brings it."""
+    _not_let_go: Exception | None = None
+    """Why the order to let it go was in vain; None: it was not, or somebody has been told."""
 
     def __post_init__(self) -> None:
         self.standby = Standby(self.name, self.around.places)
@@ -138,6 +141,19 @@ class Charge:
         self.started.set()
         self._watch_the_end()
 
+    async def let_go(self) -> None:
+        """Wait until the guard has been told of an order to let go: before that, the next lanes would find the program again.
+
+        Raises:
+            AgentError: it was in vain; with the reason.
+        """
+        reached = asyncio.get_running_loop().create_future()
+        self._queue.put_nowait(reached)
+        await reached
+        trouble, self._not_let_go = self._not_let_go, None
+        if trouble is not None:
+            raise AgentError(f"cannot let {self.name} go: {trouble}") from trouble
+
     async def close(self) -> None:
         """Let everything go; the program runs on."""
         for task in self._tasks:
@@ -159,6 +175,10 @@ class Charge:
     async def _work(self) -> None:
         while True:
             act = await self._queue.get()
+            if isinstance(act, asyncio.Future):
+                if not act.done():  # who waited for it may have hung up
+                    act.set_result(None)
+                continue
             if act.epoch < self.epoch and not isinstance(act, acts.Stop):  # type: ignore[union-attr]
                 log.info("%s: an order of epoch %d came after epoch %d; dropped", self.name, act.epoch, self.epoch)  # type: ignore[union-attr]
                 continue
@@ -214,6 +234,8 @@ class Charge:
         if not isinstance(act, acts.Capture) or reasons != self.figures.reasons:  # a capture is tried again every second
             log.warning("%s: %s: %s", self.name, type(act).__name__, message)
         match act:
+            case acts.LetGo():
+                self._not_let_go = trouble
             case acts.Capture():
                 unsupported = isinstance(trouble, UnsupportedError)
                 self.figures.reasons = reasons

@@ -177,11 +177,12 @@ class Verbs(Questions):
         return {"name": name, "pid": wanted.pid, "notes": list(charge.figures.notes)}
 
     async def release(self, arguments: dict[str, Any]) -> dict[str, Any]:
-        """Let a component run on unprotected."""
+        """Let a component run on unprotected; answers once its guard has been told, so that no later agent finds it again."""
         name = await self._known(arguments_of(NameArguments, "release", arguments).name)
         charge = self._lanes.charge(name)
         pid = charge.component.pid if charge.component is not None else None
         await self._command(lambda number: events.Release(number, name))
+        await charge.let_go()  # the order came before the answer
         return {"name": name, "pid": pid}
 
     async def stop(self, arguments: dict[str, Any]) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -19,6 +20,7 @@ from agent.following import Following
 from agent.records import Records
 from agent.standby import Standby
 from agent.surroundings import Surroundings
+from agent.verbs import Verbs
 from checkpoint.model import Position
 from failover.core import acts
 
@@ -150,3 +152,61 @@ def test_a_takeover_that_what_waited_cannot_carry_out_starts_the_program_anew(
         assert tried == [waiting, None]
 
     asyncio.run(run())
+
+
+class Guarded:
+    """Stands for a component whose guard answers late, or not at all."""
+
+    pid = 1
+
+    def __init__(self, trouble: GuardError | None = None) -> None:
+        self.answers = asyncio.Event()
+        self.trouble = trouble
+
+    async def release(self) -> None:
+        await self.answers.wait()
+        if self.trouble is not None:
+            raise self.trouble
+
+
+def released(directory: Path, trouble: GuardError | None = None) -> Exception | None:
+    """Have a component released as an operator orders it; what he is told, which is nothing before its guard has answered."""
+
+    async def run() -> Exception | None:
+        none = cast(Any, None)
+        around = Surroundings(none, none, Records(directory), lambda _: None, none, none, lambda _: ComponentConfig())
+        guard = Guarded(trouble)
+        charge = Charge(NAME, around, cast(Component, guard), epoch=3)
+        charge.begin()
+
+        async def command(_: object) -> acts.Answer:
+            charge.order(acts.LetGo(NAME, 3))
+            return acts.Answer(1, True, "it is protected no longer")
+
+        async def known(name: str) -> str:
+            return name
+
+        verbs = Verbs.__new__(Verbs)
+        verbs.__dict__.update(_lanes=SimpleNamespace(charge=lambda _: charge), _command=command, _known=known)
+        answer = asyncio.create_task(verbs.release({"name": NAME}))
+        await settled()
+        assert not answer.done()
+        guard.answers.set()
+        (outcome,) = await asyncio.gather(answer, return_exceptions=True)
+        for task in tuple(charge._tasks):
+            task.cancel()
+        return outcome if isinstance(outcome, Exception) else None
+
+    return asyncio.run(run())
+
+
+def test_a_release_is_answered_once_the_guard_has_been_told(tmp_path: Path) -> None:
+    records = Records(tmp_path)
+    records.note(NAME, 3)
+    assert released(tmp_path) is None
+    assert not records.epoch(NAME)
+
+
+def test_a_release_that_the_guard_was_not_told_of_is_not_said_to_be_one(tmp_path: Path) -> None:
+    told = released(tmp_path, GuardError("its guard is gone"))
+    assert str(told) == f"cannot let {NAME} go: its guard is gone"
