@@ -245,7 +245,8 @@ def test_a_program_that_is_stopped_does_not_run_because_a_keeper_is_late(
     session.capture(CaptureOrder(base=True, generation=1, sequence=1))
     session.close()
     monkeypatch.undo()
-    assert (procfs.stat(worker.pid).state, (worker.directory / "turn").read_bytes()) == ("T", turn)
+    worker.wait_until(lambda: procfs.stat(worker.pid).state == "T", "it to be stopped as it was")
+    assert (worker.directory / "turn").read_bytes() == turn
     os.kill(worker.pid, signal.SIGCONT)
     expect_undisturbed(worker)
 

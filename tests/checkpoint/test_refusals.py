@@ -325,9 +325,10 @@ def test_a_stopped_program_is_still_stopped_after_a_capture(compiled: Compiled, 
         os.kill(tracee.pid, signal.SIGSTOP)
         tracee.wait_until(lambda: _state(tracee.pid) == "T", "it stopped")
         captured(tracee)
+        tracee.wait_until(lambda: _state(tracee.pid) == "T", "it stopped again")  # it has some way there
         deadline = time.monotonic() + 0.1
         while time.monotonic() < deadline:
-            assert _state(tracee.pid) in "Tt"
+            assert _state(tracee.pid) == "T"
         tracee.tell()
         os.kill(tracee.pid, signal.SIGCONT)
         expect_ok(tracee)

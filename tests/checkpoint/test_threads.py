@@ -170,6 +170,7 @@ def test_a_stopped_program_of_many_threads_is_still_stopped_after_a_capture(comp
         tracee.wait_until(lambda: set(states(tracee.pid)) == {"T"}, "all stopped")
         for _ in range(3):
             captured(tracee)
+        tracee.wait_until(lambda: set(states(tracee.pid)) == {"T"}, "all stopped again")  # each of them has some way there
         deadline = time.monotonic() + 0.1
         while time.monotonic() < deadline:
             assert set(states(tracee.pid)) == {"T"}

@@ -82,7 +82,7 @@ for child, number in ((untold, signal.SIGSTOP), (told, signal.SIGSTOP), (by_term
     os.setpgid(child, child)
     os.kill(child, number)
     os.waitid(os.P_PID, child, os.WSTOPPED | (0 if child == told else os.WNOWAIT))
-while signal.sigtimedwait([signal.SIGCHLD], 0.5):  # a stop can be waited for a moment before the kernel sends the signal for it
+while signal.sigtimedwait([signal.SIGCHLD], 2):  # a stop can be waited for a moment before the kernel sends the signal for it
     pass
 is_ready()
 expect("signals of the restore", signal.sigtimedwait([signal.SIGCHLD], 0), None)
