@@ -35,6 +35,7 @@ from checkpoint.chain import position_of
 from checkpoint.engine import COOPERATIVE, CaptureOrder
 from checkpoint.errors import CaptureError, NothingCommittedError, RestoreError, SegmentError, UnsupportedError
 from checkpoint.linux import abi, procfs
+from checkpoint.linux.spokesman import spokesman_of, told_by_spokesman
 from checkpoint.model import (
     Clocks,
     Credentials,
@@ -103,7 +104,7 @@ class CooperativeSession:
         self._outputs = outputs
         self._reader = reader
         self._component = component
-        self._process = describe_process(pid)
+        self._process = told_by_spokesman(pid, describe_process)
         self._directory = self._process.working_directory
         self.program: tuple[Resource, ...] = ()
         """What it is started again from, as `checkpoint.program_files` tells it."""
@@ -166,9 +167,9 @@ class CooperativeSession:
             return self._reader.read(since), None
         from checkpoint.resources.carried_trees import mapped_shared
 
-        self._trees.prepare(mapped_shared(self._pid))
+        self._trees.prepare(told_by_spokesman(self._pid, mapped_shared))
         with contextlib.nullcontext() if is_held else _standing_still(self._pid):
-            seen = self._trees.look(mapped_shared(self._pid))
+            seen = self._trees.look(told_by_spokesman(self._pid, mapped_shared))
             committed = self._reader.read(since)
         if reasons := self._trees.reasons(seen):
             raise UnsupportedError(f"cannot capture {self._component}: {'; '.join(reasons)}", reasons)
@@ -284,7 +285,7 @@ def _standing_still(pid: int) -> Iterator[None]:
     from checkpoint.linux.threads import Threads
     from checkpoint.linux.tracee import Tracee
 
-    threads = Threads(Tracee(pid))
+    threads = Threads(Tracee(spokesman_of(pid)), process=pid)
     threads.freeze()
     try:
         yield
@@ -318,13 +319,16 @@ def this_machine(robot: str) -> Machine:
 def describe_process(pid: int) -> ProcessState:
     """What is true of a program whose memory is not carried: who it is and how it was started.
 
+    Args:
+        pid: by which it is looked at (`checkpoint.linux.spokesman`).
+
     Raises:
         ProcessGoneError: it ended.
     """
     status = procfs.status(pid)
     arguments = procfs.read_bytes(pid, "cmdline").rstrip(b"\0").split(b"\0")
     return ProcessState(
-        pid=pid,
+        pid=status.tgid,
         ppid=0,
         pgid=0,
         sid=0,
@@ -343,6 +347,9 @@ def describe_process(pid: int) -> ProcessState:
 
 def open_segment(pid: int) -> SegmentReader:
     """The segment that a process commits to, found among its descriptors.
+
+    Args:
+        pid: by which it is looked at (`checkpoint.linux.spokesman`).
 
     Raises:
         CaptureError: it has none, or several, or is another user's.

@@ -29,6 +29,7 @@ from checkpoint.engines.cooperative import CooperativeSession, now, open_segment
 from checkpoint.engines.outputs import Outputs
 from checkpoint.errors import CaptureError, ProcessGoneError, RestoreError, UnsupportedError
 from checkpoint.linux import procfs
+from checkpoint.linux.spokesman import spokesman_of, told_by_spokesman
 from checkpoint.model import Position, Snapshot
 from checkpoint.needs import program_of
 from checkpoint.resources import carried_trees
@@ -59,13 +60,13 @@ class GuardedTask:
 
     def capture(self, order: CaptureOrder) -> Snapshot:
         """See `checkpoint.engine.Session.capture`."""
-        if procfs.status(self.pid).state in "ZX":
+        if procfs.status(self.pid).has_ended:
             raise ProcessGoneError(f"the process of {self.component} that keeps its state (pid {self.pid}) has ended")
         session = self._following()
         if order.base or time.monotonic() >= self._look_at_s:
             self._look_at_s = time.monotonic() + LOOK_S
             arguments, directory = session.process.arguments, session.process.working_directory
-            program = program_files.describe(self.pid, self.component, arguments, directory)
+            program = program_files.describe(spokesman_of(self.pid), self.component, arguments, directory)
             session.program = (program,) if program is not None else ()
         return session.capture(order)
 
@@ -76,7 +77,7 @@ class GuardedTask:
 
     def unchanged(self) -> Position | None:
         """The newest acknowledged position, if a capture would say nothing new; None: capture."""
-        if self._session is None or self._session.reader.is_superseded or procfs.status(self.pid).state in "ZX":
+        if self._session is None or self._session.reader.is_superseded or procfs.status(self.pid).has_ended:
             return None
         return self._session.unchanged()
 
@@ -96,7 +97,7 @@ class GuardedTask:
     def open_file(self, path: str, digest: bytes) -> int:
         """See `checkpoint.engine.Session.open_file`."""
         try:
-            return program_files.open_file(self.pid, path)
+            return program_files.open_file(spokesman_of(self.pid), path)
         except OSError as error:
             raise CaptureError(f"cannot open {path} of {self.component}: {error.strerror}") from error
 
@@ -117,10 +118,10 @@ class GuardedTask:
             CaptureError: there is none.
         """
         if self._session is None:
-            reader, trees = open_segment(self.pid), self._follow_files()
+            reader, trees = told_by_spokesman(self.pid, open_segment), self._follow_files()
             self._session = CooperativeSession(reader, self.pid, self.component, self._outputs, trees)
         elif self._session.reader.is_superseded:
-            self._session.go_on_in(open_segment(self.pid))
+            self._session.go_on_in(told_by_spokesman(self.pid, open_segment))
         return self._session
 
     def _follow_files(self) -> CarriedTrees | None:
@@ -130,7 +131,7 @@ class GuardedTask:
             UnsupportedError: they cannot be carried.
         """
         if self._trees is None and self._carry.paths:
-            trees = carried_trees.followed(self.pid, self._carry)
+            trees = told_by_spokesman(self.pid, lambda tid: carried_trees.followed(tid, self._carry))
             assert trees is not None, "it has paths"
             if reasons := trees.refuse():
                 trees.close()
@@ -150,7 +151,7 @@ class CooperativeEngine:
 
     def probe(self, pid: int) -> Report:
         """See `checkpoint.engine.Engine.probe`: nothing stands in the way of a program that keeps its state itself."""
-        arguments = procfs.read_bytes(pid, "cmdline").rstrip(b"\0").split(b"\0")
+        arguments = told_by_spokesman(pid, lambda tid: procfs.read_bytes(tid, "cmdline")).rstrip(b"\0").split(b"\0")
         command = " ".join(word.decode(errors="replace") for word in arguments)
         text = "only what it commits comes back; the program is started again and resumes from that"
         return Report(pid, command, 0, "versions", (Finding("process", f"pid {pid}", NOTED, text),))

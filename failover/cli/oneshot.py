@@ -222,7 +222,7 @@ def _lacks_its_ids(outline: Snapshot) -> bool:
 def _is_ending(pid: int) -> bool:
     """Whether a PID is of a process that has ended, and was not reaped."""
     with contextlib.suppress(ProbeError, ProcessGoneError):
-        return procfs.status(pid).state in "ZX"
+        return procfs.status(pid).has_ended
     return False
 
 
