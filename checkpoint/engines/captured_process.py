@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 
 from checkpoint.arch import extended
@@ -35,6 +35,7 @@ from checkpoint.resources import (
     Opened,
     aio_rings,
     deadlines,
+    death_signals,
     gather,
     logins,
     memory_locks,
@@ -280,9 +281,16 @@ class CapturedProcess:
             *untouched.describe(look.taken.lines, look.taken.untouched, look.standing.opened),
             *self._limits(look.standing),
             *deadlines.describe(self.pid),
+            *death_signals.describe(self._death_signals(look.standing)),
             *logins.describe(self.pid),
             *self.onlooker.tables.describe(),
         )
+
+    def _death_signals(self, standing: Standing) -> Iterator[tuple[int, int]]:
+        """By thread, of those besides the first."""
+        if self.ended_first is not None:  # another one speaks for it
+            yield standing.status.pids[-1], standing.told.parent_death_signal
+        yield from ((other.place.inner_tid, other.death_signal) for other in standing.others)
 
     def _limits(self, standing: Standing) -> tuple[Resource, ...]:
         """What its threads may, and what they are confined to.

@@ -55,6 +55,7 @@ from checkpoint.resources import (
     aio_rings,
     carried_connections,
     deadlines,
+    death_signals,
     departed,
     files,
     joint,
@@ -549,6 +550,7 @@ class ProcessRestore:
         thread_tables.part(table, self._state.resources, thread.tid, open_here(self._state))
         self._confine(table, thread, credentials)
         restore_process.rights(table, replace(process, credentials=credentials), vessel)
+        death_signals.rebuild(table, self._state.resources, thread.tid)
         restore_process.pending_of_thread(table, process, thread, vessel.inner_pid, thread.tid)
         switches.set_again(table, [switch for switch in process.switches if switch[0] in switches.OF_THREADS])
         return table

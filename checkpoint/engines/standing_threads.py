@@ -112,6 +112,11 @@ class ThreadStanding:
         """Of prctl(2), PR_GET_TIMERSLACK."""
         return self.questions.timer_slack_in(self.answers)
 
+    @property
+    def death_signal(self) -> int:
+        """Of prctl(2), PR_GET_PDEATHSIG; 0 for none."""
+        return self.questions.death_signal_in(self.answers)
+
 
 class ThreadQuestions:
     """The calls that one thread makes at one desk."""
@@ -123,6 +128,8 @@ class ThreadQuestions:
         self._clear_tid = self.batch.output(8)
         self._told_clear_tid = self.batch.add("prctl", abi.PR_GET_TID_ADDRESS, self._clear_tid)
         self._slack = self.batch.add("prctl", abi.PR_GET_TIMERSLACK)
+        self._death_signal = self.batch.output(4)
+        self.batch.add("prctl", abi.PR_GET_PDEATHSIG, self._death_signal)
 
     def altstack_in(self, answers: Answers) -> tuple[int, int, int]:
         """(address, flags, size)."""
@@ -142,6 +149,10 @@ class ThreadQuestions:
             )
             raise UnsupportedError(f"cannot capture: {reason}", (reason,))
         return int.from_bytes(answers.at(self._clear_tid, 8), "little")
+
+    def death_signal_in(self, answers: Answers) -> int:
+        """0 for none."""
+        return int.from_bytes(answers.at(self._death_signal, 4), "little")
 
     def timer_slack_in(self, answers: Answers) -> int:
         """In nanoseconds."""

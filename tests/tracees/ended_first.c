@@ -52,6 +52,9 @@ static void compare(int number) {
     uint64_t wanted[64];
     fill(wanted, sizeof wanted, number);
     EXPECT(!memcmp(own, wanted, sizeof own), "worker %d: thread-local storage", number);
+    int death_signal = 0;
+    prctl(PR_GET_PDEATHSIG, &death_signal);
+    EXPECT_EQUAL("signal at the parent's death", death_signal, SIGURG);
     EXPECT(tgkill(process, process, 0) == 0, "worker %d: nobody has the first thread's id", number);
     pthread_mutex_unlock(&lock);
 }
@@ -76,6 +79,7 @@ static void *work(void *argument) {
     char name[16];
     snprintf(name, sizeof name, "worker %d", number);
     prctl(PR_SET_NAME, name);
+    prctl(PR_SET_PDEATHSIG, SIGURG);
     fill(own, sizeof own, number);
     pthread_mutex_lock(&lock);
     waiting++;

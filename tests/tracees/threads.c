@@ -29,7 +29,7 @@ struct marks {
     stack_t altstack;
     void *robust, *clear_tid, *pointer;
     size_t robust_length;
-    int policy, nice, io_priority, slack, has_rseq;
+    int policy, nice, io_priority, slack, death_signal, has_rseq;
     pid_t tid;
     cpu_set_t processors;
     uint64_t own_sum;
@@ -48,6 +48,7 @@ static void look(struct marks *marks) {
     marks->nice = getpriority(PRIO_PROCESS, 0);
     marks->io_priority = syscall(SYS_ioprio_get, 1, 0);
     marks->slack = prctl(PR_GET_TIMERSLACK);
+    prctl(PR_GET_PDEATHSIG, &marks->death_signal);
     marks->tid = syscall(SYS_gettid);
     sched_getaffinity(0, sizeof marks->processors, &marks->processors);
     char *area = (char *)__builtin_thread_pointer() + __rseq_offset;
@@ -70,6 +71,8 @@ static void compare(const struct marks *before, const struct marks *after) {
     EXPECT(before->nice == after->nice, "%s: nice %d, was %d", name, after->nice, before->nice);
     EXPECT(before->io_priority == after->io_priority, "%s: I/O priority", name);
     EXPECT(before->slack == after->slack, "%s: timer slack %d, was %d", name, after->slack, before->slack);
+    EXPECT(before->death_signal == after->death_signal, "%s: signal at the parent's death %d, was %d", name, after->death_signal,
+           before->death_signal);
     EXPECT(before->tid == after->tid, "%s: tid %d, was %d", name, after->tid, before->tid);
     EXPECT(CPU_EQUAL(&before->processors, &after->processors), "%s: processors", name);
     EXPECT(before->has_rseq == after->has_rseq, "%s: rseq", name);
@@ -101,6 +104,8 @@ static void become(int number) {
     if (number % 3 == 1) sched_setscheduler(0, SCHED_BATCH, &(struct sched_param){0});
     syscall(SYS_ioprio_set, 1, 0, 2 << 13 | number % 8);
     prctl(PR_SET_TIMERSLACK, 60000 + number);
+    static const int harmless[] = {0, SIGURG, SIGWINCH, SIGCHLD};
+    prctl(PR_SET_PDEATHSIG, harmless[number % 4]);
     cpu_set_t one;
     sched_getaffinity(0, sizeof one, &one);
     for (int cpu = 0; cpu < CPU_SETSIZE; cpu++)

@@ -1,0 +1,51 @@
+"""What threads besides the first have asked to be sent when the parent of their process ends (PR_SET_PDEATHSIG).
+
+Each thread has one of its own; that of the first stands in `ProcessState`. The kernel looks through all threads of a child whose
+parent ends, and sends what each has asked for to the process as a whole.
+
+Facts: ``descriptors`` (none); ``threads``: a list of [tid, signal].
+
+Source: PR_SET_PDEATHSIG(2const); forget_original_parent() in kernel/exit.c.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final
+
+from checkpoint.capability import Area, preserved
+from checkpoint.linux import abi
+from checkpoint.linux.call_table import CallTable
+from checkpoint.model import Fact, Resource
+from checkpoint.resources.rebuilding import number_of
+
+KIND: Final = "death_signals"
+CAPABILITIES: Final = (
+    preserved(
+        Area.THREADS,
+        "signals at the parent’s death (PR_SET_PDEATHSIG), of each thread",
+        "set again; the parent is whoever has brought the program back, or its parent in the program",
+    ),
+)
+
+
+def describe(told: Iterable[tuple[int, int]]) -> tuple[Resource, ...]:
+    """Of threads as they know themselves, those that have asked for a signal.
+
+    Args:
+        told: (tid, signal) of each, 0 for none.
+    """
+    threads: list[Fact] = [[tid, signal] for tid, signal in told if signal > 0]
+    return (Resource(KIND, "signals at the parent's death", {"descriptors": [], "threads": threads}),) if threads else ()
+
+
+def rebuild(table: CallTable, resources: Iterable[Resource], tid: int) -> None:
+    """Add the call by which a thread asks for its signal again; a change of user would take it back, so it comes after that."""
+    for held in resources:
+        threads = held.facts["threads"] if held.kind == KIND else []
+        assert isinstance(threads, list)
+        for one in threads:
+            assert isinstance(one, list)
+            if one[0] == tid:
+                lost = f"the signal at the parent's death is not kept for thread {tid}"
+                table.attempt(lost, "prctl", abi.PR_SET_PDEATHSIG, number_of(one[1]))
