@@ -12,7 +12,8 @@ The mark lies where a call's number has room (`arch.CALL_NUMBER_BITS`) and nobod
 sets the whole register for each call that it makes, and finds the result there. So a mark that is found proves that this is the
 very call that was made again, without having come back between. No call times out too early: it began before we saw it. It may
 do so late, by less than its timeout and by less than the time between three captures. A signal handler that runs ends it with
-EINTR, as ever. If we die, a system call is left that times out by itself.
+EINTR, as ever. If we die, a system call is left that times out by itself; only in the middle of a stop, before it was made
+again, the EINTR of that stop is left.
 
 Programs that make such a call again themselves, with what is left of its time, do that more exactly than we can: of theirs only
 those without a timeout are made again here (`makes_calls_again`).
