@@ -500,7 +500,8 @@ class ProcessRestore:
         restore_process.memory_layout(
             table, process, with_executable=vessel.may_choose_executable, brought=self._executable
         )  # before the program's own descriptors take their numbers
-        self.notes += logins.rebuild(table, self._state.resources, vessel.pid)
+        ours = restore_process.our_eyes(table, process, vessel, self._options)  # its own file of /proc is root's by now
+        self.notes += logins.rebuild(table, self._state.resources, vessel.pid, ours)
         if self.has_table_of_parent:
             for number in set(self._objects.values()) - self._inherited():
                 table.close(number)

@@ -14,9 +14,11 @@ import signal
 import struct
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
 
+from checkpoint.engine import RestoreOptions
 from checkpoint.errors import MismatchError, RestoreError
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.call_table import AT_FDCWD, CallTable
@@ -404,8 +406,23 @@ def own_eyes(table: CallTable, process: ProcessState, vessel: Vessel) -> None:
     groups = table.place(struct.pack(f"<{len(theirs.groups)}I", *theirs.groups))
     table.call("set the groups", "setgroups", len(theirs.groups), groups)
     table.call("set the filesystem's gid", "setfsgid", theirs.gids[3])
-    table.call("set the filesystem's uid", "setfsuid", theirs.uids[3])
+    _see_as(table, process)
+
+
+def _see_as(table: CallTable, process: ProcessState) -> None:
+    table.call("set the filesystem's uid", "setfsuid", process.credentials.uids[3])
     table.call("end with the parent, still", "prctl", abi.PR_SET_PDEATHSIG, signal.SIGKILL)  # a change of user takes it back
+
+
+@contextmanager
+def our_eyes(table: CallTable, process: ProcessState, vessel: Vessel, options: RestoreOptions) -> Iterator[None]:
+    """After `own_eyes`, have the calls that the body adds open files as the vessel again: what nobody can put another one for."""
+    is_switched = options.own_eyes and vessel.may(CAP_SETUID) and vessel.may(CAP_SETGID)
+    if is_switched:
+        table.call("set the filesystem's uid to ours", "setfsuid", vessel.credentials.uids[3])
+    yield
+    if is_switched:
+        _see_as(table, process)
 
 
 def rights(table: CallTable, process: ProcessState, vessel: Vessel) -> tuple[str, ...]:

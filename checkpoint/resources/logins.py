@@ -1,7 +1,7 @@
 """Whose login a process belongs to, as the kernel's audit knows it: the user (loginuid) and the number of the session.
 
-A process may say it itself, without a right while nobody has; the number is a new one then, which the kernel chooses. Threads
-have them for themselves, but are told of as the first is: the vessel says it before they are born.
+A process may say it itself, without a right while nobody has; the number is a new one then, which the kernel chooses. Each
+thread has them for itself, but all are told of as the first is: the vessel says it before they are born.
 
 Facts: ``descriptors`` (none); ``user`` of the login, ``session`` its number, -1 where that is not set. Nothing is told of a
 process that belongs to no login.
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Final
 
@@ -28,13 +29,14 @@ CAPABILITIES: Final = (
     by_rule(
         Area.PROCESS,
         "the login that a program belongs to (loginuid, sessionid of the kernel's audit)",
-        "its user is kept where nobody has logged in yet, or with CAP_AUDIT_CONTROL; the session's number is a new one",
+        "its user (for all threads the first one’s) where nobody has logged in, or with CAP_AUDIT_CONTROL; its number is new",
         "the user of its login (loginuid",
         "the number of its audit session",
     ),
 )
 NOBODY: Final = -1
 """Nobody has logged in; also where the kernel has no audit."""
+NO_OTHERS: Final = nullcontext()
 _UNSET: Final = 0xFFFF_FFFF
 
 
@@ -59,30 +61,34 @@ def describe(pid: int) -> tuple[Resource, ...]:
     return (Resource(KIND, "login", {"descriptors": [], "user": user, "session": session}),)
 
 
-def rebuild(table: CallTable, resources: Iterable[Resource], vessel_pid: int) -> list[str]:
+def rebuild(
+    table: CallTable, resources: Iterable[Resource], vessel_pid: int, eyes: AbstractContextManager[None] = NO_OTHERS
+) -> list[str]:
     """Add the calls by which a vessel says whose login it is, where that is another one; answers with notes.
 
     Args:
         vessel_pid: as we see it.
+        eyes: for its body, the vessel may open its own files of /proc.
     """
     told = [held.facts for held in resources if held.kind == KIND]
     user, session = (number_of(told[0]["user"]), number_of(told[0]["session"])) if told else (NOBODY, NOBODY)
     vessel_user, vessel_session = login_of(vessel_pid)
     notes = []
     if user != vessel_user:
-        notes = _say(table, user, vessel_pid)
+        notes = _say(table, user, vessel_pid, eyes)
     elif session == vessel_session:
         return []
     return notes if session == NOBODY else [*notes, f"the number of its audit session is not kept: it was {session}"]
 
 
-def _say(table: CallTable, user: int, vessel_pid: int) -> list[str]:
+def _say(table: CallTable, user: int, vessel_pid: int, eyes: AbstractContextManager[None]) -> list[str]:
     wanted = "nobody" if user == NOBODY else str(user)
     reason = f"the user of its login (loginuid {wanted}) is not kept: that takes CAP_AUDIT_CONTROL here"
     if not _has_file(vessel_pid):
         return [reason]
     number, word = table.lowest_descriptor(), str(user & _UNSET).encode()
-    table.attempt("", "openat", AT_FDCWD, table.place_path("/proc/self/loginuid"), os.O_WRONLY | os.O_CLOEXEC, 0)
+    with eyes:
+        table.attempt("", "openat", AT_FDCWD, table.place_path("/proc/self/loginuid"), os.O_WRONLY | os.O_CLOEXEC, 0)
     table.attempt(reason, "write", number, table.place(word), len(word))
     table.attempt("", "close", number)
     return []

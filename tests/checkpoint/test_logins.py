@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,6 +15,8 @@ from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Resource
 from checkpoint.resources import logins
 from checkpoint.resources.logins import NOBODY
+from tests.checkpoint.round_trip import NOBODY as NOBODY_ELSE
+from tests.checkpoint.round_trip import captured_and_killed, ended, expect_ok, restored, start_tracee
 from tests.checkpoint.test_tree_states import goes_through_three_lives
 
 LOGIN = 4321
@@ -45,6 +50,24 @@ def has_no_login() -> bool:
 @pytest.mark.skipif(not has_no_login(), reason="somebody has logged in, or this kernel has no audit")
 def test_each_process_of_a_program_keeps_the_user_of_its_login(tmp_path: Path) -> None:
     goes_through_three_lives(PROGRAM, tmp_path)
+
+
+@pytest.mark.root
+@pytest.mark.compiler
+@pytest.mark.skipif(not has_no_login(), reason="somebody has logged in, or this kernel has no audit")
+def test_a_users_program_keeps_it_where_its_files_are_opened_with_his_own_eyes(compiled: Callable[..., Path]) -> None:
+    """The vessel's file of /proc is root's: it may not be looked into, since it sees with other eyes."""
+    with tempfile.TemporaryDirectory() as made:
+        place = Path(made)
+        place.chmod(0o755)
+        program = Path(shutil.copy(compiled("login", "-O2"), place))
+        with ended(start_tracee(program, place, str(LOGIN), str(NOBODY_ELSE))) as tracee:
+            for name in ("out", "err"):
+                (place / name).chmod(0o666)
+            snapshot = captured_and_killed(tracee)
+        with ended(restored(snapshot, place, own_eyes=True)) as tracee:
+            tracee.tell()
+            expect_ok(tracee)
 
 
 @pytest.mark.skipif(not has_no_login(), reason="somebody has logged in, or this kernel has no audit")
