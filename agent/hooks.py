@@ -140,7 +140,7 @@ class Hooks:
         except (OSError, ValueError) as error:  # a command that came from another robot may hold a zero byte
             return self._told(kind, hook, occasion, f"cannot be started: {error}")
         try:
-            said = await asyncio.wait_for(running.last_said(), hook.limit_s + (SYSTEMD_S if self.starter else 0))
+            said = await running.last_said(hook.limit_s + (SYSTEMD_S if self.starter else 0))
         except TimeoutError:
             await _end(running.process)
             return self._told(kind, hook, occasion, f"took longer than {hook.limit_s:g} s and was ended")
@@ -207,11 +207,15 @@ class _Running:
     output: asyncio.ReadTransport
     said: bytes = b""
 
-    async def last_said(self) -> bytes:
-        """Wait for the end of the hook; of what it said, which may be without end, the last bytes."""
+    async def last_said(self, limit_s: float) -> bytes:
+        """Wait for the end of the hook; of what it said, which may be without end, the last bytes.
+
+        Raises:
+            TimeoutError: it runs for longer than ``limit_s``; how long the rest of what it said takes does not count.
+        """
         reading = asyncio.create_task(self._read())
         try:
-            await self.process.wait()
+            await asyncio.wait_for(self.process.wait(), limit_s)
             done, _ = await asyncio.wait((reading,), timeout=REST_S)
         finally:
             reading.cancel()

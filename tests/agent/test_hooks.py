@@ -10,9 +10,11 @@ import sys
 import time
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from agent import hooks
 from agent.hook_kinds import signal_in
 from agent.hooks import STARTED, Hook, Hooks, Occasion
 
@@ -94,3 +96,20 @@ def test_a_hook_that_leaves_a_process_behind_has_ended_all_the_same(tmp_path: Pa
         assert is_alive(child)
     finally:
         os.kill(child, signal.SIGKILL)
+
+
+def test_how_long_its_output_stays_open_does_not_count_against_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hook that ends just in time and leaves a process behind was in time."""
+    begin, limit_s = Hooks._begun, 1.0
+    monkeypatch.setattr(hooks, "REST_S", 2 * limit_s)
+
+    async def begun_and_over(*arguments: Any) -> Any:
+        running = await begin(*arguments)
+        await running.process.wait()
+        return running
+
+    monkeypatch.setattr(Hooks, "_begun", begun_and_over)
+    hook = Hook(("/bin/sh", "-c", "sleep 1000 & echo $!"), limit_s)
+    outcome = asyncio.run(Hooks().run("before_start", hook, Occasion("/lab/x", "robot1", 1, 64, STARTED)))
+    assert outcome.failure == ""
+    os.kill(int(outcome.last_line), signal.SIGKILL)
