@@ -179,7 +179,8 @@ def result(robot: RobotMachine, name: str) -> dict[str, Any]:
 def start_inside(robot: RobotMachine, *command: str) -> None:
     """Start a process of the robot that nobody there is the parent of; it ends with the robot at the latest."""
     script = f'"$@" </dev/null >>{robot.log} 2>&1 &'
-    inside = ["nsenter", f"--target={robot.processes()[0]}", "--all"] if means().own_pids and os.geteuid() == 0 else []
+    which = ["--all"] if os.geteuid() == 0 else ["--user", "--preserve-credentials", "--pid", "--mount"]
+    inside = ["nsenter", f"--target={robot.processes()[0]}", *which] if means().own_pids else []
     subprocess.run([*inside, "setsid", "sh", "-c", script, "sh", *command], check=True)
 
 
