@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -208,11 +209,11 @@ def test_status_tells_what_is_still_on_its_way(tmp_path: Path, place: Path) -> N
     with robots.two_robots(tmp_path, "link_mbit_s = 8\n") as (first, second):
         hide(second, place.parent)
         start(first, place)
-        shown = robots.until(lambda: [note for note in notes_of(first) if "have arrived" in note], "the status to tell")
-        assert "protected from robot2 after" in shown[0]
-        assert robots.component(first, "count")["protection"] == "none"
+        shown = robots.until(lambda: on_its_way(first), "the status to tell")
+        assert "protected from robot2 after" in next(note for note in shown["notes"] if ARRIVING in note)
+        assert shown["protection"] == "none"
         robots.until_protected(first)
-        assert not [note for note in notes_of(first) if "have arrived" in note]
+        assert not on_its_way(first)
 
 
 def test_a_standby_that_would_have_to_take_too_much_is_none_and_says_which_files(tmp_path: Path, place: Path) -> None:
@@ -225,8 +226,13 @@ def test_a_standby_that_would_have_to_take_too_much_is_none_and_says_which_files
         assert not contents_of(second)
 
 
-def notes_of(robot: RobotMachine) -> list[str]:
-    return list(robots.component(robot, "count").get("notes", ()))
+ARRIVING = "have arrived"
+
+
+def on_its_way(robot: RobotMachine) -> dict[str, Any]:
+    """What its status shows of the component while it tells of files that travel; empty otherwise."""
+    shown = robots.component(robot, "count")
+    return shown if any(ARRIVING in note for note in shown.get("notes", ())) else {}
 
 
 READER = """

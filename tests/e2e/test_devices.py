@@ -86,7 +86,7 @@ def test_a_driver_goes_on_with_the_device_of_the_other_robot(tmp_path: Path) -> 
             robots.until(lambda: robots.failover(first, "handover", "driver").returncode == 0, "a handover")
             assert told(second_line, b"three\n") == b"got three\n"
             robots.until_protected(second, "driver")
-            robots.until(lambda: logged(second)[-1] == "heard three same 0", "what it said")
+            robots.until(lambda: logged(second)[-1:] == ["heard three same 0"], "what it said")
     finally:
         for descriptor in (first_line, first_end, second_line, second_end):
             os.close(descriptor)

@@ -22,7 +22,6 @@ THREADED = """
 import os, threading, time
 held = os.pidfd_open(1)  # of somebody else, which nobody can bring back
 threading.Thread(target=time.sleep, args=(1e6,), daemon=True).start()
-time.sleep(2.5)
 """
 COUNTS = """
 import time
@@ -110,9 +109,10 @@ def test_a_program_with_threads_below_a_shell_is_protected_without_a_word_of_ala
     pair: tuple[RobotMachine, RobotMachine], tmp_path: Path
 ) -> None:
     first, second = pair
-    start(first, tmp_path, THREADED + COUNTS, shell=True)
+    start(first, tmp_path, THREADED + WAITS + COUNTS, shell=True)
     robots.until(lambda: "may yet say that it keeps its state" in "".join(shown(first)["notes"]), "it to be refused from outside")
     assert (shown(first)["state"], shown(first)["reasons"]) == ("running", [])
+    (tmp_path / "go").touch()
     robots.until(lambda: captured_by(second, "cooperative"), "a checkpoint of its own")
     assert (shown(first)["state"], shown(first)["reasons"], words_of_alarm(first)) == ("running", [], [])
     taken_over(first, second)

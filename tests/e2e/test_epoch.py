@@ -36,9 +36,10 @@ def epoch(robot: RobotMachine) -> int:
     return int(robots.component(robot, "token")["epoch"])
 
 
-def newest(robot: RobotMachine) -> int:
-    """What the program said last, as far as it was seen."""
-    return robots.numbers(robot, "token")[-1]
+def until_told(primary: RobotMachine, *seers: RobotMachine) -> None:
+    """Until the program has said its epoch there, and these robots have it: the standby with the next checkpoint."""
+    for robot in seers:
+        robots.until(lambda at=robot: robots.numbers(at, "token")[-1:] == [epoch(primary)], "its epoch to be told")  # type: ignore[misc]
 
 
 def test_the_epoch_of_a_program_grows_with_a_handover_and_a_takeover(pair: Pair) -> None:
@@ -46,14 +47,14 @@ def test_the_epoch_of_a_program_grows_with_a_handover_and_a_takeover(pair: Pair)
     environment = {"PYTHONPATH": os.getcwd(), "FAILOVER_EPOCH": "17"}
     robots.run(first, "token", *PROGRAM, env=environment)
     robots.until_protected(first, "token")
-    robots.until(lambda: newest(second) == epoch(first), "the first epoch to be told")
+    until_told(first, first, second)
     for _ in range(2):
         robots.until(lambda: robots.failover(first, "handover", "token").returncode == 0, "a handover")
         there = first if robots.component(first, "token")["role"] == "primary" else second
         robots.until_protected(there, "token")
-        robots.until(lambda there=there: newest(there) == epoch(there), "the next epoch to be told")  # type: ignore[misc]
+        until_told(there, first, second)
     first.cut_power()
     robots.until_taken_over(second, "token")
-    robots.until(lambda: newest(second) == epoch(second), "the last epoch to be told")
+    until_told(second, second)
     told = robots.numbers(second, "token")
     assert told == sorted(told) and len(set(told)) == 4

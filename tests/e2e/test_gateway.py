@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -54,7 +55,8 @@ def stand_still(robot: RobotMachine) -> list[int]:
     stopped: list[int] = []
     while fresh := [pid for pid in robot.processes() if pid not in stopped]:
         for pid in fresh:
-            os.kill(pid, signal.SIGSTOP)
+            with contextlib.suppress(ProcessLookupError):  # it was about to end
+                os.kill(pid, signal.SIGSTOP)
         stopped += fresh
     return stopped
 
@@ -75,7 +77,8 @@ def test_an_old_primary_that_wakes_up_as_a_whole_moves_nothing(tmp_path: Path) -
             robots.until(lambda: len(obeyed(said)) > before + MORE, "robot2 to drive on")
         finally:
             for pid in stopped:
-                os.kill(pid, signal.SIGCONT)
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGCONT)
         robots.until(lambda: not Path(f"/proc/{program}").exists(), "the old copy to be ended")
         robots.until(lambda: robots.component(first, "drive").get("primary") == "robot2", "robot1 to know who drives")
         epochs = [epoch for epoch, _, _ in obeyed(said)]

@@ -7,6 +7,7 @@ FAILOVER_HOSTILE=all tries everything; otherwise one of each kind.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
@@ -171,8 +172,9 @@ def programs(robot: RobotMachine) -> list[int]:
     """Processes of the program."""
     found = []
     for pid in robot.processes():
-        if b"counter.py" in Path(f"/proc/{pid}/cmdline").read_bytes():
-            found.append(pid)
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended
+            if b"counter.py" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                found.append(pid)
     return found
 
 

@@ -110,7 +110,11 @@ def test_a_cable_that_is_out_while_the_radio_lives_degrades_and_moves_nothing(tm
             assert robots.component(second, "count")["role"] == "standby"
             for robot in pair:
                 robots.until(lambda at=robot: heard(at) and links_heard(at) == ["air"], "it to be heard over the radio")  # type: ignore[misc]
-                assert "wire has no carrier any more" in robots.failover(robot, "why", "--brief", "--robot", robot.name).stdout
+                brief = ("why", "--brief", "--robot", robot.name)
+                robots.until(
+                    lambda at=robot, asked=brief: "wire has no carrier any more" in robots.failover(at, *asked).stdout,  # type: ignore[misc]
+                    "the story to tell of it",
+                )
 
         robots.cable(first, "up")
         robots.until_status(first, 0)
@@ -183,9 +187,13 @@ def test_an_agent_that_restarts_while_the_cable_is_out_is_heard_again_over_the_r
         counts_on(first)
         assert robots.component(first, "count")["epoch"] == epoch
         with only_beats_over_the_air(first):
-            told = json.loads(robots.failover(second, "why", "--json").stdout)
-            assert all(one["answered"] for one in told["robots"]), "questions travel over the radio"
+            robots.until(lambda: all_answer(second), "everybody's part of the story: questions travel over the radio")
             assert "has ended" in robots.failover(second, "stop", "count").stdout, "and orders"
+
+
+def all_answer(robot: RobotMachine) -> bool:
+    """Whether each robot told its part of the story in time when it was asked there."""
+    return all(one["answered"] for one in json.loads(robots.failover(robot, "why", "--json").stdout)["robots"])
 
 
 def heard(robot: RobotMachine) -> bool:

@@ -85,6 +85,7 @@ def test_a_standby_that_goes_in_the_middle_is_named_and_gets_all_when_it_is_back
     before = len(robots.numbers(first))
     robots.until(lambda: "the connection was lost" in robots.failover(first, "why", "count").stdout, "the loss to be told")
     robots.until(lambda: len(robots.numbers(first)) > before, "the program to run on")
+    robots.until(lambda: robots.answers(second), "its other half to be back")
     stored = robots.checkpoints(second, "count")
     robots.until(lambda: robots.answers(second) and robots.checkpoints(second, "count") > stored + 1, "checkpoints to arrive")
     robots.until(lambda: robots.component(first, "count").get("protection") == "protected", "it to be protected again")

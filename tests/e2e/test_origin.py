@@ -28,7 +28,8 @@ def told(robot: RobotMachine, *expected: str) -> None:
 
 
 def crash(robot: RobotMachine) -> None:
-    os.kill(robots.host_pid(robot, robots.component(robot, "count")["pid"]), signal.SIGSEGV)
+    pid = robots.until(lambda: robots.component(robot, "count").get("pid"), "its PID")  # it may write before the status knows it
+    os.kill(robots.host_pid(robot, pid), signal.SIGSEGV)
 
 
 def test_a_program_is_told_whether_it_was_handed_over_restarted_or_taken_over(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def test_a_takeover_lets_the_ready_copy_go(tmp_path: Path) -> None:
         assert "ready copy at robot2" in robots.failover(second, "status").stdout
         first.cut_power()
         count_goes_on(second)
-        assert "taking the ready copy" in robots.failover(second, "why", "count").stdout
+        robots.until(lambda: "taking the ready copy" in robots.failover(second, "why", "count").stdout, "the story to tell of it")
 
 
 def test_without_the_option_the_checkpoints_alone_are_kept_and_a_takeover_uses_them(tmp_path: Path) -> None:

@@ -50,7 +50,7 @@ def test_a_server_keeps_what_it_was_told_to_shows_it_and_a_full_disk_harms_nobod
             assert not olds(hall), "what was kept for people has given its room first"
             before = len(counted(first))
             robots.until(lambda: len(counted(first)) > before, "the standby to take checkpoints meanwhile")
-            assert robots.component(first, "count")["protection"] == "protected"
+            robots.until_protected(first)
         robots.until(lambda: not robots.component(hall, "count")["unstored"], "the server to store again")
         numbers = counted(first)
         assert numbers == list(range(len(numbers)))

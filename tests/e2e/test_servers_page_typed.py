@@ -59,4 +59,4 @@ def test_the_server_returns_a_component_to_an_empty_robot_as_the_page_tells_it(t
         robots.until(lambda: len(typed.type(logs).split()) > before + SEEN, "the counter to count on")
         numbers = typed.type(logs).split()
         assert numbers == [str(number) for number in range(1, len(numbers) + 1)]
-        assert "hall gives its checkpoint back to r2" in typed.type(why)
+        robots.until(lambda: "hall gives its checkpoint back to r2" in typed.type(why), "the server to tell its part")

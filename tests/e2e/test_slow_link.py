@@ -54,8 +54,8 @@ def test_what_does_not_fit_the_cable_is_taken_less_often_and_the_status_says_so(
         assert "until robot2 has one" in said
         held = robots.checkpoints(second, "write")
         robots.until(lambda: robots.checkpoints(second, "write") >= held + 3, "checkpoints to arrive all the same")
-        assert robots.component(first, "write")["protection"] == "protected"
-        assert INSTEAD in robots.failover(first, "status").stdout
+        robots.until_protected(first, "write")
+        robots.until(lambda: INSTEAD in robots.failover(first, "status").stdout, "the status to say so still")
         shape(first, "delete", "dev", "wire", "root")
         robots.until(lambda: not slow_note(first), "the status to say nothing of it any more")
         assert robots.component(first, "write")["role"] == "primary", "nobody took it over meanwhile"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 from tests.e2e import robots
@@ -19,6 +20,8 @@ def test_a_heart_and_its_lanes_do_without_openssl_and_the_tables_of_names(tmp_pa
 
 def mapped_by(robot: RobotMachine, part: str) -> str:
     """The mappings of a part of its agent, by what stands in the command line."""
-    command = {pid: Path(f"/proc/{pid}/cmdline").read_bytes().decode() for pid in robot.processes()}
-    pid = next(pid for pid, line in command.items() if part in line.split("\0")[1:4])
-    return Path(f"/proc/{pid}/maps").read_text()
+    for pid in robot.processes():
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended
+            if part in Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")[1:4]:
+                return Path(f"/proc/{pid}/maps").read_text()
+    raise AssertionError(f"{robot.name} has no {part}")

@@ -15,14 +15,16 @@ from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 
 BOTH = """
-import sys, time
-for number in range({limit}):
+import os, sys, time
+number = 0
+while number < {limit} and not os.path.exists({go!r}):
     print(number, flush=True)
     print(-number, file=sys.stderr, flush=True)
+    number += 1
     time.sleep(0.01)
 sys.exit(7)
 """
-"""Counts up on standard output and down on standard error."""
+"""Counts up on standard output and down on standard error, so far or until a file exists."""
 
 ENDLESS = 1_000_000
 BRIEF = 300
@@ -40,8 +42,8 @@ def command(robot: RobotMachine, verb: str, *arguments: str) -> list[str]:
     return [sys.executable, "-m", "failover.cli.main", verb, "--socket", str(robot.socket), *arguments]
 
 
-def program(limit: int) -> tuple[str, ...]:
-    return ("/usr/bin/python3", "-S", "-c", BOTH.format(limit=limit))
+def program(limit: int, go: str = "") -> tuple[str, ...]:
+    return ("/usr/bin/python3", "-S", "-c", BOTH.format(limit=limit, go=go))
 
 
 def lines(path: Path) -> list[int]:
@@ -82,16 +84,21 @@ def test_the_end_of_a_stream_is_shown_at_the_robot_where_it_did_not_run(pair: Pa
 
 def test_run_stays_with_its_program_when_that_is_handed_over(pair: Pair, tmp_path: Path) -> None:
     first, second = pair
-    out, err = tmp_path / "out", tmp_path / "err"
+    out, err, go = tmp_path / "out", tmp_path / "err", tmp_path / "go"
+    order = command(first, "run", "--name", "both", "--", *program(ENDLESS, str(go)))
     with out.open("wb") as stdout, err.open("wb") as stderr:
-        running = subprocess.Popen(command(first, "run", "--name", "both", "--", *program(BRIEF)), stdout=stdout, stderr=stderr)
+        running = subprocess.Popen(order, stdout=stdout, stderr=stderr)
     robots.until_protected(first, "both")
     moved = robots.failover(first, "handover", "both")
     assert moved.returncode == 0, moved
     assert robots.component(second, "both")["state"] == "running", "the move is over when its answer comes"
+    seen = len(lines(out))
+    robots.until(lambda: len(lines(out)) > seen + 20, "the output to go on")
+    go.touch()
     assert running.wait(timeout=robots.PATIENCE_S) == 7
-    assert lines(out) == list(range(BRIEF))
-    assert lines(err) == [-number for number in range(BRIEF)]
+    counted = lines(out)
+    assert counted == list(range(len(counted)))
+    assert lines(err) == [-number for number in counted]
 
 
 def test_whoever_watches_goes_on_when_the_agent_is_back(pair: Pair, tmp_path: Path) -> None:
