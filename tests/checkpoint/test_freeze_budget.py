@@ -67,7 +67,7 @@ def obedient(tmp_path: Path, budget_ns: int) -> Iterator[Obedient]:
 
 @pytest.mark.root
 def test_what_a_budget_has_room_for_is_copied_once(tmp_path: Path) -> None:
-    with obedient(tmp_path, 1_000 * MS) as one:
+    with obedient(tmp_path, 1_000_000 * MS) as one:
         one.write(2000)
         snapshot = one.session.capture(CaptureOrder(base=False, sequence=2))
         one.program.kill()
