@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 TRACEES = Path(__file__).parent / "tracees"
 
 PR_SET_CHILD_SUBREAPER = 36  # linux/prctl.h
-LEAVE_S = 5.0
+LEAVE_S = 30.0
 """How long a process that a test has told to end may take for it."""
 
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -39,7 +39,7 @@ from tests.checkpoint.round_trip import (
     transported,
 )
 
-pytestmark = [pytest.mark.compiler, pytest.mark.root]
+pytestmark = [pytest.mark.compiler, pytest.mark.root, pytest.mark.timeout(600)]
 
 Compiled = Callable[..., Path]
 

@@ -58,15 +58,17 @@ def running(path: Path, state: Path, *words: str) -> Iterator[subprocess.Popen[s
 
 def segment_of(pid: int) -> SegmentReader:
     """The segment of a program that is about to commit."""
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
         try:
             reader = open_segment(pid)
         except (CaptureError, SegmentError, OSError):  # it has not made it yet, or not all of it
+            time.sleep(0.001)
             continue
         if reader.newest():
             return reader
         reader.close()
+        time.sleep(0.001)
     raise AssertionError(f"pid {pid} committed nothing")
 
 
