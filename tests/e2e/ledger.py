@@ -1,4 +1,4 @@
-"""A program with a write-ahead log of its own: ``ledger.py FOLDER STEPS``.
+"""A program with a write-ahead log of its own: ``ledger.py FOLDER ENOUGH``; it makes steps until ENOUGH exists.
 
 Every step is a transaction: a line in the log, with its sum, forced to the disk; only then it is done, and its number printed.
 After some steps all accounts are written aside, renamed, and a new log is begun. Again and again it reads the folder as it would
@@ -70,9 +70,9 @@ class Ledger:
 
 
 def main() -> None:
-    """Make so many steps."""
-    ledger = Ledger(Path(sys.argv[1]))
-    while ledger.step < int(sys.argv[2]):
+    """Make steps until a file exists."""
+    ledger, enough = Ledger(Path(sys.argv[1])), Path(sys.argv[2])
+    while not enough.exists():
         ledger.transfer()
         print(ledger.step, flush=True)
         if ledger.step % READ_EVERY == 0:
