@@ -62,7 +62,11 @@ def become_realtime() -> tuple[str, ...]:
     """
     notes: list[str] = []
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(HEART_PRIORITY))
+        if (priority := kernel.become_realtime(HEART_PRIORITY)) < HEART_PRIORITY:
+            notes.append(
+                f"beats run at real-time priority {priority}: what has a higher one may delay them; "
+                f"allow {HEART_PRIORITY} (LimitRTPRIO, ulimit -r)"
+            )
     except OSError as error:
         notes.append(
             f"beats run at normal priority: SCHED_FIFO was refused ({error.strerror}); under load a live robot may be taken for "

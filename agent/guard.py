@@ -393,8 +393,11 @@ def _settle() -> tuple[str, ...]:
     except OSError as error:
         notes.append(f"the guard's memory is not locked, so its lease may be late when memory is short: {error.strerror}")
     try:
-        parameter = os.sched_param(REALTIME_PRIORITY)
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, parameter)
+        if (priority := kernel.become_realtime(REALTIME_PRIORITY)) < REALTIME_PRIORITY:
+            notes.append(
+                f"the guard has real-time priority {priority}, as keepers have while a program stands still, so its lease may be "
+                f"late by what they do then: allow {REALTIME_PRIORITY} (LimitRTPRIO, ulimit -r)"
+            )
     except OSError as error:
         notes.append(f"the guard has no real-time priority, so its lease may be late on a busy machine: {error.strerror}")
     return tuple(notes)

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import resource
 import subprocess
 import sys
 from typing import Final
 
 import pytest
+
+from agent import clock, guard, kernel
+from tests.checkpoint.round_trip import as_nobody
 
 LOCKED: Final = """
 import threading
@@ -37,3 +43,44 @@ def test_two_threads_of_a_process_that_is_locked_take_little_memory() -> None:
     if "not allowed" in found:
         pytest.skip("this user may not lock memory")
     assert int(found) < 4096
+
+
+@pytest.mark.root
+@pytest.mark.parametrize("limit", [0, 1])
+def test_a_user_whose_limit_allows_little_gets_that_and_is_told(limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The refusals are made here, as the kernel makes them: to raise our own limit would take CAP_SYS_RESOURCE."""
+    had = os.SCHED_OTHER, 0
+
+    def granted(_pid: int, policy: int, wanted: os.sched_param) -> None:
+        nonlocal had
+        if wanted.sched_priority > limit:
+            raise PermissionError(errno.EPERM, "Operation not permitted")
+        had = policy, wanted.sched_priority
+
+    def settled() -> str:
+        monkeypatch.setattr(resource, "getrlimit", lambda _: (limit, limit))
+        monkeypatch.setattr(os, "sched_setscheduler", granted)
+        notes = [*guard._settle(), *clock.become_realtime()]
+        return "\n".join((f"{had[0]} {had[1]}", *notes))
+
+    first, *notes = as_nobody(settled).splitlines()
+    told = "\n".join(notes)
+    if limit:
+        assert first == f"{os.SCHED_FIFO | os.SCHED_RESET_ON_FORK} 1"
+        assert "the guard has real-time priority 1, as keepers have" in told
+        assert "beats run at real-time priority 1: " in told
+    else:
+        assert first == f"{os.SCHED_OTHER} 0"
+        assert "the guard has no real-time priority" in told
+        assert "beats run at normal priority" in told
+
+
+@pytest.mark.root
+def test_who_may_have_any_priority_gets_what_is_wanted() -> None:
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        assert kernel.become_realtime(guard.REALTIME_PRIORITY) == os.sched_getparam(0).sched_priority == guard.REALTIME_PRIORITY
+    except PermissionError as error:
+        pytest.skip(f"no real-time priority here: {error.strerror}")
+    finally:
+        os.sched_setscheduler(0, *before)
