@@ -9,6 +9,7 @@ Source: vdso(7), userfaultfd(2), pidfd_getfd(2).
 from __future__ import annotations
 
 import ctypes
+import errno
 import itertools
 import os
 import struct
@@ -51,7 +52,7 @@ class Entered:
     """What the first entry brought.
 
     Attributes:
-        faults: a userfaultfd of the tracee's memory, ours now; None where the kernel refused it.
+        faults: a userfaultfd of the tracee's memory, ours now; None where it was refused, there or to us.
         inside: its number in the tracee, where it must still be closed; -1 if none.
         why_not: the errno of a refusal.
     """
@@ -69,7 +70,8 @@ def reenter(tracee: Tracee, pages: BorrowedPages, registers: bytes, mask: int) -
     inside = pages.run(tracee, batch, registers, mask).results[index]
     if inside < 0:
         return Entered(pages, None, -1, -inside)
-    return Entered(pages, _taken(tracee.pid, inside), inside)
+    faults, why_not = _taken(tracee.pid, inside)
+    return Entered(pages, faults, inside, why_not)
 
 
 def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int) -> Entered:
@@ -107,8 +109,8 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
         )
     pages = BorrowedPages(tracee.memory, hole)
     tracee.memory.poke(pages.table - len(MAGIC), MAGIC)
-    faults = _taken(tracee.pid, inside) if inside >= 0 else None
-    return Entered(pages, faults, inside, -inside if inside < 0 else 0)
+    faults, why_not = _taken(tracee.pid, inside) if inside >= 0 else (None, -inside)
+    return Entered(pages, faults, inside, why_not)
 
 
 def _entry_calls(hole: int) -> EntryCalls:
@@ -139,12 +141,16 @@ def _wait_in_call(pid: int, name: str) -> None:
         rest(waited)
 
 
-def _taken(pid: int, inside: int) -> int:
-    pidfd = pidfd_of(pid)
+def _taken(pid: int, inside: int) -> tuple[int | None, int]:
+    """A userfaultfd out of the tracee; or None and the errno, where we have no descriptor left, for one."""
     try:
-        return abi.pidfd_getfd(pidfd, inside)
-    finally:
-        os.close(pidfd)
+        pidfd = pidfd_of(pid)
+        try:
+            return abi.pidfd_getfd(pidfd, inside), 0
+        finally:
+            os.close(pidfd)
+    except OSError as error:
+        return None, error.errno or errno.EIO
 
 
 USER_END: Final = 0x7FFF_FFFF_E000
