@@ -69,6 +69,7 @@ def _probe(pid: int, surroundings: Surroundings, files_kept: bool, first: int) -
     looked = _looked(opened, first, surroundings)
     findings = (
         *_process_findings(first, status, kin, files_kept),
+        *_root_findings(first),
         *_processor_findings(first),
         *_memory_findings(first, opened[first]),
         *looked[first].findings,
@@ -234,6 +235,13 @@ def _process_findings(pid: int, status: Status, kin: tuple[int, ...], files_kept
     if status.ppid and len(status.pids) == 1:
         text = "its PID is kept where it is free on the other side: failover run gives a program a PID namespace of its own"
         yield Finding("process", f"pid {pid}", NOTED, text)
+
+
+def _root_findings(pid: int) -> Iterator[Finding]:
+    """What whoever brings it back must be allowed to do."""
+    if (root := procfs.read_link(pid, "root")) != "/":
+        text = f"its root directory is {root}: to enter that again takes CAP_SYS_CHROOT (an agent of root, and a program of root)"
+        yield Finding("process", "root", NOTED, text)
 
 
 def _processor_findings(pid: int) -> Iterator[Finding]:

@@ -23,6 +23,7 @@ from checkpoint.engines import restore_kinds, restore_vdso
 from checkpoint.engines.description import this_machine
 from checkpoint.engines.identities import build_id
 from checkpoint.engines.restore_memory import is_file_mapping, kernel_pages, makes_shared_memory
+from checkpoint.engines.restore_process import CAP_SYS_CHROOT, may_not_enter
 from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux import abi, processor, procfs
 from checkpoint.model import FileIdentity, Resource, Snapshot
@@ -153,8 +154,15 @@ def lacks(outline: Snapshot, options: RestoreOptions, digest_of: DigestOf) -> tu
     found: list[str] = []
     for view in tree.views(carried.without(outline)):
         expected = (*options.accept_changed, *carried.every_path(outline), *_in_flux(view))
-        found += _compare(view, replace(options, accept_changed=expected), digest_of)[0]
+        found += (*_of_root(view), *_compare(view, replace(options, accept_changed=expected), digest_of)[0])
     return tuple(dict.fromkeys(found))
+
+
+def _of_root(state: Snapshot) -> Iterator[str]:
+    """Whether its vessel could enter its root directory: one with PIDs of its own has the right to in its user namespace."""
+    may = procfs.status(os.getpid()).capabilities[2] >> CAP_SYS_CHROOT & 1
+    if state.process.root_directory != "/" and not (may or state.process.isolated):
+        yield may_not_enter(state.process.root_directory)
 
 
 def _in_flux(state: Snapshot) -> Iterator[str]:

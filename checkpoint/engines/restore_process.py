@@ -332,6 +332,11 @@ def enter_directory(table: CallTable, directory: str, opened: int | None) -> Non
         table.call(f"enter the working directory {directory}", "chdir", table.place_path(directory))
 
 
+def may_not_enter(root: str) -> str:
+    """Why a program cannot have its root directory."""
+    return f"its root directory is {root}, and to enter it takes CAP_SYS_CHROOT: restore it as root"
+
+
 def enter_root(table: CallTable, process: ProcessState, vessel: Vessel) -> None:
     """Have the program see the root directory that it had (chroot): after all that is opened by our paths, with its rights left.
 
@@ -342,7 +347,7 @@ def enter_root(table: CallTable, process: ProcessState, vessel: Vessel) -> None:
     if root == "/":
         return
     if not vessel.may(CAP_SYS_CHROOT):
-        reason = f"its root directory is {root}, and to enter it takes CAP_SYS_CHROOT: restore it as root"
+        reason = may_not_enter(root)
         raise MismatchError(reason, (reason,))
     table.call(f"make {root} its root directory", "chroot", table.place_path(root))
 

@@ -9,10 +9,21 @@ from pathlib import Path
 
 import pytest
 
+from checkpoint.engine import RestoreOptions
 from checkpoint.engines.restore_process import Vessel, enter_root
 from checkpoint.errors import CheckpointError, MismatchError, UnsupportedError
 from checkpoint.linux.call_table import CallTable
-from tests.checkpoint.round_trip import captured, captured_and_killed, ended, expect_three_lives, restored, start_tracee
+from tests.checkpoint.round_trip import (
+    ENGINE,
+    as_nobody,
+    captured,
+    captured_and_killed,
+    ended,
+    expect_three_lives,
+    protected,
+    restored,
+    start_tracee,
+)
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
@@ -57,6 +68,27 @@ def test_a_root_directory_that_is_gone_is_refused(compiled: Compiled, tmp_path: 
         (tmp_path / "cage").rmdir()
         with pytest.raises(CheckpointError, match=r"its root directory .*/cage \(deleted\) is gone"):
             captured(tracee)
+
+
+def test_what_entering_its_root_directory_takes_is_said_when_it_is_looked_at(compiled: Compiled, tmp_path: Path) -> None:
+    with ended(start_tracee(compiled("chroots"), tmp_path, "across")) as tracee, protected(tracee) as session:
+        said = f"its root directory is {tmp_path}/cage: to enter that again takes CAP_SYS_CHROOT"
+        assert any(said in note for note in ENGINE.probe(tracee.pid).notes)
+        assert any(said in note for note in session.notes)
+
+
+@pytest.mark.parametrize("isolate", [False, True], ids=["of this machine", "in PIDs of its own"])
+def test_a_standby_that_may_not_enter_its_root_directory_says_so_beforehand(
+    isolate: bool, compiled: Compiled, tmp_path: Path
+) -> None:
+    with ended(start_tracee(compiled("chroots"), tmp_path, "inside", isolate=isolate)) as tracee:
+        outline = captured_and_killed(tracee)
+
+    def lacking() -> str:
+        return "\n".join(ENGINE.lacks(outline, RestoreOptions()))
+
+    assert ("takes CAP_SYS_CHROOT" in as_nobody(lacking)) == (not isolate)
+    assert "CAP_SYS_CHROOT" not in lacking()
 
 
 def test_who_may_not_enter_a_root_directory_is_told_so(compiled: Compiled, tmp_path: Path) -> None:
