@@ -61,6 +61,8 @@ SOCK_FILTER_SIZE: Final = 8
 
 # asm-generic/siginfo.h, asm-generic/signal.h
 SIGINFO_SIZE: Final = 128
+SIGINFO_PID: Final = 16
+"""Offset of si_pid in struct siginfo: after three numbers, and four bytes that are nobody's."""
 SIGSET_SIZE: Final = 8
 SIGNAL_COUNT: Final = 64
 ALL_SIGNALS: Final = (1 << SIGNAL_COUNT) - 1

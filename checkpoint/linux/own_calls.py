@@ -33,9 +33,16 @@ _mmap = ctypes.CDLL(None, use_errno=True).mmap
 _mmap.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, ctypes.c_long)
 _mmap.restype = ctypes.c_void_p
 
-_syscall = ctypes.PyDLL(None, use_errno=True).syscall
-_syscall.argtypes = (ctypes.c_long,) * 7
-_syscall.restype = ctypes.c_long
+
+def _syscall_of(library: ctypes.CDLL) -> Callable[..., int]:
+    syscall = library.syscall
+    syscall.argtypes = (ctypes.c_long,) * 7
+    syscall.restype = ctypes.c_long
+    return syscall
+
+
+_syscall = _syscall_of(ctypes.PyDLL(None, use_errno=True))
+_syscall_that_may_wait = _syscall_of(ctypes.CDLL(None, use_errno=True))
 
 
 def row(name: str, *arguments: int, to: int = 0) -> tuple[int, ...]:
@@ -68,11 +75,16 @@ class OwnCalls:
         self.cells = self.entries.reshape(-1).data
         self.address = int(self.entries.ctypes.data)
 
-    def run(self, first: int = 0, last: int | None = None) -> None:
-        """Make the calls of the rows [first, last), one after the other, whatever comes of each; other threads of ours wait."""
+    def run(self, first: int = 0, last: int | None = None, *, may_wait: bool = False) -> None:
+        """Make the calls of the rows [first, last), one after the other, whatever comes of each.
+
+        Args:
+            may_wait: one of them may, for another thread of ours even: those go on meanwhile. Otherwise they wait for us.
+        """
         end = len(self.entries) if last is None else last
         if first < end:
-            _loop()(self.address + first * ROW_SIZE, self.address + end * ROW_SIZE)
+            loop = _patient_loop() if may_wait else _loop()
+            loop(self.address + first * ROW_SIZE, self.address + end * ROW_SIZE)
 
     def address_of(self, index: int, place: int) -> int:
         """Where a word of a row lies: a result that goes there is an argument of that row.
@@ -91,8 +103,27 @@ def _loop() -> Loop:
         return one_by_one
 
 
+@functools.cache
+def _patient_loop() -> Loop:
+    try:
+        return _in_machine_code_that_may_wait()
+    except OSError:
+        return one_by_one_that_may_wait
+
+
 def _in_machine_code() -> Loop:
-    """The loop in memory that nobody can write, so that it is allowed where memory that is both is not.
+    """Raises as `_machine_code`."""
+    return ctypes.PYFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(_machine_code())
+
+
+def _in_machine_code_that_may_wait() -> Loop:
+    """Raises as `_machine_code`."""
+    return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(_machine_code())
+
+
+@functools.cache
+def _machine_code() -> int:
+    """The address of the loop, in memory that nobody can write, so that it is allowed where memory that is both is not.
 
     Raises:
         OSError: the system does not allow it (a noexec policy, for one).
@@ -103,15 +134,24 @@ def _in_machine_code() -> Loop:
         place = _mmap(None, len(stubs.OWN_LOOP), mmap.PROT_READ | mmap.PROT_EXEC, mmap.MAP_PRIVATE, file, 0)
     finally:
         os.close(file)  # Python's own mmap would keep a copy of it
-    if place == ctypes.c_void_p(-1).value:
+    if place is None or place == ctypes.c_void_p(-1).value:
         abi.raise_errno("mmap of instructions")
-    return ctypes.PYFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(place)
+    return int(place)
 
 
 def one_by_one(first: int, end: int) -> None:
     """The same, slowly, by the C library."""
+    _one_by_one(first, end, _syscall)
+
+
+def one_by_one_that_may_wait(first: int, end: int) -> None:
+    """As `one_by_one`, of calls that may wait."""
+    _one_by_one(first, end, _syscall_that_may_wait)
+
+
+def _one_by_one(first: int, end: int, syscall: Callable[..., int]) -> None:
     for place in range(first, end, ROW_SIZE):
         number, *arguments, to = (ctypes.c_uint64 * ROW).from_address(place)
-        result = int(_syscall(number, *(ctypes.c_long(argument) for argument in arguments)))
+        result = int(syscall(number, *(ctypes.c_long(argument) for argument in arguments)))
         if to:
             ctypes.c_int64.from_address(to).value = -ctypes.get_errno() if result == -1 else result

@@ -22,6 +22,7 @@ Source: ptrace(2), "Attaching and detaching", "Death under ptrace"; proc_pid_tas
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import signal
 import threading
@@ -33,12 +34,15 @@ from checkpoint.errors import CaptureError, CheckpointError, ProbeError, Process
 from checkpoint.linux import procfs, second_stops
 from checkpoint.linux.burial import Burial, bury
 from checkpoint.linux.tasks import thread_count, thread_ids
-from checkpoint.linux.tracee import STOP_TIMEOUT_S, Tracee, no_stop, rest
+from checkpoint.linux.together import Together
+from checkpoint.linux.tracee import PLAIN_STOP, STOP_TIMEOUT_S, Tracee, no_stop, rest
 
 GLANCE_S: Final = 0.02
 """How long a thread may take before we look whether it waits inside the kernel."""
 PATIENCE_S: Final = 1.0
 """How long we wait for threads that do not stop where no signal can tell us (in a thread of ours that is not the first)."""
+FEW: Final = 4
+"""Fewer threads are asked one after the other: a table of calls costs something, too."""
 SEIZINGS: Final = 30
 """How often a thread is seized before it is believed that we may not; the kernel has one word for that and for one that ends."""
 
@@ -127,6 +131,10 @@ class Threads:
         """Of threads that can be stopped: a first one that has ended is counted until all have."""
         return thread_count(self.pid) - (self.process != self.pid)
 
+    @functools.cached_property
+    def _together(self) -> Together:
+        return Together()
+
     @property
     def others(self) -> tuple[Tracee, ...]:
         """Those that stand still, besides the leader, oldest first."""
@@ -198,9 +206,12 @@ class Threads:
         """Stop these; those that have ended instead."""
         ended: set[int] = set()
         with self._watched(tids):
-            asked = [tid for tid in tids if self._unless_ended(self._seize, tid, ended)]
+            seized = self._seize_together(tids) if len(tids) >= FEW else set[int]()
+            asked = [tid for tid in tids if tid in seized or self._unless_ended(self._seize, tid, ended)]
+        told = self._ask_together(asked) if len(asked) >= FEW else set[int]()
         for tid in asked:
-            self._unless_ended(self._ask, tid, ended)
+            if tid not in told:
+                self._unless_ended(self._ask, tid, ended)
         self._await_all(deadline, ended)
         return ended
 
@@ -213,10 +224,29 @@ class Threads:
         self._seized = set(self._held) - {self.pid}
         return self._burial.watching(self._seized)
 
-    def _seize(self, tid: int) -> None:
+    def _seize_together(self, tids: list[int]) -> set[int]:
+        """Those that are seized by this. While it waits (7) all must be known whose end may have to be noted."""
+        self._seized.update(tid for tid in tids if tid != self.pid)
+        seized = [tid for tid, is_ours in zip(tids, self._together.seize(tids), strict=True) if is_ours]
+        for tid in seized:
+            tracee = self._held[tid] = self._tracee(tid)
+            tracee.is_as_found = True
+        return set(seized)
+
+    def _ask_together(self, tids: list[int]) -> set[int]:
+        """Those that are asked to stop by this."""
+        asked = {tid for tid, was_asked in zip(tids, self._together.ask_to_stop(tids), strict=True) if was_asked}
+        self._moving |= asked
+        return asked
+
+    def _tracee(self, tid: int) -> Tracee:
         tracee = self._known.get(tid)
         if tracee is None:
             tracee = self._known[tid] = Tracee(tid, self.leader.memory)
+        return tracee
+
+    def _seize(self, tid: int) -> None:
+        tracee = self._tracee(tid)
         _seized_at_last(tracee)
         self._held[tid] = tracee
         if tid != self.pid:
@@ -255,7 +285,7 @@ class Threads:
         glance = began + GLANCE_S
         while self._moving:
             count = len(self._moving)
-            for tid in tuple(self._moving):
+            for tid in self._hear_reports(ended) if count >= FEW else tuple(self._moving):
                 self._unless_ended(self._look_whether_it_stands, tid, ended)
             if len(self._moving) == count:
                 rest(now - began)
@@ -265,6 +295,24 @@ class Threads:
             if now > glance:
                 glance = now + GLANCE_S
                 self._glance(now - began, ended)
+
+    def _hear_reports(self, ended: set[int]) -> list[int]:
+        """Hear of all in one go; who is to be asked singly: the first one, whose end may be for somebody else to note."""
+        others = [tid for tid in self._moving if tid != self.pid]
+        singly = [self.pid] if self.pid in self._moving else []
+        for tid, report in zip(others, self._together.reports(others), strict=True):
+            if report.status == PLAIN_STOP:
+                self._held[tid].stopped_by = 0
+                self._moving.discard(tid)
+            elif report.status is not None:
+                self._unless_ended(functools.partial(self._take_report, report.status), tid, ended)
+            elif report.is_lost:
+                singly.append(tid)
+        return singly
+
+    def _take_report(self, status: int, tid: int) -> None:
+        if self._held[tid].stands_by(status):
+            self._moving.discard(tid)
 
     def _look_whether_it_stands(self, tid: int) -> None:
         if self._held[tid].has_stopped():
@@ -303,13 +351,20 @@ class Threads:
     def thaw(self) -> None:
         """Let everybody go, however far `freeze` came, whoever has ended meanwhile."""
         held, self._held = self._held, {}
+        together: list[int] = []
         for tid, tracee in held.items():
             try:
                 if self._mend and tracee.is_as_found:
                     self._mend(tracee)
-                tracee.detach()
+                if len(held) < FEW:
+                    tracee.detach()
+                else:
+                    together.append(tid)
             except CheckpointError:
                 self._loose[tid] = tracee
+        if together:
+            gone = self._together.let_go(together)
+            self._loose |= {tid: held[tid] for tid, is_gone in zip(together, gone, strict=True) if not is_gone}
         self._settle()
 
     def close(self) -> None:

@@ -220,9 +220,17 @@ class Tracee:
     def has_stopped(self) -> bool:
         """Whether it stands now, as `await_stop` would find it. Raises as `_standing`."""
         stop = self._standing()
-        if stop is not None and stop.is_delivery:
+        return stop is not None and self._stays(stop)
+
+    def stands_by(self, status: int) -> bool:
+        """As `has_stopped`, of one of which a wait status has told already."""
+        return self._stays(self.stop_of(status))
+
+    def _stays(self, stop: Stop) -> bool:
+        """Whether it stands for us; where it is for a signal to be delivered, that is."""
+        if stop.is_delivery:
             self.cont(stop.signal)
-        return stop is not None and not stop.is_delivery
+        return not stop.is_delivery
 
     def _standing(self) -> Stop | None:
         """As `reported`, but of its end no note is taken: it may be our child, which somebody of us waits for."""

@@ -7,7 +7,7 @@ import itertools
 import os
 import signal
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from checkpoint.linux.procfs import Stat
 from checkpoint.linux.spokesman import PIDFD_THREAD, SPOKESMEN_MAX, spokesman_of, told_by_spokesman
 from checkpoint.linux.tasks import thread_ids
 from checkpoint.linux.threads import Threads
+from checkpoint.linux.together import Together
 from checkpoint.linux.tracee import Tracee
 from checkpoint.resources import refused_threads
 from tests.checkpoint.round_trip import (
@@ -192,7 +193,7 @@ def test_a_first_thread_comes_to_its_end_before_the_others_are_stopped(
 ) -> None:
     """Until it is a zombie it may still write where those wait who join it."""
     seen: list[str] = []
-    read, seize = procfs.thread_stat, Tracee.seize
+    read, seize = procfs.thread_stat, Together.seize
 
     def about_to_end(pid: int, tid: int) -> Stat:
         stat = read(pid, tid)
@@ -201,14 +202,14 @@ def test_a_first_thread_comes_to_its_end_before_the_others_are_stopped(
         seen.append("ends")
         return replace(stat, state="R", flags=stat.flags | procfs.PF_EXITING)
 
-    def noted(tracee: Tracee, options: int = 0) -> None:
-        seen.append("seized")
-        seize(tracee, options)
+    def noted(together: Together, tids: Sequence[int]) -> list[bool]:
+        seen.extend(["seized"] * len(tids))
+        return seize(together, tids)
 
     with ended(started(compiled, tmp_path)) as tracee:
         threads = Threads(Tracee(spokesman_of(tracee.pid)), process=tracee.pid)
         monkeypatch.setattr(procfs, "thread_stat", about_to_end)
-        monkeypatch.setattr(Tracee, "seize", noted)
+        monkeypatch.setattr(Together, "seize", noted)
         threads.freeze()
         threads.thaw()
         threads.close()

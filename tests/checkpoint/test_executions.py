@@ -12,8 +12,10 @@ from checkpoint.engine import ProtectOrder
 from checkpoint.engines import entering
 from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
 from checkpoint.linux import procfs
+from checkpoint.linux import threads as all_of_one
 from checkpoint.linux.tasks import thread_ids
 from checkpoint.linux.threads import Threads
+from checkpoint.linux.together import Together
 from checkpoint.linux.tracee import Stop, Tracee, no_stop
 from tests.checkpoint.round_trip import ENGINE, PATIENCE_S, Program, ended, expect_ok, start_tracee
 from tests.checkpoint.test_threads import open_descriptors, states, tracers
@@ -24,6 +26,8 @@ Compiled = Callable[..., Path]
 
 OTHERS = 4
 """Threads of executes.c besides the one that executes."""
+MANY = 1000
+"""Fewer threads are asked one after the other, if `checkpoint.linux.threads.FEW` is this."""
 
 
 def have_it_execute(tracee: Program) -> None:
@@ -78,18 +82,47 @@ def test_an_execution_at_any_step_of_a_freeze_ends_it(
         return answer
 
     with ended(start_tracee(compiled("executes", "-O2", "-pthread"), tmp_path)) as tracee:
-        ours = open_descriptors()
-        threads = Threads(Tracee(tracee.pid))
+        monkeypatch.setattr(all_of_one, "FEW", MANY)
         monkeypatch.setattr(Tracee, step, then_execute)
-        try:
-            threads.freeze()
-        except CheckpointError:
-            assert step != "detach"
-        else:
-            threads.thaw()
-        monkeypatch.undo()
-        expect_unharmed(tracee, threads)
-        assert open_descriptors() == ours
+        expect_an_end_of_a_freeze(tracee, monkeypatch, fails=step != "detach")
+
+
+@pytest.mark.parametrize("step", ["seize", "ask_to_stop", "reports", "let_go"])
+@pytest.mark.parametrize("turn", [0, 1, 2, 4, 5])
+def test_an_execution_in_the_middle_of_a_step_that_all_take_together_ends_it(
+    step: str, turn: int, compiled: Compiled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    has_executed = False
+    original = getattr(Together, step)
+
+    def in_two_goes(self: Together, tids: list[int]) -> list[object]:
+        nonlocal has_executed
+        if has_executed:
+            return list(original(self, tids))
+        before = original(self, tids[:turn])
+        has_executed = True
+        have_it_execute(tracee)
+        return [*before, *original(self, tids[turn:])]
+
+    with ended(start_tracee(compiled("executes", "-O2", "-pthread"), tmp_path)) as tracee:
+        monkeypatch.setattr(Together, step, in_two_goes)
+        expect_an_end_of_a_freeze(tracee, monkeypatch, fails=step != "let_go")
+        assert has_executed
+
+
+def expect_an_end_of_a_freeze(tracee: Program, monkeypatch: pytest.MonkeyPatch, *, fails: bool) -> None:
+    """Its thread executes a program in the middle of one: that may fail, nobody is harmed."""
+    ours = open_descriptors()
+    threads = Threads(Tracee(tracee.pid))
+    try:
+        threads.freeze()
+    except CheckpointError:
+        assert fails
+    else:
+        threads.thaw()
+    monkeypatch.undo()
+    expect_unharmed(tracee, threads)
+    assert open_descriptors() == ours
 
 
 def test_a_thread_that_did_not_stop_and_executes_a_program_instead_is_let_go(
@@ -111,6 +144,7 @@ def test_a_thread_that_did_not_stop_and_executes_a_program_instead_is_let_go(
                 have_it_execute(tracee)
 
         threads = Threads(Tracee(tracee.pid))
+        monkeypatch.setattr(all_of_one, "FEW", MANY)
         monkeypatch.setattr(Tracee, "ask_to_stop", ask_all_but_one)
         monkeypatch.setattr(Tracee, "detach", detach_then_execute)
         with pytest.raises(CaptureError, match="did not stop"):
@@ -145,6 +179,7 @@ def test_a_thread_that_executes_a_program_between_two_looks_at_it_is_let_go(
             return stop
 
         threads = Threads(Tracee(tracee.pid))
+        monkeypatch.setattr(all_of_one, "FEW", MANY)
         monkeypatch.setattr(Tracee, "ask_to_stop", ask_all_but_one)
         monkeypatch.setattr(Tracee, "reported", report_then_execute)
         with pytest.raises(CaptureError, match="did not stop"):
