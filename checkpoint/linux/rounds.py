@@ -21,8 +21,6 @@ from checkpoint.linux.tracee import PLAIN_STOP, SPIN_S, Tracee, rest
 
 WORD: Final = 8
 REGISTERS_ROOM: Final = 512
-SIGINFO_PID: Final = 12
-"""Offset of si_pid in struct siginfo."""
 START, LOOK, INTERRUPT, STAND, GIVE_BACK = range(5)
 """Groups of calls, each made about all threads in one go."""
 CALLS: Final = (3, 1, 1, 2, 2)
@@ -96,7 +94,7 @@ class Round:
 
     def ask_to_stop(self) -> list[bool] | None:
         """Ask all who were started to stop: who takes it; None when one stands by itself already, and nobody was asked."""
-        pids = self._memory[: len(self._tids), _Layout.siginfo + SIGINFO_PID : _Layout.siginfo + SIGINFO_PID + 4]
+        pids = self._memory[: len(self._tids), _Layout.siginfo + abi.SIGINFO_PID : _Layout.siginfo + abi.SIGINFO_PID + 4]
         if any(self._run(LOOK)) or pids.any():
             return None
         return [result == 0 for result in self._run(INTERRUPT)]

@@ -15,6 +15,7 @@ import pytest
 from checkpoint.arch import stubs
 from checkpoint.linux import own_calls
 from checkpoint.linux.own_calls import OwnCalls, row
+from checkpoint.linux.rounds import Round
 from checkpoint.linux.tasks import thread_ids
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.together import LOST, NOTHING, STEP, Together
@@ -90,6 +91,12 @@ def stopped(program: Program) -> Iterator[list[int]]:
 def test_who_stands_already_is_not_asked_to_stop_once_more(stopped: list[int]) -> None:
     """He would stop a second time, as soon as he is to run for us."""
     assert Together().ask_to_stop(stopped) == [False] * COUNT
+
+
+def test_nobody_at_a_desk_is_asked_to_stop_when_one_stands_already(stopped: list[int]) -> None:
+    round_of_all = Round(COUNT)
+    round_of_all._address(stopped)
+    assert round_of_all.ask_to_stop() is None
 
 
 @pytest.mark.parametrize("is_seen", [True, False], ids=["seen", "unseen"])
