@@ -100,7 +100,7 @@ def fold(chain: Sequence[Snapshot]) -> Snapshot:
     """The base that holds the same state as a whole chain, with the newest position; proved by its digest.
 
     Output is joined from all snapshots, notes likewise. The work is linear in the memory's size and in the
-    deltas' sizes: each page is copied once, from the newest snapshot that carries it.
+    deltas' sizes: each page is copied once, from the newest snapshot that carries it; a base alone is not copied.
 
     Args:
         chain: a base, then each delta, oldest first.
@@ -111,6 +111,10 @@ def fold(chain: Sequence[Snapshot]) -> Snapshot:
     _check_chain(chain)
     newest = chain[-1]
     page_size = newest.machine.page_size
+    if len(chain) == 1:  # all of it is where it belongs already
+        nothing = PageTable.empty(page_size)
+        check_state(newest, nothing.apply((), newest.runs, newest.contents, every_mapping(newest), newest.copies).page_sum)
+        return replace(newest, cleared=(), output=_joined_output(chain), notes=tuple(dict.fromkeys(newest.notes)))
     sources, layers = _newest_sources(chain, page_size)
     has_copies = newest.is_tree and any(snapshot.copies for snapshot in chain)  # one process alone has none
     carried, copies = _told_once(sources, layers, page_size) if has_copies else (sources, ())

@@ -52,6 +52,14 @@ def refused(snapshots: tuple[Snapshot, ...], words: str) -> None:
         chain.fold(snapshots)
 
 
+def test_a_base_alone_is_proved_and_not_copied() -> None:
+    base = history(1)[0]
+    folded = chain.fold([base])
+    assert folded == base
+    assert folded.contents is base.contents
+    refused((replace(base, contents=bytes(len(base.contents))),), "do not add up")
+
+
 def test_a_missing_delta_is_found() -> None:
     base, _, third, _ = history(4)
     refused((base, third), "continues 1.2")
