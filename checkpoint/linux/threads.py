@@ -221,7 +221,7 @@ class Threads:
             return contextlib.nullcontext()
         if self._burial is None:
             self._burial = Burial()
-        self._seized = set(self._held) - {self.pid}
+        self._seized = {*self._held, *tids} - {self.pid, self.process}  # one may be ours since an earlier look, and have ended
         return self._burial.watching(self._seized)
 
     def _seize_together(self, tids: list[int]) -> set[int]:

@@ -189,6 +189,19 @@ def test_a_thread_that_executes_a_program_between_two_looks_at_it_is_let_go(
         expect_unharmed(tracee, threads)
 
 
+def test_a_thread_that_is_ours_since_an_earlier_look_keeps_no_execution_waiting(compiled: Compiled, tmp_path: Path) -> None:
+    """It has ended for the execution, which waits for us to take note; we wait for that, and hear no signal meanwhile."""
+    with ended(start_tracee(compiled("executes", "-O2", "-pthread"), tmp_path)) as tracee:
+        earlier = Tracee(sorted(thread_ids(tracee.pid))[1])
+        earlier.seize()
+        tracee.tell()
+        tracee.wait_until(lambda: state(tracee.pid, earlier.pid) == "Z", "its end")
+        threads = Threads(Tracee(tracee.pid))
+        freeze_until_it_stands(threads)
+        threads.thaw()
+        expect_unharmed(tracee, threads)
+
+
 def test_who_looks_whether_a_program_has_ended_takes_no_note_of_its_stops(compiled: Compiled, tmp_path: Path) -> None:
     """They are for the tracer, who is told once; each wait in these tests looks."""
     with ended(start_tracee(compiled("executes", "-O2", "-pthread"), tmp_path)) as tracee:
