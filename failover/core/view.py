@@ -75,9 +75,9 @@ def _protection(component: Component, turn: Turn) -> Protection:
 
 
 def _overdue(component: Component, turn: Turn) -> bool:
-    """Snapshots are taken and do not become checkpoints."""
+    """Snapshots are taken and do not become checkpoints; an old loss says nothing while there is nothing to take."""
     limit_ns = max(STALE_NS, 2 * component.rules.period_ms * MS)
-    return bool(component.undelivered) and turn.now_ns - _state_ns(component) > limit_ns
+    return bool(component.undelivered) and not component.awaited and turn.now_ns - _state_ns(component) > limit_ns
 
 
 def _slow(component: Component, turn: Turn) -> str:

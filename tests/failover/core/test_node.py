@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TypeVar
 
 import pytest
@@ -143,6 +144,17 @@ def test_a_program_that_has_committed_nothing_yet_is_captured_as_soon_as_it_has(
     assert isinstance(capture, acts.Capture)
     node.step(Captured("/lab/x", 1, Position(capture.generation, capture.sequence, b"d"), None), 8 * MS)
     assert node.status(9 * MS).components[0].notes == ()
+
+
+def test_a_snapshot_that_was_lost_degrades_nothing_while_there_is_nothing_to_take() -> None:
+    node = Node(replace(ALONE, ship_ms=500), 1, Ballot(), 0)
+    running(node)
+    node.step(Tick(), 600 * MS)
+    assert node.status(5_000 * MS).components[0].protection == "degraded"
+    assert only(node.step(Tick(), 5_000 * MS), acts.Capture)
+    node.step(NothingToCapture("/lab/x", 1, "nothing yet"), 5_001 * MS)
+    seen = node.status(9_000 * MS).components[0]
+    assert (seen.protection, [note.partition(":")[0] for note in seen.notes]) == ("none", ["nothing to protect yet"])
 
 
 def test_a_first_commit_in_the_middle_of_a_capture_is_not_passed_over() -> None:
