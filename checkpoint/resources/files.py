@@ -22,7 +22,7 @@ from blake3 import blake3
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.engine import REFUSED, Finding
-from checkpoint.errors import CaptureError
+from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.descriptors import Descriptor
 from checkpoint.linux.digests import filled_extents
@@ -212,7 +212,11 @@ def is_found(held: OpenFile) -> bool:
 
 
 def _has_just_lost_its_name(held: OpenFile) -> bool:
-    """Whether it was deleted or closed since we looked, by a program that runs meanwhile: the next look finds it otherwise."""
+    """Whether it was deleted or closed since we looked, by a program that runs meanwhile: the next look finds it otherwise.
+
+    Raises:
+        ProcessGoneError: it has ended: an ordinary user may not look at such a one, and finds nothing.
+    """
     through = f"/proc/{held.pid}/fd/{held.first.number}"
     try:
         about = os.stat(through)
@@ -222,6 +226,8 @@ def _has_just_lost_its_name(held: OpenFile) -> bool:
     except FileNotFoundError:
         return True
     except OSError:
+        if procfs.status(held.pid).has_ended:
+            raise ProcessGoneError(f"pid {held.pid} ended while its files were looked at") from None
         return False
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +17,8 @@ import pytest
 from checkpoint import capabilities
 from checkpoint.capability import Verdict
 from checkpoint.engine import CaptureOrder, ProtectOrder
-from checkpoint.errors import ProbeError, UnsupportedError
+from checkpoint.errors import ProbeError, ProcessGoneError, UnsupportedError
+from checkpoint.resources import Surroundings, files, gather
 from tests.checkpoint.round_trip import (
     ENGINE,
     as_nobody,
@@ -336,3 +339,21 @@ def test_a_stopped_program_is_still_stopped_after_a_capture(compiled: Compiled, 
 
 def _state(pid: int) -> str:
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+
+
+def test_a_program_that_ends_while_its_files_are_looked_at_has_ended_also_for_an_ordinary_user(tmp_path: Path) -> None:
+    """He may not look into it any more, which is not the same as a file that no path leads to."""
+
+    def act() -> str:
+        place = tempfile.mkdtemp()
+        with open(os.path.join(place, "out"), "w") as out, subprocess.Popen(["sleep", "1000"], stdout=out) as process:
+            held = next(one for one in gather(process.pid) if one.name == "fd 1")
+            assert files.refuse(held, Surroundings()) is None
+            process.kill()
+            os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+            with pytest.raises(ProcessGoneError, match="ended while its files were looked at"):
+                files.refuse(held, Surroundings())
+        shutil.rmtree(place)
+        return "ok"
+
+    assert as_nobody(act) == "ok"
