@@ -316,13 +316,15 @@ class Charge:
             component, age_ns = await self._resumed(act, descriptors, outage_ns, laps)
         finally:
             close_all(tuple(descriptors))
+        acts_ns = component.let_go_ns or clock.now_ns()
         self.component = component
         self.figures.restores += 1
         self.figures.commits = Commits()  # of another process: its numbers begin anew
         self.figures.reasons = ()
-        self.figures.outage_ms = (silent_ns + clock.now_ns() - began_ns) / 1e6
+        self.figures.outage_ms = (silent_ns + acts_ns - began_ns) / 1e6
         since = f"the last word of the robot that ran it: silence {silent_ns / 1e6:.1f} ms, " if silent_ns else "the order: "
-        sentence = f"it acts again {self.figures.outage_ms:.1f} ms after {since}{laps}"
+        protecting = f"; protecting it again {(clock.now_ns() - acts_ns) / 1e6:.1f} ms" if component.let_go_ns else ""
+        sentence = f"it acts again {self.figures.outage_ms:.1f} ms after {since}{laps}{protecting}"
         log.info("%s: %s", self.name, sentence)
         self.started.set()
         self.around.tell(events.Restored(self.name, act.epoch, act.position, age_ns + clock.now_ns() - read_ns))
@@ -364,7 +366,7 @@ class Charge:
                 await component.lease(self._lease_until_ns)
             told = self._occasions.told_by(act)
             untold = await component.resume(told)
-            laps.lap("letting it go")
+            laps.lap("letting it go", clock.now_ns() - component.let_go_ns if component.let_go_ns else 0)
             if told:
                 self._occasions.told(told[0], untold)
         except GuardError:

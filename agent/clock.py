@@ -27,11 +27,11 @@ class Laps:
     last_ns: int = field(default_factory=time.monotonic_ns)
     stages: list[tuple[str, int]] = field(default_factory=list)
 
-    def lap(self, stage: str) -> None:
-        """The stage of that name ends now; the next one begins."""
-        now = time.monotonic_ns()
-        self.stages.append((stage, now - self.last_ns))
-        self.last_ns = now
+    def lap(self, stage: str, ago_ns: int = 0) -> None:
+        """The stage of that name ends now, or ended so long ago; the next one begins there."""
+        end = max(time.monotonic_ns() - ago_ns, self.last_ns)
+        self.stages.append((stage, end - self.last_ns))
+        self.last_ns = end
 
     def __str__(self) -> str:
         return ", ".join(f"{stage} {took_ns / 1e6:.1f} ms" for stage, took_ns in self.stages)

@@ -120,6 +120,7 @@ class Component:
         commit: what `resume` commits to it with.
         prepared: a program that is to be started with a state, by `resume`.
         streams: what its guard gave of them: counters, two read ends, two logs; none of somebody else's child.
+        let_go_ns: when `resume` let it go on, by our clock; 0 where nobody told.
         ended: the wait status once the program has ended (None: it was not our child); GuardLostError if the guard died first.
     """
 
@@ -134,6 +135,7 @@ class Component:
         self._guard = guard
         self.keeper = Following(name, places)
         self.streams: tuple[int, ...] = ()
+        self.let_go_ns = 0
         self._totals: dict[Position, tuple[int, int]] = {}
         self._commits: dict[Position, int] = {}
         self.engine_wanted = PTRACE
@@ -193,6 +195,7 @@ class Component:
             await self.undo()
             raise
         self.notes = (*self.notes, *resumed.notes)
+        self.let_go_ns = resumed.let_go_ns
         if any(note.startswith(channel.UNPROTECTED) for note in resumed.notes):
             self._drop_keeper()  # the next capture tries with a new one
         else:

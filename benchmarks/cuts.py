@@ -36,7 +36,7 @@ IN_FLIGHT_S: Final = 0.02
 """A snapshot that was on its way at the cut may still lengthen the standby's log so much later."""
 
 POLL_S: Final = 0.0005
-STAGE: Final = re.compile(r"(.+?) (\d+(?:\.\d+)?) ms(?:, |$)")
+STAGE: Final = re.compile(r"(.+?) (\d+(?:\.\d+)?) ms(?:[,;] |$)")
 """One stage of a takeover, as the standby tells it."""
 
 ACTS_AGAIN: Final = "it acts again"

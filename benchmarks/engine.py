@@ -93,22 +93,26 @@ def _restores_of(megabytes: int, count: int, directory: Path) -> list[Figure]:
         _, (content,) = keeper.ask(channel.Capture(base=True, generation=1, sequence=1, hold=True), channel.Captured)
         os.kill(pid, signal.SIGKILL)
     whole = tuple(_restored_once(content, pid) for _ in range(count))
-    ready = tuple(_taken_over_once(content, pid) for _ in range(count))
+    ready, again = zip(*(_taken_over_once(content, pid) for _ in range(count)), strict=True)
     os.close(content)
     case = f"{megabytes} MB"
-    return [Figure("restore", case, "ms", whole), Figure("takeover from a ready copy", case, "ms", ready)]
+    return [
+        Figure("restore", case, "ms", whole),
+        Figure("takeover from a ready copy", case, "ms", ready),
+        Figure("… and protected again", case, "ms", again),
+    ]
 
 
-def _taken_over_once(content: int, pid: int) -> float:
-    """From the order to the program running; what the copy took before is its memory's."""
+def _taken_over_once(content: int, pid: int) -> tuple[float, float]:
+    """From the order to the program running, and to its being protected again; what the copy took before is its memory's."""
     with Keeper.spawn() as keeper:
         born = vessel.spawn_vessel(Birth(pid))
         try:
             laid, _ = keeper.ask(channel.Lay(born.pid, "/benchmark"), channel.Laid, (content,))
-            began = time.perf_counter()
+            began_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
             keeper.ask(channel.Finish(channel.Restore(born.pid, "/benchmark"), laid.position), channel.Restored)
-            keeper.ask(channel.Resume(), channel.Resumed)
-            return (time.perf_counter() - began) * 1000
+            resumed, _ = keeper.ask(channel.Resume(), channel.Resumed)
+            return (resumed.let_go_ns - began_ns) / 1e6, (time.clock_gettime_ns(time.CLOCK_BOOTTIME) - began_ns) / 1e6
         finally:
             vessel.discard(born)
 
@@ -116,12 +120,12 @@ def _taken_over_once(content: int, pid: int) -> float:
 def _restored_once(content: int, pid: int) -> float:
     with Keeper.spawn() as keeper:
         _wait_until_ready(keeper)
-        began = time.perf_counter()
+        began_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         born = vessel.spawn_vessel(Birth(pid))
         try:
             keeper.ask(channel.Restore(born.pid, "/benchmark"), channel.Restored, (content,))
-            keeper.ask(channel.Resume(), channel.Resumed)
-            return (time.perf_counter() - began) * 1000
+            resumed, _ = keeper.ask(channel.Resume(), channel.Resumed)
+            return (resumed.let_go_ns - began_ns) / 1e6
         finally:
             vessel.discard(born)
 

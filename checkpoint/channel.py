@@ -448,9 +448,15 @@ class Compared(msgspec.Struct, frozen=True, tag=True):
 
 
 class Resumed(msgspec.Struct, frozen=True, tag=True):
-    """The program goes on; ``notes`` as of `Protected`, or `UNPROTECTED` and why."""
+    """The program goes on, and is protected again.
+
+    Attributes:
+        notes: as of `Protected`, or `UNPROTECTED` and why.
+        let_go_ns: when it went on, by this machine's CLOCK_BOOTTIME; to be protected again takes longer the more memory it has.
+    """
 
     notes: tuple[str, ...] = ()
+    let_go_ns: int = 0
 
 
 class Released(msgspec.Struct, frozen=True, tag=True):

@@ -13,6 +13,7 @@ import resource
 import signal
 import socket
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -251,9 +252,10 @@ class Keeper:
             raise RestoreError("cannot resume: nothing was restored by this keeper")
         self._restored = self._revived = None
         restored.resume()
+        let_go_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         order, streams = revived
         self._robot = order.robot
-        return channel.Resumed(self._follow(restored.pid, order, streams or late)), ()
+        return channel.Resumed(self._follow(restored.pid, order, streams or late), let_go_ns), ()
 
     def _follow(self, pid: int, request: channel.Restore, streams: Streams | None) -> tuple[str, ...]:
         """Protect what has just been let go; that it cannot be protected again must not end it."""

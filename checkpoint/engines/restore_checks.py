@@ -5,6 +5,7 @@ Everything that is wrong is found at once, so that it can be put right at once.
 
 from __future__ import annotations
 
+import functools
 import mmap
 import os
 import stat
@@ -184,8 +185,7 @@ def _of_machine(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
     if machine.page_size != abi.PAGE_SIZE:
         yield f"its pages are {machine.page_size} bytes, this kernel's {abi.PAGE_SIZE}: boot a kernel with the same"
     yield from _of_threads(state)
-    ours = kernel_pages(procfs.parse_maps(procfs.read_text(os.getpid(), "maps")))
-    if state.contents and not restore_vdso.fits(state, ours):
+    if state.contents and not restore_vdso.fits(state, _own_kernel_pages()):
         yield from restore_vdso.refuse(state)
     if listed := ", ".join(portable.lacking(machine.features, here.features)):
         cure = "use one that has them, or start it with failover run --portable"
@@ -200,6 +200,12 @@ def _of_machine(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
     is_made = directory in options.accept_changed or (options.contents and missing_directories(state))
     if not (os.path.isdir(directory) or procfs.is_gone(directory) or is_made):
         yield f"its working directory {directory} is missing: make it"
+
+
+@functools.cache
+def _own_kernel_pages() -> list[procfs.MapsLine]:
+    """Where our own vdso and its data lie, as long as we live."""
+    return kernel_pages(procfs.parse_maps(procfs.read_text(os.getpid(), "maps")))
 
 
 def missing_directories(state: Snapshot) -> tuple[str, ...]:

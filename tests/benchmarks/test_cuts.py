@@ -14,7 +14,8 @@ STORY = [
     {
         "at": 100.085,
         "did": "it acts again 85.0 ms after the last word of the robot that ran it: silence 60.5 ms, asking and clearing away "
-        "0.5 ms, opening 3 snapshots 0.5 ms, its descriptors, timers and registers 7.0 ms, letting it go 18.0 ms",
+        "0.5 ms, opening 3 snapshots 0.5 ms, its descriptors, timers and registers 7.0 ms, letting it go 3.0 ms; protecting it "
+        "again 15.0 ms",
     },
 ]
 
@@ -27,7 +28,8 @@ def test_the_phases_add_up_and_what_was_before_the_cut_does_not_count() -> None:
         "asking and clearing away": 0.5,
         "opening the snapshots": 0.5,
         "its descriptors, timers and registers": 7.0,
-        "letting it go": 18.0,
+        "letting it go": 3.0,
+        "protecting it again": 15.0,
     }
 
 
