@@ -22,7 +22,7 @@ from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.tasks import thread_ids
 from checkpoint.model import Fact, Resource
-from checkpoint.resources.rebuilding import number_of
+from checkpoint.resources.rebuilding import numbers_of_thread
 
 KIND: Final = "deadlines"
 
@@ -73,14 +73,8 @@ def _asked(tid: int) -> tuple[int, int, int, int, int] | None:
 
 def rebuild(table: CallTable, resources: Iterable[Resource], tid: int, reset_on_fork: bool) -> None:
     """Add the call by which a thread gets its own again, after everything that gives birth."""
-    for held in resources:
-        threads = held.facts["threads"] if held.kind == KIND else []
-        assert isinstance(threads, list)
-        for one in threads:
-            assert isinstance(one, list)
-            if one[0] == tid:
-                policy, nice, runtime, deadline, period = map(number_of, one[1:])
-                flags = RESET_ON_FORK if reset_on_fork else 0
-                packed = ATTRIBUTES.pack(ATTRIBUTES.size, policy, flags, nice, 0, runtime, deadline, period)
-                lost = f"the deadline or slice of thread {tid} is not kept"
-                table.attempt(lost, "sched_setattr", 0, table.place(packed), 0)
+    for policy, nice, runtime, deadline, period in numbers_of_thread(resources, KIND, tid):
+        flags = RESET_ON_FORK if reset_on_fork else 0
+        packed = ATTRIBUTES.pack(ATTRIBUTES.size, policy, flags, nice, 0, runtime, deadline, period)
+        lost = f"the deadline or slice of thread {tid} is not kept"
+        table.attempt(lost, "sched_setattr", 0, table.place(packed), 0)

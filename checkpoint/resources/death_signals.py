@@ -17,7 +17,7 @@ from checkpoint.capability import Area, preserved
 from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
-from checkpoint.resources.rebuilding import number_of
+from checkpoint.resources.rebuilding import numbers_of_thread
 
 KIND: Final = "death_signals"
 CAPABILITIES: Final = (
@@ -41,11 +41,6 @@ def describe(told: Iterable[tuple[int, int]]) -> tuple[Resource, ...]:
 
 def rebuild(table: CallTable, resources: Iterable[Resource], tid: int) -> None:
     """Add the call by which a thread asks for its signal again; a change of user would take it back, so it comes after that."""
-    for held in resources:
-        threads = held.facts["threads"] if held.kind == KIND else []
-        assert isinstance(threads, list)
-        for one in threads:
-            assert isinstance(one, list)
-            if one[0] == tid:
-                lost = f"the signal at the parent's death is not kept for thread {tid}"
-                table.attempt(lost, "prctl", abi.PR_SET_PDEATHSIG, number_of(one[1]))
+    for number, *_ in numbers_of_thread(resources, KIND, tid):
+        lost = f"the signal at the parent's death is not kept for thread {tid}"
+        table.attempt(lost, "prctl", abi.PR_SET_PDEATHSIG, number)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -55,6 +56,17 @@ def ended_place(held: Resource) -> tuple[int, int]:
     descriptors = held.facts["descriptors"]
     assert isinstance(descriptors, list) and isinstance(descriptors[0], list)
     return NO_DEVICE, number_of(descriptors[0][0])
+
+
+def numbers_of_thread(resources: Iterable[Resource], kind: str, tid: int) -> Iterator[list[int]]:
+    """What a kind tells of a thread, whose ``threads`` are lists of numbers, each with the thread's id first: those after it."""
+    for held in resources:
+        threads = held.facts["threads"] if held.kind == kind else []
+        assert isinstance(threads, list)
+        for one in threads:
+            assert isinstance(one, list)
+            if one[0] == tid:
+                yield [number_of(fact) for fact in one[1:]]
 
 
 def number_of(fact: Fact) -> int:
