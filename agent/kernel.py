@@ -52,6 +52,9 @@ def give_back() -> None:
 def become_realtime(priority: int) -> int:
     """Run this process ahead of ordinary ones (SCHED_FIFO), its children not; the priority that it has, which may be less.
 
+    All threads that it has by now do: one at ordinary priority that waits for a processor with the interpreter's lock in its hand
+    would hold up the others.
+
     Raises:
         OSError: none at all is allowed. With neither CAP_SYS_NICE nor a limit (RLIMIT_RTPRIO) above 0, none is.
 
@@ -61,7 +64,8 @@ def become_realtime(priority: int) -> int:
     wanted = [priority, limit] if 0 < limit < priority else [priority]
     for one in wanted:
         try:
-            os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(one))
+            for thread in os.listdir("/proc/self/task"):
+                os.sched_setscheduler(int(thread), os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(one))
             return one
         except PermissionError as error:
             refusal = error

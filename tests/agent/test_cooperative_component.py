@@ -62,11 +62,13 @@ def commit():
 commit(); print("begun", flush=True)
 until("FLAGS/stopped")
 pipe = os.open("/proc/self/fd/1", os.O_WRONLY | os.O_NONBLOCK)
+filled = 0
 try:
     while True:
-        os.write(pipe, b"." * 1023 + b"\\n")
+        filled += os.write(pipe, b"." * 1023 + b"\\n")
 except BlockingIOError:
     print("printed before the commits", state["step"])  # it stays in Python's buffer
+pathlib.Path("FLAGS/filled").write_text(str(filled))
 pathlib.Path("FLAGS/took").write_text(" ".join(str(commit()) for _ in range(500)))
 until("FLAGS/goes-on")
 commit(); print("printed after it", flush=True)
@@ -211,6 +213,8 @@ def test_a_guard_that_stands_still_holds_up_no_commit_and_costs_no_output(tmp_pa
                     await first.capture(base=True, generation=1, sequence=51, epoch=1)
             finally:
                 os.kill(guard, signal.SIGCONT)
+            filled = int((tmp_path / "filled").read_text())
+            await until(lambda: len(output(first)) >= len(b"begun\n") + filled, "the guard to make room for the next commit")
             (tmp_path / "goes-on").touch()
             await until(lambda: output(first).endswith(b"printed after it\n"), "the guard to take it all")
             captured = await captures.take()

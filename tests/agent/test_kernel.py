@@ -7,6 +7,7 @@ import os
 import resource
 import subprocess
 import sys
+import threading
 from typing import Final
 
 import pytest
@@ -76,11 +77,23 @@ def test_a_user_whose_limit_allows_little_gets_that_and_is_told(limit: int, monk
 
 
 @pytest.mark.root
-def test_who_may_have_any_priority_gets_what_is_wanted() -> None:
-    before = os.sched_getscheduler(0), os.sched_getparam(0)
+def test_who_may_have_any_priority_gets_what_is_wanted_for_all_of_its_threads() -> None:
+    before = {int(thread): policy_of(int(thread)) for thread in os.listdir("/proc/self/task")}
+    end = threading.Event()
+    another = threading.Thread(target=end.wait)
+    another.start()
     try:
         assert kernel.become_realtime(guard.REALTIME_PRIORITY) == os.sched_getparam(0).sched_priority == guard.REALTIME_PRIORITY
+        assert another.native_id is not None
+        assert policy_of(another.native_id) == policy_of(0) == (os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, guard.REALTIME_PRIORITY)
     except PermissionError as error:
         pytest.skip(f"no real-time priority here: {error.strerror}")
     finally:
-        os.sched_setscheduler(0, *before)
+        end.set()
+        another.join()
+        for thread, (policy, priority) in before.items():
+            os.sched_setscheduler(thread, policy, os.sched_param(priority))
+
+
+def policy_of(thread: int) -> tuple[int, int]:
+    return os.sched_getscheduler(thread), os.sched_getparam(thread).sched_priority
