@@ -14,14 +14,15 @@ import os
 import stat
 import struct
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from queue import SimpleQueue
 from typing import BinaryIO, Protocol
 
 import zstandard
 from blake3 import blake3
 
-from checkpoint import layout, pages, state
+from checkpoint import layout, pages, side_by_side, state
 from checkpoint.arrays import NDArray, np
 from checkpoint.differences import Rows
 from checkpoint.errors import FormatError
@@ -51,6 +52,9 @@ encoding``), which no link is slow enough to be asked for.
 WORTH_COMPRESSING = 15 / 16
 """A frame is stored compressed when that takes less than this part of its size."""
 
+WORTH_THREADS = 8
+"""Frames that are worth threads of their own."""
+
 _COUNTS = struct.Struct("<QQ")  # of the run table: cleared runs, carried runs
 _RUN_SIZE = 16
 _COUNT = struct.Struct("<Q")  # of its copies, and of its differences
@@ -60,8 +64,11 @@ _COPY_SIZE = 24
 # Writing
 
 
-def encode(snapshot: Snapshot, file: Sink) -> int:
+def encode(snapshot: Snapshot, file: Sink, *, threads: int = 1) -> int:
     """Write a snapshot to a file, at its position, in one pass.
+
+    Args:
+        threads: that compress; more than one takes processors from a program that runs.
 
     Returns:
         Bytes written.
@@ -78,12 +85,18 @@ def encode(snapshot: Snapshot, file: Sink) -> int:
     seal = blake3(preamble.pack())
     _write_all(file, preamble.pack() + b"".join(stored))
     offset = preamble.frames_offset
-    for index in range(preamble.frame_count):
-        raw = contents[index * layout.FRAME_SIZE :][: layout.FRAME_SIZE]
-        offset += _write_frame(file, raw, offset, compressor, seal)
+    raws = (contents[index * layout.FRAME_SIZE :][: layout.FRAME_SIZE] for index in range(preamble.frame_count))
+    with closing(side_by_side.in_order(_Packer(threads), raws, _worth(threads, preamble))) as bodies:
+        for body in bodies:
+            offset += _write_frame(file, body, offset, seal)
     file_size = offset + layout.TRAILER_SIZE
     _write_all(file, layout.pack_trailer(file_size, seal))
     return file_size
+
+
+def _worth(threads: int, preamble: Preamble) -> int:
+    """So many of these threads as the frames are worth."""
+    return threads if preamble.frame_count >= WORTH_THREADS else 1
 
 
 def _version_of(snapshot: Snapshot) -> int:
@@ -127,15 +140,41 @@ def _stored(raw: bytes | memoryview, compressor: zstandard.ZstdCompressor) -> tu
     return Codec.RAW, raw
 
 
-def _write_frame(file: Sink, raw: memoryview, offset: int, compressor: zstandard.ZstdCompressor, seal: blake3) -> int:
+@dataclass(frozen=True, slots=True)
+class _Body:
+    """A frame that is ready to be written, wherever it will lie."""
+
+    codec: Codec
+    content: bytes | memoryview
+    raw_size: int
+    digest: bytes
+
+
+class _Packer:
+    """Makes bodies of frames, in several threads at once: each borrows a compressor, for none may be used twice at a time."""
+
+    def __init__(self, threads: int) -> None:
+        self._compressors: SimpleQueue[zstandard.ZstdCompressor] = SimpleQueue()
+        for _ in range(threads):
+            self._compressors.put(zstandard.ZstdCompressor(level=COMPRESSION_LEVEL))
+
+    def __call__(self, raw: memoryview) -> _Body:
+        compressor = self._compressors.get()
+        try:
+            codec, content = _stored(raw, compressor)
+        finally:
+            self._compressors.put(compressor)
+        return _Body(codec, content, len(raw), layout.digest_of(content))
+
+
+def _write_frame(file: Sink, body: _Body, offset: int, seal: blake3) -> int:
     """Write one frame whose head lies at ``offset``; answer how many bytes it took."""
-    codec, body = _stored(raw, compressor)
-    padding = layout.padding_at(offset, codec)
-    head = FrameHead(codec, padding, len(body), len(raw), layout.digest_of(body)).pack()
+    padding = layout.padding_at(offset, body.codec)
+    head = FrameHead(body.codec, padding, len(body.content), body.raw_size, body.digest).pack()
     seal.update(head)
     _write_all(file, head + bytes(padding))
-    _write_all(file, body)
-    return len(head) + padding + len(body)
+    _write_all(file, body.content)
+    return len(head) + padding + len(body.content)
 
 
 def _write_all(file: Sink, content: bytes | memoryview) -> None:
@@ -171,11 +210,12 @@ def _pairs(runs: Iterable[PageRun]) -> bytes:
 # Reading
 
 
-def decode(source: Source, max_contents_size: int = layout.MAX_CONTENTS_SIZE) -> Snapshot:
+def decode(source: Source, max_contents_size: int = layout.MAX_CONTENTS_SIZE, *, threads: int = 1) -> Snapshot:
     """Read and verify a whole snapshot file.
 
     Args:
         max_contents_size: refuse a file that claims more bytes of pages than this.
+        threads: that read and verify; more than one takes processors from what else runs here.
 
     Raises:
         FormatError: not a whole, unaltered snapshot of a version that we read; says what and where.
@@ -186,11 +226,15 @@ def decode(source: Source, max_contents_size: int = layout.MAX_CONTENTS_SIZE) ->
         if preamble.contents_size > max_contents_size:
             raise FormatError(f"preamble: claims {preamble.contents_size} bytes of pages; the limit here is {max_contents_size}")
         contents = np.empty(preamble.contents_size, dtype=np.uint8).data
-        decompressor = zstandard.ZstdDecompressor()
-        position = 0
-        for frame in _frames(reader, preamble):
-            _read_frame(reader, frame, contents[position : position + frame.head.raw_size], decompressor)
-            position += frame.head.raw_size
+
+        def read(numbered: tuple[int, _Frame]) -> None:
+            index, frame = numbered
+            target = contents[index * layout.FRAME_SIZE :][: frame.head.raw_size]
+            _read_frame(reader, frame, target, zstandard.ZstdDecompressor())
+
+        frames = enumerate(_frames(reader, preamble))
+        for _ in side_by_side.in_order(read, frames, _worth(threads, preamble)):
+            pass
     return replace(outline, contents=contents.toreadonly())
 
 

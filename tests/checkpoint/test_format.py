@@ -7,6 +7,7 @@ import random
 import resource
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,6 +74,44 @@ def test_a_file_of_several_frames_is_read_from_a_path_a_descriptor_and_memory(tm
         assert format.decode(path) == format.decode(descriptor) == format.decode(path.read_bytes()) == made
     finally:
         os.close(descriptor)
+
+
+def large(frames: int = 12) -> Snapshot:
+    """One of so many frames, of which each other one compresses."""
+    dice, per_frame = random.Random(6), layout.FRAME_SIZE // PAGE
+    count = frames * per_frame - 3
+    return snapshot(
+        {n: dice.randbytes(PAGE) if n // per_frame % 2 else bytes([n % 251]) * PAGE for n in range(count)}, vmas=(vma(0, count),)
+    )
+
+
+def test_several_threads_write_and_read_the_very_same_bytes(tmp_path: Path) -> None:
+    made = large()
+    alone = format.encode_bytes(made)
+    with (tmp_path / "snapshot").open("wb", buffering=0) as file:
+        assert format.encode(made, file, threads=3) == len(alone)
+    assert (tmp_path / "snapshot").read_bytes() == alone
+    assert format.decode(tmp_path / "snapshot", threads=3) == format.decode(alone) == made
+
+
+def test_several_threads_find_the_damage_that_one_finds(tmp_path: Path) -> None:
+    whole = format.encode_bytes(large())
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1
+    for damaged in (bytes(flipped), whole[: len(whole) // 2], whole[:-1], whole + b"x"):
+        said = []
+        for threads in (1, 3):
+            with pytest.raises(FormatError) as refused:
+                format.decode(damaged, threads=threads)
+            said.append(str(refused.value))
+        assert said[0] == said[1]
+
+
+def test_a_file_that_takes_nothing_more_ends_the_threads_that_write_it() -> None:
+    before = threading.active_count()
+    with pytest.raises(OSError, match="takes nothing more"):
+        format.encode(large(), FullSink(5 << 20), threads=3)
+    assert threading.active_count() == before
 
 
 @pytest.fixture(scope="module")
@@ -237,10 +276,15 @@ def test_no_input_makes_the_reader_crash_hang_or_allocate_without_bound(sample: 
 
 
 class FullSink:
-    """A file that takes nothing and says no reason."""
+    """A file that takes so many bytes, and then nothing, and says no reason."""
+
+    def __init__(self, room: int = 0) -> None:
+        self._room = room
 
     def write(self, content: bytes | memoryview, /) -> int:
-        return 0
+        taken = min(len(content), self._room)
+        self._room -= taken
+        return taken
 
 
 def test_a_file_that_takes_nothing_more_is_an_error_and_no_endless_loop() -> None:

@@ -1,0 +1,75 @@
+"""Pieces of work on several processors at once, their results in order: of work that lets other threads run meanwhile."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from typing import TYPE_CHECKING, Final, TypeVar
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future, ThreadPoolExecutor
+
+THREADS: Final = 4
+"""No more: the memory's bandwidth, and whoever else works on this machine."""
+AHEAD: Final = 4
+"""Pieces a thread that are begun before the oldest result is taken: what waits is held in memory."""
+
+A = TypeVar("A")
+B = TypeVar("B")
+
+
+def thread_count() -> int:
+    """How many threads can work at once here, `THREADS` at most."""
+    return min(THREADS, len(os.sched_getaffinity(0)))
+
+
+def in_order(work: Callable[[A], B], pieces: Iterable[A], threads: int) -> Generator[B, None, None]:
+    """What ``work`` answers for each piece, in their order; one thread is our own alone.
+
+    What a piece raises is raised in its place, and so is what the iterable raises: after the answers of all pieces before it.
+    No thread is left when the generator is exhausted, closed or has raised.
+    """
+    if threads < 2:
+        yield from map(work, pieces)
+        return
+    from concurrent.futures import ThreadPoolExecutor  # who has nothing large to do starts without it
+
+    begun: deque[Future[B]] = deque()
+    rest = iter(pieces)
+    trouble: Exception | None = None
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            while True:
+                while trouble is None and len(begun) < threads * AHEAD:
+                    try:
+                        piece = next(rest)
+                    except StopIteration:
+                        break
+                    except Exception as error:  # noqa: BLE001  # raised below, in its place
+                        trouble = error
+                    else:
+                        begun.append(_begin(pool, work, piece))
+                if not begun:
+                    break
+                yield begun.popleft().result()
+        finally:
+            for one in begun:
+                one.cancel()
+    if trouble is not None:
+        raise trouble
+
+
+def _begin(pool: ThreadPoolExecutor, work: Callable[[A], B], piece: A) -> Future[B]:
+    """One piece in a thread; where no thread may be born (a limit of tasks), at once in ours."""
+    from concurrent.futures import Future
+
+    try:
+        return pool.submit(work, piece)
+    except RuntimeError:
+        done: Future[B] = Future()
+        try:
+            done.set_result(work(piece))
+        except Exception as error:  # noqa: BLE001  # raised in its place
+            done.set_exception(error)
+        return done
