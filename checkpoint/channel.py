@@ -222,6 +222,8 @@ class Protect(msgspec.Struct, frozen=True, tag=True):
 class Capture(msgspec.Struct, frozen=True, tag=True):
     """Take a snapshot. Answer: `Captured` with a sealed memfd that holds it encoded.
 
+    With a descriptor, of an empty file: it is encoded there, and the answer brings none.
+
     Attributes:
         hold: leave the program standing still afterwards, until `Release`: who ends it now ends it in exactly this state.
         xor_cache: bytes in which the keeper may remember pages, to tell deltas as differences from them; 0: not at all.

@@ -20,11 +20,11 @@ from typing import Final
 
 import msgspec
 
-from checkpoint import carried, chain, channel, engine, foreign, format
+from checkpoint import carried, chain, channel, engine, foreign, format, side_by_side
 from checkpoint.channel import Channel, ChannelClosedError, ChannelError, Failed, Reply, Request
 from checkpoint.digests_of_files import DigestsOfFiles
 from checkpoint.engine import CaptureOrder, Copy, Engine, ProtectOrder, Restored, RestoreOptions, Session, Streams
-from checkpoint.errors import CaptureError, CheckpointError, FormatError, RestoreError
+from checkpoint.errors import CaptureError, CheckpointError, FormatError, RestoreError, StoreError
 from checkpoint.hot_pages import Sender
 from checkpoint.linux.address import address_of
 from checkpoint.model import Position, Snapshot
@@ -117,14 +117,24 @@ class Keeper:
         self._session = chosen.protect(request.pid, ProtectOrder(request.component, streams, request.terms, names))
         return channel.Protected(self._session.notes), ()
 
-    def _capture(self, request: channel.Capture, _: Descriptors) -> Answer:
+    def _capture(self, request: channel.Capture, descriptors: Descriptors) -> Answer:
+        try:
+            return self._captured(request, descriptors[0] if descriptors else None)
+        finally:
+            channel.close_all(descriptors)
+
+    def _captured(self, request: channel.Capture, target: int | None) -> Answer:
         session = self._following("capture")
         if unchanged := _unchanged(session, request):
             return unchanged, ()
         order = CaptureOrder(request.base, request.generation, request.sequence, request.epoch, self._robot, request.hold)
         snapshot = session.capture(order)
         told, known_bytes = self._sender.told(snapshot, request.xor_cache)
-        encoded, size = encoded_in_memory(told)
+        threads = side_by_side.thread_count() if request.hold else 1  # a program that runs needs the processors itself
+        if target is None:
+            encoded, size = encoded_in_memory(told, threads)
+        else:
+            encoded, size = None, encoded_in(target, told, threads)
         commit, age_ns = _commit_at(session, snapshot.position)
         answer = channel.Captured(
             position=snapshot.position,
@@ -139,7 +149,7 @@ class Keeper:
             known_bytes=known_bytes,
             frozen_bytes=session.frozen_size,
         )
-        return answer, (encoded,)
+        return answer, () if encoded is None else (encoded,)
 
     def _acknowledge(self, request: channel.Acknowledge, _: Descriptors) -> None:
         if self._session is not None:
@@ -333,17 +343,29 @@ def streams_of(descriptors: Descriptors) -> Streams:
     return Streams(counters, (first_output, second_output), (first_log, second_log))
 
 
-def encoded_in_memory(snapshot: Snapshot) -> tuple[int, int]:
+def encoded_in_memory(snapshot: Snapshot, threads: int = 1) -> tuple[int, int]:
     """A sealed memory file with the snapshot encoded, ours to close, and its size in bytes."""
     descriptor = os.memfd_create("snapshot", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     try:
-        with open(descriptor, "wb", buffering=0, closefd=False) as file:
-            size = format.encode(snapshot, file)
+        size = encoded_in(descriptor, snapshot, threads)
         channel.seal(descriptor)
     except BaseException:
         os.close(descriptor)
         raise
     return descriptor, size
+
+
+def encoded_in(descriptor: int, snapshot: Snapshot, threads: int) -> int:
+    """Encode a snapshot into an empty file; its size in bytes.
+
+    Raises:
+        StoreError: the file does not take it.
+    """
+    try:
+        with open(descriptor, "wb", buffering=0, closefd=False) as file:
+            return format.encode(snapshot, file, threads=threads)
+    except OSError as error:
+        raise StoreError(f"cannot write a snapshot of {snapshot.component}: {error.strerror}") from error
 
 
 def folded(files: Descriptors) -> Snapshot:
@@ -353,7 +375,8 @@ def folded(files: Descriptors) -> Snapshot:
         FormatError: one of them is damaged.
         ChainError: they do not continue each other.
     """
-    return chain.fold([format.decode(descriptor) for descriptor in files])
+    threads = side_by_side.thread_count()
+    return chain.fold([format.decode(descriptor, threads=threads) for descriptor in files])
 
 
 def main(arguments: list[str]) -> int:

@@ -18,7 +18,15 @@ from checkpoint import channel, format
 from checkpoint.channel import Capture, Captured, Protect, Protected, Release, Released, Restore, Restored, Resume, Resumed
 from checkpoint.device_rules import DeviceRule, rule_from
 from checkpoint.engine import Terms
-from checkpoint.errors import CaptureError, CheckpointError, NothingCommittedError, ProbeError, ProcessGoneError, UnsupportedError
+from checkpoint.errors import (
+    CaptureError,
+    CheckpointError,
+    NothingCommittedError,
+    ProbeError,
+    ProcessGoneError,
+    StoreError,
+    UnsupportedError,
+)
 from checkpoint.linux import kinship, namespaces, procfs, vessel
 from checkpoint.linux.vessel import Birth, Born
 from checkpoint.model import Snapshot
@@ -55,16 +63,21 @@ def capture(arguments: argparse.Namespace) -> int:
         protected, _ = _at_last(lambda: keeper.ask(order, Protected))
         held = not arguments.leave_running
         whole = Capture(base=True, generation=1, sequence=1, hold=held)
-        captured, (content,) = _at_last(lambda: keeper.ask(whole, Captured))
-        try:
-            _write_whole(target, content)
-        finally:
-            os.close(content)
+        with _written_whole(target) as file:
+            captured = _captured(keeper, whole, file, target)
         if held:
             _end(arguments.pid)
         with contextlib.suppress(CheckpointError):  # it was killed a moment ago: nothing is left to let go of
             keeper.ask(Release(), Released)
     return _tell_capture(arguments, captured, tuple(dict.fromkeys(protected.notes + captured.notes)))
+
+
+def _captured(keeper: Keeper, order: Capture, file: int, target: Path) -> Captured:
+    """Have a snapshot written straight into a file: of a large program a copy more takes as long as all the rest."""
+    try:
+        return _at_last(lambda: keeper.ask(order, Captured, (file,)))[0]
+    except StoreError as error:
+        raise FailoverError(f"cannot write {target}: {error}; the program was not ended") from error
 
 
 def _at_last(ask: Callable[[], A]) -> A:
@@ -125,16 +138,17 @@ def _tell_capture(arguments: argparse.Namespace, captured: Captured, notes: tupl
     return 0
 
 
-def _write_whole(target: Path, content: int) -> None:
-    """Write a snapshot aside, have the disk confirm it, then give it its name: 0600, for memory is secret."""
+@contextmanager
+def _written_whole(target: Path) -> Iterator[int]:
+    """A descriptor of a file aside for the body to write; then the disk confirms it, and it gets its name.
+
+    It is 0600, for memory is secret. Nothing is left of one that was not finished.
+    """
     aside = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
         descriptor = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         try:
-            size = os.fstat(content).st_size
-            sent = 0
-            while sent < size:
-                sent += os.sendfile(descriptor, content, sent, size - sent)
+            yield descriptor
             os.fsync(descriptor)
         finally:
             os.close(descriptor)

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import re
+import resource
 import shutil
 import signal
 import subprocess
@@ -295,6 +296,25 @@ def test_a_file_that_is_missing_is_said_to_be(tmp_path: Path) -> None:
         ran = failover(verb, str(tmp_path / "nothing"))
         assert ran.returncode == 1
         assert "nothing" in ran.stderr
+
+
+def test_a_file_that_takes_no_more_is_said_so_and_the_program_runs_on(tmp_path: Path) -> None:
+    argv = [PYTHON, "-c", "import os, time; x = os.urandom(16 << 20); print('ready', flush=True); time.sleep(600)"]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        try:
+            process.stdout.readline()
+            words = [sys.executable, "-m", "failover", "capture", str(process.pid), "-o", str(tmp_path / "snapshot")]
+            bound = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (4 << 20, 4 << 20))  # noqa: E731
+            ran = subprocess.run(words, capture_output=True, text=True, check=False, preexec_fn=bound, timeout=BOUND_S)
+            assert ran.returncode == 1
+            assert "File too large; the program was not ended" in ran.stderr
+            assert process.poll() is None
+            wait_for("the program to go on", lambda: procfs.status(process.pid).state == "S")
+            assert procfs.status(process.pid).tracer == 0
+        finally:
+            process.kill()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_process_that_does_not_exist_cannot_be_captured(tmp_path: Path) -> None:
