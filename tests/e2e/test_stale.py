@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,6 +28,9 @@ STOPPED = {
     "agent_and_keeper": ("heart", "lanes", "keeper"),
 }
 """Parts whose rest makes a robot silent; the guard, which stands by itself, freezes the program before its lease ends."""
+
+REST_S = 0.5
+"""A counting program's log grows all the time; one that did not for so long grows no more."""
 
 MORE = 30
 """Numbers that show that it counts on."""
@@ -52,6 +56,13 @@ def written(robot: RobotMachine) -> bytes:
     """All that its copy wrote, shown to anybody or not."""
     (log,) = (robot.directory / "state" / "logs").glob("*/stdout.log")
     return log.read_bytes()
+
+
+def came_to_rest(robot: RobotMachine) -> bytes:
+    """All that its copy wrote, once nothing comes any more; nothing while it grows."""
+    before = written(robot)
+    time.sleep(REST_S)
+    return before if written(robot) == before else b""
 
 
 def runs_at(robot: RobotMachine) -> bool:
@@ -107,7 +118,7 @@ def test_who_stops_and_wakes_up_stale_has_not_run_on(pair: Pair, way: str) -> No
         os.kill(pid, signal.SIGSTOP)
     try:
         robots.until(lambda: runs_at(second), "robot2 to take over")
-        standing = written(first)
+        standing = robots.until(lambda: came_to_rest(first), "what it wrote before to be in its log")
         before = len(robots.output(second, "count"))
         robots.until(lambda: len(robots.output(second, "count")) > before + MORE, "robot2 to count on")
         assert written(first) == standing, "the old copy stood still before the new one ran"
