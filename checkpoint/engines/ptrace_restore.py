@@ -28,7 +28,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from checkpoint import carried, epoch_variable, rights, room
+from checkpoint import carried, epoch_variable, rights, room, side_by_side
 from checkpoint.arch import cpu, extended, stubs
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import (
@@ -398,7 +398,8 @@ class ProcessRestore:
         if self._rings:
             self._make_rings(self._stub, self._rings, first.descriptors)
         restore_threads.open_what_is_left(self._tracee, self._start_registers, self._stub, self._ended, first.descriptors)
-        restore_memory.fill(self._tracee.memory, self._state, self._legacy, self._untouched)
+        threads = side_by_side.thread_count()
+        restore_memory.fill(self._tracee.memory, self._state, self._legacy, self._untouched, threads)
 
     def _complete(self, later: LaterTables) -> None:
         """Everything but mappings and pages, which are there."""

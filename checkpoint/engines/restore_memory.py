@@ -305,8 +305,10 @@ class Carried:
         return index < len(self._starts) and int(self._starts[index]) < vma.end
 
 
-def fill(memory: Memory, snapshot: Snapshot, legacy: Legacy = NOTHING, untouched: Words = NONE) -> None:
+def fill(memory: Memory, snapshot: Snapshot, legacy: Legacy = NOTHING, untouched: Words = NONE, threads: int = 1) -> None:
     """Write every page that the snapshot carries, but for those of the kernel's own mappings, and those that are there.
+
+    By several threads, if there is much of it: most of the time is the kernel's, which finds and clears a page for each of ours.
 
     Droppable memory begins empty, as its program must expect at any time: seeds of random numbers lie there (vgetrandom), which
     two lives must not have in common.
@@ -319,7 +321,7 @@ def fill(memory: Memory, snapshot: Snapshot, legacy: Legacy = NOTHING, untouched
         ranges[:, 1] -= ranges[:, 0]
         size = int(ranges[:, 1].sum())
         if is_wanted:
-            memory.write_from(ranges, contents[position : position + size])
+            memory.write_side_by_side(ranges, contents[position : position + size], threads)
         position += size
 
 
