@@ -19,7 +19,7 @@ class Copy:
     """A set of pages and their bytes, as they were at one moment.
 
     Attributes:
-        content: of ``pages``, in address order.
+        content: of ``pages``, in address order; there may be room behind it.
     """
 
     pages: Words
@@ -53,19 +53,43 @@ def gathered(contents: Sequence[Buffer], sources: PageMap, page_size: int) -> me
     return gathered_bytes(contents, sources, page_size).data.toreadonly()
 
 
+def gathered_within(host: int, contents: Sequence[Buffer], sources: PageMap, page_size: int) -> memoryview | None:
+    """As `gathered`, in the memory of the copy ``host``, which is overwritten: half of the memory for a large program.
+
+    Returns:
+        None where it cannot be, and nothing was changed: pages that are not there would have to come between those that are.
+    """
+    count = len(sources.addresses)
+    if count * page_size > memoryview(contents[host]).nbytes:
+        return None
+    from_here = sources.words[:, 0] == np.uint64(host)
+    if (sources.words[from_here, 1] < np.flatnonzero(from_here)).any():
+        return None
+    target = np.frombuffer(contents[host], dtype=np.uint8)  # as no page moves up, none is overwritten before it was moved
+    _copy_stretches(contents, sources.words, target, page_size)
+    return target[: count * page_size].data.toreadonly()
+
+
 def gathered_bytes(contents: Sequence[Buffer], sources: PageMap, page_size: int) -> NDArray[np.uint8]:
     """The same, for who has to change them yet. Neighbours from one copy are copied at once."""
+    buffer = np.empty(len(sources.addresses) * page_size, dtype=np.uint8)
+    _copy_stretches(contents, sources.words, buffer, page_size)
+    return buffer
+
+
+def _copy_stretches(contents: Sequence[Buffer], places: Words, buffer: NDArray[np.uint8], page_size: int) -> None:
+    """Pages from their places to their order, from the first one on."""
     carried = [memoryview(content).cast("B") for content in contents]
     arrays = [np.frombuffer(content, dtype=np.uint8) for content in contents]
-    buffer = np.empty(len(sources.addresses) * page_size, dtype=np.uint8)
     target = buffer.data
-    for first, (index, page), count in _stretches(sources.words):
+    for first, (index, page), count in _stretches(places):
         begin, start, size = first * page_size, page * page_size, count * page_size
+        if begin == start and arrays[index].ctypes.data == buffer.ctypes.data:
+            continue
         if size < LONG_COPY:
             target[begin : begin + size] = carried[index][start : start + size]
         else:
             buffer[begin : begin + size] = arrays[index][start : start + size]
-    return buffer
 
 
 def _stretches(places: Words) -> list[tuple[int, tuple[int, int], int]]:

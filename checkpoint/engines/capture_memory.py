@@ -38,6 +38,8 @@ from checkpoint.resources import aio_rings
 
 BUFFER_SIZE: Final = 8 << 20
 """Bytes that a freeze may copy without asking for memory first."""
+ROOM_SIZE: Final = 64 << 10
+"""Bytes that a copy has room for behind its pages: of the vdso, and of what came since."""
 WORTH_COUNT: Final = 16
 """Pages that are worth the first pass of a delta while the program runs."""
 LARGE_COUNT: Final = 256
@@ -234,14 +236,14 @@ class MemoryCapture:
 
     def _read_into(self, copied: RunningCopy, wanted: Words) -> None:
         """Read a set as far as it is there."""
-        buffer = np.empty(pages.total_size(wanted), dtype=np.uint8).data
+        buffer = np.empty(pages.total_size(wanted) + ROOM_SIZE, dtype=np.uint8).data
         found, filled = [], 0
         for chunk in digests.chunks_of(wanted):
             readable = self._memory.readable_pages_into(chunk, buffer[filled:])
             found.append(readable)
             filled += pages.total_size(readable)
         if found:
-            copied.add(Copy(pagetables.pages_joined(np.concatenate(found)), buffer[:filled]))
+            copied.add(Copy(pagetables.pages_joined(np.concatenate(found)), buffer[: filled + ROOM_SIZE]))
 
     # While it stands still
 

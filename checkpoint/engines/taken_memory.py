@@ -12,7 +12,7 @@ from checkpoint.linux import abi, tracking
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.tracking import NONE
 from checkpoint.model import Position
-from checkpoint.pages import Words
+from checkpoint.pages import PageMap, Words
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,8 @@ class Taken:
         guards: see ``checkpoint.model.Vma.guards``.
         scans: everything that was named and is not acknowledged, the last scan's at the end.
         valid: pages of ``copies`` that only the last scan may have named since.
-        copies: oldest first; the last one was made while the program stood still, in a buffer that the next one uses again.
+        copies: oldest first; the last one was made while the program stood still, in a buffer that the next one uses again,
+            the others are this capture's alone.
         untouched: see `checkpoint.resources.untouched`.
         copy_ns: how long that last copy took.
     """
@@ -75,13 +76,26 @@ class Taken:
         return pages.total_size(self.copies[-1].pages)
 
     def contents(self) -> tuple[Words, memoryview, Words]:
-        """The carried pages that are to be sent, in order, their bytes, and those of anonymous memory that are all zero."""
+        """The carried pages that are to be sent, in order, their bytes, and those of anonymous memory that are all zero.
+
+        Once: the copies may be used up by it.
+        """
         sources, _ = gathering.newest(self.copies, abi.PAGE_SIZE).without(self.carried, NONE)
         of_files = tracking.extents_of([line for line in self.lines if line.has_file])
         zero = gathering.are_zero(self.copies, sources, abi.PAGE_SIZE) & ~pages.covered(of_files, sources.addresses)
         dropped = pages.extents_of_addresses(sources.addresses[zero], abi.PAGE_SIZE)
         sent, _ = sources.without(self.carried, dropped)
-        return sent.addresses, gathering.gathered([copy.content for copy in self.copies], sent, abi.PAGE_SIZE), dropped
+        return sent.addresses, self._gathered(sent), dropped
+
+    def _gathered(self, sent: PageMap) -> memoryview:
+        """Their bytes, in the largest copy that nobody needs any more, if that can be."""
+        contents = [copy.content for copy in self.copies]
+        if len(contents) > 1:
+            largest = max(range(len(contents) - 1), key=lambda index: pages.total_size(self.copies[index].pages))
+            within = gathering.gathered_within(largest, contents, sent, abi.PAGE_SIZE)
+            if within is not None:
+                return within
+        return gathering.gathered(contents, sent, abi.PAGE_SIZE)
 
 
 def since(scans: Sequence[Unacknowledged], mapped: Words, *, is_base: bool) -> tuple[Words, Words]:
