@@ -34,6 +34,11 @@ CODE_SEGMENT_64: Final = 0x33
 """``cs`` of a 64-bit program; 0x23 is a 32-bit one."""
 
 
+def words_of(content: bytes) -> tuple[int, ...]:
+    """Read NT_PRSTATUS: its words, unsigned, in the order of `REGISTER_NAMES`."""
+    return _REGISTERS.unpack(content)
+
+
 def decode_registers(content: bytes) -> Registers:
     """Read NT_PRSTATUS."""
     return dict(zip(REGISTER_NAMES, _REGISTERS.unpack(content), strict=True))
@@ -45,6 +50,15 @@ def encode_registers(registers: Mapping[str, int]) -> bytes:
         return _REGISTERS.pack(*_in_order(registers))
     except struct.error:  # a negative one
         return _REGISTERS.pack(*(registers[name] & _WORD for name in REGISTER_NAMES))
+
+
+_STAND: Final = struct.Struct("<80xq32xqQ")
+
+
+def stand_of(content: bytes) -> tuple[int, int, int]:
+    """Of NT_PRSTATUS, for many threads in little time: (instruction pointer, result, call number); the last two are signed."""
+    result, number, pointer = _STAND.unpack_from(content)
+    return pointer, result, number
 
 
 _WORD: Final = (1 << 64) - 1

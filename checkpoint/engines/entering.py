@@ -5,12 +5,11 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
 from checkpoint.arch import cpu as arch
-from checkpoint.arch.calls import Registers
 from checkpoint.engines.confinements import Confinements
 from checkpoint.engines.restart import Interruptions, outside_critical_section
 from checkpoint.errors import CaptureError, UnsupportedError
@@ -96,7 +95,8 @@ def _enter_once(
     for one in threads.others if mode or modes else ():
         confinements.suspended(one, modes.get(one.pid, FILTERED if mode else 0), (one.pid, 0))
     mask = tracee.signal_mask()
-    decoded = where_it_stands(tracee, tracee.registers(), tracee.rseq(), interruptions)
+    registers = where_it_stands(tracee, tracee.registers(), tracee.rseq, interruptions)
+    decoded = arch.decode_registers(registers)
     lines = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
     left = entry.leftovers(tracee.memory, lines)
     others = [(other, arch.decode_registers(other.registers())) for other in threads.others]
@@ -110,7 +110,6 @@ def _enter_once(
         return None
     for one, found in ((tracee, decoded), *others):
         interruptions.of(one).settled(found)  # remembers the call that it stands in
-    registers = arch.encode_registers(decoded)
     for borrowed in left:
         if borrowed.state() == remote.ARMED:
             borrowed.abandon()
@@ -149,12 +148,26 @@ def _put_back(pid: int, borrowed: BorrowedPages) -> None:
         sockets.set_peek_offset(looked, offset)
 
 
-def where_it_stands(tracee: Tracee, registers: bytes, rseq: Rseq | None, interruptions: Interruptions) -> Registers:
-    """The registers that the program is given back: as they are, but for what our stop alone has brought about."""
-    decoded = arch.decode_registers(registers)
-    if decoded[arch.CALL_NUMBER] >> 63:
-        return outside_critical_section(decoded, tracee.memory, rseq.address) if rseq else decoded
-    return interruptions.of(tracee).undisturbed(decoded)
+def where_it_stands(tracee: Tracee, registers: bytes, rseq: Callable[[], Rseq | None], interruptions: Interruptions) -> bytes:
+    """The registers that the program is given back: as they are, but for what our stop alone has brought about.
+
+    Args:
+        rseq: answers with its registration for restartable sequences; it may be in one if it is in no call.
+    """
+    _, result, number = arch.stand_of(registers)
+    if number < 0:
+        registration = rseq()
+        if registration is None:
+            return registers
+        decoded = arch.decode_registers(registers)
+        found = outside_critical_section(decoded, tracee.memory, registration.address)
+    else:
+        interruption = interruptions.of(tracee)
+        if not interruption.is_disturbed(result):
+            return registers
+        decoded = arch.decode_registers(registers)
+        found = interruption.undisturbed(decoded)
+    return registers if found is decoded else arch.encode_registers(found)
 
 
 def _tracker_for(pid: int, entered: entry.Entered) -> tuple[Tracker, tuple[str, ...]]:

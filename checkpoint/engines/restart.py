@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import operator
 from collections.abc import Container
+from typing import Final
 
 from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import Registers
@@ -25,6 +27,8 @@ CODE_LOOKED_AT = 32
 
 Place = tuple[int, ...]
 """Instruction pointer, stack pointer and arguments: the same while one call is restarted again and again."""
+_OF_PLACE: Final = (arch.INSTRUCTION_POINTER, arch.STACK_POINTER, *arch.ARGUMENTS)
+_place_in: Final = operator.itemgetter(*map(arch.REGISTER_NAMES.index, _OF_PLACE))
 
 
 class Interruption:
@@ -44,6 +48,10 @@ class Interruption:
         self._place: Place = ()
         self._number = -1
 
+    def is_disturbed(self, result: int) -> bool:
+        """Whether a stop in a call may have changed what it returns, signed; or it is to be noted that none has any more."""
+        return self.waiting.is_disturbed(result) or (self.begins_anew and result == arch.RESTART_BLOCK)
+
     def undisturbed(self, registers: Registers) -> Registers:
         """The registers that the live program gets back: see `Waiting.undisturbed`."""
         registers = self.waiting.undisturbed(registers)
@@ -52,6 +60,13 @@ class Interruption:
         number, registers = self._interrupted(registers, arch.call_number(registers))
         known = arch.SYSCALL_NAMES.get(number) in arch.RESTART_BLOCK_USERS
         return made_again({**registers, arch.CALL_NUMBER: number}, 0) if known else registers
+
+    def remembers(self, registers: bytes) -> bool:
+        """Whether `settled` needs to ask the program nothing, for these registers as `Tracee.registers` gives them."""
+        _, result, number = arch.stand_of(registers)
+        if result != arch.RESTART_BLOCK or number != arch.SYSCALLS["restart_syscall"]:
+            return True
+        return bool(_place_in(arch.words_of(registers)) == self._place)
 
     def settled(self, registers: Registers) -> tuple[Registers, str]:
         """The registers that a snapshot goes on with, and the name of the call that is made again ("" if none)."""
@@ -74,7 +89,7 @@ class Interruption:
 
     def _interrupted(self, registers: Registers, number: int) -> tuple[int, Registers]:
         """The call itself, and the registers with which it waits for what is left of its time."""
-        place = tuple(registers[name] for name in (arch.INSTRUCTION_POINTER, arch.STACK_POINTER, *arch.ARGUMENTS))
+        place = tuple(registers[name] for name in _OF_PLACE)
         if number == arch.SYSCALLS["restart_syscall"]:
             number = self._number if place == self._place else self._read_from_code(registers[arch.INSTRUCTION_POINTER])
         self._place, self._number = place, number

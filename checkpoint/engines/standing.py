@@ -40,11 +40,11 @@ class Place(Read):
     """Where the first thread stands, and the others.
 
     Attributes:
-        registers: that it is given back.
+        registers: that it is given back, as `Tracee.registers` gives them.
         special: signals with an action of their own, bit 0 is signal 1.
     """
 
-    registers: Registers
+    registers: bytes
     reading: Reading
     special: int
     shared_pending: tuple[bytes, ...]
@@ -178,8 +178,8 @@ class Onlooker:
         )
         special, _, waits_shared = procfs.signal_sets(status)
         shared_pending = tracee.pending(shared=True) if waits_shared else ()
-        registers = where_it_stands(tracee, reading.registers, reading.rseq, self._interruptions)
-        if self._borrowed.holds(registers[arch.INSTRUCTION_POINTER]):
+        registers = where_it_stands(tracee, reading.registers, lambda: reading.rseq, self._interruptions)
+        if self._borrowed.holds(arch.stand_of(registers)[0]):
             raise CaptureError(f"pid {tracee.pid} still stands in code of an earlier look; capture it again in a moment")
         others = self._others.places(of_others, self.rights.modes, mode)
         return Place(registers, reading, special, shared_pending, status, others, confined)
@@ -193,12 +193,12 @@ class Onlooker:
         tracee = self._tracee
         self.tables.look()
         inquiry = self._questions(place.special)
-        answers = self._borrowed.run(tracee, inquiry.batch, arch.encode_registers(place.registers), place.mask)
+        answers = self._borrowed.run(tracee, inquiry.batch, place.registers, place.mask)
         others = self._others.ask(place.others)
         waiting = (*tracee.pending(shared=False), *tracee.pending(shared=True))
         if inquiry.has_timers:
             waiting += self._others.waiting(place.others)
-        settled, interrupted = self._interruptions.of(tracee).settled(place.registers)
+        settled, interrupted = self._interruptions.of(tracee).settled(arch.decode_registers(place.registers))
         return Standing(
             place=place,
             others=others,

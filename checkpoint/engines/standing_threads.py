@@ -17,6 +17,7 @@ from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import Registers
 from checkpoint.engines.confinements import Confinements, Life
 from checkpoint.engines.entering import Entered, where_it_stands
+from checkpoint.engines.restart import Interruption
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.confinement import FILTERED, FREE, Confinement
@@ -58,7 +59,7 @@ class ThreadPlace(Read):
     """Where a thread stands.
 
     Attributes:
-        registers: that it is given back.
+        registers: that it is given back, as `Tracee.registers` gives them.
         inner_tid: its id as it sees it itself.
         confinement: by seccomp(2); suspended as long as it stands.
     """
@@ -67,7 +68,7 @@ class ThreadPlace(Read):
     life: Life
     inner_tid: int
     stat_text: bytes
-    registers: Registers
+    registers: bytes
     reading: Reading
     confinement: Confinement = FREE
 
@@ -78,12 +79,11 @@ class ThreadStanding:
 
     Attributes:
         settled: registers that a snapshot goes on with.
-        interrupted: see ``checkpoint.model.ThreadState``.
+        interruption: of the thread.
     """
 
     place: ThreadPlace
-    settled: Registers
-    interrupted: str
+    interruption: Interruption
     questions: ThreadQuestions
     answers: Answers
 
@@ -91,6 +91,24 @@ class ThreadStanding:
     def reading(self) -> Reading:
         """What the kernel told of it."""
         return self.place.reading
+
+    def settle(self) -> None:
+        """Have the call remembered that it stands in: before the program is stopped again."""
+        _ = self._settled
+
+    @property
+    def settled(self) -> Registers:
+        """Registers that a snapshot goes on with."""
+        return self._settled[0]
+
+    @property
+    def interrupted(self) -> str:
+        """See ``checkpoint.model.ThreadState``."""
+        return self._settled[1]
+
+    @functools.cached_property
+    def _settled(self) -> tuple[Registers, str]:
+        return self.interruption.settled(arch.decode_registers(self.place.registers))
 
     @functools.cached_property
     def stat(self) -> Stat:
@@ -176,6 +194,7 @@ class ThreadOnlooker:
         self._inner_tids: dict[Life, int] = {}
         self._stats: dict[int, int] = {}
         self._interruptions = entered.interruptions
+        self._asked: tuple[ThreadStanding, ...] = ()
 
     def close(self) -> None:
         """Close what is kept open of them."""
@@ -186,13 +205,20 @@ class ThreadOnlooker:
             os.close(self._stats.pop(tid))
 
     def prepare(self) -> None:
-        """Look up, while the program runs, what does not change."""
+        """Look up, while the program runs, what does not change; what is left of an earlier look."""
+        self._settle()
         for tid in thread_ids(self._threads.pid):
             if tid != self._threads.pid:
                 try:
                     self._inner_tid((tid, _start_time(self._stat_text(tid))))
                 except (ProcessGoneError, ProbeError):
                     continue  # it has ended
+
+    def _settle(self) -> None:
+        """Note where threads stood at the last look, also if nobody wanted to know: the kernel forgets which call that was."""
+        asked, self._asked = self._asked, ()
+        for standing in asked:
+            standing.settle()
 
     def _stat_text(self, tid: int) -> bytes:
         """Its stat, by a file that stays open: reading it again takes a third of opening it anew. Of whoever has this id now."""
@@ -252,32 +278,27 @@ class ThreadOnlooker:
         inner_tid = self._inner_tid(life)
         mode = self._modes.get(life, mode) or (FILTERED if reading.is_filtered else 0)
         found = self._confinements.suspended(tracee, mode, life)
-        registers = where_it_stands(tracee, reading.registers, reading.rseq, self._interruptions)
-        if self._borrowed.holds(registers[arch.INSTRUCTION_POINTER]):
+        registers = where_it_stands(tracee, reading.registers, lambda: reading.rseq, self._interruptions)
+        if self._borrowed.holds(arch.stand_of(registers)[0]):
             raise CaptureError(f"thread {tracee.pid} still stands in code of an earlier look; capture it again in a moment")
         return ThreadPlace(tracee, life, inner_tid, stat_text, registers, reading, found)
 
     def ask(self, places: tuple[ThreadPlace, ...]) -> tuple[ThreadStanding, ...]:
         """Everything else."""
+        self._settle()
         if not places:
             return ()
         guests = [Guest(place.tracee, place.registers, place.mask) for place in places]
         answers = self._borrowed.run_each([questions.batch for questions in self._questions], guests)
         count = len(self._questions)
-        return tuple(
-            self._standing(place, self._questions[index % count], answer)
+        self._asked = tuple(
+            ThreadStanding(place, self._interruptions.of(place.tracee), self._questions[index % count], answer)
             for index, (place, answer) in enumerate(zip(places, answers, strict=True))
         )
-
-    def _standing(self, place: ThreadPlace, questions: ThreadQuestions, answers: Answers) -> ThreadStanding:
-        settled, interrupted = self._interruptions.of(place.tracee).settled(place.registers)
-        return ThreadStanding(
-            place=place,
-            settled=settled,
-            interrupted=interrupted,
-            questions=questions,
-            answers=answers,
-        )
+        for standing in self._asked:
+            if not standing.interruption.remembers(standing.place.registers):
+                standing.settle()
+        return self._asked
 
     @staticmethod
     def waiting(places: tuple[ThreadPlace, ...]) -> tuple[bytes, ...]:

@@ -100,6 +100,10 @@ class Waiting:
         self._makes_again = makes_again
         self._wait: Wait | None = None
 
+    def is_disturbed(self, result: int) -> bool:
+        """Whether `undisturbed` has anything to do, for a call with this result."""
+        return result == -errno.EINTR or self._wait is not None
+
     def undisturbed(self, registers: Registers) -> Registers:
         """The registers that the live program gets back: without what our stop alone has brought about."""
         before, self._wait = self._wait, None

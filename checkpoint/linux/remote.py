@@ -36,7 +36,7 @@ import struct
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import Call, Registers, TablePlaces
@@ -68,10 +68,11 @@ ARMED: Final = 1
 ENDED: Final = 2
 ABANDONED: Final = 3
 
-_HEAD: Final = struct.Struct("<32sQQQQQQQQ")  # magic, state, done, serial, mask, timeout (2 words), empty set, resume
-_CLOBBERED: Final = struct.Struct(f"<{len(arch.CLOBBERED)}Q")
-_of_clobbered: Final = operator.itemgetter(*arch.CLOBBERED)
-_HEAD_SIZE: Final = _HEAD.size + _CLOBBERED.size
+_HEAD: Final = struct.Struct(f"<32s8Q{len(arch.CLOBBERED)}Q")
+"""Magic, state, done, serial, mask, timeout (2 words), empty set, resume, registers."""
+_HEAD_SIZE: Final = _HEAD.size
+_of_clobbered: Final = operator.itemgetter(*map(arch.REGISTER_NAMES.index, arch.CLOBBERED))
+_OF_RESULT: Final = arch.CLOBBERED.index(arch.RESULT)
 _OUTPUT_ALIGNMENT: Final = 16
 _STATE_OFFSET: Final = 32
 _IDLE_WORD: Final = struct.pack("<Q", IDLE)
@@ -174,8 +175,7 @@ class Answers:
         return self._outputs[offset : offset + size]
 
 
-@dataclass(frozen=True, slots=True)
-class Guest:
+class Guest(NamedTuple):
     """A thread that is to make the calls of a batch, and where it stands.
 
     Attributes:
@@ -184,7 +184,7 @@ class Guest:
     """
 
     tracee: Tracee
-    registers: Registers
+    registers: bytes
     mask: int
 
 
@@ -232,11 +232,8 @@ class Desk:
             self._code_key = key
         self._serial += 1
         self.is_known_idle = False
-        resume = resumed(guest.registers)
         patience = divmod(patience_ns(guest.tracee), 10**9)
-        return _HEAD.pack(
-            MAGIC, ARMED, 0, self._serial, guest.mask, *patience, 0, resume[arch.INSTRUCTION_POINTER]
-        ) + _CLOBBERED.pack(*_of_clobbered(resume))
+        return _HEAD.pack(MAGIC, ARMED, 0, self._serial, guest.mask, *patience, 0, *_going_on(guest.registers))
 
     def is_done(self, table: bytes) -> bool:
         """Whether the calls have been made, by the table's bytes."""
@@ -327,8 +324,7 @@ class BorrowedPages:
             ProcessGoneError: it was killed meanwhile.
             CaptureError: the batch did not run in time, or we came too late to take the thread back; the program goes on.
         """
-        guest = Guest(tracee, arch.decode_registers(registers), mask)
-        return self._run_at([self._large], [batch], [guest])[0]
+        return self._run_at([self._large], [batch], [Guest(tracee, registers, mask)])[0]
 
     def run_each(self, batches: Sequence[Batch], guests: Sequence[Guest]) -> list[Answers]:
         """Have each of many threads make the calls of a batch, as many at a time as there are small desks; raises as `run`.
@@ -407,7 +403,7 @@ class BorrowedPages:
             with _collected(failures):
                 if moves:
                     guest.tracee.await_stop()
-                set_back(guest.tracee, arch.encode_registers(guest.registers), guest.mask, self.holds)
+                set_back(guest.tracee, guest.registers, guest.mask, self.holds)
                 given.append(desk)
         return given
 
@@ -476,13 +472,8 @@ def resumed(registers: Registers) -> Registers:
     """The registers with which the live program can go on without the kernel's help: an interrupted call is made again."""
     result = ctypes.c_int64(registers[arch.RESULT]).value
     number = ctypes.c_int64(registers[arch.CALL_NUMBER]).value
-    if number < 0:
-        return registers
-    if result in arch.RESTARTABLE:
-        again = number
-    elif result == arch.RESTART_BLOCK:
-        again = arch.SYSCALLS["restart_syscall"]
-    else:
+    again = _call_made_again(result, number)
+    if again is None:
         return registers
     return {
         **registers,
@@ -490,3 +481,26 @@ def resumed(registers: Registers) -> Registers:
         arch.INSTRUCTION_POINTER: registers[arch.INSTRUCTION_POINTER] - len(arch.SYSCALL),
         arch.CALL_NUMBER: arch.NO_CALL,
     }
+
+
+def _call_made_again(result: int, number: int) -> int | None:
+    """The call by which an interrupted one goes on without the kernel's help; None where none was interrupted.
+
+    Args:
+        result, number: of the call that a thread stands in, signed.
+    """
+    if number < 0:
+        return None
+    if result in arch.RESTARTABLE:
+        return number
+    return arch.SYSCALLS["restart_syscall"] if result == arch.RESTART_BLOCK else None
+
+
+def _going_on(registers: bytes) -> tuple[int, ...]:
+    """As `resumed`, of what a table has to hold of it: the instruction pointer, then what the calls of a batch change."""
+    pointer, result, number = arch.stand_of(registers)
+    again = _call_made_again(result, number)
+    found: tuple[int, ...] = _of_clobbered(arch.words_of(registers))
+    if again is None:
+        return (pointer, *found)
+    return (pointer - len(arch.SYSCALL), *found[:_OF_RESULT], again, *found[_OF_RESULT + 1 :])

@@ -14,7 +14,6 @@ from typing import Final
 import numpy as np
 
 from checkpoint.arch import cpu as arch
-from checkpoint.arch.calls import Registers
 from checkpoint.linux import abi
 from checkpoint.linux.own_calls import FIRST_ARGUMENT, ROW, OwnCalls, row
 from checkpoint.linux.tracee import PLAIN_STOP, SPIN_S, Tracee, rest
@@ -56,7 +55,6 @@ class Round:
         self._capacity = capacity
         self._memory = np.zeros((capacity, _Layout.size), dtype=np.uint8)
         self._words = self._memory.view(np.uint64)
-        self._view = self._memory.reshape(-1).data
         base = int(self._memory.ctypes.data)
         places = [base + index * _Layout.size for index in range(capacity)]
         by_thread = [_calls_about(place) for place in places]
@@ -72,21 +70,19 @@ class Round:
                 self._words[index, iov // WORD + 1] = arch.REGISTERS_SIZE
         self._words[:, _Layout.every_signal // WORD] = abi.ALL_SIGNALS
 
-    def start(
-        self, tracees: Sequence[Tracee], codes: Sequence[int], registers: Sequence[Registers], masks: Sequence[int]
-    ) -> bool:
+    def start(self, tracees: Sequence[Tracee], codes: Sequence[int], registers: Sequence[bytes], masks: Sequence[int]) -> bool:
         """Have each run the code at its place; False when one did not take it: it has been killed.
 
         Args:
             registers, masks: that each stands with; `give_back` sets them again.
         """
         self._address([tracee.pid for tracee in tracees])
-        for index, (tracee, found) in enumerate(zip(tracees, registers, strict=True)):
+        for tracee in tracees:
             tracee.is_as_found = False
-            back = arch.encode_registers(found)
-            self._put(index, _Layout.back, back)
-            self._put(index, _Layout.there, back)
         count = len(tracees)
+        found = np.frombuffer(b"".join(registers), dtype=np.uint8).reshape(count, arch.REGISTERS_SIZE)
+        self._memory[:count, _Layout.back : _Layout.back + arch.REGISTERS_SIZE] = found
+        self._memory[:count, _Layout.there : _Layout.there + arch.REGISTERS_SIZE] = found
         self._words[:count, _Layout.there // WORD + _POINTER] = np.array(codes, dtype=np.uint64)
         self._words[:count, _Layout.there // WORD + _NUMBER] = arch.NO_CALL
         self._words[:count, _Layout.mask // WORD] = np.array(masks, dtype=np.uint64)
@@ -130,10 +126,6 @@ class Round:
         if not all(map(is_ours, self._words[: len(self._tids), _Layout.found // WORD + _POINTER].tolist())):
             return False
         return not any(self._run(GIVE_BACK))
-
-    def _put(self, index: int, place: int, content: bytes) -> None:
-        begin = index * _Layout.size + place
-        self._view[begin : begin + len(content)] = content
 
     def _address(self, tids: list[int]) -> None:
         """Fill in whom the calls are about."""
