@@ -22,7 +22,7 @@ from checkpoint.linux import confinement, procfs
 from checkpoint.linux.confinement import FREE, Confinement
 from checkpoint.linux.descriptors import lending
 from checkpoint.linux.procfs import KeptFiles, Stat, Status
-from checkpoint.linux.readings import Reading, Readings
+from checkpoint.linux.readings import Readings, Unread
 from checkpoint.linux.remote import Answers
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.timers import parse_timers
@@ -45,7 +45,7 @@ class Place(Read):
     """
 
     registers: bytes
-    reading: Reading
+    unread: Unread
     special: int
     shared_pending: tuple[bytes, ...]
     status_text: bytes
@@ -173,16 +173,16 @@ class Onlooker:
         status = self._files.read("status")
         mode = confinement.mode_in(status)
         confined = self._confinements.suspended(tracee, mode, (tracee.pid, 0))
-        reading, *of_others = self._readings.read(
+        unread, *of_others = self._readings.read(
             [tracee, *self._threads.others], [self._files.descriptor("stat"), *self._others.stat_files()]
         )
         special, _, waits_shared = procfs.signal_sets(status)
         shared_pending = tracee.pending(shared=True) if waits_shared else ()
-        registers = where_it_stands(tracee, reading.registers, lambda: reading.rseq, self._interruptions)
+        registers = where_it_stands(tracee, unread.registers, lambda: unread.reading.rseq, self._interruptions)
         if self._borrowed.holds(arch.stand_of(registers)[0]):
             raise CaptureError(f"pid {tracee.pid} still stands in code of an earlier look; capture it again in a moment")
         others = self._others.places(of_others, self.rights.modes, mode)
-        return Place(registers, reading, special, shared_pending, status, others, confined)
+        return Place(registers, unread, special, shared_pending, status, others, confined)
 
     def ask(self, place: Place, outputs: Outputs | None, opened: Opened | None = None) -> Standing:
         """Everything else. Its system calls are made inside the process: the memory has been taken before.

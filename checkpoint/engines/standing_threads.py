@@ -12,6 +12,7 @@ import os
 import struct
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import Registers
@@ -23,7 +24,7 @@ from checkpoint.linux import abi, procfs
 from checkpoint.linux.confinement import FILTERED, FREE, Confinement
 from checkpoint.linux.kept_descriptors import TEXTS_KEPT
 from checkpoint.linux.procfs import Stat
-from checkpoint.linux.readings import NO_FILE, Reading
+from checkpoint.linux.readings import NO_FILE, Reading, Unread
 from checkpoint.linux.remote import SMALL, Answers, Batch, Desk, Guest
 from checkpoint.linux.tasks import thread_ids
 from checkpoint.linux.threads import Threads
@@ -36,12 +37,17 @@ class Read:
 
     __slots__ = ()
 
-    reading: Reading
+    unread: Unread
+
+    @property
+    def reading(self) -> Reading:
+        """What the kernel told."""
+        return self.unread.reading
 
     @property
     def mask(self) -> int:
         """The program's own."""
-        return self.reading.mask
+        return self.unread.mask
 
     @property
     def pending(self) -> tuple[bytes, ...]:
@@ -61,15 +67,16 @@ class ThreadPlace(Read):
     Attributes:
         registers: that it is given back, as `Tracee.registers` gives them.
         inner_tid: its id as it sees it itself.
+        text: its /proc/PID/task/TID/stat; empty where that was read with all the rest.
         confinement: by seccomp(2); suspended as long as it stands.
     """
 
     tracee: Tracee
     life: Life
     inner_tid: int
-    stat_text: bytes
     registers: bytes
-    reading: Reading
+    unread: Unread
+    text: bytes = b""
     confinement: Confinement = FREE
 
 
@@ -113,7 +120,7 @@ class ThreadStanding:
     @functools.cached_property
     def stat(self) -> Stat:
         """Its /proc/PID/task/TID/stat."""
-        return procfs.parse_stat(os.fsdecode(self.place.stat_text))
+        return procfs.parse_stat(os.fsdecode(self.place.text or self.reading.stat_text))
 
     @functools.cached_property
     def altstack(self) -> tuple[int, int, int]:
@@ -182,6 +189,16 @@ def _start_time(stat_text: bytes) -> int:
     return int(stat_text[stat_text.rindex(b")") + 2 :].split(b" ", 20)[19])
 
 
+class _KeptStat(NamedTuple):
+    """The stat file of a thread, and which thread that is."""
+
+    file: int
+    life: Life
+
+
+NOTHING_KEPT: Final = _KeptStat(NO_FILE, (0, 0))
+
+
 class ThreadOnlooker:
     """Asks the threads of one process besides the first, again and again."""
 
@@ -192,7 +209,7 @@ class ThreadOnlooker:
         self._borrowed = entered.pages
         self._questions = [ThreadQuestions(desk) for desk in entered.pages.desks]
         self._inner_tids: dict[Life, int] = {}
-        self._stats: dict[int, int] = {}
+        self._stats: dict[int, _KeptStat] = {}
         self._interruptions = entered.interruptions
         self._asked: tuple[ThreadStanding, ...] = ()
 
@@ -202,7 +219,7 @@ class ThreadOnlooker:
 
     def _keep_only(self, tids: Collection[int]) -> None:
         for tid in [tid for tid in self._stats if tid not in tids]:
-            os.close(self._stats.pop(tid))
+            os.close(self._stats.pop(tid).file)
 
     def prepare(self) -> None:
         """Look up, while the program runs, what does not change; what is left of an earlier look."""
@@ -210,7 +227,7 @@ class ThreadOnlooker:
         for tid in thread_ids(self._threads.pid):
             if tid != self._threads.pid:
                 try:
-                    self._inner_tid((tid, _start_time(self._stat_text(tid))))
+                    self._inner_tid(self._stat(tid)[0])
                 except (ProcessGoneError, ProbeError):
                     continue  # it has ended
 
@@ -220,18 +237,29 @@ class ThreadOnlooker:
         for standing in asked:
             standing.settle()
 
-    def _stat_text(self, tid: int) -> bytes:
-        """Its stat, by a file that stays open: reading it again takes a third of opening it anew. Of whoever has this id now."""
+    def _stat(self, tid: int) -> tuple[Life, bytes]:
+        """Who has this id now, and its stat.
+
+        By a file that stays open: reading it again takes a third of opening it anew, and once its thread has ended it tells of no
+        other one.
+        """
         kept = self._stats.get(tid)
         if kept is not None:
-            with contextlib.suppress(ProcessLookupError):  # another thread had it then
-                return os.pread(kept, procfs.READ_SIZE, 0)
-            os.close(self._stats.pop(tid))
+            with contextlib.suppress(ProcessLookupError):
+                return kept.life, os.pread(kept.file, procfs.READ_SIZE, 0)
+            os.close(self._stats.pop(tid).file)
         name = f"task/{tid}/stat"
         if len(self._stats) >= TEXTS_KEPT:
-            return procfs.read_line(self._threads.pid, name)
-        self._stats[tid] = procfs.opened(self._threads.pid, name)
-        return procfs.read_line(self._threads.pid, name)
+            text = procfs.read_line(self._threads.pid, name)
+            return (tid, _start_time(text)), text
+        file = procfs.opened(self._threads.pid, name)
+        try:
+            text = procfs.read_kept(file, self._threads.pid, name)
+        except BaseException:
+            os.close(file)
+            raise
+        kept = self._stats[tid] = _KeptStat(file, (tid, _start_time(text)))
+        return kept.life, text
 
     def _inner_tid(self, life: Life) -> int:
         """Its id as it sees it itself; whether it is confined since its birth is noted by the way."""
@@ -245,9 +273,9 @@ class ThreadOnlooker:
 
     def stat_files(self) -> list[int]:
         """Of those that stand still: what `Readings.read` is to read of them."""
-        return [self._stats.get(tracee.pid, NO_FILE) for tracee in self._threads.others]
+        return [self._stats.get(tracee.pid, NOTHING_KEPT).file for tracee in self._threads.others]
 
-    def places(self, readings: Sequence[Reading], modes: Mapping[int, int], of_first: int) -> tuple[ThreadPlace, ...]:
+    def places(self, readings: Sequence[Unread], modes: Mapping[int, int], of_first: int) -> tuple[ThreadPlace, ...]:
         """Where they stand.
 
         Args:
@@ -272,16 +300,15 @@ class ThreadOnlooker:
             self._keep_only(tids)
         return found
 
-    def _place(self, tracee: Tracee, reading: Reading, mode: int) -> ThreadPlace:
-        stat_text = reading.stat_text or self._stat_text(tracee.pid)
-        life = tracee.pid, _start_time(stat_text)
+    def _place(self, tracee: Tracee, unread: Unread, mode: int) -> ThreadPlace:
+        life, text = (self._stats[tracee.pid].life, b"") if unread.has_text else self._stat(tracee.pid)
         inner_tid = self._inner_tid(life)
-        mode = self._modes.get(life, mode) or (FILTERED if reading.is_filtered else 0)
+        mode = self._modes.get(life, mode) or (FILTERED if unread.is_filtered else 0)
         found = self._confinements.suspended(tracee, mode, life)
-        registers = where_it_stands(tracee, reading.registers, lambda: reading.rseq, self._interruptions)
+        registers = where_it_stands(tracee, unread.registers, lambda: unread.reading.rseq, self._interruptions)
         if self._borrowed.holds(arch.stand_of(registers)[0]):
             raise CaptureError(f"thread {tracee.pid} still stands in code of an earlier look; capture it again in a moment")
-        return ThreadPlace(tracee, life, inner_tid, stat_text, registers, reading, found)
+        return ThreadPlace(tracee, life, inner_tid, registers, unread, text, found)
 
     def ask(self, places: tuple[ThreadPlace, ...]) -> tuple[ThreadStanding, ...]:
         """Everything else."""

@@ -1,7 +1,8 @@
 """What the kernel tells of threads that stand still: of many in one go, kept as bytes until somebody has the time to read them.
 
 What the table of calls cannot bring (pending signals, more processors than it has room for) is asked once more, singly; so
-is what failed, and that says why.
+is what failed, and that says why. All that is asked while they stand still; what the answers mean is read when somebody wants
+to know, for most of it when they run again.
 
 Source: ptrace(2), seccomp_get_filter() in kernel/seccomp.c, get_robust_list(2), sched_getaffinity(2), proc_pid_stat(5).
 """
@@ -11,6 +12,7 @@ from __future__ import annotations
 import errno
 import os
 import struct
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -26,6 +28,8 @@ TEXT_SIZE: Final = 4096
 """Room for one file of /proc; one that fills it is read again, as long as it is."""
 PEEKED: Final = 1
 """Room for so many pending signals: whether there are any. A thread that has some is asked again."""
+STEP: Final = 16
+"""By so many threads at a time the tables grow."""
 PROCESSORS_SIZE: Final = 128
 """Bytes of a set of processors: a bit for each of 1,024."""
 
@@ -50,6 +54,10 @@ class _Layout:
     xstate = registers + REGISTERS_SIZE
     size = xstate + XSTATE_SIZE
 
+
+_REGISTERS_LENGTH: Final = _Layout.registers_iov // _WORD + 1
+_XSTATE_LENGTH: Final = _Layout.xstate_iov // _WORD + 1
+"""Places of the lengths that the kernel has written, in words."""
 
 CALLS: Final = 11
 """About each thread."""
@@ -91,17 +99,46 @@ class Reading:
         return tuple(number for number in range(every.bit_length()) if every >> number & 1)
 
 
-class Readings:
-    """Asks about the threads of one process, again and again. Every call from the thread that traces them."""
+class Unread:
+    """What was told of one thread: what is needed while it stands still, and all of it, which is read when it is wanted.
 
-    def __init__(self) -> None:
-        self._grow(1)
+    Attributes:
+        registers, mask, is_filtered: as in `Reading`.
+        has_text: its stat file has answered: it is the thread for which that was opened.
+    """
 
-    def _grow(self, capacity: int) -> None:
-        self._capacity = capacity
+    __slots__ = ("_answers", "_index", "_reading", "_tracee", "has_text", "is_filtered", "mask", "registers")
+
+    def __init__(self, answers: _Answers, index: int, tracee: Tracee, results: list[int]) -> None:
+        self._answers: _Answers | None = answers
+        self._index = index
+        self._tracee = tracee
+        self._reading: Reading | None = None
+        self.has_text = results[TEXT] >= 0
+        self.is_filtered = _is_filtered(results)
+        if _is_complete(results):
+            self.registers, self.mask = answers.registers(index), answers.mask(index)
+        else:
+            self.registers, self.mask = self.reading.registers, self.reading.mask
+
+    @property
+    def reading(self) -> Reading:
+        """All of it; the thread need not stand still for that any more."""
+        if self._reading is None:
+            assert self._answers is not None
+            self._reading, self._answers = self._answers.reading(self._index, self._tracee), None
+        return self._reading
+
+
+class _Area:
+    """Tables of the calls about so many threads, and the memory that these write to."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
         self._memory = np.zeros(capacity * _Layout.size, dtype=np.uint8)
-        self._view = self._memory.data
+        self.view = self._memory.data
         self._words = self._memory.view(np.uint64).reshape(capacity, -1)
+        self.cells = self._memory.view(np.uint64).data
         self._results = np.zeros((capacity, CALLS), dtype=np.int64)
         base, answers = int(self._memory.ctypes.data), int(self._results.ctypes.data)
         rows: list[tuple[int, ...]] = []
@@ -111,32 +148,22 @@ class Readings:
             self._words[index, _Layout.registers_iov // _WORD] = area + _Layout.registers
             self._words[index, _Layout.xstate_iov // _WORD] = area + _Layout.xstate
             order = abi.PeekSiginfo(0, 0, PEEKED)
-            self._view[index * _Layout.size + _Layout.order :][: len(bytes(order))] = bytes(order)
+            self.view[index * _Layout.size + _Layout.order :][: len(bytes(order))] = bytes(order)
         self._calls = OwnCalls(rows)
         self._rows = self._calls.entries.reshape(capacity, CALLS, -1)
         self._about: tuple[list[int], list[int]] = ([], [])
 
-    def read(self, tracees: Sequence[Tracee], stats: Sequence[int]) -> list[Reading]:
-        """Ask about these; they stand still.
-
-        Args:
-            stats: for each a descriptor of its stat file; `NO_FILE` if that is not wanted.
-
-        Raises:
-            ProcessGoneError: one of them has been killed.
-        """
-        count = len(tracees)
-        if count > self._capacity:
-            self._grow(-(-count // 16) * 16)
-        about = [tracee.pid for tracee in tracees], list(stats)
-        if about != self._about:
-            self._address(*about)
-            self._about = about
-        self._words[:count, _Layout.registers_iov // _WORD + 1] = REGISTERS_SIZE
-        self._words[:count, _Layout.xstate_iov // _WORD + 1] = XSTATE_SIZE
+    def ask(self, tids: list[int], stats: list[int]) -> list[list[int]]:
+        """Make the calls about these: the results of each."""
+        count = len(tids)
+        if (tids, stats) != self._about:
+            self._address(tids, stats)
+            self._about = tids, stats
+        self._words[:count, _REGISTERS_LENGTH] = REGISTERS_SIZE
+        self._words[:count, _XSTATE_LENGTH] = XSTATE_SIZE
         self._calls.run(0, count * CALLS)
-        results = self._results[:count].tolist()
-        return [self._reading(index, tracee, results[index], stats[index]) for index, tracee in enumerate(tracees)]
+        found: list[list[int]] = self._results[:count].tolist()
+        return found
 
     def _address(self, tids: list[int], stats: list[int]) -> None:
         """Fill in whom the calls are about."""
@@ -147,41 +174,106 @@ class Readings:
             rows[:, place, 1] = ids
         rows[:, TEXT, 1] = np.array(stats, dtype=np.int64).view(np.uint64)
 
-    def _reading(self, index: int, tracee: Tracee, results: list[int], stat: int) -> Reading:
-        at, view = index * _Layout.size, self._view
+
+class _Answers:
+    """What was told of all threads at once, as bytes. Whoever holds it keeps its memory from being written to again."""
+
+    __slots__ = ("__weakref__", "_area", "_results", "_stats")
+
+    def __init__(self, area: _Area, results: list[list[int]], stats: Sequence[int]) -> None:
+        self._area = area
+        self._results = results
+        self._stats = stats
+
+    def reading(self, index: int, tracee: Tracee) -> Reading:
+        """All that was told of a thread.
+
+        Args:
+            tracee: is asked what has failed, and must stand still if anything has.
+
+        Raises:
+            ProcessGoneError: it has been killed.
+        """
+        at, view, results = index * _Layout.size, self._area.view, self._results[index]
         return Reading(
-            registers=self._registers(index, _Layout.registers_iov) if results[REGISTERS] == 0 else tracee.registers(),
-            mask=int(self._words[index, _Layout.mask // _WORD]) if results[MASK] == 0 else tracee.signal_mask(),
+            registers=self.registers(index) if results[REGISTERS] == 0 else tracee.registers(),
+            mask=self.mask(index) if results[MASK] == 0 else tracee.signal_mask(),
             rseq=self._rseq(at) if results[RSEQ] > 0 else tracee.rseq(),
             pending=tracee.pending(shared=False) if results[PENDING] else (),
-            xstate=self._registers(index, _Layout.xstate_iov) if results[XSTATE] == 0 else tracee.xstate(),
-            stat_text=self._text(at, results[TEXT], stat),
+            xstate=self._xstate(index) if results[XSTATE] == 0 else tracee.xstate(),
+            stat_text=self._text(at, results[TEXT], self._stats[index]),
             robust_list=_PAIR.unpack_from(view, at + _Layout.robust) if results[ROBUST] == 0 else abi.robust_list(tracee.pid),
             policy=results[POLICY] if results[POLICY] >= 0 else os.sched_getscheduler(tracee.pid),
             processors=self._processors(at, tracee.pid, results[PROCESSORS]),
             io_priority=max(results[IO_PRIORITY], 0),
-            is_filtered=results[FILTER] >= 0 or results[FILTER] == -errno.EMEDIUMTYPE,
+            is_filtered=_is_filtered(results),
         )
 
-    def _registers(self, index: int, iov: int) -> bytes:
+    def registers(self, index: int) -> bytes:
         """As many bytes as the kernel has written."""
-        place = index * _Layout.size + (_Layout.registers if iov == _Layout.registers_iov else _Layout.xstate)
-        return bytes(self._view[place : place + int(self._words[index, iov // _WORD + 1])])
+        begin = index * _Layout.size + _Layout.registers
+        return bytes(self._area.view[begin : begin + self._word(index, _REGISTERS_LENGTH)])
+
+    def mask(self, index: int) -> int:
+        """Of signals."""
+        return self._word(index, _Layout.mask // _WORD)
+
+    def _word(self, index: int, place: int) -> int:
+        return self._area.cells[index * (_Layout.size // _WORD) + place]
+
+    def _xstate(self, index: int) -> bytes:
+        begin = index * _Layout.size + _Layout.xstate
+        return bytes(self._area.view[begin : begin + self._word(index, _XSTATE_LENGTH)])
 
     def _rseq(self, at: int) -> Rseq | None:
-        address, size, signature, flags, _ = _RSEQ.unpack_from(self._view, at + _Layout.rseq)
+        address, size, signature, flags, _ = _RSEQ.unpack_from(self._area.view, at + _Layout.rseq)
         return Rseq(address, size, signature, flags) if address else None
 
     def _text(self, at: int, result: int, stat: int) -> bytes:
         if 0 <= result < TEXT_SIZE:
-            return bytes(self._view[at + _Layout.text :][:result])
+            return bytes(self._area.view[at + _Layout.text :][:result])
         return b"" if stat == NO_FILE or result < 0 else os.pread(stat, procfs.READ_SIZE, 0)
 
     def _processors(self, at: int, tid: int, result: int) -> bytes:
         if result > 0:
-            return bytes(self._view[at + _Layout.processors :][:result])
+            return bytes(self._area.view[at + _Layout.processors :][:result])
         every = sum(1 << number for number in os.sched_getaffinity(tid))
         return every.to_bytes(-(-every.bit_length() // 8), "little")
+
+
+def _is_complete(results: Sequence[int]) -> bool:
+    """Whether the calls about a thread have brought all that was asked."""
+    registers, mask, rseq, pending, xstate, _, robust, processors, _, policy, text = results
+    return not (registers or mask or pending or xstate or robust) and rseq > 0 < processors and policy >= 0 and text < TEXT_SIZE
+
+
+def _is_filtered(results: Sequence[int]) -> bool:
+    return results[FILTER] >= 0 or results[FILTER] == -errno.EMEDIUMTYPE
+
+
+class Readings:
+    """Asks about the threads of one process, again and again. Every call from the thread that traces them."""
+
+    def __init__(self) -> None:
+        self._area = _Area(1)
+        self._given: weakref.ref[_Answers] | None = None
+
+    def read(self, tracees: Sequence[Tracee], stats: Sequence[int]) -> list[Unread]:
+        """Ask about these; they stand still. What was read earlier stays as it was.
+
+        Args:
+            stats: for each a descriptor of its stat file; `NO_FILE` if that is not wanted.
+
+        Raises:
+            ProcessGoneError: one of them has been killed.
+        """
+        is_taken = self._given is not None and self._given() is not None
+        if is_taken or len(tracees) > self._area.capacity:
+            self._area = _Area(max(self._area.capacity, 1 if len(tracees) == 1 else -(-len(tracees) // STEP) * STEP))
+        results = self._area.ask([tracee.pid for tracee in tracees], list(stats))
+        answers = _Answers(self._area, results, stats)
+        self._given = weakref.ref(answers)
+        return [Unread(answers, index, tracee, results[index]) for index, tracee in enumerate(tracees)]
 
 
 def _calls_about(area: int) -> list[tuple[int, ...]]:
