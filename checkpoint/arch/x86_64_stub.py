@@ -93,6 +93,64 @@ OWN_LOOP: Final = bytes.fromhex(
 Each call is eight little-endian words: number, six arguments, address where the result goes, 0 for nowhere.
 """
 
+SECOND_LOOP: Final = bytes.fromhex(
+    "53"  #                push rbx
+    "55"  #                push rbp
+    "4154"  #              push r12
+    "4155"  #              push r13
+    "4989fc"  #            mov  r12, rdi        argument: the board
+    "4531ed"  #            xor  r13d, r13d      the last order that was heard
+    "418b0424"  #    wait: mov  eax, [r12]      the order
+    "4439e8"  #            cmp  eax, r13d
+    "7516"  #              jne  heard
+    "4c89e7"  #            mov  rdi, r12
+    "be80000000"  #        mov  esi, 128        FUTEX_WAIT | FUTEX_PRIVATE_FLAG
+    "89c2"  #              mov  edx, eax
+    "4531d2"  #            xor  r10d, r10d      no timeout
+    "b8ca000000"  #        mov  eax, 202        futex(2)
+    "0f05"  #              syscall
+    "ebe1"  #              jmp  wait
+    "4189c5"  #     heard: mov  r13d, eax
+    "83f8ff"  #            cmp  eax, -1
+    "7457"  #              je   over
+    "a901000000"  #        test eax, 1
+    "7449"  #              jz   rest            an even one: to rest
+    "498b5c2410"  #        mov  rbx, [r12+16]   first row
+    "498b6c2418"  #        mov  rbp, [r12+24]   end of the rows
+    "49895c2420"  #  next: mov  [r12+32], rbx   done so far
+    "4839eb"  #            cmp  rbx, rbp
+    "7435"  #              je   rest
+    "45392c24"  #          cmp  [r12], r13d
+    "752f"  #              jne  rest            there is another order
+    "488b03"  #            mov  rax, [rbx]
+    "488b7b08"  #          mov  rdi, [rbx+8]
+    "488b7310"  #          mov  rsi, [rbx+16]
+    "488b5318"  #          mov  rdx, [rbx+24]
+    "4c8b5320"  #          mov  r10, [rbx+32]
+    "4c8b4328"  #          mov  r8,  [rbx+40]
+    "4c8b4b30"  #          mov  r9,  [rbx+48]
+    "0f05"  #              syscall
+    "488b4b38"  #          mov  rcx, [rbx+56]   where the result goes
+    "4885c9"  #            test rcx, rcx
+    "7403"  #              jz   on
+    "488901"  #            mov  [rcx], rax
+    "4883c340"  #   on:    add  rbx, 64
+    "ebc1"  #              jmp  next
+    "4d896c2408"  #  rest: mov  [r12+8], r13    done with that order
+    "eb82"  #              jmp  wait
+    "415d"  #       over:  pop  r13
+    "415c"  #              pop  r12
+    "5d"  #                pop  rbp
+    "5b"  #                pop  rbx
+    "c3"  #                ret
+)
+"""A function of C that makes the calls of tables like those of `OWN_LOOP`, one table after the other, as it is told to.
+
+It is told by a board of five words: the order (32 bits: odd, make the calls; even, rest; -1, return), the last one that it is
+done with, the first row and the end of the rows, and the first row that is not made yet. Between two orders it sleeps (futex(2)).
+A processor that does not show others its stores in their order needs barriers before the stores to the second and the last word.
+"""
+
 SYSTEM_CALLS: Final = {
     "accept4": 288,
     "arch_prctl": 158,

@@ -140,6 +140,7 @@ class Onlooker:
         self._kept.texts.close()
         self._files.close()
         self._others.close()
+        self._recollection.close()
 
     def is_entered(self) -> bool:
         """Whether it still is the program that was entered."""

@@ -112,26 +112,26 @@ def _patient_loop() -> Loop:
 
 
 def _in_machine_code() -> Loop:
-    """Raises as `_machine_code`."""
-    return ctypes.PYFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(_machine_code())
+    """Raises as `instructions`."""
+    return ctypes.PYFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(instructions(stubs.OWN_LOOP))
 
 
 def _in_machine_code_that_may_wait() -> Loop:
-    """Raises as `_machine_code`."""
-    return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(_machine_code())
+    """Raises as `instructions`."""
+    return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(instructions(stubs.OWN_LOOP))
 
 
 @functools.cache
-def _machine_code() -> int:
-    """The address of the loop, in memory that nobody can write, so that it is allowed where memory that is both is not.
+def instructions(code: bytes) -> int:
+    """The address of machine code, in memory that nobody can write, so that it is allowed where memory that is both is not.
 
     Raises:
         OSError: the system does not allow it (a noexec policy, for one).
     """
     file = os.memfd_create("calls", os.MFD_CLOEXEC)
     try:
-        os.write(file, stubs.OWN_LOOP)
-        place = _mmap(None, len(stubs.OWN_LOOP), mmap.PROT_READ | mmap.PROT_EXEC, mmap.MAP_PRIVATE, file, 0)
+        os.write(file, code)
+        place = _mmap(None, len(code), mmap.PROT_READ | mmap.PROT_EXEC, mmap.MAP_PRIVATE, file, 0)
     finally:
         os.close(file)  # Python's own mmap would keep a copy of it
     if place is None or place == ctypes.c_void_p(-1).value:

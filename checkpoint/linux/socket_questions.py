@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from checkpoint.linux.own_calls import FIRST_ARGUMENT, ROW, OwnCalls, row
+from checkpoint.linux.second_thread import SecondThread
 
 Option = tuple[int, int, int]
 """Level, number and size of an option."""
@@ -47,6 +48,8 @@ POLLED: Final = select.POLLIN | select.POLLPRI | select.POLLRDHUP
 _DATAGRAMS: Final = (socket.IPPROTO_UDP, 136)
 _INTERNET: Final = (socket.AF_INET, socket.AF_INET6)
 
+WORTH_SHARING: Final = 16
+"""As many sockets of a kind are asked by two threads: to wake the second takes as long as to ask two or three."""
 BUFFERS: Final = 2
 """Rows at the end of a table: the sizes of the buffers, which are asked for only where the program has chosen one."""
 RESULT_AT: Final = 16
@@ -198,6 +201,46 @@ def _laid_out(plan: _Plan, buffers: slice, locked: int, info: int, polled: int) 
     )
 
 
+class _Sheet:
+    """Questions to so many sockets of one kind, and memory for their answers.
+
+    Attributes:
+        memory: (capacity, bytes) answers, in the order of those that are asked.
+        table: the calls, those about one socket after the other.
+        of_buffers: the same of `BUFFERS`.
+    """
+
+    def __init__(self, asked: Questions, capacity: int) -> None:
+        self._image = asked.image
+        self._always = always = len(asked.words) - BUFFERS
+        self.memory: NDArray[np.uint8] = np.zeros((capacity, len(asked.image)), dtype=np.uint8)
+        starts = int(self.memory.ctypes.data) + np.arange(capacity, dtype=np.uint64) * np.uint64(len(asked.image))
+        words = asked.words + asked.moved * starts[:, None, None]
+        self.table, self.of_buffers = OwnCalls(capacity * always), OwnCalls(capacity * BUFFERS)
+        self.table.entries[:] = words[:, :always].reshape(-1, ROW)
+        self.of_buffers.entries[:] = words[:, always:].reshape(-1, ROW)
+        self._descriptors = self.table.entries.reshape(capacity, always, ROW)[:, :-1, FIRST_ARGUMENT]
+        self._descriptors_of_buffers = self.of_buffers.entries.reshape(capacity, BUFFERS, ROW)[:, :, FIRST_ARGUMENT]
+        self._polled = self.memory.reshape(-1).view(np.int32).reshape(capacity, -1)[:, asked.polled // 4]
+
+    def address(self, first: int, descriptors: NDArray[np.int64]) -> None:
+        """Have the questions from the first place on go to these."""
+        last = first + len(descriptors)
+        self.memory[first:last] = self._image
+        self._descriptors[first:last] = descriptors[:, None]
+        self._polled[first:last] = descriptors
+
+    def ask(self, first: int, descriptors: NDArray[np.int64]) -> None:
+        """Ask them."""
+        self.address(first, descriptors)
+        self.table.run(first * self._always, (first + len(descriptors)) * self._always)
+
+    def ask_of_buffers(self, index: int, descriptor: int) -> None:
+        """Ask one more of one."""
+        self._descriptors_of_buffers[index] = descriptor
+        self.of_buffers.run(index * BUFFERS, (index + 1) * BUFFERS)
+
+
 class Asking:
     """The questions to sockets of one kind, with memory for the answers of those that were asked last."""
 
@@ -205,52 +248,72 @@ class Asking:
         self.subject = subject
         self._questions = questions(subject)
         self._always = len(self._questions.words) - BUFFERS
-        self._capacity = 0
+        self._capacity = self._capacity_of_second = 0
         self.reserve(1)
 
-    def reserve(self, capacity: int) -> None:
-        """Have room for the answers of so many at once."""
-        if capacity <= self._capacity:
-            return
-        asked = self._questions
-        self._capacity = capacity
-        self._memory = np.zeros((capacity, len(asked.image)), dtype=np.uint8)
-        starts = int(self._memory.ctypes.data) + np.arange(capacity, dtype=np.uint64) * np.uint64(len(asked.image))
-        words = asked.words + asked.moved * starts[:, None, None]
-        self._table, self._of_buffers = OwnCalls(capacity * self._always), OwnCalls(capacity * BUFFERS)
-        self._table.entries[:] = words[:, : self._always].reshape(-1, ROW)
-        self._of_buffers.entries[:] = words[:, self._always :].reshape(-1, ROW)
-        self._descriptors = self._table.entries.reshape(capacity, self._always, ROW)[:, :-1, FIRST_ARGUMENT]
-        self._descriptors_of_buffers = self._of_buffers.entries.reshape(capacity, BUFFERS, ROW)[:, :, FIRST_ARGUMENT]
-        self._polled = self._memory.reshape(-1).view(np.int32).reshape(capacity, -1)[:, asked.polled // 4]
+    def reserve(self, capacity: int, *, is_shared: bool = False) -> None:
+        """Have room for the answers of so many at once.
+
+        Args:
+            is_shared: a second thread may ask some of them.
+        """
+        if capacity > self._capacity:
+            self._capacity, self._sheet = capacity, _Sheet(self._questions, capacity)
+        share = capacity // 2 if is_shared and capacity >= WORTH_SHARING else 0
+        if share > self._capacity_of_second:
+            self._capacity_of_second, self._sheet_of_second = share, _Sheet(self._questions, share)
 
     def ask(self, descriptor: int) -> Told:
         """Ask everything, through a descriptor of ours."""
         return self.ask_each([descriptor])[0]
 
-    def ask_each(self, descriptors: Sequence[int]) -> list[Told]:
-        """The same of many, in one go."""
+    def ask_each(self, descriptors: Sequence[int], second: SecondThread | None = None) -> list[Told]:
+        """The same of many, in one go.
+
+        Args:
+            second: asks up to half of them, as far as there is memory for that.
+        """
         count, numbers = len(descriptors), np.array(descriptors, dtype=np.int64)
         self.reserve(count)
-        self._memory[:count] = self._questions.image
-        self._descriptors[:count] = numbers[:, None]
-        self._polled[:count] = numbers
-        self._table.run(0, count * self._always)
+        if second is None or count < WORTH_SHARING or not self._ask_with(second, numbers):
+            self._sheet.ask(0, numbers)
         chosen = self._have_chosen_buffers(count)
         for index in chosen:
-            self._descriptors_of_buffers[index] = descriptors[index]
-            self._of_buffers.run(index * BUFFERS, (index + 1) * BUFFERS)
+            self._sheet.ask_of_buffers(index, descriptors[index])
         return self._told(count, chosen)
+
+    def _ask_with(self, second: SecondThread, numbers: NDArray[np.int64]) -> bool:
+        """Ask from the front while a second thread asks from the back; what it has not finished by then we ask, too.
+
+        False, and nothing was asked, where that thread is busy still.
+        """
+        count, ours, theirs = len(numbers), self._sheet, self._sheet_of_second
+        share = min(count // 2, self._capacity_of_second)
+        if not second.is_at_rest():
+            return False
+        theirs.address(0, numbers[: count - share - 1 : -1])
+        second.begin(theirs.table, share * self._always, theirs)
+        try:
+            asked, more = 0, count - share
+            while more:
+                ours.ask(asked, numbers[asked : asked + more])
+                asked += more
+                left = count - asked - second.made() // self._always
+                more = max(1, left // 4) if left > 0 else 0
+        finally:
+            second.stop()
+        ours.memory[asked:count] = theirs.memory[: count - asked][::-1]
+        return True
 
     def _have_chosen_buffers(self, count: int) -> list[int]:
         """Where the program has chosen the size of a buffer, or the kernel does not say; else it changes by itself."""
-        locked, place = self._memory[:count], self._questions.locked
+        locked, place = self._sheet.memory[:count], self._questions.locked
         found: list[int] = np.flatnonzero(locked[:, place] | locked[:, place + RESULT_AT]).tolist()
         return found
 
     def _told(self, count: int, chosen: Sequence[int]) -> list[Told]:
         """Of each what the program has set, and what has become of it otherwise."""
-        asked, memory = self._questions, self._memory[:count]
+        asked, memory = self._questions, self._sheet.memory[:count]
         parts = [memory[:, : asked.ends[STATE]]]
         if asked.info >= 0:
             parts += [memory[:, asked.info + first : asked.info + last] for first, last in _TCP_INFO_TOLD]

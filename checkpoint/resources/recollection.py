@@ -19,7 +19,8 @@ from typing import Final
 
 from checkpoint.linux import socket_questions
 from checkpoint.linux.descriptors import copies_of, copy_of
-from checkpoint.linux.socket_questions import Asking, Subject, Told, events
+from checkpoint.linux.second_thread import SecondThread
+from checkpoint.linux.socket_questions import WORTH_SHARING, Asking, Subject, Told, events
 from checkpoint.model import Fact
 from checkpoint.resources import Opened, OpenFile, Recalled, internet_sockets, pipes, sockets, tcp_connections, unix_sockets
 from checkpoint.resources.listings import Group
@@ -93,6 +94,13 @@ class Recollection:
         self._pipes: dict[int, OpenFile] = {}
         self._askings: dict[Subject, Asking] = {}
         self._round: _Round | None = None
+        self._second: SecondThread | None = None
+
+    def close(self) -> None:
+        """End what it has running."""
+        if self._second is not None:
+            self._second.close()
+            self._second = None
 
     def prepare(self) -> None:
         """Do what need not be done while the program stands still."""
@@ -106,9 +114,18 @@ class Recollection:
                 self._round = None
                 known.asking = wanted.get(subject) or self._askings.get(subject) or Asking(subject)
             wanted[known.asking.subject] = known.asking
-        for asking, count in Counter(known.asking for known in self._known.values() if known.asking).items():
-            asking.reserve(min(count, COPIES_MAX))
+        counts = Counter(known.asking for known in self._known.values() if known.asking)
+        self._be_two(max(counts.values(), default=0) >= WORTH_SHARING)
+        for asking, count in counts.items():
+            asking.reserve(min(count, COPIES_MAX), is_shared=self._second is not None)
         self._askings = wanted  # a machine may have other multicast groups every minute
+
+    def _be_two(self, is_worth_it: bool) -> None:
+        """Have a second thread where there is much to ask, and only there."""
+        if not is_worth_it:
+            self.close()
+        elif self._second is None:
+            self._second = SecondThread.where_it_gains()
 
     def recall(self, opened: Opened) -> dict[int, _Answer]:
         """Ask every socket that was there last time; ``opened`` is told what is as it was. The process stands still.
@@ -123,7 +140,7 @@ class Recollection:
         for first in range(0, len(asked), COPIES_MAX):
             some = asked[first : first + COPIES_MAX]
             with copies_of(some[0][0].pid, [one.first.number for one, _ in some]) as copies:
-                for (one, known), told in zip(some, _told([known for _, known in some], copies), strict=True):
+                for (one, known), told in zip(some, _told([known for _, known in some], copies, self._second), strict=True):
                     if told is not None and (answer := _recalled(one, known, told, opened)) is not None:
                         changed[one.first.number] = answer
         if len(self._known) > len(asked):
@@ -184,7 +201,7 @@ class Recollection:
             known.state = answer.state if _is_quiet(one.observed) and _answers_again(one, known.asking, answer) else None
 
 
-def _told(every: Sequence[_Known], copies: Sequence[int]) -> list[Told | None]:
+def _told(every: Sequence[_Known], copies: Sequence[int], second: SecondThread | None) -> list[Told | None]:
     """Ask all, those of a kind in one go; None of one that cannot be asked."""
     by_kind: dict[Asking, list[int]] = {}
     for index, (known, copy) in enumerate(zip(every, copies, strict=True)):
@@ -192,7 +209,7 @@ def _told(every: Sequence[_Known], copies: Sequence[int]) -> list[Told | None]:
             by_kind.setdefault(known.asking, []).append(index)
     found: list[Told | None] = [None] * len(every)
     for asking, places in by_kind.items():
-        for index, told in zip(places, asking.ask_each([copies[index] for index in places]), strict=True):
+        for index, told in zip(places, asking.ask_each([copies[index] for index in places], second), strict=True):
             found[index] = told
     return found
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from checkpoint.linux.descriptors import NOT_YET, copies_of, lending
-from checkpoint.linux.socket_questions import SO_ATTACH_FILTER, Asking, Subject
+from checkpoint.linux.socket_questions import SO_ATTACH_FILTER, WORTH_SHARING, Asking, Subject
 from checkpoint.model import Fact
 from checkpoint.resources import Opened, OpenFile, gather, unix_sockets, with_contents
 from checkpoint.resources import sockets as kinds_of_sockets
@@ -117,6 +117,30 @@ def test_sockets_that_are_as_they_were_are_known(sockets: Sockets) -> None:
     told_again = {number for number, recalled in again.recalled.items() if recalled is opened.recalled.get(number)}
     assert told_again >= {one.fileno() for one in sockets.every() if one is not sockets.named}, "worked out anew"
     assert facts == anew()
+
+
+def test_of_many_sockets_a_second_thread_asks_half_and_of_few_none(sockets: Sockets, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1})
+    onlooker = Onlooker()
+    many = [sockets.made(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2 * WORTH_SHARING)]
+    for _ in range(LOOKS_UNTIL_KNOWN):
+        before, _ = onlooker.look()
+    second = onlooker.recollection._second
+    assert second is not None
+    for ttl, one in enumerate(many, 1):  # whoever of the two asks it
+        one.setsockopt(socket.IPPROTO_IP, socket.IP_TTL, ttl)
+        after, _ = onlooker.look()
+        assert [number for number in after if after[number] != before[number]] == [one.fileno()]
+        before = after
+    assert before == anew()
+    for one in many[WORTH_SHARING // 2 :]:
+        one.close()
+    onlooker.look()
+    after, _ = onlooker.look()
+    assert onlooker.recollection._second is None
+    assert not second._thread.is_alive()
+    assert after == anew()
+    onlooker.recollection.close()
 
 
 def _attach_filter(one: socket.socket, instructions: bytes = PASS_ALL) -> None:
