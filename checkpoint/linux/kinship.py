@@ -15,14 +15,19 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from typing import Final
 
+import numpy as np
+
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import abi, procfs
+from checkpoint.linux.own_calls import OwnCalls, row
 from checkpoint.linux.spokesman import spokesman_of
 
 STREAMS: Final = (0, 1, 2)
 LEFT_BEHIND_MAX: Final = 4096
 """Strangers of which it is remembered whether they belong to the component: there are new ones as long as a machine runs."""
 CHILDREN_SIZE: Final = 1 << 12
+GLANCE_SIZE: Final = 16
+"""Bytes of a list that tell whether there is anything in it."""
 NEARLY_A_PAGE: Final = 4000
 """Bytes: the kernel gives a list in pieces of a page at most, so what is shorter is the end.
 
@@ -35,6 +40,7 @@ class Children:
     def __init__(self, pid: int) -> None:
         self.pid = pid
         self._files: dict[int, int] = {}
+        self._glance: _Glance | None = None
 
     def read(self, tids: list[int]) -> list[int]:
         """Those that these threads have given birth to, oldest first; zombies among them."""
@@ -42,10 +48,23 @@ class Children:
         for tid in tids:
             with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended; its children are another one's now
                 found += map(int, _whole(self._file(tid)).split())
+        self._keep_only(tids)
+        return found
+
+    def are_there(self, tids: list[int]) -> bool:
+        """Whether there are any; these threads stand still. All are asked in one go, for there may be many."""
+        if self._glance is not None and self._glance.tids == tids and self._glance.finds_nobody():
+            return False
+        found = self.read(tids)
+        if len(self._files) == len(tids):
+            self._glance = _Glance(tids, [self._files[tid] for tid in tids])
+        return bool(found)
+
+    def _keep_only(self, tids: list[int]) -> None:
         if len(self._files) > len(tids):
+            self._glance = None
             for tid in set(self._files) - set(tids):
                 os.close(self._files.pop(tid))
-        return found
 
     def _file(self, tid: int) -> int:
         if tid not in self._files:
@@ -54,9 +73,32 @@ class Children:
 
     def close(self) -> None:
         """Give descriptors back."""
+        self._glance = None
         for file in self._files.values():
             os.close(file)
         self._files.clear()
+
+
+class _Glance:
+    """Reads whether there is anything in the lists of some threads.
+
+    Args:
+        files: of each, which stay open as long as this is used.
+    """
+
+    def __init__(self, tids: list[int], files: list[int]) -> None:
+        self.tids = tids
+        self._results = np.zeros(len(files), dtype=np.int64)
+        self._content = np.zeros(GLANCE_SIZE, dtype=np.uint8)
+        into, first, step = int(self._content.ctypes.data), int(self._results.ctypes.data), self._results.itemsize
+        self._calls = OwnCalls(
+            [row("pread64", file, into, GLANCE_SIZE, 0, to=first + step * index) for index, file in enumerate(files)]
+        )
+
+    def finds_nobody(self) -> bool:
+        """Whether all lists are empty; one that cannot be read is not."""
+        self._calls.run()
+        return not self._results.any()
 
 
 def _whole(file: int) -> bytes:
@@ -91,7 +133,7 @@ class Kinship:
         Args:
             tids: its threads.
         """
-        return self._has_strays or bool(self._of_first.read(tids)) or bool(self._reaper and self._orphans())
+        return self._has_strays or self._of_first.are_there(tids) or bool(self._reaper and self._orphans())
 
     def _orphans(self) -> list[int]:
         return [pid for pid in self._of_reaper.read([self._reaper]) if pid != self._pid]

@@ -157,22 +157,31 @@ class Batch:
         return len(self.calls) - 1
 
 
-@dataclass(frozen=True, slots=True)
 class Answers:
-    """What a batch brought back.
+    """What a batch brought back: a desk's table, read when somebody wants to know.
 
-    Attributes:
-        results: of each call, signed: negative is an errno.
+    Args:
+        address: of the table.
+        count: of the calls.
     """
 
-    results: tuple[int, ...]
-    _outputs: bytes
-    _base: int
+    __slots__ = ("_address", "_count", "_plan", "_table")
+
+    def __init__(self, table: bytes, address: int, plan: Plan, count: int) -> None:
+        self._table = table
+        self._address = address
+        self._plan = plan
+        self._count = count
+
+    @property
+    def results(self) -> tuple[int, ...]:
+        """Of each call, signed: negative is an errno."""
+        return struct.unpack_from(f"<{self._count}q", self._table, self._plan.results)
 
     def at(self, address: int, size: int) -> bytes:
         """What a call wrote at an address that `Batch.output` gave."""
-        offset = address - self._base
-        return self._outputs[offset : offset + size]
+        offset = address - self._address
+        return self._table[offset : offset + size]
 
 
 class Guest(NamedTuple):
@@ -242,9 +251,7 @@ class Desk:
 
     def answers(self, table: bytes, batch: Batch) -> Answers:
         """What they brought back, by the table's bytes."""
-        results = struct.unpack_from(f"<{len(batch.calls)}q", table, self._plan.results)
-        outputs = table[self._plan.outputs : self._plan.outputs + batch.output_size]
-        return Answers(results, outputs, self.table + self._plan.outputs)
+        return Answers(table, self.table, self._plan, len(batch.calls))
 
 
 class BorrowedPages:

@@ -138,7 +138,8 @@ class Threads:
     @property
     def others(self) -> tuple[Tracee, ...]:
         """Those that stand still, besides the leader, oldest first."""
-        return tuple(tracee for tid, tracee in sorted(self._held.items()) if tid != self.pid)
+        first, held = self.pid, self._held
+        return tuple([held[tid] for tid in sorted(held) if tid != first])
 
     # Stopping
 
