@@ -19,8 +19,13 @@ from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.tracking import NONE, Scan, extents_of
 from checkpoint.pages import Words
 
-WHOLE_WINDOW: Final = 64 << 20
-"""A mapping up to this size is protected whole: its page tables (two thousandths) are cheaper than finding what is populated."""
+WHOLE_WINDOW: Final = 4 << 20
+"""A mapping up to this size is protected whole: its page tables (two thousandths) are cheaper than finding what is populated.
+
+A larger one, such as a thread's stack of 8 MiB, is mostly empty, and a hole that is protected takes a scan as long as a page.
+"""
+WHOLE_FILE: Final = 64 << 20
+"""The same for the mapping of a file: to find which of its pages are copies takes longer than to scan them all."""
 WINDOW: Final = 2 << 20
 """Larger ones are protected in windows of what one page table covers."""
 LONG_RUN: Final = 16 * abi.PAGE_SIZE
@@ -32,9 +37,14 @@ SMALL_GAP: Final = 64 * abi.PAGE_SIZE
 """Extents that are no farther apart are looked at together."""
 
 
+def is_small(line: MapsLine) -> bool:
+    """Whether a mapping is protected whole."""
+    return line.size <= (WHOLE_FILE if line.has_file else WHOLE_WINDOW)
+
+
 def windows_of(line: MapsLine, existing: Words) -> Words:
     """The parts of a mapping that are worth protecting: all of a small one, the surroundings of what exists in a large one."""
-    if line.size <= WHOLE_WINDOW:
+    if is_small(line):
         return np.array([[line.start, line.end]], dtype=np.uint64)
     step = np.uint64(WINDOW)
     low = np.maximum(existing[:, 0] // step * step, np.uint64(line.start))
@@ -206,11 +216,7 @@ class PagemapTracker:
 
         Where a mapping has gone meanwhile nothing is protected, and the next scan finds out.
         """
-        parts = [
-            windows_of(line, _inside(existing, line))
-            for line in lines
-            if line.size <= WHOLE_WINDOW or len(_inside(existing, line))
-        ]
+        parts = [windows_of(line, _inside(existing, line)) for line in lines if is_small(line) or len(_inside(existing, line))]
         if parts:
             windows = pages.difference(pages_joined(np.concatenate(parts)), self._armed)
             self._scanner.written_where_protected(windows)

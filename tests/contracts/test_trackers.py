@@ -343,5 +343,14 @@ def test_large_mappings_are_protected_around_what_exists() -> None:
     assert not len(pages.difference(existing, windows))
 
 
+@pytest.mark.parametrize(("inode", "is_whole"), [(0, False), (7, True)])
+def test_the_stack_of_a_thread_is_protected_around_what_exists_and_a_library_whole(inode: int, is_whole: bool) -> None:
+    """Each hole that is protected takes a scan as long as a page; which pages of a file are copies takes longer to find."""
+    line = MapsLine(8 << 20, 16 << 20, 3, False, 0, 0, inode, "")
+    existing = np.array([[line.end - 2 * PAGE, line.end]], dtype=np.uint64)
+    windows = write_protection.windows_of(line, existing)
+    assert pages.total_size(windows) == (line.size if is_whole else write_protection.WINDOW)
+
+
 def test_the_scan_structure_is_as_the_kernel_has_it() -> None:
     assert ctypes.sizeof(abi.PageScan) == 96
