@@ -7,6 +7,7 @@ What happens to a node is in ``events.py``, what it orders in ``acts.py``, what 
 from __future__ import annotations
 
 import enum
+import functools
 from dataclasses import dataclass, field
 
 from checkpoint.model import Position
@@ -212,7 +213,7 @@ class Waiting:
     keeps_state: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Config:
     """What one robot's node is told at birth.
 
@@ -277,12 +278,12 @@ class Config:
         if strangers or set(self.servers) & set(self.witnesses):
             raise RulesError(f"servers {self.servers} and witnesses {self.witnesses}: each a member of the team, with one role")
 
-    @property
+    @functools.cached_property
     def by_majority(self) -> bool:
         """Whether primaries are elected."""
         return self.rule is Rule.MAJORITY
 
-    @property
+    @functools.cached_property
     def quorum(self) -> int:
         """How many members, oneself among them, are a majority."""
         return (len(self.peers) + 1) // 2 + 1
@@ -295,27 +296,27 @@ class Config:
         """Whether this member keeps checkpoints."""
         return robot not in self.witnesses
 
-    @property
+    @functools.cached_property
     def beat_ns(self) -> int:
         """Between two beats."""
         return self.beat_ms * MS
 
-    @property
+    @functools.cached_property
     def lease_ns(self) -> int:
         """How long a primary may act after a beat that was heard."""
         return self.lease_ms * MS
 
-    @property
+    @functools.cached_property
     def loyalty_ns(self) -> int:
         """Silence after which a peer counts as dead: the lease and the margin."""
         return self.lease_ns + max(self.margin_ms_min * MS, self.lease_ns * self.margin_percent // 100)
 
-    @property
+    @functools.cached_property
     def loyalty_ns_max(self) -> int:
         """The same for a peer whose beats come late: see `failover.core.membership.Membership.loyal_until_ns`."""
         return max(self.loyalty_ns, 2 * self.lease_ns)
 
-    @property
+    @functools.cached_property
     def grace_ns(self) -> int:
         """How long a peer that was never heard in this life may be on its way; never less than the loyalty."""
         return max(self.grace_ms * MS, self.loyalty_ns)
