@@ -38,13 +38,14 @@ class BeatLane:
             LaneError: an address cannot be had.
         """
         self._sockets = [_bound(address) for address in me.beats]
+        self._filenos = tuple(link.fileno() for link in self._sockets)
         self._names: dict[int, str] = {}
         self._ways = {name: _ways(self._sockets, robot) for name, robot in peers.items()}
         self.unsent = 0
 
     def filenos(self) -> tuple[int, ...]:
         """To wait for datagrams."""
-        return tuple(link.fileno() for link in self._sockets)
+        return self._filenos
 
     def send(self, peer: str, frame: bytes) -> None:
         """One datagram to the peer over every link."""

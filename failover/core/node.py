@@ -108,6 +108,7 @@ class Node:
         self._begun = False
         self._load = 0
         self._promise = ""
+        self._grounds: tuple[tuple[str, ...], tuple[str, ...]] | None = None
         self._configure(held)
 
     def step(self, event: Event, now_ns: int) -> Ready:
@@ -152,10 +153,13 @@ class Node:
 
     def _note_promise(self, turn: Turn) -> None:
         """The journal has the team's promise at each change, and a component's while it differs from that."""
-        sentence = promise.team(turn)
-        if sentence != self._promise:
-            self._promise = sentence
-            turn.say_of_robot(sentence)
+        grounds = promise.grounds(turn)
+        if grounds != self._grounds:
+            self._grounds = grounds
+            sentence = promise.team(turn)
+            if sentence != self._promise:
+                self._promise = sentence
+                turn.say_of_robot(sentence)
         for component in self._components.values():
             sentence = promise.exception(component, turn)
             if sentence and sentence != component.promise:

@@ -10,15 +10,20 @@ from failover.core.component import Component, Turn
 from failover.core.types import ENDED, MS, Protection
 
 
+def grounds(turn: Turn) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What `team` depends on as time goes by: the peers that have another rule, and all that are heard."""
+    living = turn.team.living(turn.now_ns)
+    return tuple(peer.robot for peer in living if peer.at_odds), tuple(peer.robot for peer in living)
+
+
 def team(turn: Turn) -> str:
     """What the rule in force promises, given who is heard."""
-    at_odds = turn.team.at_odds(turn.now_ns)
+    at_odds, living = grounds(turn)
     if at_odds:
         return (
             f"{turn.me} decides by rule = {turn.config.rule}, {' and '.join(at_odds)} by another: nothing is started, "
             "taken over, moved or protected between them until all have the same rule in agent.toml."
         )
-    living = [peer.robot for peer in turn.team.living(turn.now_ns)]
     if not turn.team.peers:
         return f"{turn.me} is alone in its team: a lost robot takes its programs with it."
     if turn.config.by_majority:
