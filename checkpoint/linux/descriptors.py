@@ -15,7 +15,7 @@ import numpy as np
 
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import abi
-from checkpoint.linux.own_calls import FIRST_ARGUMENT, RESULT_TO, OwnCalls, row
+from checkpoint.linux.own_calls import FIRST_ARGUMENT, NUMBER, RESULT_TO, OwnCalls, row
 from checkpoint.linux.procfs import READ_SIZE, parse_fields
 from checkpoint.linux.spokesman import pidfd_of
 
@@ -300,11 +300,10 @@ def copies_of(pid: int, numbers: Sequence[int]) -> Iterator[Sequence[int]]:
     try:
         yield results.tolist()
     finally:
-        ours = results[results >= 0]
-        closing = OwnCalls(len(ours))
-        closing.entries[:] = row("close")
-        closing.entries[:, FIRST_ARGUMENT] = ours
-        closing.run()
+        taking.entries[:, NUMBER] = row("close")[NUMBER]
+        taking.entries[:, FIRST_ARGUMENT] = results  # where it could not be had that is no descriptor, and nothing happens
+        taking.entries[:, RESULT_TO] = 0
+        taking.run()
 
 
 @contextlib.contextmanager

@@ -120,7 +120,7 @@ class Questions:
         moved: where those are, 1 or 0.
         image: what the memory holds before.
         ends: where the parts end.
-        buffers, info, polled: offsets of what is not compared as a whole; ``info`` -1 for none.
+        buffers, info, polled: offsets of what is not compared as a whole, from `ends[STATE]` on; ``info`` -1 for none.
     """
 
     words: NDArray[np.uint64]
@@ -188,16 +188,15 @@ def _laid_out(plan: _Plan, buffers: slice, locked: int, info: int, polled: int) 
         for place, where in places.items():
             words[index, place] = starts[where >> 32] + (where & 0xFFFFFFFF)
             moved[index, place] = 1
-    aside = starts[ASIDE]
     return Questions(
         words=words,
         moved=moved,
         image=np.frombuffer(b"".join(plan.images), dtype=np.uint8),
         ends=(starts[1], starts[2], starts[2] + len(plan.images[2])),
-        buffers=slice(aside + buffers.start, aside + buffers.stop),
+        buffers=buffers,
         locked=locked,
-        info=aside + info if info >= 0 else -1,
-        polled=aside + polled,
+        info=info,
+        polled=polled,
     )
 
 
@@ -205,30 +204,40 @@ class _Sheet:
     """Questions to so many sockets of one kind, and memory for their answers.
 
     Attributes:
-        memory: (capacity, bytes) answers, in the order of those that are asked.
+        memory: (capacity, bytes) settings and states, in the order of those that are asked.
+        aside: (capacity, bytes) what is not compared as a whole.
         table: the calls, those about one socket after the other.
         of_buffers: the same of `BUFFERS`.
     """
 
     def __init__(self, asked: Questions, capacity: int) -> None:
-        self._image = asked.image
+        compared = asked.ends[STATE]
+        self._image, self._image_aside = asked.image[:compared], asked.image[compared:]
         self._always = always = len(asked.words) - BUFFERS
-        self.memory: NDArray[np.uint8] = np.zeros((capacity, len(asked.image)), dtype=np.uint8)
-        starts = int(self.memory.ctypes.data) + np.arange(capacity, dtype=np.uint64) * np.uint64(len(asked.image))
-        words = asked.words + asked.moved * starts[:, None, None]
+        self.memory: NDArray[np.uint8] = np.zeros((capacity, compared), dtype=np.uint8)
+        self.aside: NDArray[np.uint8] = np.zeros((capacity, len(self._image_aside)), dtype=np.uint8)
+        places = np.arange(capacity, dtype=np.uint64)[:, None, None]
+        starts = np.uint64(self.memory.ctypes.data) + places * np.uint64(compared)
+        starts_aside = np.uint64(self.aside.ctypes.data - compared) + places * np.uint64(len(self._image_aside))
+        is_aside = asked.words >= compared
+        words = asked.words + asked.moved * np.where(is_aside, starts_aside, starts)
         self.table, self.of_buffers = OwnCalls(capacity * always), OwnCalls(capacity * BUFFERS)
         self.table.entries[:] = words[:, :always].reshape(-1, ROW)
         self.of_buffers.entries[:] = words[:, always:].reshape(-1, ROW)
         self._descriptors = self.table.entries.reshape(capacity, always, ROW)[:, :-1, FIRST_ARGUMENT]
         self._descriptors_of_buffers = self.of_buffers.entries.reshape(capacity, BUFFERS, ROW)[:, :, FIRST_ARGUMENT]
-        self._polled = self.memory.reshape(-1).view(np.int32).reshape(capacity, -1)[:, asked.polled // 4]
+        self._addressed = np.full(capacity, -1, dtype=np.int64)
+        self._polled = self.aside.reshape(-1).view(np.int32).reshape(capacity, -1)[:, asked.polled // 4]
 
     def address(self, first: int, descriptors: NDArray[np.int64]) -> None:
         """Have the questions from the first place on go to these."""
         last = first + len(descriptors)
         self.memory[first:last] = self._image
-        self._descriptors[first:last] = descriptors[:, None]
+        self.aside[first:last] = self._image_aside
         self._polled[first:last] = descriptors
+        if not np.array_equal(self._addressed[first:last], descriptors):  # copies of the same have the same numbers, as a rule
+            self._addressed[first:last] = descriptors
+            self._descriptors[first:last] = descriptors[:, None]
 
     def ask(self, first: int, descriptors: NDArray[np.int64]) -> None:
         """Ask them."""
@@ -248,7 +257,8 @@ class Asking:
         self.subject = subject
         self._questions = questions(subject)
         self._always = len(self._questions.words) - BUFFERS
-        self._capacity = self._capacity_of_second = 0
+        self._capacity = self._capacity_of_second = self._more = 0
+        self._chosen: list[int] = []
         self.reserve(1)
 
     def reserve(self, capacity: int, *, is_shared: bool = False) -> None:
@@ -268,7 +278,11 @@ class Asking:
         return self.ask_each([descriptor])[0]
 
     def ask_each(self, descriptors: Sequence[int], second: SecondThread | None = None) -> list[Told]:
-        """The same of many, in one go.
+        """The same of many, in one go; see `hear`."""
+        return self.told(self.hear(descriptors, second))
+
+    def hear(self, descriptors: Sequence[int], second: SecondThread | None = None) -> bytes:
+        """All that many answer: the same bytes, of the same sockets in the same order, mean that each has answered the same.
 
         Args:
             second: asks up to half of them, as far as there is memory for that.
@@ -277,10 +291,10 @@ class Asking:
         self.reserve(count)
         if second is None or count < WORTH_SHARING or not self._ask_with(second, numbers):
             self._sheet.ask(0, numbers)
-        chosen = self._have_chosen_buffers(count)
-        for index in chosen:
+        self._chosen = self._have_chosen_buffers(count)
+        for index in self._chosen:
             self._sheet.ask_of_buffers(index, descriptors[index])
-        return self._told(count, chosen)
+        return self._heard(count)
 
     def _ask_with(self, second: SecondThread, numbers: NDArray[np.int64]) -> bool:
         """Ask from the front while a second thread asks from the back; what it has not finished by then we ask, too.
@@ -303,6 +317,7 @@ class Asking:
         finally:
             second.stop()
         ours.memory[asked:count] = theirs.memory[: count - asked][::-1]
+        ours.aside[asked:count] = theirs.aside[: count - asked][::-1]
         return True
 
     def _have_chosen_buffers(self, count: int) -> list[int]:
@@ -311,18 +326,29 @@ class Asking:
         found: list[int] = np.flatnonzero(locked[:, place] | locked[:, place + RESULT_AT]).tolist()
         return found
 
-    def _told(self, count: int, chosen: Sequence[int]) -> list[Told]:
-        """Of each what the program has set, and what has become of it otherwise."""
-        asked, memory = self._questions, self._sheet.memory[:count]
-        parts = [memory[:, : asked.ends[STATE]]]
+    def _heard(self, count: int) -> bytes:
+        """Settings and state of each, what else tells of the state of each, and the sizes of buffers of which they were asked."""
+        asked, aside = self._questions, self._sheet.aside[:count]
+        more = [aside[:, asked.polled + 6 : asked.polled + 8]]
         if asked.info >= 0:
-            parts += [memory[:, asked.info + first : asked.info + last] for first, last in _TCP_INFO_TOLD]
-        parts.append(memory[:, asked.polled + 6 : asked.polled + 8])
-        size, end, every = sum(part.shape[1] for part in parts), asked.ends[SETTINGS], np.concatenate(parts, axis=1).tobytes()
-        found = [(every[at : at + end], every[at + end : at + size]) for at in range(0, count * size, size)]
-        for index in chosen:
+            more = [aside[:, asked.info + first : asked.info + last] for first, last in _TCP_INFO_TOLD] + more
+        self._more = sum(part.shape[1] for part in more)
+        buffers = aside[self._chosen, asked.buffers]
+        return b"".join((self._sheet.memory[:count].tobytes(), np.concatenate(more, axis=1).tobytes(), buffers.tobytes()))
+
+    def told(self, heard: bytes) -> list[Told]:
+        """Of each what the program has set, and what has become of it otherwise, of what was heard last."""
+        (end, size, _), more, buffers = self._questions.ends, self._more, self._questions.buffers
+        each = buffers.stop - buffers.start
+        of_buffers = len(heard) - each * len(self._chosen)
+        count = of_buffers // (size + more)
+        found = [
+            (heard[at : at + end], heard[at + end : at + size] + heard[rest : rest + more])
+            for at, rest in zip(range(0, count * size, size), range(count * size, of_buffers, more), strict=True)
+        ]
+        for index, at in zip(self._chosen, range(of_buffers, len(heard), each), strict=True):
             settings, state = found[index]
-            found[index] = settings + memory[index, asked.buffers].tobytes(), state
+            found[index] = settings + heard[at : at + each], state
         return found
 
 

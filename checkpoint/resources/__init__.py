@@ -235,7 +235,7 @@ def with_contents(
     found = []
     empty = recollection.empty_pipes(opened) if recollection and not rules else {}
     for held in _with_travelling(opened, noted, recollection):
-        if held.first.number in empty and held.lent is None:
+        if empty and held.first.number in empty and held.lent is None:
             held = empty[held.first.number]
         elif held.is_echo or held.observed:
             pass
@@ -257,7 +257,11 @@ def _with_travelling(opened: Opened, noted: Noted | None, recollection: Recollec
     from checkpoint.resources import travelling
 
     answers = recollection.recall(opened) if recollection else {}
-    found = [_looked_into(held, opened, noted) for held in opened]
+    known = {number: one.whole for number, one in opened.recalled.items() if one.whole is not None}
+    found = [
+        same if held.lent is None and (same := known.get(held.first.number)) else _looked_into(held, opened, noted)
+        for held in opened
+    ]
     if recollection:
         recollection.remember(found, answers, opened)
     for held in opened.travelling:  # which grows meanwhile
@@ -279,12 +283,9 @@ def _with_travelling(opened: Opened, noted: Noted | None, recollection: Recollec
 
 
 def _looked_into(held: OpenFile, opened: Opened, noted: Noted | None) -> OpenFile:
-    """A socket as it is observed; as it was where it cannot be, of which whoever asks next is told."""
+    """A socket as it is observed now; as it was where it cannot be, of which whoever asks next is told."""
     from checkpoint.resources import kinds, sockets
 
-    recalled = opened.recalled.get(held.first.number)
-    if recalled and recalled.whole is not None and held.lent is None:
-        return recalled.whole
     if not held.is_echo and sockets.is_socket(held.first):
         with contextlib.suppress(CaptureError):
             return replace(held, observed=kinds.observe_socket(held, opened, noted=noted))

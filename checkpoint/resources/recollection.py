@@ -57,6 +57,45 @@ class _Known:
     again: Recalled | None = None
 
 
+@dataclass(slots=True)
+class _Alike:
+    """Sockets of one kind that are asked in one go.
+
+    Attributes:
+        places: of their descriptors among those that are asked at a time.
+        heard: what all of them answered at the last look; b"" where one of them had something new to say, or could not be asked.
+        again: what is told of them where they answer as before, by their descriptors.
+        listed: those of whom the kernel's lists say something.
+    """
+
+    asking: Asking
+    members: list[tuple[OpenFile, _Known]] = field(default_factory=list)
+    places: list[int] = field(default_factory=list)
+    heard: bytes = b""
+    again: Mapping[int, Recalled] = field(default_factory=dict)
+    listed: list[tuple[OpenFile, _Known]] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class _AtATime:
+    """Sockets that are asked at a time, by their descriptors."""
+
+    pid: int
+    numbers: list[int]
+    kinds: list[_Alike]
+
+    @classmethod
+    def of(cls, some: Sequence[tuple[OpenFile, _Known]]) -> _AtATime:
+        """Those of a kind together."""
+        kinds: dict[Asking, _Alike] = {}
+        for place, (one, known) in enumerate(some):
+            if known.asking is not None:
+                alike = kinds.setdefault(known.asking, _Alike(known.asking))
+                alike.members.append((one, known))
+                alike.places.append(place)
+        return cls(some[0][0].pid, [one.first.number for one, _ in some], list(kinds.values()))
+
+
 @dataclass(frozen=True, slots=True)
 class _Round:
     """Who is asked, as long as the open files are the very same.
@@ -64,12 +103,13 @@ class _Round:
     Attributes:
         opened: all open files.
         numbers: descriptors of sockets among them.
+        asked: those that are asked, by `COPIES_MAX` at a time.
         groups: multicast groups of the machine, by process and family.
     """
 
     opened: tuple[OpenFile, ...] = ()
     numbers: frozenset[int] = frozenset()
-    asked: tuple[tuple[OpenFile, _Known], ...] = ()
+    asked: tuple[_AtATime, ...] = ()
     groups: Mapping[tuple[int, int], tuple[Group, ...]] = field(default_factory=dict)
 
     def holds(self, opened: Opened) -> bool:
@@ -135,15 +175,12 @@ class Recollection:
         """
         if self._round is None or not self._round.holds(opened):
             self._round = self._round_of(opened)
-        asked = self._round.asked
         changed: dict[int, _Answer] = {}
-        for first in range(0, len(asked), COPIES_MAX):
-            some = asked[first : first + COPIES_MAX]
-            with copies_of(some[0][0].pid, [one.first.number for one, _ in some]) as copies:
-                for (one, known), told in zip(some, _told([known for _, known in some], copies, self._second), strict=True):
-                    if told is not None and (answer := _recalled(one, known, told, opened)) is not None:
-                        changed[one.first.number] = answer
-        if len(self._known) > len(asked):
+        for some in self._round.asked:
+            with copies_of(some.pid, some.numbers) as copies:
+                for alike in some.kinds:
+                    _recall_alike(alike, [copies[place] for place in alike.places], self._second, opened, changed)
+        if len(self._known) > sum(len(some.numbers) for some in self._round.asked):
             self._known = {number: known for number, known in self._known.items() if number in self._round.numbers}
         return changed
 
@@ -154,7 +191,8 @@ class Recollection:
         for _, known in asked:
             known.again = None
         groups = {(one.pid, number_of(known.facts["family"])): known.groups for one, known in asked if _may_join(known.facts)}
-        return _Round(tuple(opened), frozenset(one.first.number for one in held), asked, groups)
+        some = tuple(_AtATime.of(asked[first : first + COPIES_MAX]) for first in range(0, len(asked), COPIES_MAX))
+        return _Round(tuple(opened), frozenset(one.first.number for one in held), some, groups)
 
     def empty_pipes(self, opened: Iterable[OpenFile]) -> dict[int, OpenFile]:
         """Pipes in which nothing waits, with all that must be known of them, by their first descriptors."""
@@ -201,17 +239,29 @@ class Recollection:
             known.state = answer.state if _is_quiet(one.observed) and _answers_again(one, known.asking, answer) else None
 
 
-def _told(every: Sequence[_Known], copies: Sequence[int], second: SecondThread | None) -> list[Told | None]:
-    """Ask all, those of a kind in one go; None of one that cannot be asked."""
-    by_kind: dict[Asking, list[int]] = {}
-    for index, (known, copy) in enumerate(zip(every, copies, strict=True)):
-        if copy >= 0 and known.asking is not None:
-            by_kind.setdefault(known.asking, []).append(index)
-    found: list[Told | None] = [None] * len(every)
-    for asking, places in by_kind.items():
-        for index, told in zip(places, asking.ask_each([copies[index] for index in places], second), strict=True):
-            found[index] = told
-    return found
+def _recall_alike(
+    alike: _Alike, copies: Sequence[int], second: SecondThread | None, opened: Opened, changed: dict[int, _Answer]
+) -> None:
+    """Ask all, in one go; what one answers that cannot be asked is not known. See `Recollection.recall`."""
+    members = alike.members
+    if can_all := min(copies) >= 0:
+        asked = copies
+    else:
+        members = [member for member, copy in zip(members, copies, strict=True) if copy >= 0]
+        asked = [copy for copy in copies if copy >= 0]
+    heard = alike.asking.hear(asked, second)
+    if can_all and heard == alike.heard and all(_listed(one, known.facts, opened) == known.listed for one, known in alike.listed):
+        opened.recalled.update(alike.again)
+        return
+    alike.heard = b""
+    is_new = not can_all
+    for (one, known), told in zip(members, alike.asking.told(heard), strict=True):
+        if (answer := _recalled(one, known, told, opened)) is not None:
+            changed[one.first.number] = answer
+        is_new |= known.again is None or answer is not None
+    if not is_new:
+        alike.heard, alike.listed = heard, [(one, known) for one, known in members if _is_listed(known.facts)]
+        alike.again = {one.first.number: known.again for one, known in members if known.again}
 
 
 def _recalled(one: OpenFile, known: _Known, told: Told, opened: Opened) -> _Answer | None:
@@ -266,11 +316,18 @@ def _may_join(facts: Mapping[str, Fact]) -> bool:
 
 def _listed(one: OpenFile, facts: Mapping[str, Fact], opened: Opened) -> object:
     """What only the kernel's lists say of a socket."""
+    if not _is_listed(facts):
+        return 0
     if facts["family"] == socket.AF_UNIX:
         return opened.listings.unix_answer(one.first.inode)
-    if facts["protocol"] in internet_sockets.DATAGRAMS and facts.get("address"):
-        return opened.listings.shut_down(number_of(facts["family"]), number_of(facts["protocol"])).get(one.first.inode, 0)
-    return 0
+    return opened.listings.shut_down(number_of(facts["family"]), number_of(facts["protocol"])).get(one.first.inode, 0)
+
+
+def _is_listed(facts: Mapping[str, Fact]) -> bool:
+    """Whether the kernel's lists say more of such a socket."""
+    if facts["family"] == socket.AF_UNIX:
+        return True
+    return facts["protocol"] in internet_sockets.DATAGRAMS and bool(facts.get("address"))
 
 
 def _may_hold_something(state: bytes, facts: Mapping[str, Fact]) -> bool:

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from checkpoint.linux.descriptors import NOT_YET, copies_of, lending
-from checkpoint.linux.socket_questions import SO_ATTACH_FILTER, WORTH_SHARING, Asking, Subject
+from checkpoint.linux.socket_questions import SO_ATTACH_FILTER, WORTH_SHARING, Asking, Subject, Told
 from checkpoint.model import Fact
 from checkpoint.resources import Opened, OpenFile, gather, unix_sockets, with_contents
 from checkpoint.resources import sockets as kinds_of_sockets
@@ -141,6 +141,32 @@ def test_of_many_sockets_a_second_thread_asks_half_and_of_few_none(sockets: Sock
     assert not second._thread.is_alive()
     assert after == anew()
     onlooker.recollection.close()
+
+
+def test_what_many_answer_as_before_is_not_taken_apart(sockets: Sockets, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken_apart: list[int] = []
+    told = Asking.told
+
+    def counted(asking: Asking, heard: bytes) -> list[Told]:
+        found = told(asking, heard)
+        taken_apart.append(len(found))
+        return found
+
+    sockets.named.close()  # a path may lead elsewhere by now
+    onlooker = Onlooker()
+    for _ in range(LOOKS_UNTIL_KNOWN + 1):
+        before, _ = onlooker.look()
+    monkeypatch.setattr(Asking, "told", counted)
+    assert onlooker.look()[0] == before
+    assert taken_apart == []
+    sockets.udp.setsockopt(socket.IPPROTO_IP, socket.IP_TTL, 9)
+    assert onlooker.look()[0] == anew()
+    assert sum(taken_apart) >= 1
+    for _ in range(LOOKS_UNTIL_KNOWN):
+        after, _ = onlooker.look()
+    taken_apart.clear()
+    assert onlooker.look()[0] == after == anew()
+    assert taken_apart == []
 
 
 def _attach_filter(one: socket.socket, instructions: bytes = PASS_ALL) -> None:
