@@ -306,7 +306,8 @@ class ThreadOnlooker:
         mode = self._modes.get(life, mode) or (FILTERED if unread.is_filtered else 0)
         found = self._confinements.suspended(tracee, mode, life)
         registers = where_it_stands(tracee, unread.registers, lambda: unread.reading.rseq, self._interruptions)
-        if self._borrowed.holds(arch.stand_of(registers)[0]):
+        pointer, _, _ = arch.stand_of(registers)
+        if self._borrowed.holds(pointer):
             raise CaptureError(f"thread {tracee.pid} still stands in code of an earlier look; capture it again in a moment")
         return ThreadPlace(tracee, life, inner_tid, registers, unread, text, found)
 

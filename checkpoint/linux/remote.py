@@ -42,7 +42,7 @@ from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import Call, Registers, TablePlaces
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import abi
-from checkpoint.linux.memory import Memory
+from checkpoint.linux.memory import Memory, Ranges, ranges_of
 from checkpoint.linux.rounds import Round
 from checkpoint.linux.tracee import Tracee, rest
 
@@ -241,8 +241,9 @@ class Desk:
             self._code_key = key
         self._serial += 1
         self.is_known_idle = False
-        patience = divmod(patience_ns(guest.tracee), 10**9)
-        return _HEAD.pack(MAGIC, ARMED, 0, self._serial, guest.mask, *patience, 0, *_going_on(guest.registers))
+        tracee, registers, mask = guest
+        patience = divmod(patience_ns(tracee), 10**9)
+        return _HEAD.pack(MAGIC, ARMED, 0, self._serial, mask, *patience, 0, *_going_on(registers))
 
     def is_done(self, table: bytes) -> bool:
         """Whether the calls have been made, by the table's bytes."""
@@ -271,6 +272,8 @@ class BorrowedPages:
         offsets = range(LARGE_DESK, CODE_SIZE, SMALL_DESK)
         self._of_large = Round(1)
         self.desks = tuple(Desk(memory, address + offset, self.table + offset, SMALL) for offset in offsets)
+        self._large_head = ranges_of([(self.table, _HEAD_SIZE)])
+        self._small_heads = ranges_of([(desk.table, _HEAD_SIZE) for desk in self.desks])
 
     @functools.cached_property
     def _of_small(self) -> Round:
@@ -347,8 +350,8 @@ class BorrowedPages:
     def _run_at(self, desks: Sequence[Desk], batches: Sequence[Batch], guests: Sequence[Guest]) -> list[Answers]:
         places = list(zip(desks, batches, guests, strict=False))
         self._require_free([desk for desk, _, _ in places])
-        heads = [(desk.table, desk.armed(batch, guest)) for desk, batch, guest in places]
-        self._memory.write_each(heads)
+        heads = b"".join([desk.armed(batch, guest) for desk, batch, guest in places])
+        self._memory.write_from(self._heads_of(desks)[: len(places)], bytearray(heads))
         tracees = [guest.tracee for guest in guests]
         sent = self._of_small if desks is self.desks else self._of_large
         registers, masks = [guest.registers for guest in guests], [guest.mask for guest in guests]
@@ -359,6 +362,10 @@ class BorrowedPages:
         finally:
             self._take_back(sent, [(desk, guest) for desk, _, guest in places])
         return [desk.answers(table, batch) for (desk, batch, _), table in zip(places, tables, strict=True)]
+
+    def _heads_of(self, desks: Sequence[Desk]) -> Ranges:
+        """Where the heads of their tables lie."""
+        return self._small_heads if desks is self.desks else self._large_head
 
     def _require_free(self, desks: Sequence[Desk]) -> None:
         if all(desk.is_known_idle for desk in desks):
@@ -388,7 +395,9 @@ class BorrowedPages:
             moving = [was and not stands for was, stands in zip(asked, stand, strict=True)]
             given = self._set_back_singly(places, moving, failures)
         with _collected(failures):
-            self._memory.write_each([(desk.table + _STATE_OFFSET, _IDLE_WORD) for desk in given])
+            if given:
+                states = ranges_of([(desk.table + _STATE_OFFSET, len(_IDLE_WORD)) for desk in given])
+                self._memory.write_from(states, bytearray(_IDLE_WORD * len(given)))
             for desk in given:
                 desk.is_known_idle = True
         if failures:

@@ -132,12 +132,15 @@ class Round:
         if tids == self._tids:
             return
         self._tids = tids
+        ids = np.array(tids, dtype=np.uint64)
         for group, count in enumerate(CALLS):
-            for index, tid in enumerate(tids):
-                for call in range(count):
-                    place = (self._firsts[group] + index * count + call) * ROW
-                    is_wait = group == STAND and call == 0
-                    self._calls.cells[place + FIRST_ARGUMENT + (0 if is_wait else 1)] = tid
+            first = self._firsts[group]
+            rows = self._calls.entries[first : first + count * len(tids)].reshape(len(tids), count, ROW)
+            if group == STAND:
+                rows[:, 0, FIRST_ARGUMENT] = ids
+                rows[:, 1:, FIRST_ARGUMENT + 1] = ids[:, None]
+            else:
+                rows[:, :, FIRST_ARGUMENT + 1] = ids[:, None]
 
     def _run(self, group: int) -> array.array[int]:
         """Make one group of calls: the results, those about one thread together."""
