@@ -24,7 +24,7 @@ def _other_thread(standing: ThreadStanding) -> ThreadState:
     place = standing.place
     return ThreadState(
         tid=place.inner_tid,
-        name=standing.stat.name,
+        name=standing.name,
         registers={"prstatus": arch.encode_registers(standing.settled), "xstate": standing.reading.xstate},
         signal_mask=place.mask,
         pending=place.pending,
@@ -33,8 +33,8 @@ def _other_thread(standing: ThreadStanding) -> ThreadState:
         clear_tid=standing.clear_tid,
         rseq=place.rseq,
         policy=standing.reading.policy,
-        priority=standing.stat.priority,
-        nice=standing.stat.nice,
+        priority=standing.reading.priority,
+        nice=standing.reading.nice,
         io_priority=standing.reading.io_priority,
         affinity=standing.reading.affinity,
         timer_slack_ns=standing.timer_slack_ns,

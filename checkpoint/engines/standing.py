@@ -90,7 +90,7 @@ class Standing:
     @functools.cached_property
     def stat(self) -> Stat:
         """Its /proc/PID/stat."""
-        return procfs.parse_stat(os.fsdecode(self.place.reading.stat_text))
+        return procfs.parse_stat(os.fsdecode(self.place.reading.text))
 
 
 class Onlooker:
@@ -175,7 +175,7 @@ class Onlooker:
         mode = confinement.mode_in(status)
         confined = self._confinements.suspended(tracee, mode, (tracee.pid, 0))
         unread, *of_others = self._readings.read(
-            [tracee, *self._threads.others], [self._files.descriptor("stat"), *self._others.stat_files()]
+            [tracee, *self._threads.others], [self._files.descriptor("stat"), *self._others.name_files()]
         )
         special, _, waits_shared = procfs.signal_sets(status)
         shared_pending = tracee.pending(shared=True) if waits_shared else ()

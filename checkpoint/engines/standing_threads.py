@@ -23,7 +23,6 @@ from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, Unsupp
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.confinement import FILTERED, FREE, Confinement
 from checkpoint.linux.kept_descriptors import TEXTS_KEPT
-from checkpoint.linux.procfs import Stat
 from checkpoint.linux.readings import NO_FILE, Reading, Unread
 from checkpoint.linux.remote import SMALL, Answers, Batch, Desk, Guest
 from checkpoint.linux.tasks import thread_ids
@@ -67,7 +66,7 @@ class ThreadPlace(Read):
     Attributes:
         registers: that it is given back, as `Tracee.registers` gives them.
         inner_tid: its id as it sees it itself.
-        text: its /proc/PID/task/TID/stat; empty where that was read with all the rest.
+        comm: its /proc/PID/task/TID/comm; empty where that was read with all the rest.
         confinement: by seccomp(2); suspended as long as it stands.
     """
 
@@ -76,7 +75,7 @@ class ThreadPlace(Read):
     inner_tid: int
     registers: bytes
     unread: Unread
-    text: bytes = b""
+    comm: bytes = b""
     confinement: Confinement = FREE
 
 
@@ -85,7 +84,6 @@ class ThreadStanding:
     """Everything that a thread was asked; nothing in it needs the process any more.
 
     Attributes:
-        settled: registers that a snapshot goes on with.
         interruption: of the thread.
     """
 
@@ -117,10 +115,10 @@ class ThreadStanding:
     def _settled(self) -> tuple[Registers, str]:
         return self.interruption.settled(arch.decode_registers(self.place.registers))
 
-    @functools.cached_property
-    def stat(self) -> Stat:
-        """Its /proc/PID/task/TID/stat."""
-        return procfs.parse_stat(os.fsdecode(self.place.text or self.reading.stat_text))
+    @property
+    def name(self) -> str:
+        """Of PR_SET_NAME."""
+        return os.fsdecode((self.place.comm or self.reading.text).removesuffix(b"\n"))
 
     @functools.cached_property
     def altstack(self) -> tuple[int, int, int]:
@@ -189,14 +187,14 @@ def _start_time(stat_text: bytes) -> int:
     return int(stat_text[stat_text.rindex(b")") + 2 :].split(b" ", 20)[19])
 
 
-class _KeptStat(NamedTuple):
-    """The stat file of a thread, and which thread that is."""
+class _KeptName(NamedTuple):
+    """The file that tells the name of a thread, and which thread that is."""
 
     file: int
     life: Life
 
 
-NOTHING_KEPT: Final = _KeptStat(NO_FILE, (0, 0))
+NOTHING_KEPT: Final = _KeptName(NO_FILE, (0, 0))
 
 
 class ThreadOnlooker:
@@ -209,7 +207,7 @@ class ThreadOnlooker:
         self._borrowed = entered.pages
         self._questions = [ThreadQuestions(desk) for desk in entered.pages.desks]
         self._inner_tids: dict[Life, int] = {}
-        self._stats: dict[int, _KeptStat] = {}
+        self._names: dict[int, _KeptName] = {}
         self._interruptions = entered.interruptions
         self._asked: tuple[ThreadStanding, ...] = ()
 
@@ -218,8 +216,8 @@ class ThreadOnlooker:
         self._keep_only(())
 
     def _keep_only(self, tids: Collection[int]) -> None:
-        for tid in [tid for tid in self._stats if tid not in tids]:
-            os.close(self._stats.pop(tid).file)
+        for tid in [tid for tid in self._names if tid not in tids]:
+            os.close(self._names.pop(tid).file)
 
     def prepare(self) -> None:
         """Look up, while the program runs, what does not change; what is left of an earlier look."""
@@ -227,7 +225,7 @@ class ThreadOnlooker:
         for tid in thread_ids(self._threads.pid):
             if tid != self._threads.pid:
                 try:
-                    self._inner_tid(self._stat(tid)[0])
+                    self._inner_tid(self._named(tid)[0])
                 except (ProcessGoneError, ProbeError):
                     continue  # it has ended
 
@@ -237,29 +235,30 @@ class ThreadOnlooker:
         for standing in asked:
             standing.settle()
 
-    def _stat(self, tid: int) -> tuple[Life, bytes]:
-        """Who has this id now, and its stat.
+    def _named(self, tid: int) -> tuple[Life, bytes]:
+        """Who has this id now, and its comm.
 
         By a file that stays open: reading it again takes a third of opening it anew, and once its thread has ended it tells of no
-        other one.
+        other one. So if it still answers after the thread's stat has been read, by name, that was the same thread's.
         """
-        kept = self._stats.get(tid)
+        kept = self._names.get(tid)
         if kept is not None:
             with contextlib.suppress(ProcessLookupError):
                 return kept.life, os.pread(kept.file, procfs.READ_SIZE, 0)
-            os.close(self._stats.pop(tid).file)
-        name = f"task/{tid}/stat"
-        if len(self._stats) >= TEXTS_KEPT:
-            text = procfs.read_line(self._threads.pid, name)
-            return (tid, _start_time(text)), text
-        file = procfs.opened(self._threads.pid, name)
+            os.close(self._names.pop(tid).file)
+        pid, name = self._threads.pid, f"task/{tid}/comm"
+        file = procfs.opened(pid, name)
         try:
-            text = procfs.read_kept(file, self._threads.pid, name)
+            life = tid, _start_time(procfs.read_line(pid, f"task/{tid}/stat"))
+            comm = procfs.read_kept(file, pid, name)
         except BaseException:
             os.close(file)
             raise
-        kept = self._stats[tid] = _KeptStat(file, (tid, _start_time(text)))
-        return kept.life, text
+        if len(self._names) < TEXTS_KEPT:
+            self._names[tid] = _KeptName(file, life)
+        else:
+            os.close(file)
+        return life, comm
 
     def _inner_tid(self, life: Life) -> int:
         """Its id as it sees it itself; whether it is confined since its birth is noted by the way."""
@@ -271,9 +270,9 @@ class ThreadOnlooker:
             self._inner_tids[life] = status.pids[-1]
         return self._inner_tids[life]
 
-    def stat_files(self) -> list[int]:
+    def name_files(self) -> list[int]:
         """Of those that stand still: what `Readings.read` is to read of them."""
-        return [self._stats.get(tracee.pid, NOTHING_KEPT).file for tracee in self._threads.others]
+        return [self._names.get(tracee.pid, NOTHING_KEPT).file for tracee in self._threads.others]
 
     def places(self, readings: Sequence[Unread], modes: Mapping[int, int], of_first: int) -> tuple[ThreadPlace, ...]:
         """Where they stand.
@@ -301,7 +300,7 @@ class ThreadOnlooker:
         return found
 
     def _place(self, tracee: Tracee, unread: Unread, mode: int) -> ThreadPlace:
-        life, text = (self._stats[tracee.pid].life, b"") if unread.has_text else self._stat(tracee.pid)
+        life, comm = (self._names[tracee.pid].life, b"") if unread.has_text else self._named(tracee.pid)
         inner_tid = self._inner_tid(life)
         mode = self._modes.get(life, mode) or (FILTERED if unread.is_filtered else 0)
         found = self._confinements.suspended(tracee, mode, life)
@@ -309,7 +308,7 @@ class ThreadOnlooker:
         pointer, _, _ = arch.stand_of(registers)
         if self._borrowed.holds(pointer):
             raise CaptureError(f"thread {tracee.pid} still stands in code of an earlier look; capture it again in a moment")
-        return ThreadPlace(tracee, life, inner_tid, registers, unread, text, found)
+        return ThreadPlace(tracee, life, inner_tid, registers, unread, comm, found)
 
     def ask(self, places: tuple[ThreadPlace, ...]) -> tuple[ThreadStanding, ...]:
         """Everything else."""

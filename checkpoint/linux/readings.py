@@ -33,9 +33,10 @@ STEP: Final = 16
 PROCESSORS_SIZE: Final = 128
 """Bytes of a set of processors: a bit for each of 1,024."""
 
-_RSEQ: Final = struct.Struct("<QIIII")
-_PAIR: Final = struct.Struct("<QQ")
 _WORD: Final = 8
+_RSEQ: Final = struct.Struct("<QIIII")
+_INT: Final = struct.Struct("<i")
+_PAIR: Final = struct.Struct("<QQ")
 
 
 class _Layout:
@@ -48,7 +49,8 @@ class _Layout:
     robust = 56
     rseq = 72
     processors = 96
-    pending = processors + PROCESSORS_SIZE
+    priority = processors + PROCESSORS_SIZE
+    pending = priority + _WORD
     text = pending + PEEKED * abi.SIGINFO_SIZE
     registers = text + TEXT_SIZE
     xstate = registers + REGISTERS_SIZE
@@ -59,10 +61,12 @@ _REGISTERS_LENGTH: Final = _Layout.registers_iov // _WORD + 1
 _XSTATE_LENGTH: Final = _Layout.xstate_iov // _WORD + 1
 """Places of the lengths that the kernel has written, in words."""
 
-CALLS: Final = 11
+CALLS: Final = 13
 """About each thread."""
-REGISTERS, MASK, RSEQ, PENDING, XSTATE, FILTER, ROBUST, PROCESSORS, IO_PRIORITY, POLICY, TEXT = range(CALLS)
+REGISTERS, MASK, RSEQ, PENDING, XSTATE, FILTER, ROBUST, PROCESSORS, IO_PRIORITY, POLICY, PRIORITY, NICE, TEXT = range(CALLS)
 NO_FILE: Final = -1
+NICE_ORIGIN: Final = 20
+"""getpriority(2) itself, of the kernel, answers with this less the nice value: a negative result is an error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +76,10 @@ class Reading:
     Attributes:
         registers, xstate: as `Tracee.registers` and `Tracee.xstate` give them.
         pending: signals sent to this very thread, each a whole siginfo.
-        stat_text: its /proc/PID/task/TID/stat; empty where it was not asked for.
+        text: of a file of /proc that tells of it; empty where none was asked for.
         robust_list: head address and length.
         policy: with SCHED_RESET_ON_FORK, as sched_setscheduler(2) takes it.
+        priority: in real time; 0 for an ordinary thread.
         processors: that it may run on, a bit each.
         io_priority: as ioprio_set(2) takes it.
         is_filtered: a filter of seccomp(2) judges its calls, as far as the kernel tells us: that takes CAP_SYS_ADMIN.
@@ -85,9 +90,11 @@ class Reading:
     rseq: Rseq | None
     pending: tuple[bytes, ...]
     xstate: bytes
-    stat_text: bytes
+    text: bytes
     robust_list: tuple[int, int]
     policy: int
+    priority: int
+    nice: int
     processors: bytes
     io_priority: int
     is_filtered: bool
@@ -104,7 +111,7 @@ class Unread:
 
     Attributes:
         registers, mask, is_filtered: as in `Reading`.
-        has_text: its stat file has answered: it is the thread for which that was opened.
+        has_text: its file has answered: it is the thread for which that was opened.
     """
 
     __slots__ = ("_answers", "_index", "_reading", "_tracee", "has_text", "is_filtered", "mask", "registers")
@@ -153,37 +160,38 @@ class _Area:
         self._rows = self._calls.entries.reshape(capacity, CALLS, -1)
         self._about: tuple[list[int], list[int]] = ([], [])
 
-    def ask(self, tids: list[int], stats: list[int]) -> list[list[int]]:
+    def ask(self, tids: list[int], files: list[int]) -> list[list[int]]:
         """Make the calls about these: the results of each."""
         count = len(tids)
-        if (tids, stats) != self._about:
-            self._address(tids, stats)
-            self._about = tids, stats
+        if (tids, files) != self._about:
+            self._address(tids, files)
+            self._about = tids, files
         self._words[:count, _REGISTERS_LENGTH] = REGISTERS_SIZE
         self._words[:count, _XSTATE_LENGTH] = XSTATE_SIZE
         self._calls.run(0, count * CALLS)
         found: list[list[int]] = self._results[:count].tolist()
         return found
 
-    def _address(self, tids: list[int], stats: list[int]) -> None:
+    def _address(self, tids: list[int], files: list[int]) -> None:
         """Fill in whom the calls are about."""
         rows, ids = self._rows[: len(tids)], np.array(tids, dtype=np.uint64)
         rows[:, : FILTER + 1, 2] = ids[:, None]
         rows[:, IO_PRIORITY, 2] = ids
-        for place in (ROBUST, PROCESSORS, POLICY):
+        rows[:, NICE, 2] = ids
+        for place in (ROBUST, PROCESSORS, POLICY, PRIORITY):
             rows[:, place, 1] = ids
-        rows[:, TEXT, 1] = np.array(stats, dtype=np.int64).view(np.uint64)
+        rows[:, TEXT, 1] = np.array(files, dtype=np.int64).view(np.uint64)
 
 
 class _Answers:
     """What was told of all threads at once, as bytes. Whoever holds it keeps its memory from being written to again."""
 
-    __slots__ = ("__weakref__", "_area", "_results", "_stats")
+    __slots__ = ("__weakref__", "_area", "_files", "_results")
 
-    def __init__(self, area: _Area, results: list[list[int]], stats: Sequence[int]) -> None:
+    def __init__(self, area: _Area, results: list[list[int]], files: Sequence[int]) -> None:
         self._area = area
         self._results = results
-        self._stats = stats
+        self._files = files
 
     def reading(self, index: int, tracee: Tracee) -> Reading:
         """All that was told of a thread.
@@ -201,9 +209,13 @@ class _Answers:
             rseq=self._rseq(at) if results[RSEQ] > 0 else tracee.rseq(),
             pending=tracee.pending(shared=False) if results[PENDING] else (),
             xstate=self._xstate(index) if results[XSTATE] == 0 else tracee.xstate(),
-            stat_text=self._text(at, results[TEXT], self._stats[index]),
+            text=self._text(at, results[TEXT], self._files[index]),
             robust_list=_PAIR.unpack_from(view, at + _Layout.robust) if results[ROBUST] == 0 else abi.robust_list(tracee.pid),
             policy=results[POLICY] if results[POLICY] >= 0 else os.sched_getscheduler(tracee.pid),
+            priority=_INT.unpack_from(view, at + _Layout.priority)[0]
+            if results[PRIORITY] == 0
+            else os.sched_getparam(tracee.pid).sched_priority,
+            nice=NICE_ORIGIN - results[NICE] if results[NICE] > 0 else os.getpriority(os.PRIO_PROCESS, tracee.pid),
             processors=self._processors(at, tracee.pid, results[PROCESSORS]),
             io_priority=max(results[IO_PRIORITY], 0),
             is_filtered=_is_filtered(results),
@@ -229,10 +241,10 @@ class _Answers:
         address, size, signature, flags, _ = _RSEQ.unpack_from(self._area.view, at + _Layout.rseq)
         return Rseq(address, size, signature, flags) if address else None
 
-    def _text(self, at: int, result: int, stat: int) -> bytes:
+    def _text(self, at: int, result: int, file: int) -> bytes:
         if 0 <= result < TEXT_SIZE:
             return bytes(self._area.view[at + _Layout.text :][:result])
-        return b"" if stat == NO_FILE or result < 0 else os.pread(stat, procfs.READ_SIZE, 0)
+        return b"" if file == NO_FILE or result < 0 else os.pread(file, procfs.READ_SIZE, 0)
 
     def _processors(self, at: int, tid: int, result: int) -> bytes:
         if result > 0:
@@ -243,8 +255,10 @@ class _Answers:
 
 def _is_complete(results: Sequence[int]) -> bool:
     """Whether the calls about a thread have brought all that was asked."""
-    registers, mask, rseq, pending, xstate, _, robust, processors, _, policy, text = results
-    return not (registers or mask or pending or xstate or robust) and rseq > 0 < processors and policy >= 0 and text < TEXT_SIZE
+    registers, mask, rseq, pending, xstate, _, robust, processors, _, policy, priority, nice, text = results
+    if registers or mask or pending or xstate or robust or priority:
+        return False
+    return rseq > 0 < processors and policy >= 0 < nice and text < TEXT_SIZE
 
 
 def _is_filtered(results: Sequence[int]) -> bool:
@@ -258,11 +272,11 @@ class Readings:
         self._area = _Area(1)
         self._given: weakref.ref[_Answers] | None = None
 
-    def read(self, tracees: Sequence[Tracee], stats: Sequence[int]) -> list[Unread]:
+    def read(self, tracees: Sequence[Tracee], files: Sequence[int]) -> list[Unread]:
         """Ask about these; they stand still. What was read earlier stays as it was.
 
         Args:
-            stats: for each a descriptor of its stat file; `NO_FILE` if that is not wanted.
+            files: for each a descriptor of a file of /proc that tells of it; `NO_FILE` if none is wanted.
 
         Raises:
             ProcessGoneError: one of them has been killed.
@@ -270,8 +284,8 @@ class Readings:
         is_taken = self._given is not None and self._given() is not None
         if is_taken or len(tracees) > self._area.capacity:
             self._area = _Area(max(self._area.capacity, 1 if len(tracees) == 1 else -(-len(tracees) // STEP) * STEP))
-        results = self._area.ask([tracee.pid for tracee in tracees], list(stats))
-        answers = _Answers(self._area, results, stats)
+        results = self._area.ask([tracee.pid for tracee in tracees], list(files))
+        answers = _Answers(self._area, results, files)
         self._given = weakref.ref(answers)
         return [Unread(answers, index, tracee, results[index]) for index, tracee in enumerate(tracees)]
 
@@ -293,5 +307,7 @@ def _calls_about(area: int) -> list[tuple[int, ...]]:
         row("sched_getaffinity", 0, PROCESSORS_SIZE, area + _Layout.processors),
         row("ioprio_get", abi.IOPRIO_WHO_PROCESS, 0),
         row("sched_getscheduler", 0),
+        row("sched_getparam", 0, area + _Layout.priority),
+        row("getpriority", os.PRIO_PROCESS, 0),
         row("pread64", 0, area + _Layout.text, TEXT_SIZE, 0),
     ]

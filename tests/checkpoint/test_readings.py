@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from checkpoint.linux import procfs
 from checkpoint.linux.readings import NO_FILE, Readings, Unread
 from checkpoint.linux.tasks import thread_ids
 from checkpoint.linux.threads import Threads
@@ -69,3 +70,16 @@ def test_nothing_grows_where_nobody_wants_it_any_more(threads: Threads) -> None:
     told(readings, threads)
     assert readings._area is area
     assert len(kept) == 4
+
+
+def test_priority_and_nice_value_are_as_the_kernel_tells_them_elsewhere(threads: Threads) -> None:
+    """One in real time, one that is nice, one that is the contrary."""
+    _, in_real_time, nice, urgent = thread_ids(threads.pid)
+    os.setpriority(os.PRIO_PROCESS, nice, 19)
+    os.setpriority(os.PRIO_PROCESS, urgent, -20)
+    os.setpriority(os.PRIO_PROCESS, in_real_time, 3)
+    os.sched_setscheduler(in_real_time, os.SCHED_RR, os.sched_param(7))
+    found = [unread.reading for unread in told(Readings(), threads)]
+    assert [(reading.priority, reading.nice) for reading in found] == [(0, 0), (7, 3), (0, 19), (0, -20)]
+    stats = [procfs.thread_stat(threads.pid, tid) for tid in thread_ids(threads.pid)]
+    assert [(stat.priority, stat.nice) for stat in stats] == [(0, 0), (7, 3), (0, 19), (0, -20)]
