@@ -208,6 +208,8 @@ class _Sheet:
         aside: (capacity, bytes) what is not compared as a whole.
         table: the calls, those about one socket after the other.
         of_buffers: the same of `BUFFERS`.
+
+    Invariant: the memory of `_used` and all later ones is as it must be before they are asked.
     """
 
     def __init__(self, asked: Questions, capacity: int) -> None:
@@ -226,14 +228,25 @@ class _Sheet:
         self.of_buffers.entries[:] = words[:, always:].reshape(-1, ROW)
         self._descriptors = self.table.entries.reshape(capacity, always, ROW)[:, :-1, FIRST_ARGUMENT]
         self._descriptors_of_buffers = self.of_buffers.entries.reshape(capacity, BUFFERS, ROW)[:, :, FIRST_ARGUMENT]
+        self._used = capacity
         self._addressed = np.full(capacity, -1, dtype=np.int64)
         self._polled = self.aside.reshape(-1).view(np.int32).reshape(capacity, -1)[:, asked.polled // 4]
+
+    def forget(self) -> None:
+        """Forget all answers, so that it need not be done when it is asked."""
+        self._forget(0, self._used)
+        self._used = 0
+
+    def _forget(self, first: int, last: int) -> None:
+        self.memory[first:last] = self._image
+        self.aside[first:last] = self._image_aside
 
     def address(self, first: int, descriptors: NDArray[np.int64]) -> None:
         """Have the questions from the first place on go to these."""
         last = first + len(descriptors)
-        self.memory[first:last] = self._image
-        self.aside[first:last] = self._image_aside
+        if first < self._used:
+            self._forget(first, last)
+        self._used = max(self._used, last)
         self._polled[first:last] = descriptors
         if not np.array_equal(self._addressed[first:last], descriptors):  # copies of the same have the same numbers, as a rule
             self._addressed[first:last] = descriptors
@@ -243,6 +256,13 @@ class _Sheet:
         """Ask them."""
         self.address(first, descriptors)
         self.table.run(first * self._always, (first + len(descriptors)) * self._always)
+
+    def take_over(self, first: int, other: _Sheet, count: int) -> None:
+        """Have from a place on what so many have answered that were asked by another sheet, the last one first."""
+        last = first + count
+        self._used = max(self._used, last)
+        self.memory[first:last] = other.memory[:count][::-1]
+        self.aside[first:last] = other.aside[:count][::-1]
 
     def ask_of_buffers(self, index: int, descriptor: int) -> None:
         """Ask one more of one."""
@@ -272,6 +292,12 @@ class Asking:
         share = capacity // 2 if is_shared and capacity >= WORTH_SHARING else 0
         if share > self._capacity_of_second:
             self._capacity_of_second, self._sheet_of_second = share, _Sheet(self._questions, share)
+
+    def prepare(self, second: SecondThread | None = None) -> None:
+        """Do what need not be done while it is waited for the answers."""
+        self._sheet.forget()
+        if second is not None and second.is_at_rest() and self._capacity_of_second:
+            self._sheet_of_second.forget()
 
     def ask(self, descriptor: int) -> Told:
         """Ask everything, through a descriptor of ours."""
@@ -316,8 +342,7 @@ class Asking:
                 more = max(1, left // 4) if left > 0 else 0
         finally:
             second.stop()
-        ours.memory[asked:count] = theirs.memory[: count - asked][::-1]
-        ours.aside[asked:count] = theirs.aside[: count - asked][::-1]
+        ours.take_over(asked, theirs, count - asked)
         return True
 
     def _have_chosen_buffers(self, count: int) -> list[int]:

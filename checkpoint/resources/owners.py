@@ -25,6 +25,7 @@ F_GETOWN_EX: Final = 16
 OWNER: Final = struct.Struct("<ii")
 """struct f_owner_ex."""
 O_PATH: Final = 0o10000000
+_O_ASYNC: Final = os.O_ASYNC
 _LEASE: Final = b" LEASE "
 
 
@@ -49,14 +50,16 @@ NOTHING_SENT: Final = Signals()
 
 def asked(opened: Iterable[OpenFile]) -> tuple[OpenFile, ...]:
     """The same, with what those send that may well send something; the process stands still."""
-    return tuple(replace(held, signals=ask(held)) if _may_have_one(held) else held for held in opened)
+    return tuple([replace(held, signals=ask(held)) if _may_have_one(held) else held for held in opened])
 
 
 def _may_have_one(held: OpenFile) -> bool:
-    one = held.first
-    if one.flags & os.O_ASYNC or held.lent or _LEASE in one.told:
+    """Asked of each of thousands while the process stands still."""
+    one = held.descriptors[0]
+    if one.flags & _O_ASYNC or held.lent or _LEASE in one.told:
         return True
-    return held.owners is not None and (one.number, one.inode) in held.owners
+    known = held.owners
+    return False if not known else (one.number, one.inode) in known
 
 
 def overlooked(opened: Sequence[OpenFile], known: Owners) -> OpenFile | None:

@@ -158,6 +158,7 @@ class Recollection:
         self._be_two(max(counts.values(), default=0) >= WORTH_SHARING)
         for asking, count in counts.items():
             asking.reserve(min(count, COPIES_MAX), is_shared=self._second is not None)
+            asking.prepare(self._second)
         self._askings = wanted  # a machine may have other multicast groups every minute
 
     def _be_two(self, is_worth_it: bool) -> None:

@@ -52,6 +52,7 @@ def descriptors() -> Iterator[list[int]]:
         for ttl, one in enumerate(made, 1):
             one.bind(("127.0.0.1", 0))
             one.setsockopt(socket.IPPROTO_IP, socket.IP_TTL, ttl)
+            one.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo\0")  # who is asked with room for as much says no
         made[-2].setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 16384)  # of which more is asked
         yield [one.fileno() for one in made]
 
@@ -123,6 +124,22 @@ def test_one_that_gets_stuck_is_not_waited_for(descriptors: list[int]) -> None:
         second.wake()
         wait_until(second.is_at_rest)
         assert ours.ask_each(descriptors, second) == expected
+
+
+@pytest.mark.parametrize("is_prepared", [False, True])
+def test_nothing_of_an_earlier_answer_is_left_in_the_next_question(is_prepared: bool, descriptors: list[int]) -> None:
+    """Whoever of the two has asked, and however many."""
+    ours = asking()
+    expected = ours.ask_each(descriptors)
+    gone = SecondThread(own_calls.instructions(b"\xc3"))
+    with contextlib.closing(second_thread()) as working, contextlib.closing(Stuck()) as stuck:
+        for second in (stuck, gone, None, working, working, stuck, working, None):
+            for count in COUNTS[::-1]:
+                if is_prepared:
+                    ours.prepare(second)
+                assert ours.ask_each(descriptors[:count], second) == expected[:count]
+                wait_until(lambda second=second: second in (None, stuck, gone) or second.is_at_rest())
+    gone.close()
 
 
 def test_what_is_late_is_not_taken_for_an_answer(descriptors: list[int]) -> None:
