@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
+import mmap
 import os
 import signal
 import sys
@@ -19,9 +21,10 @@ from checkpoint.engine import CaptureOrder
 from checkpoint.engines import waits
 from checkpoint.engines.waits import Wait, decide
 from checkpoint.errors import CaptureError
-from checkpoint.linux import remote
+from checkpoint.linux import abi, remote
 from checkpoint.linux.memory import Memory
-from checkpoint.linux.remote import Desk
+from checkpoint.linux.remote import Batch, Desk, Guest
+from checkpoint.linux.tracee import Tracee
 from tests.checkpoint.round_trip import (
     PATIENCE_S,
     Program,
@@ -277,6 +280,16 @@ while True:
     came = libc.epoll_wait(epoll, events, 1, 60_000)
     print(came, ctypes.get_errno(), flush=True)
 """
+
+
+def test_a_wait_that_has_timed_out_at_a_stop_can_be_left_alone_with_its_result() -> None:
+    """Any thread: should we die, the code at its desk gives it back what the call returns, a negative number."""
+    memory, room = Memory(os.getpid()), mmap.mmap(-1, abi.PAGE_SIZE)
+    address = ctypes.addressof(ctypes.c_char.from_buffer(room))
+    desk = Desk(memory, address, address + remote.SMALL_DESK, remote.SMALL)
+    registers = arch.encode_registers({**stopped(), arch.RESULT: -errno.EAGAIN, arch.CALL_NUMBER: arch.NO_CALL})
+    head = desk.armed(Batch(desk.table, remote.SMALL), Guest(Tracee(os.getpid(), memory), registers, 0))
+    assert (-errno.EAGAIN).to_bytes(8, "little", signed=True) in head
 
 
 def test_python_makes_its_calls_again_itself_with_what_is_left_of_their_time(tmp_path: Path) -> None:
