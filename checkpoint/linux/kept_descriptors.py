@@ -77,6 +77,10 @@ class _Column:
         """Ask about all."""
         self._table.run(0, len(self._places))
 
+    def has_every_answer(self) -> bool:
+        """Whether none of the calls was refused."""
+        return not (self._results[: len(self._places)] < 0).any()
+
     def heard(self) -> bytes:
         """All answers as they are: the same bytes, of the same descriptors, mean the same."""
         count = len(self._places)
@@ -126,14 +130,38 @@ class KeptTexts:
         self._is_known = False
         self._last: tuple[list[int], tuple[bytes, ...], tuple[Descriptor, ...]] | None = None
 
-    def every(self, numbers: list[int], links: int, texts: int) -> tuple[Descriptor, ...]:
+    def are_there(self, count: int) -> bool:
+        """Ask about all that were there at the last look; whether they are there still, and nobody else.
+
+        To list them takes the kernel longer than to count them.
+
+        Args:
+            count: how many there are; 0 if nobody knows.
+        """
+        if self._last is None or not 0 < count == len(self._last[0]):
+            return False
+        self._ask()
+        return self._texts.has_every_answer()  # of one that is closed there is none
+
+    @property
+    def numbers(self) -> list[int]:
+        """Those of the last look; none where something of it was not understood from what was known."""
+        return self._last[0] if self._last is not None else []
+
+    def as_before(self) -> tuple[Descriptor, ...] | None:
+        """All, after `are_there`: the very same tuple where the kernel has answered as at the last look, else None."""
+        return self._last[2] if self._last is not None and self._last[1] == self._heard() else None
+
+    def every(self, numbers: list[int], links: int, texts: int, *, is_asked: bool = False) -> tuple[Descriptor, ...]:
         """All that have these numbers: the very same tuple where the kernel answers about all of them as at the last look.
 
         Args:
             links, texts: see `read`.
+            is_asked: `are_there` has just said that these are.
         """
-        self.ask(numbers)
-        heard = self._texts.heard(), self._links.heard(), self._abouts.heard()
+        if not is_asked:
+            self.ask(numbers)
+        heard = self._heard()
         if self._last is not None and self._last[0] == numbers and self._last[1] == heard:
             return self._last[2]
         self._is_known = True
@@ -146,9 +174,14 @@ class KeptTexts:
         kept = frozenset(numbers)
         for number in [number for number in self._files if number not in kept]:
             self._forget(number)
-        self._texts.ask()
-        self._links.ask()
-        self._abouts.ask()
+        self._ask()
+
+    def _ask(self) -> None:
+        for column in (self._texts, self._links, self._abouts):
+            column.ask()
+
+    def _heard(self) -> tuple[bytes, ...]:
+        return self._texts.heard(), self._links.heard(), self._abouts.heard()
 
     def read(self, number: int, links: int, texts: int) -> Descriptor | None:
         """One descriptor, after `ask`; None when it was closed meanwhile.

@@ -38,6 +38,71 @@ def told(number: int, texts: KeptTexts | None) -> Descriptor:
     return found
 
 
+class Program:
+    """One that does to its descriptors what it is told."""
+
+    def __init__(self) -> None:
+        body = "import os, sys\nprint(flush=True)\nfor line in sys.stdin:\n    exec(line)\n    print(flush=True)"
+        self._process = subprocess.Popen([sys.executable, "-c", body], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.pid = self._process.pid
+        self._await()
+
+    def _await(self) -> None:
+        assert self._process.stdout is not None
+        assert self._process.stdout.readline() == "\n"
+
+    def do(self, line: str) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
+        self._await()
+
+    def end(self) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+
+CHANGES_OF_SOME = {
+    "one more": ("os.dup2(0, 60)", True),
+    "one less": ("os.close(50)", True),
+    "one closed and another opened": ("os.close(50); os.dup2(0, 49)", True),
+    "another under the same number": ("os.dup2(0, 50)", False),
+    "another offset": ("os.lseek(50, 7, os.SEEK_SET)", False),
+    "close-on-exec": ("os.set_inheritable(50, False)", False),
+    "nothing": ("pass", False),
+}
+
+
+@pytest.mark.parametrize("counts", [True, False], ids=["counted by the kernel", "listed"])
+@pytest.mark.parametrize("change", CHANGES_OF_SOME)
+def test_descriptors_are_listed_only_where_their_number_has_changed_or_one_has_gone(
+    change: str, counts: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program, texts, listed = Program(), None, []
+    try:
+        program.do("os.dup2(os.open('/etc/passwd', os.O_RDONLY), 50); os.dup2(50, 51); os.dup2(1, 52)")
+        texts = KeptTexts(program.pid)
+        if not counts or not descriptors._count(program.pid):
+            counts = False
+            monkeypatch.setattr(descriptors, "_count", lambda pid: 0)
+        for _ in range(3):
+            before = descriptors.descriptors(program.pid, texts)
+        real = descriptors.descriptor_numbers
+        monkeypatch.setattr(descriptors, "descriptor_numbers", lambda pid: listed.append(pid) or real(pid))
+        line, is_listed = CHANGES_OF_SOME[change]
+        program.do(line)
+        after = descriptors.descriptors(program.pid, texts)
+        assert len(listed) == int(is_listed or not counts)
+        assert (after is before) == (change == "nothing")
+        assert after == descriptors.descriptors(program.pid)
+        for _ in range(3):
+            assert descriptors.descriptors(program.pid, texts) == after
+    finally:
+        if texts is not None:
+            texts.close()
+        program.end()
+
+
 def test_a_number_that_leads_elsewhere_by_now_is_told_anew() -> None:
     reader, writer = os.pipe()
     try:
