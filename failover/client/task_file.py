@@ -6,6 +6,7 @@ itself never waits for the disk. Where commits come faster than the disk, the ne
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import threading
@@ -41,6 +42,11 @@ RETRY_S: Final = 0.5
 """After a write that failed."""
 LOOK_S: Final = 1.0
 """How often whoever waits looks whether the thread still lives."""
+
+_LEARNING: Final = threading.Lock()
+"""Held while the thread does for the first time what loads modules and has decoders built: a child that is forked in the middle
+of that would have them half built, for ever, and end by SIGSEGV at its own first write."""
+os.register_at_fork(before=_LEARNING.acquire, after_in_parent=_LEARNING.release, after_in_child=_LEARNING.release)
 
 
 def folder_of(name: str, directory: Path) -> Path:
@@ -110,8 +116,12 @@ class StateFile:
         """
         is_small = session.reader.layout.page_count <= SMALL_PAGES
         order = CaptureOrder(base=is_small or self._sequence == 0, generation=self.generation, sequence=self._sequence + 1)
-        snapshot = session.capture(order)
-        descriptor = memfd_holding(format.encode_bytes(snapshot), "state")
+        is_first = self._sequence == 0
+        with _LEARNING if is_first else contextlib.nullcontext():
+            snapshot = session.capture(order)
+            descriptor = memfd_holding(format.encode_bytes(snapshot), "state")
+            if is_first:
+                format.read_outline(descriptor)  # as the store will, but without the disk: nobody who forks waits for that
         try:
             self._store.put(descriptor, prove=False)
         finally:

@@ -671,6 +671,40 @@ def test_a_child_may_keep_a_state_of_its_own(folder: Path) -> None:
     assert failover.resume("child", default={}) == {"n": 7}
 
 
+def test_no_child_is_forked_while_the_first_write_builds_what_all_writes_need(folder: Path) -> None:
+    """It would have half of it: modules half loaded, decoders half built, of which C code takes no notice."""
+    path = program(
+        folder,
+        """
+        import failover, os, sys, threading, time
+        from checkpoint import format
+
+        begun, steps, read_outline = threading.Event(), [], format.read_outline
+
+        def slow(descriptor):
+            begun.set()
+            time.sleep(0.3)
+            steps.append("built")
+            return read_outline(descriptor)
+
+        format.read_outline = slow
+        failover.resume("parent", default={"n": 0})
+        failover.commit()
+        begun.wait()
+        child = os.fork()
+        if child == 0:
+            failover.resume("child", default={"n": 0})["n"] = len(steps)
+            failover.commit()
+            sys.exit()
+        sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+        """,
+    )
+    with started(path) as process:
+        assert process.communicate(timeout=60) == ("", "")
+        assert process.returncode == 0
+    assert failover.resume("child", default={}) == {"n": 1}
+
+
 @pytest.mark.parametrize("way", ["def", "async def"])
 def test_the_end_of_a_program_writes_its_last_commit_and_sigterm_ends_it_between_steps(folder: Path, way: str) -> None:
     path = program(
