@@ -75,7 +75,7 @@ REGISTERS = [
     *cases("rseq_loop", told=BY_SIGNAL),
     *cases("segments"),
     *cases("thread_addresses"),
-    *cases("tight_loop", "60", told=BY_ITSELF),
+    *cases("tight_loop", "60"),
 ]
 
 SIGNALS = [

@@ -160,9 +160,10 @@ static int sleeps(pid_t tid) {
     return state == 'S';
 }
 
+/* Who is not answered yet sleeps: one that has just been let go may be on its way to its call, and would miss being woken. */
 static void wait_until_all_sleep(void) {
     for (size_t index = 0; index < WAITS; index++)
-        while (!waits[index].tid || !sleeps(waits[index].tid)) usleep(1000);
+        while (waits[index].answer == NOT_YET && (!waits[index].tid || !sleeps(waits[index].tid))) usleep(1000);
 }
 
 int main(int number, char **arguments) {
@@ -171,6 +172,7 @@ int main(int number, char **arguments) {
     for (size_t index = 0; index < WAITS; index++) pthread_create(&waits[index].thread, NULL, carry_out, &waits[index]);
     wait_until_all_sleep();
     ready(), wait_for_go(arguments[1]);
+    wait_until_all_sleep();
     for (size_t index = 0; index < WAITS; index++) {
         struct wait *wait = &waits[index];
         EXPECT(wait->answer == NOT_YET, "%s ended early with %ld", wait->name, wait->answer);
