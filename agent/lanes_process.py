@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
 from collections import deque
 from collections.abc import Iterator
 from typing import Final
 
-from agent import door
+from agent import clock, door, kernel
 from agent.config import Settings
 from agent.door import Inventory, ToHeart, ToLanes
 from agent.errors import AgentError
@@ -32,6 +35,12 @@ LOST: Final = "the agent's lanes process was restarted in the middle of it"
 
 log = logging.getLogger("failover.heart")
 
+vars(subprocess)["_USE_VFORK"] = False
+"""Of the whole heart, which would stand still until the child, at ordinary priority, has had a processor.
+
+Source: the documentation of subprocess.
+"""
+
 
 class LanesProcess:
     """One child process after another, and what the core still expects of it."""
@@ -39,6 +48,7 @@ class LanesProcess:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._child: subprocess.Popen[bytes] | None = None
+        self._succession: threading.Thread | None = None
         self._channel: Channel[ToHeart] | None = None
         self._waiting: deque[ToLanes] = deque()
         self._expected: dict[tuple[str, str], Act] = {}
@@ -53,26 +63,71 @@ class LanesProcess:
         Raises:
             AgentError: it cannot be started.
         """
+        theirs = self._opened()
+        try:
+            self._child = self._born(theirs)
+        except OSError as error:
+            raise AgentError(
+                f"cannot start the lanes process: {error.strerror}; is memory or the process limit used up?"
+            ) from error
+
+    def replace(self) -> None:
+        """End the process, if it still is there, and start another one: in a thread, for either may take a busy machine long.
+
+        One that cannot be started is told by `receive`, as one that ended at once.
+        """
+        theirs = self._opened()
+        before = self._succession
+        self._succession = threading.Thread(target=self._succeed, args=(before, theirs), name="succession", daemon=True)
+        try:
+            self._succession.start()
+        except RuntimeError:  # a limit of threads: then it has to be waited for
+            self._succession = None
+            self._succeed(before, theirs)
+
+    def _opened(self) -> socket.socket:
+        """Begin a new channel; the other end of it, for a new process."""
+        if self._channel is not None:
+            self._channel.close()
         ours, theirs = pair()
         ours.setblocking(False)
+        self._channel = Channel(ours, ToHeart)
+        self._waiting.clear()
+        self._ready = False
+        return theirs
+
+    def _succeed(self, before: threading.Thread | None, theirs: socket.socket) -> None:
+        """The thread's: let the process before come to its end, then start the next one."""
+        if self._settings.config.realtime:
+            with contextlib.suppress(
+                OSError
+            ):  # an ordinary thread could keep the interpreter's lock while it waits for a processor
+                kernel.become_realtime(clock.HEART_PRIORITY)
+        if before is not None:
+            before.join()
+        self._kill()
+        if self._child is not None:
+            self._child.wait()
+        try:
+            self._child = self._born(theirs)
+        except OSError as error:
+            log.error("cannot start the lanes process: %s; is memory or the process limit used up?", error.strerror)
+
+    def _born(self, theirs: socket.socket) -> subprocess.Popen[bytes]:
+        """A new process; our copy of its end of the channel is closed.
+
+        Raises:
+            OSError: it cannot be started.
+        """
         module = "agent.witness" if self._settings.me.role == "witness" else "agent.lanes"
         command = [sys.executable, "-m", "agent.lean", module, str(self._settings.path), str(theirs.fileno())]
-        try:
-            self._child = subprocess.Popen(
+        with theirs:
+            return subprocess.Popen(
                 command,
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 process_group=0,  # a Ctrl-C at the terminal is the heart's to act on
             )
-        except OSError as error:
-            raise AgentError(
-                f"cannot start the lanes process: {error.strerror}; is memory or the process limit used up?"
-            ) from error
-        finally:
-            theirs.close()
-        self._channel = Channel(ours, ToHeart)
-        self._waiting.clear()
-        self._ready = False
 
     def fileno(self) -> int:
         """Readable when `receive` has something."""
@@ -83,8 +138,9 @@ class LanesProcess:
         """Queue a message; it leaves in `flush`, as soon as the process reads."""
         if len(self._waiting) >= WAITING_LIMIT:
             log.error("the lanes process does not read; it is ended")
-            self._kill()
             self._waiting.clear()
+            if self._succession is None or not self._succession.is_alive():
+                self._kill()
         self._waiting.append(message)
 
     def order(self, act: Act) -> None:
@@ -159,27 +215,26 @@ class LanesProcess:
         told += [events.Exited(found.component, found.epoch, found.status) for found in inventory.found if not found.running]
         return told
 
-    def bury(self) -> None:
-        """Make sure that it is gone, and forget the channel."""
-        self._kill()
-        if self._channel is not None:
-            self._channel.close()
-        self._channel = None
-
     def wait(self) -> None:
-        """Let it end by itself, for a while."""
+        """Let it end by itself, for a while; then make sure that it is gone."""
+        if self._succession is not None:
+            self._succession.join()
         if self._child is None:
             return
         try:
             self._child.wait(END_PATIENCE_S)
         except subprocess.TimeoutExpired:
             log.warning("the lanes process did not end in %.0f s; it is ended", END_PATIENCE_S)
-        self.bury()
+        self._kill()
+        self._child.wait()
+        if self._channel is not None:
+            self._channel.close()
+        self._channel = None
 
     def _kill(self) -> None:
+        """End it, without waiting for that."""
         if self._child is not None and self._child.poll() is None:
             os.kill(self._child.pid, signal.SIGKILL)
-            self._child.wait()
 
 
 EXPECTED: Final = (acts.Start, acts.Restore, acts.Capture, acts.Ship, acts.Stop, acts.End)

@@ -151,6 +151,9 @@ class Heart:
     def _start_lanes(self) -> None:
         """Start the other process; the node is born, or told what was lost, when its inventory comes."""
         self._lanes.start()
+        self._expect_lanes()
+
+    def _expect_lanes(self) -> None:
         self._lanes_silent_ns, self._lanes_allowed_ns = (
             0,
             LANES_BIRTH_NS << self._lanes_deaths,
@@ -288,8 +291,8 @@ class Heart:
             raise AgentError(f"the lanes process ended {LANES_TRIES} times at once ({why}); what it said stands above")
         log.error("the lanes process has gone (%s); guards and programs live on, another one starts", why)
         self._poll.unregister(self._lanes.fileno())
-        self._lanes.bury()
-        self._start_lanes()
+        self._lanes.replace()
+        self._expect_lanes()
 
     # --- obligations out ---
 

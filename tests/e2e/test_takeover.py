@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from agent.loop import LANES_SILENCE_NS, NANOSECONDS_A_SECOND
+from checkpoint.linux import procfs
+from checkpoint.linux.tracee import Tracee
+from failover.cli.demo.robots import LEASE_MS
+from failover.core.types import MS
 from tests.e2e import robots, stillness
 from tests.e2e.robots import RobotMachine
 
 COUNT = "import time\ni = 0\nwhile i < {limit}:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.01)\n"
 SNAPSHOTS = 5
+PTRACE_O_TRACEEXIT = 0x40
+"""A process stops on its way to its end, also if it is killed. Source: ptrace(2)."""
+WALL = 0x40000000
 
 
 @pytest.fixture
@@ -82,6 +91,36 @@ def test_components_outlive_an_agent_that_is_killed(pair: tuple[RobotMachine, Ro
     robots.until(lambda: robots.checkpoints(first, "count") > taken + SNAPSHOTS, "snapshots to go on")
     counted = numbers(robots.output(second, "count"))
     assert counted == list(range(len(counted)))
+    assert robots.component(first, "count")["restores"] == 0
+
+
+@pytest.mark.root
+def test_a_lanes_process_that_takes_long_to_end_holds_up_no_beat(pair: tuple[RobotMachine, RobotMachine]) -> None:
+    """On a busy machine it may wait for a processor before it can end. Here we hold its end up: the heart hears nothing of it,
+    ends it at last, and beats on for a dozen leases while it still is there.
+    """
+    first, second = pair
+    start_counting(first, 1_000_000)
+    robots.until(lambda: robots.checkpoints(second, "count") >= SNAPSHOTS, "checkpoints at robot2")
+    pid = robots.component(first, "count")["pid"]
+    lanes = Tracee(robots.host_pid(first, first.status()["lanes_pid"]))
+    lanes.seize(PTRACE_O_TRACEEXIT)
+    os.kill(lanes.pid, signal.SIGKILL)
+    try:
+        robots.until(lambda: procfs.status(lanes.pid).state == "t", "its end to be held up")
+        life = second.status()["life"]
+        until = time.monotonic() + (LANES_SILENCE_NS + 12 * LEASE_MS * MS) / NANOSECONDS_A_SECOND
+        while time.monotonic() < until:
+            (peer,) = second.status()["peers"]
+            assert peer["state"] != "dead"
+            assert robots.component(second, "count")["role"] == "standby"
+    finally:
+        os.waitpid(lanes.pid, WALL)
+        lanes.cont()
+        os.waitpid(lanes.pid, WALL)  # its parent hears of it after its tracer
+    robots.until(lambda: robots.answers(first), "another lanes process to answer")
+    robots.until(lambda: robots.component(first, "count").get("pid") == pid, "the guard to be found again")
+    assert second.status()["life"] == life
     assert robots.component(first, "count")["restores"] == 0
 
 
