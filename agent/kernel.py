@@ -65,7 +65,8 @@ def become_realtime(priority: int) -> int:
     for one in wanted:
         try:
             for thread in os.listdir("/proc/self/task"):
-                os.sched_setscheduler(int(thread), os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(one))
+                with contextlib.suppress(ProcessLookupError):  # it has just ended
+                    os.sched_setscheduler(int(thread), os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(one))
             return one
         except PermissionError as error:
             refusal = error

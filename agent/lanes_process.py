@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import signal
@@ -12,9 +11,10 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Iterator
+from queue import SimpleQueue
 from typing import Final
 
-from agent import clock, door, kernel
+from agent import door
 from agent.config import Settings
 from agent.door import Inventory, ToHeart, ToLanes
 from agent.errors import AgentError
@@ -48,7 +48,11 @@ class LanesProcess:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._child: subprocess.Popen[bytes] | None = None
-        self._succession: threading.Thread | None = None
+        self._awaited: SimpleQueue[socket.socket | None] = SimpleQueue()
+        self._wanted = self._begun = 0
+        self._is_doomed = False
+        self._successor = threading.Thread(target=self._succeed, name="successor", daemon=True)
+        self._successor.start()  # now, while nobody minds: a heart would wait for the birth of a thread at ordinary priority
         self._channel: Channel[ToHeart] | None = None
         self._waiting: deque[ToLanes] = deque()
         self._expected: dict[tuple[str, str], Act] = {}
@@ -76,14 +80,8 @@ class LanesProcess:
 
         One that cannot be started is told by `receive`, as one that ended at once.
         """
-        theirs = self._opened()
-        before = self._succession
-        self._succession = threading.Thread(target=self._succeed, args=(before, theirs), name="succession", daemon=True)
-        try:
-            self._succession.start()
-        except RuntimeError:  # a limit of threads: then it has to be waited for
-            self._succession = None
-            self._succeed(before, theirs)
+        self._wanted += 1
+        self._awaited.put(self._opened())
 
     def _opened(self) -> socket.socket:
         """Begin a new channel; the other end of it, for a new process."""
@@ -96,22 +94,20 @@ class LanesProcess:
         self._ready = False
         return theirs
 
-    def _succeed(self, before: threading.Thread | None, theirs: socket.socket) -> None:
-        """The thread's: let the process before come to its end, then start the next one."""
-        if self._settings.config.realtime:
-            with contextlib.suppress(
-                OSError
-            ):  # an ordinary thread could keep the interpreter's lock while it waits for a processor
-                kernel.become_realtime(clock.HEART_PRIORITY)
-        if before is not None:
-            before.join()
-        self._kill()
-        if self._child is not None:
-            self._child.wait()
-        try:
-            self._child = self._born(theirs)
-        except OSError as error:
-            log.error("cannot start the lanes process: %s; is memory or the process limit used up?", error.strerror)
+    def _succeed(self) -> None:
+        """The thread's life: whenever another process is wanted, let the one before come to its end, and start it."""
+        while (theirs := self._awaited.get()) is not None:
+            self._kill()
+            if self._child is not None:
+                self._child.wait()
+            try:
+                self._child = self._born(theirs)
+            except OSError as error:
+                log.error("cannot start the lanes process: %s; is memory or the process limit used up?", error.strerror)
+            self._begun += 1
+            if self._is_doomed:
+                self._is_doomed = False
+                self._kill()
 
     def _born(self, theirs: socket.socket) -> subprocess.Popen[bytes]:
         """A new process; our copy of its end of the channel is closed.
@@ -139,7 +135,9 @@ class LanesProcess:
         if len(self._waiting) >= WAITING_LIMIT:
             log.error("the lanes process does not read; it is ended")
             self._waiting.clear()
-            if self._succession is None or not self._succession.is_alive():
+            if self._wanted > self._begun:
+                self._is_doomed = True  # it will miss what was for it
+            else:
                 self._kill()
         self._waiting.append(message)
 
@@ -217,8 +215,8 @@ class LanesProcess:
 
     def wait(self) -> None:
         """Let it end by itself, for a while; then make sure that it is gone."""
-        if self._succession is not None:
-            self._succession.join()
+        self._awaited.put(None)
+        self._successor.join()
         if self._child is None:
             return
         try:

@@ -286,6 +286,7 @@ class ThreadOnlooker:
             CaptureError: one has not left the code of an earlier look yet.
             UnsupportedError: it is confined, and we may do nothing about it.
         """
+        self._settle()
         unknown = FILTERED if of_first else 0
         told = zip(self._threads.others, readings, strict=True)
         found = tuple(self._place(tracee, reading, modes.get(tracee.pid, unknown)) for tracee, reading in told)
@@ -312,7 +313,6 @@ class ThreadOnlooker:
 
     def ask(self, places: tuple[ThreadPlace, ...]) -> tuple[ThreadStanding, ...]:
         """Everything else."""
-        self._settle()
         if not places:
             return ()
         guests = [Guest(place.tracee, place.registers, place.mask) for place in places]

@@ -118,7 +118,8 @@ class _Board:
 
     def is_at_rest(self) -> bool:
         """Whether it is done with the last table."""
-        return self.words[ORDER] != RETURN and self.words[DONE_WITH] + 1 >= self.words[ORDER]
+        order = self.words[ORDER]
+        return order != RETURN and self.words[DONE_WITH] + (1 - order % 2) >= order
 
     def begin(self, table: OwnCalls, last: int, keeps: object) -> None:
         """Give it a table; what it had before it needs no more."""

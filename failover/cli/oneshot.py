@@ -74,8 +74,14 @@ def capture(arguments: argparse.Namespace) -> int:
 
 def _captured(keeper: Keeper, order: Capture, file: int, target: Path) -> Captured:
     """Have a snapshot written straight into a file: of a large program a copy more takes as long as all the rest."""
+
+    def ask() -> Captured:
+        os.ftruncate(file, 0)  # of a try before this one nothing may be left
+        os.lseek(file, 0, os.SEEK_SET)
+        return keeper.ask(order, Captured, (file,))[0]
+
     try:
-        return _at_last(lambda: keeper.ask(order, Captured, (file,)))[0]
+        return _at_last(ask)
     except StoreError as error:
         raise FailoverError(f"cannot write {target}: {error}; the program was not ended") from error
 

@@ -82,6 +82,7 @@ class StateFile:
         newest = self._store.newest(component)
         self.generation = newest.generation + 1 if newest else 1
         self._sequence = 0
+        self._has_learnt = False
         self._is_small = True
         self._tidied = time.monotonic()
         self._is_closed = False
@@ -116,12 +117,12 @@ class StateFile:
         """
         is_small = session.reader.layout.page_count <= SMALL_PAGES
         order = CaptureOrder(base=is_small or self._sequence == 0, generation=self.generation, sequence=self._sequence + 1)
-        is_first = self._sequence == 0
-        with _LEARNING if is_first else contextlib.nullcontext():
+        with contextlib.nullcontext() if self._has_learnt else _LEARNING:
             snapshot = session.capture(order)
             descriptor = memfd_holding(format.encode_bytes(snapshot), "state")
-            if is_first:
+            if not self._has_learnt:
                 format.read_outline(descriptor)  # as the store will, but without the disk: nobody who forks waits for that
+                self._has_learnt = True
         try:
             self._store.put(descriptor, prove=False)
         finally:
