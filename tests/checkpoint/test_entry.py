@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,9 @@ def test_of_a_keeper_without_a_descriptor_left_none_stays_in_the_program(tmp_pat
     def none_left(_tid: int) -> int:
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
-    with ended(start(["sleep", "600"], tmp_path)) as program:
+    sleeps = "import time; print('ready', flush=True); time.sleep(600)"
+    with ended(start([sys.executable, "-S", "-c", sleeps], tmp_path)) as program:
+        program.wait_for_line("ready")
         had = sorted(os.listdir(f"/proc/{program.pid}/fd"))
         with monkeypatch.context() as patched:
             patched.setattr(entry, "pidfd_of", none_left)
