@@ -67,13 +67,7 @@ class LanesProcess:
         Raises:
             AgentError: it cannot be started.
         """
-        theirs = self._opened()
-        try:
-            self._child = self._born(theirs)
-        except OSError as error:
-            raise AgentError(
-                f"cannot start the lanes process: {error.strerror}; is memory or the process limit used up?"
-            ) from error
+        self._child = self._born(self._opened())
 
     def replace(self) -> None:
         """End the process, if it still is there, and start another one: in a thread, for either may take a busy machine long.
@@ -102,8 +96,8 @@ class LanesProcess:
                 self._child.wait()
             try:
                 self._child = self._born(theirs)
-            except OSError as error:
-                log.error("cannot start the lanes process: %s; is memory or the process limit used up?", error.strerror)
+            except AgentError as error:
+                log.error("%s", error)
             self._begun += 1
             if self._is_doomed:
                 self._is_doomed = False
@@ -113,17 +107,23 @@ class LanesProcess:
         """A new process; our copy of its end of the channel is closed.
 
         Raises:
-            OSError: it cannot be started.
+            AgentError: it cannot be started.
         """
         module = "agent.witness" if self._settings.me.role == "witness" else "agent.lanes"
         command = [sys.executable, "-m", "agent.lean", module, str(self._settings.path), str(theirs.fileno())]
-        with theirs:
+        try:
             return subprocess.Popen(
                 command,
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 process_group=0,  # a Ctrl-C at the terminal is the heart's to act on
             )
+        except OSError as error:
+            raise AgentError(
+                f"cannot start the lanes process: {error.strerror}; is memory or the process limit used up?"
+            ) from error
+        finally:
+            theirs.close()
 
     def fileno(self) -> int:
         """Readable when `receive` has something."""

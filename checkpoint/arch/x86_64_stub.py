@@ -63,13 +63,7 @@ Needs no stack. Each call is ten little-endian words: number, six arguments, res
 
 CALL: Final = struct.Struct("<7Q3q")
 
-OWN_LOOP: Final = bytes.fromhex(
-    "53"  #                push rbx
-    "55"  #                push rbp
-    "4889fb"  #            mov  rbx, rdi        first argument: this call
-    "4889f5"  #            mov  rbp, rsi        second: end of the table
-    "4839eb"  #     next:  cmp  rbx, rbp
-    "742f"  #              je   done
+MAKE_CALL: Final = (
     "488b03"  #            mov  rax, [rbx]
     "488b7b08"  #          mov  rdi, [rbx+8]
     "488b7310"  #          mov  rsi, [rbx+16]
@@ -83,6 +77,17 @@ OWN_LOOP: Final = bytes.fromhex(
     "7403"  #              jz   on
     "488901"  #            mov  [rcx], rax
     "4883c340"  #   on:    add  rbx, 64
+)
+"""Hexadecimal: the call of the row at rbx is made, its result stored where the row says, and rbx goes to the next row."""
+
+OWN_LOOP: Final = bytes.fromhex(
+    "53"  #                push rbx
+    "55"  #                push rbp
+    "4889fb"  #            mov  rbx, rdi        first argument: this call
+    "4889f5"  #            mov  rbp, rsi        second: end of the table
+    "4839eb"  #     next:  cmp  rbx, rbp
+    "742f"  #              je   done
+    f"{MAKE_CALL}"
     "ebcc"  #              jmp  next
     "5d"  #         done:  pop  rbp
     "5b"  #                pop  rbx
@@ -122,19 +127,7 @@ SECOND_LOOP: Final = bytes.fromhex(
     "7435"  #              je   rest
     "45392c24"  #          cmp  [r12], r13d
     "752f"  #              jne  rest            there is another order
-    "488b03"  #            mov  rax, [rbx]
-    "488b7b08"  #          mov  rdi, [rbx+8]
-    "488b7310"  #          mov  rsi, [rbx+16]
-    "488b5318"  #          mov  rdx, [rbx+24]
-    "4c8b5320"  #          mov  r10, [rbx+32]
-    "4c8b4328"  #          mov  r8,  [rbx+40]
-    "4c8b4b30"  #          mov  r9,  [rbx+48]
-    "0f05"  #              syscall
-    "488b4b38"  #          mov  rcx, [rbx+56]   where the result goes
-    "4885c9"  #            test rcx, rcx
-    "7403"  #              jz   on
-    "488901"  #            mov  [rcx], rax
-    "4883c340"  #   on:    add  rbx, 64
+    f"{MAKE_CALL}"
     "ebc1"  #              jmp  next
     "4d896c2408"  #  rest: mov  [r12+8], r13    done with that order
     "eb82"  #              jmp  wait
