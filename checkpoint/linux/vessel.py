@@ -38,7 +38,9 @@ from checkpoint.arch import stubs
 from checkpoint.errors import ProbeError, ProcessGoneError, RestoreError
 from checkpoint.linux import namespaces, procfs
 from checkpoint.linux.brought import BroughtFile, User, show
+from checkpoint.linux.burial import bury
 from checkpoint.linux.inheritance import Inheritance, take_on
+from checkpoint.linux.tasks import thread_ids
 from checkpoint.model import Clocks
 
 _MFD_CLOEXEC_EXEC: Final = 0x1 | 0x10
@@ -48,6 +50,9 @@ _WATCHED: Final = 3
 
 _REPORT_LIMIT: Final = 65536
 """Bytes of all reports of one birth; a few hundred are usual."""
+
+_REST_S: Final = 0.001
+"""Before it is looked again whether a process that was killed has ended."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,8 +137,7 @@ def discard(born: Born) -> None:
         os.kill(born.pid, signal.SIGKILL)
     for pid in (born.pid, born.init_pid):
         if pid:
-            with contextlib.suppress(ChildProcessError):  # not ours to reap: another thread or a subreaper did
-                os.waitpid(pid, 0)
+            _reap(pid)
 
 
 # --- The caller ------------------------------------------------------------------------------------------------------
@@ -196,7 +200,21 @@ def _born_or_raise(facts: dict[str, object]) -> Born:
 
 def _reap_killed(pid: int) -> None:
     os.kill(pid, signal.SIGKILL)
-    os.waitpid(pid, 0)
+    _reap(pid)
+
+
+def _reap(pid: int) -> None:
+    """Wait for the end of a child that has been told to end.
+
+    The kernel keeps a thread that we trace until we take note of its end, and the process until its last other thread is gone.
+    """
+    with contextlib.suppress(ChildProcessError):  # not ours to reap: another thread or a subreaper did
+        while os.waitpid(pid, os.WNOHANG) == (0, 0):
+            with contextlib.suppress(ProcessGoneError):
+                for tid in thread_ids(pid):
+                    if tid != pid:
+                        bury(tid)
+            time.sleep(_REST_S)
 
 
 # --- The midwife -----------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from checkpoint.errors import CaptureError, MismatchError, ProcessGoneError, Uns
 from checkpoint.linux import procfs
 from checkpoint.linux.tasks import thread_ids
 from checkpoint.linux.tracee import Tracee
-from checkpoint.linux.vessel import Birth, discard, spawn_vessel
+from checkpoint.linux.vessel import Birth, discard, spawn_program, spawn_vessel
 from checkpoint.model import Snapshot
 from tests.checkpoint.round_trip import (
     ENGINE,
@@ -186,6 +186,20 @@ def test_an_unfinished_restore_that_is_given_up_leaves_nothing(compiled: Compile
     ENGINE.restore(born.pid, snapshot, RestoreOptions())
     assert set(states(born.pid)) == {"t"}
     assert len(states(born.pid)) == len(snapshot.threads)
+    discard(born)
+    assert not Path(f"/proc/{born.pid}").exists()
+
+
+def test_a_program_is_discarded_also_while_its_threads_are_traced(compiled: Compiled, tmp_path: Path) -> None:
+    program = compiled("threads", "-O2")
+    born = spawn_program([str(program)], os.environ, tmp_path, 0o22, Birth())
+    while len(states(born.pid)) < 7:
+        time.sleep(0.01)
+    traced = [Tracee(tid) for tid in thread_ids(born.pid)]
+    for tracee in traced:
+        tracee.seize()
+    for tracee in traced:
+        tracee.freeze()
     discard(born)
     assert not Path(f"/proc/{born.pid}").exists()
 
