@@ -18,6 +18,7 @@ from checkpoint.linux.tracking import NOT_CARRIED, is_shared_object
 from checkpoint.model import FileIdentity, Resource, Vma, VmaKind
 from checkpoint.pages import Words
 from checkpoint.resources import files
+from checkpoint.resources.unsupported import HUGE_NAME
 
 _ADVICE: Final = frozenset(("gd", "dc", "dd", "wf", "hg", "nh", "lo", "lf", "nr", "sr", "rr", "mg"))
 KEPT_FLAGS: Final = _ADVICE | {vm_flags.HUGE, vm_flags.GIGANTIC, vm_flags.SEALED, vm_flags.DROPPABLE} | vm_flags.KEYS
@@ -69,7 +70,11 @@ class Identities:
         return tuple(replace(vma, guards=pages.page_runs(pages.intersection(guards, pages.extents((vma,))))) for vma in found)
 
     def _vma(self, line: MapsLine, flags: tuple[str, ...]) -> Vma:
-        is_file = line.has_file and line.name not in NOT_CARRIED and not line.name.startswith("/dev/zero")
+        is_told = self._is_told(line)
+        is_shared_huge = is_told and line.name.startswith(HUGE_NAME)
+        is_file = not is_shared_huge and line.has_file and line.name not in NOT_CARRIED and not line.name.startswith("/dev/zero")
+        if is_shared_huge:  # by relatives, who can have it as ordinary memory alone
+            flags = tuple(flag for flag in flags if flag not in (vm_flags.HUGE, vm_flags.GIGANTIC))
         return Vma(
             start=line.start,
             end=line.end,
@@ -78,7 +83,7 @@ class Identities:
             kind=VmaKind.FILE if is_file else KINDS.get(line.name, VmaKind.ANONYMOUS),
             offset=line.offset,
             name=self._names.get(line.name, line.name),
-            file=self.of_mapping(line) if is_file else _of_shared(line) if self._is_told(line) else None,
+            file=self.of_mapping(line) if is_file else _of_shared(line) if is_told else None,
             flags=tuple(flag for flag in flags if flag in KEPT_FLAGS or (flag == vm_flags.MAY_WRITE and is_file and line.shared)),
         )
 

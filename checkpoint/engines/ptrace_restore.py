@@ -464,6 +464,7 @@ class ProcessRestore:
         self._vdso = restore_memory.move_kernel_pages(table, ours, theirs, refuge)
         self._vdso_size = ours[-1].size
         restore_kinds.allocate_keys(table, restore_kinds.keys_of(self._state))
+        self.notes += restore_kinds.ordinary_by_now(vmas)
         attached = [vma for vma in vmas if system_v_memory.is_segment(vma)]
         system_v_memory.attach(table, attached, self._segments.ids, system_v_memory.sizes_of(self._state.resources))
         sizes = {} if self._estate else restore_memory.anonymous_sizes(vmas)

@@ -15,14 +15,14 @@ from checkpoint.capability import Area, by_rule, preserved
 from checkpoint.linux import abi, processor
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.vm_flags import DROPPABLE, GIGANTIC, HUGE, SEALED, key_in
-from checkpoint.model import Snapshot, Vma
+from checkpoint.model import Snapshot, Vma, VmaKind
 from checkpoint.resources.unsupported import HUGE_NAME
 
 CAPABILITIES: Final = (
     by_rule(
         Area.MEMORY,
         "huge pages (MAP_HUGETLB), up to 64 MiB each where they are private",
-        "huge pages again where enough are free there; else ordinary ones, and that is noted",
+        "huge pages again where enough are free there; else, and where relatives share them, ordinary ones, and that is noted",
     ),
     preserved(
         Area.MEMORY,
@@ -73,6 +73,13 @@ def map_special(table: CallTable, vma: Vma, protection: int, flags: int) -> None
         lost = f"memory at {vma.start:#x} is not droppable here"
         table.attempt(lost, "mmap", *arguments, flags & ~(abi.MAP_PRIVATE | abi.MAP_SHARED) | MAP_DROPPABLE, -1, 0)
     table.attempt("", "mmap", *arguments, flags, -1, 0)  # there is something already, if that has worked
+
+
+def ordinary_by_now(vmas: Iterable[Vma]) -> Iterator[str]:
+    """Which shared memory was of huge pages, and is a part of what relatives have in common: of ordinary ones, that is."""
+    for vma in vmas:
+        if vma.kind is VmaKind.ANONYMOUS and vma.name.startswith(HUGE_NAME):
+            yield f"{vma.size >> 20} MiB of huge pages at {vma.start:#x}, which its processes share, are ordinary ones here"
 
 
 def seal(table: CallTable, vma: Vma) -> None:

@@ -76,6 +76,52 @@ def test_memory_of_a_special_kind_comes_back_as_it_was(kind: str, compiled: Comp
             expect_ok(tracee)
 
 
+SHARES_HUGE_PAGES = """
+import mmap, os, sys, time
+MAP_HUGETLB, SIZE = 0x40000, 2 << 20
+ours, theirs, private = [mmap.mmap(-1, SIZE, how | mmap.MAP_ANONYMOUS | MAP_HUGETLB)
+    for how in (mmap.MAP_SHARED, mmap.MAP_SHARED, mmap.MAP_PRIVATE)]
+content = os.urandom(SIZE)
+private[:] = content
+child = os.fork()
+if child:
+    ours[:] = b"o" * SIZE
+else:
+    theirs[:] = content
+    private[:9] = b"the child"
+    open("written", "w").close()
+def wait_for(name):
+    while not os.path.exists(name):
+        time.sleep(0.01)
+wait_for("written")
+print("ready", flush=True) if child else None
+wait_for("go")
+found = [theirs[:] == content, private[9:] == content[9:]]
+if not child:
+    found += [private[:9] == b"the child"]
+    ours[7:8] = b"c"
+    open("told", "w").close()
+    os._exit(0 if all(found) else 1)
+wait_for("told")
+found += [ours[:] == b"o" * 7 + b"c" + b"o" * (SIZE - 8), private[:9] == content[:9], os.waitpid(child, 0)[1] == 0]
+print(found)
+"""
+
+
+def test_relatives_share_on_what_was_of_huge_pages(tmp_path: Path) -> None:
+    with huge_pages(PAGES):
+        program = start([sys.executable, "-c", SHARES_HUGE_PAGES], tmp_path, isolate=True)
+        program.wait_for_line("ready")
+        for _ in range(3):
+            with ended(program):
+                snapshot = captured_and_killed(program)
+            program = restored(snapshot, tmp_path)
+        with ended(program):
+            program.tell()
+            assert program.finish() == 0
+            assert program.output.splitlines()[1:] == [str([True] * 5)]
+
+
 @pytest.mark.parametrize("kind", ["memfd", "deleted"])
 def test_a_file_without_a_name_shows_in_what_is_mapped_of_it_and_was_not_written(
     kind: str, compiled: Compiled, tmp_path: Path
