@@ -29,7 +29,7 @@ from checkpoint.linux.spokesman import SPOKESMEN_MAX, spokesman_of
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.tracking import NONE, NOT_CARRIED
-from checkpoint.linux.vm_flags import FlagsReader
+from checkpoint.linux.vm_flags import WATCHED, FlagsReader
 from checkpoint.model import Position, ProcessState, Resource, ThreadState, Vma
 from checkpoint.resources import (
     Opened,
@@ -308,4 +308,4 @@ class CapturedProcess:
 
     def _foreign_flags(self, line: MapsLine) -> tuple[str, ...]:
         """VmFlags without those that our own write protection sets."""
-        return tuple(flag for flag in self._flags.flags.get(line.start, ()) if flag not in ("um", "uw"))
+        return tuple(flag for flag in self._flags.flags.get(line.start, ()) if flag not in WATCHED)

@@ -7,7 +7,7 @@ import functools
 import os
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 from checkpoint import portable
@@ -16,7 +16,9 @@ from checkpoint.engines import births
 from checkpoint.engines.lasting import lasting
 from checkpoint.errors import CheckpointError, ProbeError, ProcessGoneError
 from checkpoint.linux import dirty, kinship, processor, procfs, vm_flags
-from checkpoint.linux.procfs import Status
+from checkpoint.linux.entry import leftovers
+from checkpoint.linux.memory import Memory
+from checkpoint.linux.procfs import MapsLine, Status
 from checkpoint.linux.spokesman import told_by_spokesman
 from checkpoint.resources import (
     Held,
@@ -172,12 +174,11 @@ def _against(pid: int, opened: sharing.OpenedByAll) -> tuple[str, ...]:
     """What stands against a process besides the first, but for what it has open."""
     try:
         reasons = list(unsupported.refuse_process(pid, procfs.status(pid), tuple(opened)))
-        flags = vm_flags.parse(procfs.read_text(pid, "smaps"))
-        lines = procfs.parse_maps(procfs.read_text(pid, "maps"))
+        mapped = _Mapped.by(pid)
     except (CheckpointError, FileNotFoundError, ProcessLookupError):
         return ()
-    reasons += [why for line in lines if (why := unsupported.refuse_mapping(line, flags.get(line.start, ())))]
-    reasons += aio_rings.refuse(opened[pid]) if any(map(aio_rings.is_ring, lines)) else ()
+    reasons += [why for _, why in mapped.refused()]
+    reasons += aio_rings.refuse(opened[pid]) if any(map(aio_rings.is_ring, mapped.lines)) else ()
     return _named(pid, reasons)
 
 
@@ -254,13 +255,50 @@ def _processor_findings(pid: int) -> Iterator[Finding]:
     yield Finding("process", "processor", KEPT, f"not started with failover run --portable: it may have chosen {needed}")
 
 
+@dataclass(frozen=True, slots=True)
+class _Mapped:
+    """What a process has mapped.
+
+    Attributes:
+        flags: VmFlags by start, without those that our own write protection sets.
+        is_followed: failover protects it already.
+    """
+
+    lines: tuple[MapsLine, ...]
+    flags: Mapping[int, tuple[str, ...]]
+    is_followed: bool
+
+    @classmethod
+    def by(cls, pid: int) -> _Mapped:
+        """Look.
+
+        Raises:
+            ProcessGoneError, ProbeError: it has ended, or we may not.
+        """
+        flags: Mapping[int, tuple[str, ...]] = vm_flags.parse(procfs.read_text(pid, "smaps"))
+        lines = procfs.parse_maps(procfs.read_text(pid, "maps"))
+        is_followed = False
+        if any(not vm_flags.WATCHED.isdisjoint(told) for told in flags.values()):
+            with contextlib.suppress(CheckpointError):  # it unmaps something just now
+                is_followed = bool(leftovers(Memory(pid), lines))
+        if is_followed:
+            flags = {start: tuple(flag for flag in told if flag not in vm_flags.WATCHED) for start, told in flags.items()}
+        return cls(lines, flags, is_followed)
+
+    def refused(self) -> Iterator[tuple[MapsLine, str]]:
+        """Mappings that cannot be made again, and why."""
+        for line in self.lines:
+            if why := unsupported.refuse_mapping(line, self.flags.get(line.start, ())):
+                yield line, why
+
+
 def _memory_findings(pid: int, opened: Sequence[OpenFile]) -> Iterator[Finding]:
-    flags = vm_flags.parse(procfs.read_text(pid, "smaps"))
-    lines = procfs.parse_maps(procfs.read_text(pid, "maps"))
-    for line in lines:
-        reason = unsupported.refuse_mapping(line, flags.get(line.start, ()))
-        if reason is not None:
-            yield Finding("memory", f"VMA {line.start:x}-{line.end:x}", REFUSED, reason)
+    mapped = _Mapped.by(pid)
+    lines = mapped.lines
+    if mapped.is_followed:
+        yield Finding("memory", "written pages", NOTED, "failover follows them already: the program is protected")
+    for line, reason in mapped.refused():
+        yield Finding("memory", f"VMA {line.start:x}-{line.end:x}", REFUSED, reason)
     for reason in system_v_memory.refuse(lines):
         yield Finding("memory", "System V shared memory", REFUSED, reason)
     if any(map(aio_rings.is_ring, lines)):

@@ -26,6 +26,8 @@ DROPPABLE: Final = "dp"
 MAY_WRITE: Final = "mw"
 """Its protection may be changed to allow writing: what is mapped was open for that. Kept of shared mappings of files only."""
 LOCKED, LOCKED_ON_FAULT = "lo", "lf"
+WATCHED: Final = frozenset(("um", "uw"))
+"""A userfaultfd watches it, or write-protects it: ours, or one of the program's own."""
 _KEYS: Final = "123456789abcdef"
 KEYS: Final = frozenset(f"k{digit}" for digit in _KEYS)
 _EXECUTE_ONLY: Final = "--x"

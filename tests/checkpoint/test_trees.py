@@ -14,7 +14,8 @@ import pytest
 
 from checkpoint import tree
 from checkpoint.engine import CaptureOrder
-from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError
+from checkpoint.engines.probe import probe
+from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import kinship, procfs
 from checkpoint.model import Resource, Snapshot
 from checkpoint.resources import OpenFile, Surroundings, pidfds
@@ -70,6 +71,48 @@ def grown_by(count: int) -> Callable[[Program], bool]:
         return True
 
     return is_ready
+
+
+HAS_A_FANOTIFY_FOR_A_WHILE = """
+import ctypes, os, time
+def wait_for(name):
+    while not os.path.exists(name):
+        time.sleep(0.01)
+child = os.fork()
+if not child:
+    wait_for("open")
+    group = ctypes.CDLL(None).fanotify_init(0, 0)
+    open("opened", "w").close()
+    wait_for("close")
+    os.close(group)
+    open("closed", "w").close()
+    time.sleep(600)
+print("ready", flush=True)
+os.wait()
+"""
+
+
+def test_a_family_that_was_refused_once_is_captured_again(tmp_path: Path) -> None:
+    def make(name: str, then: str) -> None:
+        (tmp_path / name).touch()
+        family.wait_until((tmp_path / then).exists, f"it has {then} it")
+
+    family = start([sys.executable, "-c", HAS_A_FANOTIFY_FOR_A_WHILE], tmp_path, isolate=True)
+    with ended(family), protected(family) as session:
+        family.wait_for_line("ready")
+        captured_at_last(session, CaptureOrder())
+        report = probe(family.pid)
+        assert not report.reasons
+        assert [found.text for found in report.findings if found.name == "written pages"] == [
+            "failover follows them already: the program is protected"
+        ]
+        make("open", "opened")
+        for _ in range(2):
+            with pytest.raises(UnsupportedError, match="fanotify") as refused:
+                session.capture(CaptureOrder(base=False, sequence=2))
+            assert len(refused.value.reasons) == 1
+        make("close", "closed")
+        assert session.capture(CaptureOrder(base=False, sequence=2)).position.sequence == 2
 
 
 def test_a_shell_loop_with_pipelines_counts_on(tmp_path: Path) -> None:
