@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import subprocess
-import sys
-import tempfile
 from typing import IO, TypeVar
 
 import msgspec
@@ -16,6 +14,7 @@ import msgspec
 from checkpoint import channel, errors
 from checkpoint.channel import Channel, ChannelClosedError, Failed, Reply
 from checkpoint.errors import CheckpointError, MismatchError, UnsupportedError
+from failover.cli import ahead
 
 LEAVE_S = 10.0
 """How long a keeper that was hung up on may take to let go of its tracee."""
@@ -33,17 +32,8 @@ class Keeper:
 
     @classmethod
     def spawn(cls) -> Keeper:
-        """Start one."""
-        ours, theirs = channel.pair()
-        complaints = tempfile.TemporaryFile()  # noqa: SIM115  # ours until `close`
-        with theirs:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "checkpoint", "keeper", str(theirs.fileno())],
-                pass_fds=(theirs.fileno(),),
-                stdin=subprocess.DEVNULL,
-                stderr=complaints,
-                process_group=0,  # a Ctrl-C at the terminal is ours to act on
-            )
+        """One of our own, which may have been started ahead."""
+        process, ours, complaints = ahead.taken()
         return cls(process, Channel(ours, Reply), complaints)
 
     def ask(self, request: msgspec.Struct, wanted: type[A], descriptors: tuple[int, ...] = ()) -> tuple[A, tuple[int, ...]]:

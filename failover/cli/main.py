@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import io
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from checkpoint import quiet
@@ -21,6 +22,8 @@ USAGE: Final = 2
 NO_AGENT: Final = 3
 
 REASONS_SHOWN: Final = 8
+WITH_A_KEEPER: Final = "failover.cli.oneshot:"
+"""The functions of all verbs that ask a keeper of their own."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -38,9 +41,10 @@ def _main(argv: Sequence[str] | None) -> int:
     room = parser.build()
     arguments = room.parse_args(argv)
     try:
-        verb = verb_function(arguments.function)
-        quiet.loaded()
-        status = verb(arguments)
+        with _keeper_ahead(arguments.function):
+            verb = verb_function(arguments.function)
+            quiet.loaded()
+            status = verb(arguments)
         sys.stdout.flush()
         return status
     except NoAgentError as error:
@@ -53,6 +57,21 @@ def _main(argv: Sequence[str] | None) -> int:
         return FAILED
     except OSError as error:
         return tell(error, arguments, FAILED)
+
+
+@contextlib.contextmanager
+def _keeper_ahead(function: str) -> Iterator[None]:
+    """Start the keeper of a verb that will ask one; other verbs load nothing for it."""
+    if not function.startswith(WITH_A_KEEPER):
+        yield
+        return
+    from failover.cli import ahead
+
+    ahead.start()
+    try:
+        yield
+    finally:
+        ahead.forsake()
 
 
 def verb_function(name: str) -> Callable[[argparse.Namespace], int]:
