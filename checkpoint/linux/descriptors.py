@@ -15,7 +15,7 @@ import numpy as np
 
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import abi
-from checkpoint.linux.own_calls import FIRST_ARGUMENT, NUMBER, RESULT_TO, OwnCalls, row
+from checkpoint.linux.own_calls import FIRST_ARGUMENT, NUMBER, RESULT_TO, ROW_SIZE, OwnCalls, row
 from checkpoint.linux.procfs import READ_SIZE, parse_fields
 from checkpoint.linux.spokesman import pidfd_of
 
@@ -292,31 +292,41 @@ def _lent(pid: int) -> int:
     return _LENT[pid]
 
 
-@contextlib.contextmanager
-def copies_of(pid: int, numbers: Sequence[int]) -> Iterator[Sequence[int]]:
-    """Descriptors of ours for the same open files, for the body, in the same order; negative where one cannot be had."""
-    if pid not in _LENT:
-        with lending(pid), copies_of(pid, numbers) as copies:
-            yield copies
-        return
-    results = np.full(len(numbers), NOT_YET, dtype=np.int64)
-    try:
-        pidfd = _lent(pid)
-    except OSError:  # it has been killed, or we have no descriptor left
-        yield results.tolist()
-        return
-    taking = OwnCalls(len(numbers))
-    taking.entries[:] = row("pidfd_getfd", pidfd)
-    taking.entries[:, FIRST_ARGUMENT + 1] = numbers
-    taking.entries[:, RESULT_TO] = results.ctypes.data + 8 * np.arange(len(numbers))
-    taking.run()
-    try:
-        yield results.tolist()
-    finally:
-        taking.entries[:, NUMBER] = row("close")[NUMBER]
-        taking.entries[:, FIRST_ARGUMENT] = results  # where it could not be had that is no descriptor, and nothing happens
-        taking.entries[:, RESULT_TO] = 0
-        taking.run()
+class Copier:
+    """Takes copies of the same descriptors again and again, and gives them back: the tables of calls for that are made once.
+
+    Attributes:
+        numbers: the descriptors.
+    """
+
+    def __init__(self, numbers: Sequence[int]) -> None:
+        self.numbers = tuple(numbers)
+        self._taking, self._closing = OwnCalls(len(numbers)), OwnCalls(len(numbers))
+        self._closing.entries[:, NUMBER] = row("close")[NUMBER]
+        self._taking.entries[:] = row("pidfd_getfd")
+        self._taking.entries[:, FIRST_ARGUMENT + 1] = numbers
+        to = self._closing.address_of(0, FIRST_ARGUMENT)  # what is had is what is closed; an error is no descriptor
+        self._taking.entries[:, RESULT_TO] = to + ROW_SIZE * np.arange(len(numbers), dtype=np.uint64)
+        self._copies = self._closing.entries[:, FIRST_ARGUMENT].view(np.int64)
+
+    @contextlib.contextmanager
+    def taken(self, pid: int) -> Iterator[Sequence[int]]:
+        """Descriptors of ours for the same open files, for the body, in the same order; negative where one cannot be had."""
+        if pid not in _LENT:
+            with lending(pid), self.taken(pid) as copies:
+                yield copies
+            return
+        try:
+            pidfd = _lent(pid)
+        except OSError:  # it has been killed, or we have no descriptor left
+            yield [NOT_YET] * len(self.numbers)
+            return
+        self._taking.entries[:, FIRST_ARGUMENT] = pidfd
+        self._taking.run()
+        try:
+            yield self._copies.tolist()
+        finally:
+            self._closing.run()
 
 
 @contextlib.contextmanager

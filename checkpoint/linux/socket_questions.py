@@ -240,6 +240,7 @@ class _Sheet:
     def _forget(self, first: int, last: int) -> None:
         self.memory[first:last] = self._image
         self.aside[first:last] = self._image_aside
+        self._polled[first:last] = self._addressed[first:last]
 
     def address(self, first: int, descriptors: NDArray[np.int64]) -> None:
         """Have the questions from the first place on go to these."""
@@ -247,9 +248,8 @@ class _Sheet:
         if first < self._used:
             self._forget(first, last)
         self._used = max(self._used, last)
-        self._polled[first:last] = descriptors
-        if not np.array_equal(self._addressed[first:last], descriptors):  # copies of the same have the same numbers, as a rule
-            self._addressed[first:last] = descriptors
+        if not (self._addressed[first:last] == descriptors).all():  # copies of the same have the same numbers, as a rule
+            self._addressed[first:last] = self._polled[first:last] = descriptors
             self._descriptors[first:last] = descriptors[:, None]
 
     def ask(self, first: int, descriptors: NDArray[np.int64]) -> None:
@@ -358,8 +358,9 @@ class Asking:
         if asked.info >= 0:
             more = [aside[:, asked.info + first : asked.info + last] for first, last in _TCP_INFO_TOLD] + more
         self._more = sum(part.shape[1] for part in more)
-        buffers = aside[self._chosen, asked.buffers]
-        return b"".join((self._sheet.memory[:count].tobytes(), np.concatenate(more, axis=1).tobytes(), buffers.tobytes()))
+        buffers = aside[self._chosen, asked.buffers].tobytes() if self._chosen else b""
+        joined = np.concatenate(more, axis=1) if len(more) > 1 else more[0]
+        return b"".join((self._sheet.memory[:count].tobytes(), joined.tobytes(), buffers))
 
     def told(self, heard: bytes) -> list[Told]:
         """Of each what the program has set, and what has become of it otherwise, of what was heard last."""

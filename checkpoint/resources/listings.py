@@ -5,8 +5,9 @@ Source: proc_pid_net(5), sock_diag(7).
 
 from __future__ import annotations
 
+import functools
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 from checkpoint.linux import internet_sockets, packet_sockets, procfs, unix_sockets
@@ -19,6 +20,8 @@ _PEER_COLUMN: Final = 2
 _INODE_COLUMN: Final = 9
 """Of net/raw, icmp and tcp, and of net/netlink."""
 
+LISTS_MAX: Final = 16
+"""Lists of multicast groups that are remembered with what they mean: they are the same from one look to the next."""
 UNIX_ASKED_SINGLY: Final = 4
 """To ask about one has the kernel go through half of the machine's unix sockets; to ask about all, through all of them."""
 
@@ -36,7 +39,7 @@ class Listings:
     def groups(self, pid: int, family: int) -> tuple[Group, ...]:
         """All multicast groups that anybody has joined, and a socket of a family may be in: one of AF_INET6 may be in any."""
         if family not in self._groups:
-            self._groups[family] = tuple(_listed_groups(pid, family))
+            self._groups[family] = _listed_groups(pid, family)
         return self._groups[family]
 
     def shut_down(self, family: int, protocol: int) -> Mapping[int, int]:
@@ -87,15 +90,26 @@ class Listings:
         return [socket.inet_ntop(family, packed), int(port, 16), *([0, 0] if family == socket.AF_INET6 else [])]
 
 
-def _listed_groups(pid: int, family: int) -> Iterator[Group]:
-    if family == socket.AF_INET6:
-        for line in procfs.read_text(pid, "net/igmp6").splitlines():
-            words = line.split()
-            yield int(words[0]), socket.inet_ntop(socket.AF_INET6, bytes.fromhex(words[2]))
-    interface = 0
-    for line in procfs.read_text(pid, "net/igmp").splitlines()[1:]:
+def _listed_groups(pid: int, family: int) -> tuple[Group, ...]:
+    of_six = _groups_of_six(procfs.read_text(pid, "net/igmp6")) if family == socket.AF_INET6 else ()
+    return of_six + _groups_of_four(procfs.read_text(pid, "net/igmp"))
+
+
+@functools.lru_cache(maxsize=LISTS_MAX)
+def _groups_of_six(listed: str) -> tuple[Group, ...]:
+    """Read net/igmp6."""
+    lines = map(str.split, listed.splitlines())
+    return tuple((int(words[0]), socket.inet_ntop(socket.AF_INET6, bytes.fromhex(words[2]))) for words in lines)
+
+
+@functools.lru_cache(maxsize=LISTS_MAX)
+def _groups_of_four(listed: str) -> tuple[Group, ...]:
+    """Read net/igmp."""
+    groups, interface = [], 0
+    for line in listed.splitlines()[1:]:
         words = line.split()
         if not line.startswith("\t"):
             interface = int(words[0])
         else:
-            yield interface, socket.inet_ntoa(bytes.fromhex(words[0])[::-1])
+            groups.append((interface, socket.inet_ntoa(bytes.fromhex(words[0])[::-1])))
+    return tuple(groups)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from checkpoint.linux import socket_questions
-from checkpoint.linux.descriptors import copies_of, copy_of
+from checkpoint.linux.descriptors import Copier, copy_of
 from checkpoint.linux.second_thread import SecondThread
 from checkpoint.linux.socket_questions import WORTH_SHARING, Asking, Subject, Told, events
 from checkpoint.model import Fact
@@ -81,7 +81,7 @@ class _AtATime:
     """Sockets that are asked at a time, by their descriptors."""
 
     pid: int
-    numbers: list[int]
+    copier: Copier
     kinds: list[_Alike]
 
     @classmethod
@@ -93,7 +93,7 @@ class _AtATime:
                 alike = kinds.setdefault(known.asking, _Alike(known.asking))
                 alike.members.append((one, known))
                 alike.places.append(place)
-        return cls(some[0][0].pid, [one.first.number for one, _ in some], list(kinds.values()))
+        return cls(some[0][0].pid, Copier([one.first.number for one, _ in some]), list(kinds.values()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +132,7 @@ class Recollection:
     def __init__(self) -> None:
         self._known: dict[int, _Known] = {}
         self._pipes: dict[int, OpenFile] = {}
+        self._copiers: list[Copier] = []
         self._askings: dict[Subject, Asking] = {}
         self._round: _Round | None = None
         self._second: SecondThread | None = None
@@ -178,10 +179,10 @@ class Recollection:
             self._round = self._round_of(opened)
         changed: dict[int, _Answer] = {}
         for some in self._round.asked:
-            with copies_of(some.pid, some.numbers) as copies:
+            with some.copier.taken(some.pid) as copies:
                 for alike in some.kinds:
                     _recall_alike(alike, [copies[place] for place in alike.places], self._second, opened, changed)
-        if len(self._known) > sum(len(some.numbers) for some in self._round.asked):
+        if len(self._known) > sum(len(some.copier.numbers) for some in self._round.asked):
             self._known = {number: known for number, known in self._known.items() if number in self._round.numbers}
         return changed
 
@@ -199,14 +200,22 @@ class Recollection:
         """Pipes in which nothing waits, with all that must be known of them, by their first descriptors."""
         asked = [one for one in opened if one.both_ends and not one.is_echo and one.lent is None and pipes.is_pipe(one.first)]
         known = {}
-        for first in range(0, len(asked), COPIES_MAX):
+        for turn, first in enumerate(range(0, len(asked), COPIES_MAX)):
             some = asked[first : first + COPIES_MAX]
-            with copies_of(some[0].pid, [one.first.number for one in some]) as copies:
+            with self._copier_of_pipes(turn, tuple(one.first.number for one in some)).taken(some[0].pid) as copies:
                 for one, capacity in zip(some, pipes.capacities_of_empty(copies), strict=True):
                     if capacity:
                         known[one.first.number] = self._as_it_was(one, capacity)
         self._pipes = known
         return known
+
+    def _copier_of_pipes(self, turn: int, numbers: tuple[int, ...]) -> Copier:
+        """They are the same from one look to the next, as a rule."""
+        if turn == len(self._copiers):
+            self._copiers.append(Copier(numbers))
+        elif self._copiers[turn].numbers != numbers:
+            self._copiers[turn] = Copier(numbers)
+        return self._copiers[turn]
 
     def _as_it_was(self, one: OpenFile, capacity: int) -> OpenFile:
         before = self._pipes.get(one.first.number)

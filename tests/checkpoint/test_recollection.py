@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint.linux.descriptors import NOT_YET, copies_of, lending
+from checkpoint.linux.descriptors import NOT_YET, Copier, lending
 from checkpoint.linux.socket_questions import SO_ATTACH_FILTER, WORTH_SHARING, Asking, Subject, Told
 from checkpoint.model import Fact
 from checkpoint.resources import Opened, OpenFile, gather, unix_sockets, with_contents
@@ -339,7 +339,7 @@ def test_a_socket_whose_name_cannot_be_looked_up_just_now_is_looked_into(
 def test_of_a_process_that_has_ended_no_copies_can_be_had() -> None:
     ended = os.posix_spawn("/bin/true", ["true"], {})
     os.waitpid(ended, 0)
-    with copies_of(ended, [0, 1]) as copies:
+    with Copier([0, 1]).taken(ended) as copies:
         assert list(copies) == [NOT_YET, NOT_YET]
 
 
