@@ -1,24 +1,46 @@
-"""Processors as data: a file each, the same names in the same order; this machine's are `cpu`, `stubs`, `extended` and `levels`.
+"""Processors as data: files of the same names in the same order; this machine's are `cpu`, `stubs`, `extended` and `levels`.
 
-To add one: copy the files of ``x86_64``, replace every value from the processor's own manual and kernel headers, add its name
-below, and run ``tests/checkpoint``; the tracees there say what is still wrong.
+How to add one stands in ARCHITECTURE.md. On a machine whose processor has no files here, those of x86-64 are what `cpu` and the
+others are: nothing of them is used there, as `require_supported` and `number_of` see to.
 """
 
 from __future__ import annotations
 
+import importlib
 import os
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from checkpoint.arch import x86_64 as cpu
-from checkpoint.arch import x86_64_levels as levels
-from checkpoint.arch import x86_64_stub as stubs
-from checkpoint.arch import x86_64_xstate as extended
 from checkpoint.errors import ProbeError
 
-__all__ = ["SUPPORTED", "cpu", "extended", "levels", "require_supported", "stubs"]
+if TYPE_CHECKING:  # the others have the same names
+    from checkpoint.arch import x86_64 as cpu
+    from checkpoint.arch import x86_64_levels as levels
+    from checkpoint.arch import x86_64_stub as stubs
+    from checkpoint.arch import x86_64_xstate as extended
 
-SUPPORTED: Final = (cpu.NAME,)
-"""As uname(2) calls them."""
+__all__ = ["SUPPORTED", "cpu", "extended", "levels", "number_of", "require_supported", "stubs"]
+
+KNOWN: Final = ("x86_64", "aarch64")
+"""Those that there are files for, as uname(2) calls them."""
+UNPROVED: Final = ("aarch64",)
+"""Those of them on which not everything has been seen to work yet."""
+TRY_UNPROVED: Final = "FAILOVER_TRY_UNPROVED_PROCESSOR"
+"""Variable of the environment by which those who complete one run it; never for a program that matters."""
+SUPPORTED: Final = tuple(name for name in KNOWN if name not in UNPROVED or os.environ.get(TRY_UNPROVED))
+
+_MACHINE: Final = os.uname().machine
+_HERE: Final = _MACHINE if _MACHINE in KNOWN else KNOWN[0]
+
+if not TYPE_CHECKING:
+    cpu = importlib.import_module(f"checkpoint.arch.{_HERE}")
+    stubs = importlib.import_module(f"checkpoint.arch.{_HERE}_stub")
+    extended = importlib.import_module(f"checkpoint.arch.{_HERE}_xstate")
+    levels = importlib.import_module(f"checkpoint.arch.{_HERE}_levels")
+
+
+def number_of(call: str) -> int | None:
+    """The number of a system call on this machine; None where that is not known."""
+    return stubs.SYSTEM_CALLS.get(call, cpu.SYSCALLS.get(call)) if _MACHINE in KNOWN else None
 
 
 def require_supported() -> None:
@@ -27,8 +49,8 @@ def require_supported() -> None:
     Raises:
         ProbeError: it is not.
     """
-    machine = os.uname().machine
-    if machine not in SUPPORTED:
+    if _MACHINE not in SUPPORTED:
         raise ProbeError(
-            f"cannot capture on {machine}: only {', '.join(SUPPORTED)} is supported so far; run it on such a machine"
+            f"cannot capture on {_MACHINE}: only {', '.join(SUPPORTED)} is supported so far; run it on such a machine, or have "
+            "the program keep its state itself, which works on any (docs/decorator.md)"
         )

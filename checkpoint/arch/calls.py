@@ -54,7 +54,11 @@ class Unkept:
 
 @dataclass(frozen=True, slots=True)
 class TablePlaces:
-    """Addresses inside the borrowed table that the code reads and writes."""
+    """Addresses inside the borrowed table that the code reads and writes.
+
+    Attributes:
+        frame: of `FRAME_SIZE` bytes, as many as the processor's code needs for itself.
+    """
 
     state: int
     ended: int
@@ -66,6 +70,7 @@ class TablePlaces:
     resume: int
     registers: int
     results: int
+    frame: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,8 @@ from checkpoint.arch.calls import MILLISECONDS, SOCKET, TIMESPEC, Call, EntryCal
 NAME: Final = "x86_64"
 AUDIT_ARCHITECTURE: Final = 0xC000003E
 """AUDIT_ARCH_X86_64 of linux/audit.h, which filters of seccomp(2) look at."""
+FEATURES_LINE: Final = "flags"
+"""How the line of /proc/cpuinfo begins that names what the processor has."""
 
 # Registers
 
@@ -30,8 +32,6 @@ REGISTER_NAMES: Final = (
 _in_order: Final = operator.itemgetter(*REGISTER_NAMES)
 _REGISTERS: Final = struct.Struct(f"<{len(REGISTER_NAMES)}Q")
 REGISTERS_SIZE: Final = _REGISTERS.size
-CODE_SEGMENT_64: Final = 0x33
-"""``cs`` of a 64-bit program; 0x23 is a 32-bit one."""
 
 
 def words_of(content: bytes) -> tuple[int, ...]:
@@ -69,6 +69,8 @@ CALL_NUMBER: Final = "orig_rax"
 """Number of the system call that the thread stands in; -1 outside of one."""
 NO_CALL: Final = _WORD
 """As `CALL_NUMBER`, unsigned: the thread is not in a system call, so the kernel has none to restart."""
+OUTSIDE_OF_CALLS: Final = ((REGISTER_NAMES.index(CALL_NUMBER), NO_CALL),)
+"""Words of NT_PRSTATUS, by place, that say that the thread is in no call."""
 LOST_IN_A_CALL: Final = ("rcx", "r11")
 """What every system call changes, besides its result. Source: psABI, A.2.1."""
 ARGUMENTS: Final = ("rdi", "rsi", "rdx", "r10", "r8", "r9")
@@ -76,6 +78,13 @@ ARGUMENTS: Final = ("rdi", "rsi", "rdx", "r10", "r8", "r9")
 # System calls
 
 SYSCALL: Final = b"\x0f\x05"
+
+
+def call_in(code: bytes) -> int:
+    """Offset of the first instruction in a piece of code that makes a system call; -1: there is none."""
+    return code.find(SYSCALL)
+
+
 SYSCALLS: Final[Mapping[str, int]] = {
     "read": 0, "write": 1, "open": 2, "close": 3, "poll": 7, "mmap": 9, "mprotect": 10, "munmap": 11, "brk": 12,
     "rt_sigaction": 13, "rt_sigprocmask": 14, "readv": 19, "writev": 20, "select": 23, "madvise": 28, "pause": 34,
@@ -107,8 +116,18 @@ def unkept(output: int) -> tuple[Unkept, ...]:
     )
 
 
-PORT_RIGHTS: Final = 0x201
+PORT_RIGHTS: Final[int | None] = 0x201
 """NT_386_IOPERM of linux/elf.h: the register set of who may use I/O ports; nobody else has it."""
+
+
+def user_end(highest: int) -> int:
+    """The first address that a program cannot have (47-bit addresses, one guard page).
+
+    Args:
+        highest: the end of a program's highest mapping.
+    """
+    return 0x7FFF_FFFF_E000
+
 
 # Interrupted system calls
 
@@ -185,6 +204,11 @@ _MOVE_IMMEDIATE: Final = {"rax": 0, "rcx": 1, "rdx": 2, "rbx": 3, "rsp": 4, "rbp
 """Register numbers of the instruction encoding; 8 and above need a REX bit."""
 CLOBBERED: Final = ("rax", "rdi", "rsi", "rdx", "r10", "r8", "r9", "rcx", "r11")
 """What the calls change: ours to give back, in this order in the table."""
+LARGE_DESK_SIZE: Final = 16384
+SMALL_DESK_SIZE: Final = 512
+"""Bytes of a desk's code, and of its table: for 200 of the longest calls, and for four."""
+FRAME_SIZE: Final = 0
+"""Bytes at the end of a desk's table that its code needs for itself."""
 
 
 class _Code:
@@ -264,7 +288,7 @@ ENTRY_REGISTERS: Final = ("r12", "r13", "r14")
 """Where the entry keeps its results, and gives them back: the code pages, the table pages, the userfaultfd."""
 
 
-def entry_code(address: int, calls: EntryCalls, registers: Registers, mask: int, patience_ns: int) -> bytes:
+def entry_code(address: int, calls: EntryCalls, registers: Registers, mask: int, patience_ns: int, vectors: bytes = b"") -> bytes:
     """The first entry, for a place where nothing of ours is mapped yet: constants only, nothing stored.
 
     It waits with three results in `ENTRY_REGISTERS`, where a tracer sees them. If none comes it closes the descriptor, gives
@@ -274,6 +298,7 @@ def entry_code(address: int, calls: EntryCalls, registers: Registers, mask: int,
         registers: what the program goes on with; ``rip`` is where.
         mask: the program's signal mask.
         patience_ns: how long it waits for the tracer.
+        vectors: unused: nothing here changes them.
     """
     code = _Code(address + ENTRY_CODE_OFFSET)
     code.call(SYSCALLS[calls.code_pages.name], calls.code_pages.arguments)

@@ -276,6 +276,8 @@ SYSTEM_CALLS: Final = {
 """Numbers of the system calls that a restore makes inside a vessel, and of those of `OWN_LOOP` (asm/unistd_64.h)."""
 
 
+EPOLL_EVENT: Final = struct.Struct("<IQ")
+"""struct epoll_event, which is packed on x86-64."""
 VDSO_CALLS: Final = {
     "__vdso_clock_gettime": 228,
     "__vdso_gettimeofday": 96,

@@ -9,11 +9,18 @@ Source: Intel SDM volume 1, chapter 13; volume 2, CPUID leaf 0DH; AMD APM volume
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+import ctypes
+from collections.abc import Callable, Collection, Iterator
 from typing import Final
 
+from checkpoint.arch.components import Component, Layout, decode_layout, encode_layout
+
+__all__ = ["Component", "Layout", "decode_layout", "encode_layout"]
+
+XSTATE: Final = 0x202
+"""NT_X86_XSTATE of linux/elf.h: the register set, in XSAVE's own standard form."""
+XSTATE_SIZE: Final = 16384
+"""Bytes offered for it: AMX's 11,008 fit."""
 COMPONENTS: Final = {
     0: "x87",
     1: "SSE",
@@ -42,42 +49,29 @@ PKRU_OF_LINUX: Final = 0x55555554
 HIGHEST: Final = 62
 AMX: Final = (17, 18)
 """Only for a process that has asked for it, and 8 KiB a thread: kept while its tiles are released, as between computations."""
+PERMISSIONS: Final = (("amx_tile", "arch_prctl", (0x1023, 18)),)
+"""What a process asks for before it may use some of it: feature, call, arguments (ARCH_REQ_XCOMP_PERM: the tiles of AMX).
+
+Source: Documentation/arch/x86/xstate.rst.
+"""
 
 
-@dataclass(frozen=True, slots=True)
-class Component:
-    """One component of a processor's extended state, in the standard form.
+def sets(features: Callable[[], Collection[str]]) -> tuple[tuple[int, int], ...]:
+    """The register sets that make up the state, in order: number, and the bytes to offer for it.
 
-    Attributes:
-        offset, size: in bytes.
+    Args:
+        features: of this machine's processor.
     """
-
-    number: int
-    offset: int
-    size: int
-
-    @property
-    def name(self) -> str:
-        """What a message calls it."""
-        return COMPONENTS.get(self.number, f"component {self.number}")
+    return ((XSTATE, XSTATE_SIZE),)
 
 
-Layout = tuple[Component, ...]
-"""The components beyond the legacy region, in order of their numbers; () where nobody could tell."""
+def parts(state: bytes, layout: Layout) -> Iterator[tuple[int, bytes]]:
+    """The register sets to write: number and content.
 
-_ENTRY: Final = struct.Struct("<III")
-
-
-def encode_layout(layout: Layout) -> bytes:
-    """As a snapshot holds it: number, offset and size of each component, 32 bits each."""
-    return b"".join(_ENTRY.pack(one.number, one.offset, one.size) for one in layout)
-
-
-def decode_layout(content: bytes) -> Layout:
-    """The reverse of `encode_layout`; () for what is none."""
-    if len(content) % _ENTRY.size:
-        return ()
-    return tuple(Component(*entry) for entry in _ENTRY.iter_unpack(content))
+    Args:
+        layout: this machine's.
+    """
+    return iter(((XSTATE, state),))
 
 
 def in_use(xstate: bytes) -> int:
@@ -91,11 +85,11 @@ def lacking(xstate: bytes, theirs: Layout, ours: Layout) -> Iterator[str]:
     for one in _extended_in_use(xstate, theirs):
         here = known.get(one.number) if one.number not in AMX else None
         if (here is None or here.size != one.size) and not _is_as_at_first(one.number, _content(xstate, one)):
-            yield one.name
+            yield _name_of(one.number)
     told = {one.number for one in theirs}
     for number in range(FIRST_EXTENDED, HIGHEST):
         if in_use(xstate) >> number & 1 and number not in told:
-            yield COMPONENTS.get(number, f"component {number}")
+            yield _name_of(number)
 
 
 def fitted(xstate: bytes, theirs: Layout, ours: Layout, example: bytes) -> bytes:
@@ -135,6 +129,11 @@ def _extended_in_use(xstate: bytes, layout: Layout) -> Iterator[Component]:
     return (one for one in layout if used >> one.number & 1 and one.offset + one.size <= len(xstate))
 
 
+def _name_of(number: int) -> str:
+    """What a message calls it."""
+    return COMPONENTS.get(number, f"component {number}")
+
+
 def _content(xstate: bytes, one: Component) -> bytes:
     return xstate[one.offset : one.offset + one.size]
 
@@ -168,6 +167,30 @@ ASK_ENABLED: Final = bytes.fromhex(
 )
 """The components that the kernel has turned on (XCR0), as a function of C. Only where /proc/cpuinfo says "xsave"."""
 LEAF_XSTATE: Final = 0xD
+
+
+def layout_here(features: Callable[[], Collection[str]], run: Callable[[bytes], int]) -> Layout:
+    """The components of this machine's processor; () where there are none.
+
+    Args:
+        run: the address of instructions, in memory that nobody can write.
+
+    Raises:
+        OSError: by `run`: the system forbids code of our own.
+    """
+    if "xsave" not in features():
+        return ()
+    words = (ctypes.c_uint32 * 4)()
+    place = run(ASK + ASK_ENABLED)
+    instructions = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32)(place)
+    enabled = ctypes.CFUNCTYPE(ctypes.c_uint64)(place + len(ASK))
+
+    def ask(leaf: int, subleaf: int) -> tuple[int, int, int, int]:
+        instructions(ctypes.addressof(words), leaf, subleaf)
+        first, second, third, fourth = words
+        return first, second, third, fourth
+
+    return read_layout(ask, enabled())
 
 
 def read_layout(ask: Callable[[int, int], tuple[int, int, int, int]], enabled: int) -> Layout:

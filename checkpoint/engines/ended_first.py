@@ -87,6 +87,6 @@ class EndedFirst:
                 raise
             except CaptureError:
                 return 0
-            if (offset := piece.find(cpu.SYSCALL)) >= 0:
+            if (offset := cpu.call_in(piece)) >= 0:
                 return start + offset
         return 0

@@ -80,11 +80,6 @@ PTRACE_O_TRACESYSGOOD: Final = 1
 PTRACE_EVENT_EXEC: Final = 4
 OPTIONS: Final = abi.PTRACE_O_EXITKILL | PTRACE_O_TRACESYSGOOD | abi.PTRACE_O_TRACEEXEC | abi.PTRACE_O_TRACECLONE
 
-AMX: Final = frozenset({"amx_tile"})
-AMX_TILES: Final = 18
-ARCH_REQ_XCOMP_PERM: Final = 0x1023
-"""Source: Documentation/arch/x86/xstate.rst."""
-
 NOBODY_YET: Final = 0
 REFUGE_SIZE: Final = 1 << 20
 """Bytes beside the area where vdso and its data stay while their old and new places are cleared."""
@@ -513,8 +508,10 @@ class ProcessRestore:
         restore_process.thread_marks(table, thread)
         restore_process.enter_directory(table, process.working_directory, deleted_directory(self._state))
         restore_process.surroundings(table, process)
-        if set(self._state.machine.features) & set(processor.features()) >= AMX:
-            table.attempt("", "arch_prctl", ARCH_REQ_XCOMP_PERM, AMX_TILES)  # it may have asked for them
+        both = set(self._state.machine.features) & set(processor.features())
+        for feature, name, arguments in extended.PERMISSIONS:
+            if feature in both:
+                table.attempt("", name, *arguments)  # it may have asked for that
         seccomp.install(table, self._filters_of_all, process.credentials)  # all threads are born with them
         return table
 
@@ -656,7 +653,7 @@ class ProcessRestore:
 
     def _syscall_instruction(self, start: int, size: int) -> int:
         image = self._tracee.memory.read(start, size)
-        offset = image.find(cpu.SYSCALL)
+        offset = cpu.call_in(image)
         if offset < 0:
             raise RestoreError("cannot restore: this kernel's vdso has no syscall instruction to leave by")
         return start + offset

@@ -136,6 +136,7 @@ def _compare(state: Snapshot, options: RestoreOptions, digest_of: DigestOf = dig
     architecture = os.uname().machine
     if state.machine.architecture != architecture or architecture != cpu.NAME:
         reason = f"it was taken on {state.machine.architecture}, this machine is {architecture}: restore it on such a machine"
+        reason += "; a program that keeps its state itself goes on on either (docs/decorator.md)"
         return (reason,), Brought()
     run: dict[str, str] = {}
     opened: dict[str, str] = {}

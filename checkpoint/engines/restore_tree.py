@@ -177,7 +177,7 @@ class TreeRestore:
         self._terminals = terminals.controlling({estate.descriptions[number]: held for number, held in resources.items()})
         stub = Stub(self._first, base)
         image = restore_memory.kernel_pages(mappings)[-1]
-        stub.install(image.start + self._first.memory.read(image.start, image.size).find(cpu.SYSCALL), AREA_SIZE)
+        stub.install(image.start + cpu.call_in(self._first.memory.read(image.start, image.size)), AREA_SIZE)
         taken_by_vessel = pages.extents(PageRun(line.start, line.end) for line in mappings)
         inheritance = forked_memory.of(views, taken_by_vessel, {path for one in self._brought for path in one.run})
         self._legacies = inheritance.legacies

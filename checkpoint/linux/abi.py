@@ -12,6 +12,8 @@ import errno
 import os
 from typing import Any, Final
 
+from checkpoint.arch import number_of
+
 PAGE_SIZE: Final = os.sysconf("SC_PAGE_SIZE")
 IOV_MAX: Final = 1024
 """Ranges that process_vm_readv(2) takes in one call (UIO_MAXIOV)."""
@@ -53,7 +55,6 @@ ENDS: Final = (os.CLD_EXITED, os.CLD_KILLED, os.CLD_DUMPED)
 
 # linux/elf.h: names of register sets
 NT_PRSTATUS: Final = 1
-NT_X86_XSTATE: Final = 0x202
 
 # linux/filter.h
 SOCK_FILTER_SIZE: Final = 8
@@ -137,7 +138,6 @@ PR_GET_THP_DISABLE: Final = 42
 
 # System calls that have one number on every processor (from 424 on), made by ourselves.
 NR_PIDFD_GETFD: Final = 438
-NR_KCMP: Final[dict[str, int]] = {"x86_64": 312, "aarch64": 272}
 
 
 class IoVec(ctypes.Structure):
@@ -278,7 +278,7 @@ class EpollSlot(ctypes.Structure):
     _fields_ = (("epoll", ctypes.c_uint32), ("number", ctypes.c_uint32), ("skipped", ctypes.c_uint32))
 
 
-_kcmp_number: Final = NR_KCMP.get(os.uname().machine)
+_kcmp_number: Final = number_of("kcmp")
 _held_syscall: Final = ctypes.PyDLL(None, use_errno=True).syscall
 """As `_syscall`, but other threads of the interpreter wait: for short calls, thousands of them while a program stands still."""
 _held_syscall.argtypes = (ctypes.c_long,) * 6
@@ -322,8 +322,7 @@ def set_timerfd(timer: int, period_ns: int) -> None:
         raise_errno("timerfd_settime")
 
 
-NR_GET_ROBUST_LIST: Final[dict[str, int]] = {"x86_64": 274, "aarch64": 100}
-_robust_list_number: Final = NR_GET_ROBUST_LIST.get(os.uname().machine)
+_robust_list_number: Final = number_of("get_robust_list")
 
 
 def robust_list(tid: int) -> tuple[int, int]:
@@ -341,9 +340,7 @@ def robust_list(tid: int) -> tuple[int, int]:
     return head.value, length.value
 
 
-NR_IOPRIO_GET: Final[dict[str, int]] = {"x86_64": 252, "aarch64": 31}
-_io_priority_number: Final = NR_IOPRIO_GET.get(os.uname().machine)
-NR_IOPRIO_SET: Final[dict[str, int]] = {"x86_64": 251, "aarch64": 30}
+_io_priority_number: Final = number_of("ioprio_get")
 IOPRIO_WHO_PROCESS: Final = 1
 
 
@@ -362,7 +359,7 @@ def set_io_priority(priority: int) -> None:
 
     Source: ioprio_set(2).
     """
-    number = NR_IOPRIO_SET.get(os.uname().machine)
+    number = number_of("ioprio_set")
     if (
         number is not None
         and int(_syscall(number, ctypes.c_int(IOPRIO_WHO_PROCESS), ctypes.c_int(0), ctypes.c_int(priority))) < 0

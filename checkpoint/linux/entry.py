@@ -85,7 +85,8 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
     """
     place, room = vdso_tail(tracee.memory, maps)
     hole = largest_hole(maps)
-    stub = arch.entry_code(place, _entry_calls(hole), resumed(arch.decode_registers(registers)), mask, patience_ns(tracee))
+    goes_on, vectors = resumed(arch.decode_registers(registers)), tracee.xstate()
+    stub = arch.entry_code(place, _entry_calls(hole), goes_on, mask, patience_ns(tracee), vectors)
     if len(stub) > room:
         raise CaptureError(
             f"cannot enter pid {tracee.pid}: its vdso has only {room} spare bytes of {len(stub)}; upgrade the kernel"
@@ -153,8 +154,6 @@ def _taken(pid: int, inside: int) -> tuple[int | None, int]:
         return None, error.errno or errno.EIO
 
 
-USER_END: Final = 0x7FFF_FFFF_E000
-"""The first address that a program cannot have (47-bit addresses, one guard page)."""
 USER_START: Final = 1 << 20
 """Below lie vm.mmap_min_addr and what old programs expect to be free."""
 
@@ -165,8 +164,9 @@ def largest_hole(maps: Sequence[MapsLine]) -> int:
     Raises:
         CaptureError: there is no room.
     """
-    ends = [USER_START, *(line.end for line in maps if line.end < USER_END)]
-    starts = [*(line.start for line in maps if USER_START <= line.start < USER_END), USER_END]
+    user_end = arch.user_end(max(line.end for line in maps))
+    ends = [USER_START, *(line.end for line in maps if line.end < user_end)]
+    starts = [*(line.start for line in maps if USER_START <= line.start < user_end), user_end]
     size, begin = max((start - end, end) for end, start in zip(sorted(ends), sorted(starts), strict=False))
     if size < 3 * SIZE:
         raise CaptureError("cannot borrow pages: the address space has no hole left")

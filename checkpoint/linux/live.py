@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from checkpoint import pages
+from checkpoint.arch import number_of
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import abi, own_calls
 from checkpoint.linux.pagetables import PageScanner
@@ -23,7 +24,6 @@ from checkpoint.linux.tracking import NONE
 from checkpoint.linux.write_protection import enable_write_protection
 from checkpoint.pages import Words
 
-NR_USERFAULTFD: Final = {"x86_64": 323, "aarch64": 282}
 SEGMENT_PAGE: Final = 4096
 """Only kernels with pages of this size tell in the segment's pages."""
 
@@ -140,7 +140,7 @@ class LiveMemory:
 
     def _open(self) -> None:
         """Ask the kernel for its ways, and say what is missing."""
-        number = NR_USERFAULTFD.get(os.uname().machine)
+        number = number_of("userfaultfd")
         if number is None or abi.PAGE_SIZE != SEGMENT_PAGE:
             self.note = (
                 f"written pages are compared: not known how to ask on {os.uname().machine}, pages of {abi.PAGE_SIZE} bytes"

@@ -21,7 +21,7 @@ import numpy as np
 
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.own_calls import OwnCalls, row
-from checkpoint.linux.tracee import REGISTERS_SIZE, XSTATE_SIZE, Tracee
+from checkpoint.linux.tracee import REGISTERS_SIZE, STATE_SETS, Tracee
 from checkpoint.model import Rseq
 
 TEXT_SIZE: Final = 4096
@@ -37,6 +37,9 @@ _WORD: Final = 8
 _RSEQ: Final = struct.Struct("<QIIII")
 _INT: Final = struct.Struct("<i")
 _PAIR: Final = struct.Struct("<QQ")
+(_STATE_SET, _STATE_SIZE), *FURTHER = STATE_SETS
+"""The first register set of the extended state, which may come short, and those that come whole: number and size of each."""
+_IOV_SIZE: Final = 16
 
 
 class _Layout:
@@ -54,16 +57,27 @@ class _Layout:
     text = pending + PEEKED * abi.SIGINFO_SIZE
     registers = text + TEXT_SIZE
     xstate = registers + REGISTERS_SIZE
-    size = xstate + XSTATE_SIZE
+    further = xstate + _STATE_SIZE
+    size = further + len(FURTHER) * _IOV_SIZE + -(-sum(size for _, size in FURTHER) // _WORD) * _WORD
 
 
+def _further_places() -> list[tuple[int, int, int]]:
+    """Of the further register sets: where the kernel is told where they go, where they go, and their size."""
+    places, place = [], _Layout.further + len(FURTHER) * _IOV_SIZE
+    for index, (_, size) in enumerate(FURTHER):
+        places.append((_Layout.further + index * _IOV_SIZE, place, size))
+        place += size
+    return places
+
+
+_FURTHER_PLACES: Final = _further_places()
 _REGISTERS_LENGTH: Final = _Layout.registers_iov // _WORD + 1
 _XSTATE_LENGTH: Final = _Layout.xstate_iov // _WORD + 1
 """Places of the lengths that the kernel has written, in words."""
 
-CALLS: Final = 13
-"""About each thread."""
-REGISTERS, MASK, RSEQ, PENDING, XSTATE, FILTER, ROBUST, PROCESSORS, IO_PRIORITY, POLICY, PRIORITY, NICE, TEXT = range(CALLS)
+REGISTERS, MASK, RSEQ, PENDING, XSTATE, FILTER, ROBUST, PROCESSORS, IO_PRIORITY, POLICY, PRIORITY, NICE, TEXT = range(13)
+CALLS: Final = TEXT + 1 + len(FURTHER)
+"""About each thread; after those with a name those for the further register sets."""
 NO_FILE: Final = -1
 NICE_ORIGIN: Final = 20
 """getpriority(2) itself, of the kernel, answers with this less the nice value: a negative result is an error."""
@@ -154,6 +168,8 @@ class _Area:
             rows += [(*made[:-1], answer + place * _WORD) for place, made in enumerate(_calls_about(area))]
             self._words[index, _Layout.registers_iov // _WORD] = area + _Layout.registers
             self._words[index, _Layout.xstate_iov // _WORD] = area + _Layout.xstate
+            for iov, place, size in _FURTHER_PLACES:
+                self._words[index, iov // _WORD : iov // _WORD + 2] = area + place, size
             order = abi.PeekSiginfo(0, 0, PEEKED)
             self.view[index * _Layout.size + _Layout.order :][: len(bytes(order))] = bytes(order)
         self._calls = OwnCalls(rows)
@@ -167,7 +183,7 @@ class _Area:
             self._address(tids, files)
             self._about = tids, files
         self._words[:count, _REGISTERS_LENGTH] = REGISTERS_SIZE
-        self._words[:count, _XSTATE_LENGTH] = XSTATE_SIZE
+        self._words[:count, _XSTATE_LENGTH] = _STATE_SIZE
         self._calls.run(0, count * CALLS)
         found: list[list[int]] = self._results[:count].tolist()
         return found
@@ -176,6 +192,7 @@ class _Area:
         """Fill in whom the calls are about."""
         rows, ids = self._rows[: len(tids)], np.array(tids, dtype=np.uint64)
         rows[:, : FILTER + 1, 2] = ids[:, None]
+        rows[:, TEXT + 1 :, 2] = ids[:, None]
         rows[:, IO_PRIORITY, 2] = ids
         rows[:, NICE, 2] = ids
         for place in (ROBUST, PROCESSORS, POLICY, PRIORITY):
@@ -208,7 +225,7 @@ class _Answers:
             mask=self.mask(index) if results[MASK] == 0 else tracee.signal_mask(),
             rseq=self._rseq(at) if results[RSEQ] > 0 else tracee.rseq(),
             pending=tracee.pending(shared=False) if results[PENDING] else (),
-            xstate=self._xstate(index) if results[XSTATE] == 0 else tracee.xstate(),
+            xstate=self._xstate(index) if not (results[XSTATE] or any(results[TEXT + 1 :])) else tracee.xstate(),
             text=self._text(at, results[TEXT], self._files[index]),
             robust_list=_PAIR.unpack_from(view, at + _Layout.robust) if results[ROBUST] == 0 else abi.robust_list(tracee.pid),
             policy=results[POLICY] if results[POLICY] >= 0 else os.sched_getscheduler(tracee.pid),
@@ -235,7 +252,8 @@ class _Answers:
 
     def _xstate(self, index: int) -> bytes:
         begin = index * _Layout.size + _Layout.xstate
-        return bytes(self._area.view[begin : begin + self._word(index, _XSTATE_LENGTH)])
+        first, at = bytes(self._area.view[begin : begin + self._word(index, _XSTATE_LENGTH)]), index * _Layout.size
+        return b"".join([first, *(self._area.view[at + place :][:size] for _, place, size in _FURTHER_PLACES)])
 
     def _rseq(self, at: int) -> Rseq | None:
         address, size, signature, flags, _ = _RSEQ.unpack_from(self._area.view, at + _Layout.rseq)
@@ -255,8 +273,8 @@ class _Answers:
 
 def _is_complete(results: Sequence[int]) -> bool:
     """Whether the calls about a thread have brought all that was asked."""
-    registers, mask, rseq, pending, xstate, _, robust, processors, _, policy, priority, nice, text = results
-    if registers or mask or pending or xstate or robust or priority:
+    registers, mask, rseq, pending, xstate, _, robust, processors, _, policy, priority, nice, text, *further = results
+    if registers or mask or pending or xstate or robust or priority or any(further):
         return False
     return rseq > 0 < processors and policy >= 0 < nice and text < TEXT_SIZE
 
@@ -301,7 +319,7 @@ def _calls_about(area: int) -> list[tuple[int, ...]]:
         row("ptrace", abi.PTRACE_GETSIGMASK, 0, abi.SIGSET_SIZE, area + _Layout.mask),
         row("ptrace", abi.PTRACE_GET_RSEQ_CONFIGURATION, 0, _RSEQ.size, area + _Layout.rseq),
         row("ptrace", abi.PTRACE_PEEKSIGINFO, 0, area + _Layout.order, area + _Layout.pending),
-        row("ptrace", abi.PTRACE_GETREGSET, 0, abi.NT_X86_XSTATE, area + _Layout.xstate_iov),
+        row("ptrace", abi.PTRACE_GETREGSET, 0, _STATE_SET, area + _Layout.xstate_iov),
         row("ptrace", abi.PTRACE_SECCOMP_GET_FILTER, 0, 0, 0),  # the oldest one's length
         row("get_robust_list", 0, area + _Layout.robust, area + _Layout.robust + _WORD),
         row("sched_getaffinity", 0, PROCESSORS_SIZE, area + _Layout.processors),
@@ -310,4 +328,8 @@ def _calls_about(area: int) -> list[tuple[int, ...]]:
         row("sched_getparam", 0, area + _Layout.priority),
         row("getpriority", os.PRIO_PROCESS, 0),
         row("pread64", 0, area + _Layout.text, TEXT_SIZE, 0),
+        *(
+            row("ptrace", abi.PTRACE_GETREGSET, 0, kind, area + iov)
+            for (kind, _), (iov, _, _) in zip(FURTHER, _FURTHER_PLACES, strict=True)
+        ),
     ]

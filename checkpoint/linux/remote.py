@@ -46,10 +46,10 @@ from checkpoint.linux.memory import Memory, Ranges, ranges_of
 from checkpoint.linux.rounds import Round
 from checkpoint.linux.tracee import Tracee, rest
 
-LARGE_DESK: Final = 4 * abi.PAGE_SIZE
+LARGE_DESK: Final = max(arch.LARGE_DESK_SIZE, 4 * abi.PAGE_SIZE)
 """Bytes of the large desk's code, and of its table."""
 DESK_COUNT: Final = 32
-SMALL_DESK: Final = 512
+SMALL_DESK: Final = arch.SMALL_DESK_SIZE
 """Bytes of a small desk's code, and of its table: room for four short calls."""
 CODE_SIZE: Final = LARGE_DESK + DESK_COUNT * SMALL_DESK
 TABLE_SIZE: Final = CODE_SIZE
@@ -98,6 +98,11 @@ class Plan:
         return -(-_HEAD_SIZE // _OUTPUT_ALIGNMENT) * _OUTPUT_ALIGNMENT
 
     @functools.cached_property
+    def room(self) -> int:
+        """Offset of where the outputs end at the latest: the code's own room, and the note, come after."""
+        return (self.size - _NOTE.size) // _OUTPUT_ALIGNMENT * _OUTPUT_ALIGNMENT - arch.FRAME_SIZE
+
+    @functools.cached_property
     def outputs(self) -> int:
         """Offset of the outputs, which end before the note."""
         return self.results + -(-8 * self.call_limit // _OUTPUT_ALIGNMENT) * _OUTPUT_ALIGNMENT
@@ -120,6 +125,7 @@ def _places(table: int, plan: Plan) -> TablePlaces:
         resume=words + 56,
         registers=words + 64,
         results=table + plan.results,
+        frame=table + plan.room,
     )
 
 
@@ -145,7 +151,7 @@ class Batch:
         """Reserve room for what a call writes; answers with its address in the tracee."""
         address = self._table + self._plan.outputs + self.output_size
         self.output_size += -(-size // _OUTPUT_ALIGNMENT) * _OUTPUT_ALIGNMENT
-        if self.end > self._plan.size - _NOTE.size:
+        if self.end > self._plan.room:
             raise CaptureError(f"too much to ask of a process at once: {self.output_size} bytes of answers")
         return address
 

@@ -27,8 +27,7 @@ CALLS: Final = (3, 1, 1, 2, 2)
 
 
 _POINTER: Final = arch.REGISTER_NAMES.index(arch.INSTRUCTION_POINTER)
-_NUMBER: Final = arch.REGISTER_NAMES.index(arch.CALL_NUMBER)
-"""Their places among the registers, in words."""
+"""Its place among the registers, in words."""
 
 
 class _Layout:
@@ -84,7 +83,8 @@ class Round:
         self._memory[:count, _Layout.back : _Layout.back + arch.REGISTERS_SIZE] = found
         self._memory[:count, _Layout.there : _Layout.there + arch.REGISTERS_SIZE] = found
         self._words[:count, _Layout.there // WORD + _POINTER] = np.array(codes, dtype=np.uint64)
-        self._words[:count, _Layout.there // WORD + _NUMBER] = arch.NO_CALL
+        for place, word in arch.OUTSIDE_OF_CALLS:
+            self._words[:count, _Layout.there // WORD + place] = word
         self._words[:count, _Layout.mask // WORD] = np.array(masks, dtype=np.uint64)
         return not any(self._run(START))
 

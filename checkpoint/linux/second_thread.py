@@ -48,8 +48,8 @@ class SecondThread:
 
     @classmethod
     def where_it_gains(cls) -> SecondThread | None:
-        """One, if there is a second processor for it, and the system lets us have it."""
-        if len(os.sched_getaffinity(0)) < 2:
+        """One, if there is a second processor for it, its kind has a loop for that, and the system lets us have it."""
+        if len(os.sched_getaffinity(0)) < 2 or not stubs.SECOND_LOOP:
             return None
         try:
             return cls(instructions(stubs.SECOND_LOOP))

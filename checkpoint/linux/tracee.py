@@ -20,8 +20,9 @@ from typing import Final
 from ptrace.binding.func import ptrace as _ptrace
 from ptrace.error import PtraceError
 
+from checkpoint.arch import extended
 from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError
-from checkpoint.linux import abi, procfs
+from checkpoint.linux import abi, processor, procfs
 from checkpoint.linux.memory import Memory
 from checkpoint.model import Rseq
 
@@ -30,8 +31,10 @@ PLAIN_STOP: Final = PTRACE_EVENT_STOP << 16 | signal.SIGTRAP << 8 | 0x7F
 """Wait status of a thread that was asked to stop, and stands for no other reason. Source: wait(2), ptrace(2)."""
 REGISTERS_SIZE: Final = 4096
 """Bytes offered for the general registers: more than any processor has."""
-XSTATE_SIZE: Final = 16384
-"""Bytes offered for the extended state: AMX's 11,008 fit."""
+STATE_SETS: Final = processor.state_sets()
+"""The register sets of the extended state."""
+SET_SIZE: Final = max(size for _, size in STATE_SETS)
+"""Bytes offered for one at most."""
 STOP_TIMEOUT_S: Final = 2.0
 """How long a thread may take to stop: a disk that sleeps answers within this, a dead network file system does not."""
 SPIN_S: Final = 0.001
@@ -106,7 +109,7 @@ class Tracee:
         self.is_as_found = True
         self.stopped_by = 0
         self._registers = ctypes.create_string_buffer(REGISTERS_SIZE)
-        self._xstate = ctypes.create_string_buffer(XSTATE_SIZE)
+        self._xstate = ctypes.create_string_buffer(SET_SIZE)
         self._iov = abi.IoVec()
         self._mask = ctypes.c_uint64()
         self._signals: ctypes.Array[ctypes.c_char] | None = None
@@ -292,8 +295,8 @@ class Tracee:
         self._setregset("write registers of", abi.NT_PRSTATUS, content, self._registers)
 
     def xstate(self) -> bytes:
-        """Read the FPU and vector registers in XSAVE's own form (NT_X86_XSTATE)."""
-        return self._getregset("read vector registers of", abi.NT_X86_XSTATE, self._xstate)
+        """Read what it has besides the general registers: all of `STATE_SETS`, one after the other."""
+        return b"".join(self._getregset("read vector registers of", kind, self._xstate, size) for kind, size in STATE_SETS)
 
     def register_set(self, kind: int) -> bytes:
         """Read another register set.
@@ -304,11 +307,12 @@ class Tracee:
         return self._getregset("read registers of", kind, self._xstate)
 
     def set_xstate(self, content: bytes) -> None:
-        """Write the FPU and vector registers."""
-        self._setregset("write vector registers of", abi.NT_X86_XSTATE, content, self._xstate)
+        """Write what `xstate` reads."""
+        for kind, part in extended.parts(content, processor.xstate_layout()):
+            self._setregset("write vector registers of", kind, part, self._xstate)
 
-    def _getregset(self, what: str, kind: int, buffer: ctypes.Array[ctypes.c_char]) -> bytes:
-        self._iov.base, self._iov.length = ctypes.addressof(buffer), len(buffer)
+    def _getregset(self, what: str, kind: int, buffer: ctypes.Array[ctypes.c_char], size: int = 0) -> bytes:
+        self._iov.base, self._iov.length = ctypes.addressof(buffer), size or len(buffer)
         self.request(what, abi.PTRACE_GETREGSET, kind, ctypes.addressof(self._iov))
         return ctypes.string_at(buffer, self._iov.length)
 

@@ -16,10 +16,10 @@ from __future__ import annotations
 import ctypes
 import os
 import re
-import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Final
 
+from checkpoint.arch import stubs
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
@@ -48,8 +48,6 @@ GONE: Final = -1
 """In place of a descriptor: the program has none any more that leads to what is watched."""
 
 _WATCHED: Final = re.compile(rb"tfd: *(\d+) events: *([0-9a-f]+) data: *([0-9a-f]+) ")
-_EVENT: Final = struct.Struct("<IQ")
-"""struct epoll_event, which is packed on x86-64."""
 
 
 def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
@@ -132,7 +130,7 @@ def settle(table: CallTable, held: Resource, descriptor: int, marked: Collection
         assert isinstance(one, list)
         registered, now, events, word = map(number_of, one)
         what = f"watch descriptor {registered} by the epoll instance {held.name}"
-        arguments = (descriptor, EPOLL_CTL_ADD, registered, table.place(_EVENT.pack(events, word)))
+        arguments = (descriptor, EPOLL_CTL_ADD, registered, table.place(stubs.EPOLL_EVENT.pack(events, word)))
         if now == registered:
             table.call(what, "epoll_ctl", *arguments)
         else:

@@ -53,6 +53,8 @@ class Questions:
 
 def refuse_ports(tracee: Tracee) -> Iterator[str]:
     """Why a process cannot be kept that may use I/O ports."""
+    if cpu.PORT_RIGHTS is None:
+        return
     with contextlib.suppress(CaptureError):  # nearly always: it has no such registers
         if tracee.register_set(cpu.PORT_RIGHTS):
             yield refuse_what("rights to I/O ports (ioperm)")

@@ -90,7 +90,7 @@ def test_after_another_owner_or_a_cut_everything_is_compared(memory: LiveMemory)
 
 
 def test_where_the_kernel_tells_nothing_that_is_said_and_everything_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "NR_USERFAULTFD", {})
+    monkeypatch.setattr(live, "number_of", {}.get)
     memory = LiveMemory()
     array = memory.array((COUNT * PAGE,), np.dtype("u1"))
     assert "compared" in memory.note

@@ -1,0 +1,41 @@
+"""Levels of aarch64 that a fleet of different processors can agree on, and how libraries are told to choose nothing beyond.
+
+Data only. A library that asks the processor by itself (getauxval) and has no variable for it is not told: the C library among
+them, whose choice changes nothing that a program keeps.
+
+Source: Arm Architecture Reference Manual; numpy's "CPU dispatcher"; OpenBLAS, driver/others/dynamic_arm64.c; OPENSSL_armcap.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+V8: Final = "armv8-a"
+LEVELS: Final = (V8,)
+DEFAULT: Final = V8
+"""What every 64-bit ARM processor has."""
+
+_FLAGS: Final = {V8: frozenset(["asimd", "fp"])}
+"""Names in /proc/cpuinfo."""
+_NUMPY_BEYOND: Final = {V8: "ASIMDHP ASIMDDP ASIMDFHM SVE"}
+_OPENBLAS: Final = {V8: "ARMV8"}
+
+
+def flags_of(level: str) -> frozenset[str]:
+    """Names in /proc/cpuinfo that a program of a level may rely on."""
+    return _FLAGS[level]
+
+
+def glibc_hwcaps(level: str) -> str:
+    """The value of the tunable glibc.cpu.hwcaps: there is none for this processor."""
+    return ""
+
+
+def variables(level: str) -> dict[str, str]:
+    """Variables of libraries that choose by themselves, unless somebody has set them."""
+    return {
+        "LD_BIND_NOW": "1",
+        "NPY_DISABLE_CPU_FEATURES": _NUMPY_BEYOND[level],
+        "OPENBLAS_CORETYPE": _OPENBLAS[level],
+        "OPENSSL_armcap": "0",
+    }

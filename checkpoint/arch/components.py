@@ -1,0 +1,39 @@
+"""How a snapshot tells where the components of a thread's extended state lie; each processor's own file says what they are."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True, slots=True)
+class Component:
+    """One component of a thread's extended state.
+
+    Attributes:
+        number: as the processor or the kernel numbers it.
+        offset, size: in bytes.
+    """
+
+    number: int
+    offset: int
+    size: int
+
+
+Layout = tuple[Component, ...]
+"""The components in order, as their processor's file says; () where nobody could tell."""
+
+_ENTRY: Final = struct.Struct("<III")
+
+
+def encode_layout(layout: Layout) -> bytes:
+    """As a snapshot holds it: number, offset and size of each component, 32 bits each."""
+    return b"".join(_ENTRY.pack(one.number, one.offset, one.size) for one in layout)
+
+
+def decode_layout(content: bytes) -> Layout:
+    """The reverse of `encode_layout`; () for what is none."""
+    if len(content) % _ENTRY.size:
+        return ()
+    return tuple(Component(*entry) for entry in _ENTRY.iter_unpack(content))

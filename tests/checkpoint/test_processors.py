@@ -1,0 +1,167 @@
+"""The files of each processor: what others use of them is in every one, in the same order, and the machine code is what it says.
+
+A program that runs on another processor is the matter of a machine of that kind.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import importlib
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from checkpoint import arch
+from checkpoint.arch import aarch64, aarch64_xstate, x86_64
+from checkpoint.arch.calls import Call, EntryCalls, TablePlaces
+from checkpoint.arch.components import Component
+from checkpoint.linux import remote
+from checkpoint.linux.remote import Plan
+
+SOURCES = Path(__file__).parents[2] / "checkpoint"
+PARTS = {"cpu": "", "stubs": "_stub", "extended": "_xstate", "levels": "_levels"}
+OBJDUMP = "aarch64-linux-gnu-objdump"
+
+
+@functools.cache
+def names_used() -> dict[str, set[str]]:
+    """What the sources outside of ``checkpoint/arch`` use of each part."""
+    used: dict[str, set[str]] = {part: set() for part in PARTS}
+    for path in SOURCES.rglob("*.py"):
+        text = path.read_text()
+        if "from checkpoint.arch import" not in text:
+            continue
+        nodes = list(ast.walk(ast.parse(text)))
+        imported = [node for node in nodes if isinstance(node, ast.ImportFrom) and node.module == "checkpoint.arch"]
+        part_of = {alias.asname or alias.name: alias.name for node in imported for alias in node.names if alias.name in PARTS}
+        for node in nodes:
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in part_of:
+                used[part_of[node.value.id]].add(node.attr)
+    return used
+
+
+def names_in_order(name: str) -> list[str]:
+    """What a file defines, or takes over from another, by its place in the file."""
+    found: list[str] = []
+    for node in ast.parse((SOURCES / "arch" / f"{name}.py").read_text()).body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            found.append(node.target.id)
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.append(node.name)
+        elif isinstance(node, ast.ImportFrom):
+            found += [alias.name for alias in node.names]
+    return found
+
+
+@pytest.mark.parametrize("processor", arch.KNOWN)
+@pytest.mark.parametrize("part", PARTS)
+def test_what_others_use_of_a_processor_is_in_each_ones_file_in_the_same_order(part: str, processor: str) -> None:
+    used = names_used()[part]
+    assert used, "somebody uses each part"
+    ours, first = (names_in_order(f"{name}{PARTS[part]}") for name in (processor, arch.KNOWN[0]))
+    assert used <= set(ours)
+    assert [name for name in ours if name in used] == [name for name in first if name in used]
+    importlib.import_module(f"checkpoint.arch.{processor}{PARTS[part]}")
+
+
+def test_registers_are_the_same_after_they_were_read_and_written() -> None:
+    content = struct.pack("<34Q", *(number << 32 | number for number in range(34)))
+    decoded = aarch64.decode_registers(content)
+    assert aarch64.encode_registers(decoded) == content
+    assert aarch64.stand_of(content) == (decoded["pc"], decoded["x0"], -1)
+    assert aarch64.words_of(content)[aarch64.REGISTER_NAMES.index("sp")] == decoded["sp"]
+
+
+def test_a_system_call_is_found_where_an_instruction_begins() -> None:
+    across = b"\x00" + aarch64.SYSCALL + b"\x00" * 3
+    assert aarch64.call_in(across) == -1
+    assert aarch64.call_in(across + aarch64.SYSCALL) == len(across)
+    assert aarch64.call_in(aarch64.SYSCALL) == 0
+    assert x86_64.call_in(b"\x90\x0f\x05") == 1
+
+
+def test_the_end_of_a_programs_addresses_follows_from_its_highest_mapping() -> None:
+    assert aarch64.user_end(0xFFFF_EFF2_4000) == 1 << 48
+    assert aarch64.user_end(0x7F_FFFF_F000) == 1 << 39
+    assert aarch64.user_end(1 << 39) == 1 << 39
+
+
+def test_the_state_goes_to_a_processor_that_has_more_and_not_to_one_that_has_less() -> None:
+    plain = tuple(Component(number, place, size) for number, place, size in ((2, 0, 528), (0x401, 528, 8)))
+    signing = (*plain, Component(0x407, 536, 64), Component(0x408, 600, 16))
+    state, example = bytes(range(1, 133)) * 4 + b"\x01" * 8, bytes(range(77)) * 8
+    assert list(aarch64_xstate.lacking(state, plain, signing)) == []
+    grown = aarch64_xstate.fitted(state, plain, signing, example)
+    assert grown == state + example[536:616]
+    assert len(list(aarch64_xstate.lacking(grown, signing, plain))) == 2
+    assert b"".join(part for _, part in aarch64_xstate.parts(grown, signing)) == grown
+
+
+PLACES = TablePlaces(
+    state=0x20020, ended=2, done=0x20028, serial=0x20030, mask=0x20038, timeout=0x20040, empty_set=0x20050, resume=0x20058,
+    registers=0x20060, results=0x200C0, frame=0x20400,
+)  # fmt: skip
+LONGEST = Call("ppoll", tuple((1 << 64) - 0x1234_5678_9ABC_DEF0 - number for number in range(5)))
+
+
+def disassembled(code: bytes, tmp_path: Path) -> list[str]:
+    """The instructions, by binutils of that processor."""
+    if shutil.which(OBJDUMP) is None:
+        pytest.skip(f"needs {OBJDUMP}, which is not installed here: apt-get install binutils-aarch64-linux-gnu")
+    file = tmp_path / "code"
+    file.write_bytes(code)
+    told = subprocess.run([OBJDUMP, "-D", "-b", "binary", "-m", "aarch64", file], capture_output=True, text=True, check=True)
+    lines = [line.split("\t") for line in told.stdout.splitlines()]
+    return [" ".join(part.strip() for part in line[2:]).split(" //")[0] for line in lines if len(line) > 2]
+
+
+def test_a_batch_of_the_longest_calls_fits_at_its_desk() -> None:
+    for size, limit in ((aarch64.LARGE_DESK_SIZE, remote.CALL_LIMIT), (aarch64.SMALL_DESK_SIZE, 4)):
+        code = aarch64.batch_code(0x10000, [LONGEST] * limit, PLACES)
+        assert len(code) + len(remote.MAGIC) <= size
+        plan = Plan(size, limit)
+        assert plan.outputs < size - aarch64.FRAME_SIZE
+
+
+def test_constants_are_set_by_as_few_instructions_as_it_takes(tmp_path: Path) -> None:
+    calls = [Call("close", (value,)) for value in (0, -1, -100, 0x12345, 0xFFFF_0000_1234_0000, 1 << 63)]
+    lines = disassembled(aarch64.batch_code(0x10000, calls, PLACES), tmp_path)
+    before = [lines[index - 1] for index, line in enumerate(lines) if line == "svc #0x0"]
+    assert before[:6] == ["mov x8, #0x39"] * 6
+    first = [line for line in lines if line.startswith(("mov x0, #", "movk x0"))]
+    assert first[:3] == ["mov x0, #0x0", "mov x0, #0xffffffffffffffff", "mov x0, #0xffffffffffffff9c"]
+    assert first[3:5] == ["mov x0, #0x2345", "movk x0, #0x1, lsl #16"]
+
+
+def test_a_batch_gives_everything_back_by_a_frame_of_its_own(tmp_path: Path) -> None:
+    lines = disassembled(aarch64.batch_code(0x10000, [LONGEST], PLACES), tmp_path)
+    assert lines[-2:] == ["mov x8, #0x8b", "svc #0x0"]
+    stored = [line.split(",")[0] for line in lines if line.startswith(("str x", "str q"))]
+    assert {f"str q{number}" for number in range(32)} <= set(stored)
+    assert {f"str x{number}" for number in range(31) if f"x{number}" not in aarch64.CLOBBERED} <= set(stored)
+
+
+def test_an_entry_stores_nothing_and_goes_on_by_constants(tmp_path: Path) -> None:
+    calls = EntryCalls(LONGEST, LONGEST, LONGEST, LONGEST)
+    registers = dict.fromkeys(aarch64.REGISTER_NAMES, 0) | {"pc": 0x1234, "sp": 0x5678, "x30": 0x9ABC}
+    code = aarch64.entry_code(0x10000, calls, registers, 0x55, 10**8, bytes(range(256)) * 2 + bytes(16))
+    lines = disassembled(code[aarch64.ENTRY_CODE_OFFSET :], tmp_path)
+    assert not [line for line in lines if line.startswith(("str", "stp"))]
+    assert struct.pack("<QQQ", 0x9ABC, 0x5678, 0x1234) in code
+    assert aarch64.ENTRY_CODE_OFFSET % 16 == 0
+
+
+def test_the_machine_code_is_what_stands_beside_it(tmp_path: Path) -> None:
+    told = (SOURCES / "arch" / "aarch64_stub.py").read_text().splitlines()
+    rows = [line.strip().split('"  # ') for line in told if line.startswith('    "') and '"  # ' in line]
+    seen = disassembled(bytes.fromhex("".join(code.strip('"') for code, _ in rows)), tmp_path)
+    assert [comment.split(": ")[-1].split()[0] for _, comment in rows] == [line.split()[0] for line in seen]
+
+
+def test_a_number_of_another_processor_is_never_used() -> None:
+    assert arch.number_of("kcmp") is not None
+    assert arch.number_of("no such call") is None
