@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # the others have the same names
     from checkpoint.arch import x86_64_stub as stubs
     from checkpoint.arch import x86_64_xstate as extended
 
-__all__ = ["SUPPORTED", "cpu", "extended", "levels", "number_of", "require_supported", "stubs"]
+__all__ = ["SUPPORTED", "cpu", "extended", "levels", "number_of", "require_supported", "stubs", "why_unsupported"]
 
 KNOWN: Final = ("x86_64", "aarch64")
 """Those that there are files for, as uname(2) calls them."""
@@ -43,14 +43,24 @@ def number_of(call: str) -> int | None:
     return stubs.SYSTEM_CALLS.get(call, cpu.SYSCALLS.get(call)) if _MACHINE in KNOWN else None
 
 
-def require_supported() -> None:
+def why_unsupported() -> str:
+    """Why programs that nobody prepared cannot be kept on this machine's processor; "": they can."""
+    if _MACHINE in SUPPORTED:
+        return ""
+    return (
+        f"the processor is {_MACHINE}, and only {', '.join(SUPPORTED)} is supported so far: use such a machine, or have the "
+        "program keep its state itself, which works on any (docs/decorator.md)"
+    )
+
+
+def require_supported(what: str) -> None:
     """Check that this machine's processor is one that we have.
+
+    Args:
+        what: was tried, for the message: "capture pid 412".
 
     Raises:
         ProbeError: it is not.
     """
-    if _MACHINE not in SUPPORTED:
-        raise ProbeError(
-            f"cannot capture on {_MACHINE}: only {', '.join(SUPPORTED)} is supported so far; run it on such a machine, or have "
-            "the program keep its state itself, which works on any (docs/decorator.md)"
-        )
+    if reason := why_unsupported():
+        raise ProbeError(f"cannot {what}: {reason}")

@@ -5,6 +5,7 @@ Imported by the keeper alone, and at once: a keeper that waits in advance must n
 
 from __future__ import annotations
 
+from checkpoint.arch import require_supported
 from checkpoint.contents import digest_of_file
 from checkpoint.digests_of_files import DigestOf
 from checkpoint.engine import PTRACE, Copy, ProtectOrder, Report, Restored, RestoreOptions, Session
@@ -22,10 +23,12 @@ class PtraceEngine:
 
     def probe(self, pid: int) -> Report:
         """See ``checkpoint.engine.Engine.probe``."""
+        require_supported(f"look into pid {pid}")
         return probe(pid)
 
     def protect(self, pid: int, order: ProtectOrder) -> Session:
         """See ``checkpoint.engine.Engine.protect``."""
+        require_supported(f"capture pid {pid}")
         return PtraceSession.open(pid, order)
 
     def lacks(self, outline: Snapshot, options: RestoreOptions, digest_of: DigestOf = digest_of_file) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from checkpoint import carried, portable, tree
-from checkpoint.arch import cpu, extended
+from checkpoint.arch import cpu, extended, why_unsupported
 from checkpoint.capability import Area, by_rule, refused
 from checkpoint.contents import DIGEST_SIZE, digest_of_file, path_in
 from checkpoint.digests_of_files import DigestOf
@@ -134,10 +134,12 @@ def require(state: Snapshot, options: RestoreOptions, vessel_pid: int) -> tuple[
 def _compare(state: Snapshot, options: RestoreOptions, digest_of: DigestOf = digest_of_file) -> tuple[tuple[str, ...], Brought]:
     """Everything in which this machine differs from what the snapshot needs, one sentence each; and what was brought for it."""
     architecture = os.uname().machine
-    if state.machine.architecture != architecture or architecture != cpu.NAME:
+    if state.machine.architecture != architecture:
         reason = f"it was taken on {state.machine.architecture}, this machine is {architecture}: restore it on such a machine"
         reason += "; a program that keeps its state itself goes on on either (docs/decorator.md)"
         return (reason,), Brought()
+    if unsupported_here := why_unsupported():
+        return (unsupported_here,), Brought()
     run: dict[str, str] = {}
     opened: dict[str, str] = {}
     of_files = (*_of_files(state, options, run, digest_of), *_of_descriptors(state, options, opened, digest_of))

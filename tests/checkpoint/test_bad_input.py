@@ -10,10 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint import chain, format
-from checkpoint.errors import ChainError, CheckpointError, FormatError
+from checkpoint import arch, chain, format
+from checkpoint.engine import ProtectOrder
+from checkpoint.errors import ChainError, CheckpointError, FormatError, ProbeError
 from checkpoint.model import Resource, Snapshot
-from tests.checkpoint.round_trip import Program, captured_and_killed, ended, restored, start, start_tracee
+from tests.checkpoint.round_trip import ENGINE, Program, captured_and_killed, ended, restored, start, start_tracee
 from tests.conftest import children
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
@@ -40,6 +41,21 @@ def _expect_nothing_started(snapshot: Snapshot, directory: Path, sentence: str) 
 def test_a_foreign_architecture_is_said_so(snapshot: Snapshot, tmp_path: Path, architecture: str) -> None:
     foreign = replace(snapshot, machine=replace(snapshot.machine, architecture=architecture))
     _expect_nothing_started(foreign, tmp_path, f"taken on {architecture}, this machine is x86_64.*keeps its state itself")
+
+
+@pytest.mark.parametrize("machine", ["aarch64", "riscv64"])
+def test_a_processor_that_is_not_supported_is_said_so_before_anything_is_touched(
+    compiled: Callable[..., Path], snapshot: Snapshot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, machine: str
+) -> None:
+    with ended(start_tracee(compiled("heap", "-O2"), tmp_path)) as tracee:
+        monkeypatch.setattr(arch, "SUPPORTED", (machine,))
+        sentence = f"the processor is x86_64, and only {machine} is supported so far.*docs/decorator.md"
+        for act in (lambda: ENGINE.probe(tracee.pid), lambda: ENGINE.protect(tracee.pid, ProtectOrder("/test/tracee"))):
+            with pytest.raises(ProbeError, match=sentence):
+                act()
+        _expect_nothing_started(snapshot, tmp_path, sentence)
+        tracee.tell()
+        assert tracee.finish() == 0
 
 
 def test_a_processor_that_lacks_a_feature_is_said_so(snapshot: Snapshot, tmp_path: Path) -> None:
