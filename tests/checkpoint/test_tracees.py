@@ -68,12 +68,17 @@ MEMORY = [
     *cases("deleted_mapping"),
 ]
 
-REGISTERS = [
+OF_X86 = [
     *cases("registers", told=BY_SIGNAL),
     *cases("avx", told=BY_SIGNAL),
     *cases("avx512", told=BY_SIGNAL),
     *cases("rseq_loop", told=BY_SIGNAL),
     *cases("segments"),
+]
+OF_PROCESSOR = {"aarch64": cases("registers_aarch64", told=BY_SIGNAL)}
+"""What is written in instructions of one processor; `OF_X86` for those that have none of their own."""
+REGISTERS = [
+    *OF_PROCESSOR.get(os.uname().machine, OF_X86),
     *cases("thread_addresses"),
     *cases("tight_loop", "60"),
 ]

@@ -23,7 +23,7 @@ int main(int count, char **arguments) {
     }
     if (__rseq_size) {
         char *area = (char *)__builtin_thread_pointer() + __rseq_offset;
-        EXPECT(syscall(SYS_rseq, area, 32, 0, 0x53053053) == -1 && errno == EBUSY, "rseq is not registered");
+        EXPECT(syscall(SYS_rseq, area, 32, 0, RSEQ_SIG) == -1 && errno == EBUSY, "rseq is not registered");
     }
     return finish();
 }
