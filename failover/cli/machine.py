@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from checkpoint.arch import SUPPORTED
+from checkpoint.arch import why_unsupported
 from checkpoint.channel import Capture, Captured, Protect, Protected, Release, Released
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import vessel
@@ -79,8 +79,8 @@ def _what_is_lacking(component: Mapping[str, Any], lack: str) -> str:
 
 def _architecture() -> Offer:
     machine, kernel = platform.machine(), platform.release()
-    if machine not in SUPPORTED:
-        return Offer("missing", "processor", f"{machine} is not supported yet, only {', '.join(SUPPORTED)}")
+    if reason := why_unsupported():
+        return Offer("missing", "processor", reason)
     return Offer("good", "processor", f"{machine}, Linux {kernel}")
 
 
