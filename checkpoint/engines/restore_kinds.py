@@ -23,6 +23,7 @@ CAPABILITIES: Final = (
         Area.MEMORY,
         "huge pages (MAP_HUGETLB), up to 64 MiB each where they are private",
         "huge pages again where enough are free there; else, and where relatives share them, ordinary ones, and that is noted",
+        "which its processes share, are ordinary ones here",
     ),
     preserved(
         Area.MEMORY,
