@@ -252,7 +252,6 @@ class CapturedProcess:
             return (
                 *of_process,
                 *(reason for reason in of_mappings if reason),
-                *system_v_memory.refuse(look.taken.lines),
                 *of_rings,
             )
         except ProcessGoneError:

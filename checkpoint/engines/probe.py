@@ -74,6 +74,7 @@ def _probe(pid: int, surroundings: Surroundings, files_kept: bool, first: int) -
         *_root_findings(first),
         *_processor_findings(first),
         *_memory_findings(first, opened[first]),
+        *_segments_findings(pid, first, is_guarded=bool(surroundings.pipes)),
         *looked[first].findings,
         *kinds.findings_of_all([held for one in looked.values() for held in one.resources], standing=False),
         *_others_findings(opened, pid, first, looked),
@@ -299,14 +300,26 @@ def _memory_findings(pid: int, opened: Sequence[OpenFile]) -> Iterator[Finding]:
         yield Finding("memory", "written pages", NOTED, "failover follows them already: the program is protected")
     for line, reason in mapped.refused():
         yield Finding("memory", f"VMA {line.start:x}-{line.end:x}", REFUSED, reason)
-    for reason in system_v_memory.refuse(lines):
-        yield Finding("memory", "System V shared memory", REFUSED, reason)
     if any(map(aio_rings.is_ring, lines)):
         yield Finding("memory", "asynchronous I/O", NOTED, aio_rings.NOTE)
         for reason in aio_rings.refuse(opened):
             yield Finding("memory", "asynchronous I/O", REFUSED, reason)
     for path, note in unsupported.note_mappings(line for line in lines if not system_v_memory.is_segment(line)):
         yield Finding("memory", path, NOTED, note)
+
+
+def _segments_findings(pid: int, first: int, *, is_guarded: bool) -> Iterator[Finding]:
+    for reason in lasting(lambda: _segments_refused(_kin(pid, first, is_guarded=is_guarded))):
+        yield Finding("memory", "System V shared memory", REFUSED, reason)
+
+
+def _segments_refused(kin: Iterable[int]) -> tuple[str, ...]:
+    """Why their System V shared memory cannot be kept; one may be born or end in between, so this may not last."""
+    lines: list[MapsLine] = []
+    for pid in kin:
+        with contextlib.suppress(ProcessGoneError):
+            lines += procfs.parse_maps(procfs.read_text(pid, "maps"))
+    return tuple(system_v_memory.refuse(lines, system_v_memory.here(lines)))
 
 
 def _command(pid: int, status: Status) -> str:

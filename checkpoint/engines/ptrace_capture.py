@@ -20,6 +20,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import time
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -38,10 +39,22 @@ from checkpoint.errors import CaptureError, CheckpointError, ProbeError, Process
 from checkpoint.linux import abi, kinship, procfs
 from checkpoint.linux.kinship import Kinship
 from checkpoint.linux.precedence import Precedence
+from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.spokesman import SPOKESMEN_MAX, told_by_spokesman
+from checkpoint.linux.system_v import Segment
 from checkpoint.model import Position, Snapshot
 from checkpoint.pages import PageTable
-from checkpoint.resources import OpenFile, Surroundings, carried_connections, carried_trees, glance, kinds, look, refused_threads
+from checkpoint.resources import (
+    OpenFile,
+    Surroundings,
+    carried_connections,
+    carried_trees,
+    glance,
+    kinds,
+    look,
+    refused_threads,
+    system_v_memory,
+)
 from checkpoint.resources.carried_connections import Departing
 from checkpoint.resources.carried_trees import NO_PARCEL, CarriedTrees, Parcel, Seen
 from checkpoint.stream_counts import Totals
@@ -62,6 +75,7 @@ class Frozen:
         freeze_us: how long the program stood still.
         seen: its carried files.
         departing: its connections, where it may stand still for good.
+        segments: System V shared memory of this machine, where any of them has some attached.
     """
 
     first: Look
@@ -69,6 +83,7 @@ class Frozen:
     freeze_us: int
     seen: Seen = field(default_factory=Seen)
     departing: Departing = carried_connections.NOBODY
+    segments: Mapping[int, Segment] = field(default_factory=dict)
 
 
 class PtraceSession:
@@ -292,6 +307,7 @@ class PtraceSession:
             if others:
                 self._tree.look(others, first, self._surroundings, base=base)
             seen = self._carried.look(self._shared_inodes(first, others)) if self._carried else Seen()
+            segments = system_v_memory.here(_lines_of_all(first, others))  # whoever runs may attach them, and be born
             if hold:
                 self._require_owners_asked(first, others)
             if hold and self._surroundings.connections:
@@ -303,7 +319,7 @@ class PtraceSession:
             self._hold()
         else:
             self._thaw()
-        return Frozen(first, others, (time.perf_counter_ns() - began) // NS_PER_US, seen, self._departing)
+        return Frozen(first, others, (time.perf_counter_ns() - began) // NS_PER_US, seen, self._departing, segments)
 
     def _require_owners_asked(self, first: Look, others: SeenOthers | None) -> None:
         """Whatever has an owner of its signals was asked for it while it stood still.
@@ -326,8 +342,7 @@ class PtraceSession:
     @staticmethod
     def _shared_inodes(first: Look, others: SeenOthers | None) -> set[int]:
         """Of the files that any of them has mapped to be shared."""
-        looks = [first, *(look for _, look in others.looks())] if others else [first]
-        return {line.inode for look in looks for line in look.taken.lines if line.shared}
+        return {line.inode for line in _lines_of_all(first, others) if line.shared}
 
     def _freeze(self) -> int:
         """Stop it, nothing of ours half done inside; answers when that began."""
@@ -380,7 +395,8 @@ class PtraceSession:
         pids = others.pids if others else ()
         every = (*held.resources, *(others.resources() if others else ()))
         of_all = kinds.reasons_of_all(every)
-        self._refuse((*held.reasons, *of_all, *self._first.reasons(first, pids), *of_others, *of_files))
+        of_segments = system_v_memory.refuse(_lines_of_all(first, others), frozen.segments)
+        self._refuse((*held.reasons, *of_all, *self._first.reasons(first, pids), *of_others, *of_segments, *of_files))
         parcel = self._carried.parcel(frozen.seen, parent) if self._carried else NO_PARCEL
         looks = [(self._first, first), *(others.looks() if others else ())]
         taken = joined(looks, is_base=parent is None)
@@ -449,3 +465,10 @@ class PtraceSession:
             copies=pages.copies,
             page_sum=self._table.page_sum,
         )
+
+
+def _lines_of_all(first: Look, others: SeenOthers | None) -> Iterator[MapsLine]:
+    """The mappings of all processes."""
+    yield from first.taken.lines
+    for _, other in others.looks() if others else ():
+        yield from other.taken.lines

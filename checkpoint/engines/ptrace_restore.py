@@ -75,6 +75,7 @@ from checkpoint.resources.carried_connections import Arriving
 from checkpoint.resources.departed import Departed
 from checkpoint.resources.rebuild import deleted_directory, open_here, rebuild_all, rebuild_last
 from checkpoint.resources.rebuilding import number_of
+from checkpoint.resources.system_v_memory import Segments
 
 PTRACE_O_TRACESYSGOOD: Final = 1
 PTRACE_EVENT_EXEC: Final = 4
@@ -186,6 +187,7 @@ class Estate:
         descriptions: open files by their number in the snapshot: a descriptor of each.
         objects: files without a name, by (device, inode): a descriptor of each.
         anonymous: shared memory without a file, by the same: its address.
+        segments: System V shared memory, which whoever comes first makes.
     """
 
     base: int
@@ -193,6 +195,7 @@ class Estate:
     descriptions: Mapping[int, int]
     objects: Mapping[tuple[int, int], int]
     anonymous: Mapping[tuple[int, int], int]
+    segments: Segments = field(default_factory=Segments)
 
 
 def options_for(state: Snapshot) -> int:
@@ -250,7 +253,7 @@ class ProcessRestore:
         self.notes: list[str] = []
         self._objects: dict[tuple[int, int], int] = {}
         self._foreign: tuple[Vma, ...] = ()
-        self._segments = system_v_memory.Segments()
+        self._segments = estate.segments if estate else system_v_memory.Segments()
         self._own_functions: tuple[vdso.Function, ...] = ()
         self._rings: list[Ring | None] = []
         self._ended: tuple[Departed, ...] = ()

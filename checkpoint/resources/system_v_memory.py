@@ -1,5 +1,7 @@
 """System V shared memory (shmget(2), shmat(2)) that a program has to itself: content, key, size, owner, the id where it is free.
 
+Its processes may have it attached together: then each of them tells of it, and it is made once.
+
 Its pages are those of the mappings; what is told here is how to make it. A segment of which a program knows the id but has
 nothing attached cannot be seen, and stays behind.
 
@@ -32,7 +34,8 @@ CAPABILITIES: Final = (
     preserved(
         Area.MEMORY,
         "System V shared memory that is the program's alone",
-        "made again with its content, key, owner and id; another id, where that one is taken, is noted",
+        "made again, once for all of its processes, with its content, key, owner and id; another id, where that one is taken, "
+        "is noted",
     ),
     refused(
         Area.MEMORY,
@@ -79,13 +82,22 @@ def _described(segment: Segment) -> Resource:
     )
 
 
-def refuse(lines: Iterable[MapsLine]) -> Iterator[str]:
-    """Why a segment of a program cannot be kept."""
+def here(lines: Iterable[MapsLine]) -> dict[int, Segment]:
+    """The segments of this machine, where one of them is mapped."""
+    return system_v.segments() if any(map(is_segment, lines)) else {}
+
+
+def refuse(lines: Iterable[MapsLine], known: Mapping[int, Segment]) -> Iterator[str]:
+    """Why a segment of a program cannot be kept.
+
+    Args:
+        lines: the mappings of all of its processes.
+        known: the segments of this machine, of the same instant.
+    """
     found: dict[int, list[MapsLine]] = {}
     for line in lines:
         if is_segment(line):
             found.setdefault(line.inode, []).append(line)
-    known = system_v.segments() if found else {}
     for identifier, pieces in found.items():
         segment, what = known.get(identifier), f"System V shared memory {identifier} is"
         if segment is None:
@@ -139,7 +151,7 @@ def mismatches(held: Resource) -> Iterator[str]:
 
 @dataclass(slots=True)
 class Segments:
-    """The segments of a program, made on this machine.
+    """The segments of a program, made on this machine: once, however many of its processes tell of them.
 
     Attributes:
         ids: there → here.
@@ -152,12 +164,13 @@ class Segments:
     _passing: list[int] = field(default_factory=list)
 
     def make(self, resources: Iterable[Resource]) -> None:
-        """Make them, empty.
+        """Make them, empty; those that were made for another of its processes are there.
 
         Raises:
             RestoreError: one cannot be made.
         """
-        for wanted in (_wanted(held) for held in resources if held.kind == KIND):
+        told = [_wanted(held) for held in resources if held.kind == KIND]
+        for wanted in (one for one in told if one.identifier not in self.ids):
             left = _left_behind(wanted, system_v.segments().values())
             self.ids[wanted.identifier] = self._emptied(left) if left else self._new(wanted)
             if wanted.permissions & SHM_DEST:

@@ -16,6 +16,7 @@ import pytest
 from checkpoint import capabilities
 from checkpoint.capability import Verdict
 from checkpoint.engine import CaptureOrder
+from checkpoint.engines.probe import probe
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import procfs, system_v
 from checkpoint.linux.tracking import is_shared_object
@@ -276,6 +277,76 @@ def test_a_segment_without_a_key_is_the_one_it_was_with_what_it_held(tmp_path: P
                 (tmp_path / "end").touch()
                 assert program.finish() == 0
             assert identifier not in system_v.segments()
+
+
+SEGMENT_OF_RELATIVES = """\
+import ctypes, os, time
+libc = ctypes.CDLL(None, use_errno=True)
+libc.shmat.restype = ctypes.c_void_p
+identifier = libc.shmget(int(os.environ["KEY"]), 16384, 0o1600)
+if os.environ["WHO"] == "both":
+    place = libc.shmat(identifier, None, 0)
+child = os.fork()
+if os.environ["WHO"] == "each":
+    place = libc.shmat(identifier, None, 0)
+assert place != -1
+words = (ctypes.c_uint64 * 2048).from_address(place)
+if child:
+    print(identifier, flush=True)
+    while not words[1024]:
+        time.sleep(0.001)
+    words[0] = 1
+def is_told(name):
+    if os.fork() == 0:  # who is born and ends between two looks has it attached, too
+        os._exit(0)
+    os.wait() if not child else os.waitid(os.P_ALL, 0, os.WEXITED)
+    return os.path.exists(name)
+if not child:
+    words[1024] = 1
+    while not words[0]:
+        time.sleep(0.001)
+    open("ready", "w").close()
+    turns = 0
+    while not is_told("go"):
+        words[1] += 1
+        turns += 1
+        time.sleep(0.005)
+    words[2] = words[1] == turns
+    os._exit(0)
+os.wait()
+print("turned", words[1] > 0, words[2], flush=True)
+assert libc.shmctl(identifier, 0, None) == 0
+"""
+"""Two processes with one segment; the child counts in it, and gives birth, until it is told."""
+
+
+@pytest.mark.parametrize("key", [0, 0x5EED77])
+@pytest.mark.parametrize("who", ["both", "each"])
+def test_relatives_have_one_segment_again(who: str, key: int, tmp_path: Path) -> None:
+    told = {**os.environ, "WHO": who, "KEY": str(key)}
+    program = start([PYTHON, "-c", SEGMENT_OF_RELATIVES], tmp_path, env=told, isolate=True)
+    with contextlib.ExitStack() as after:
+        program.wait_until((tmp_path / "ready").exists, "that both have it")
+        identifier = int(program.output)
+        after.enter_context(segment_removed(identifier))
+        assert not probe(program.pid).reasons
+        for life in range(3):
+            with ended(program), protected(program) as session:
+                taken = [transported(captured_at_last(session, CaptureOrder()))]
+                session.acknowledge(taken[0].position)
+                for sequence in (2, 3):
+                    order = CaptureOrder(base=False, sequence=sequence, hold=sequence == 3)
+                    taken.append(transported(captured_at_last(session, order)))
+                    session.acknowledge(taken[-1].position)
+                program.kill()
+            if life == 1:
+                system_v.remove(identifier)  # as on another robot
+            program = restored(taken, tmp_path)
+        with ended(program):
+            program.tell()
+            assert program.finish() == 0, program.complaints
+            assert program.output.splitlines()[1:] == ["turned True 1"]
+        assert identifier not in system_v.segments()
 
 
 def test_a_segment_that_another_user_has_made_is_not_taken_for_the_one_that_was_left() -> None:
