@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import importlib
 import os
+from collections.abc import Mapping
+from types import ModuleType
 from typing import TYPE_CHECKING, Final
 
 from checkpoint.errors import ProbeError
@@ -31,16 +33,26 @@ SUPPORTED: Final = tuple(name for name in KNOWN if name not in UNPROVED or os.en
 _MACHINE: Final = os.uname().machine
 _HERE: Final = _MACHINE if _MACHINE in KNOWN else KNOWN[0]
 
+_PARTS: Final = {"cpu": "", "stubs": "_stub", "extended": "_xstate", "levels": "_levels"}
+_NUMBERS: Final[Mapping[str, Mapping[str, int]]] = {
+    "x86_64": {"get_robust_list": 274, "ioprio_get": 252, "ioprio_set": 251, "kcmp": 312, "userfaultfd": 323},
+    "aarch64": {"get_robust_list": 100, "ioprio_get": 31, "ioprio_set": 30, "kcmp": 272, "userfaultfd": 282},
+}
+
+
 if not TYPE_CHECKING:
-    cpu = importlib.import_module(f"checkpoint.arch.{_HERE}")
-    stubs = importlib.import_module(f"checkpoint.arch.{_HERE}_stub")
-    extended = importlib.import_module(f"checkpoint.arch.{_HERE}_xstate")
-    levels = importlib.import_module(f"checkpoint.arch.{_HERE}_levels")
+
+    def __getattr__(name: str) -> ModuleType:
+        """This machine's files, read when somebody needs them: a witness never does."""
+        if name not in _PARTS:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        globals()[name] = found = importlib.import_module(f"{__name__}.{_HERE}{_PARTS[name]}")
+        return found
 
 
 def number_of(call: str) -> int | None:
-    """The number of a system call on this machine; None where that is not known."""
-    return stubs.SYSTEM_CALLS.get(call, cpu.SYSCALLS.get(call)) if _MACHINE in KNOWN else None
+    """The number on this machine of one of the calls that we make for ourselves; None where that is not known."""
+    return _NUMBERS.get(_MACHINE, {}).get(call)
 
 
 def why_unsupported() -> str:

@@ -11,6 +11,7 @@ import importlib
 import shutil
 import struct
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -162,6 +163,21 @@ def test_the_machine_code_is_what_stands_beside_it(tmp_path: Path) -> None:
     assert [comment.split(": ")[-1].split()[0] for _, comment in rows] == [line.split()[0] for line in seen]
 
 
-def test_a_number_of_another_processor_is_never_used() -> None:
+@pytest.mark.parametrize("processor", arch.KNOWN)
+def test_numbers_of_our_own_calls_are_those_of_the_processor(processor: str) -> None:
+    cpu, stubs = (importlib.import_module(f"checkpoint.arch.{processor}{PARTS[part]}") for part in ("cpu", "stubs"))
+    for name, number in arch._NUMBERS[processor].items():
+        assert number == stubs.SYSTEM_CALLS.get(name, cpu.SYSCALLS.get(name)), name
+
+
+def test_a_number_that_is_not_known_is_never_made_up(monkeypatch: pytest.MonkeyPatch) -> None:
     assert arch.number_of("kcmp") is not None
     assert arch.number_of("no such call") is None
+    monkeypatch.setattr(arch, "_MACHINE", "riscv64")
+    assert arch.number_of("kcmp") is None
+
+
+def test_who_needs_no_registers_loads_no_processors_file() -> None:
+    told = "import sys, agent.witness; print([name for name in sys.modules if name.startswith('checkpoint.arch.')])"
+    seen = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, check=True, cwd=SOURCES.parent)
+    assert seen.stdout == "[]\n"
