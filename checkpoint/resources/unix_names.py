@@ -8,7 +8,8 @@ leads to something else by now, or that began at a root directory of its own: th
 Facts of unix sockets that are told here: ``path`` of its name, "" if that is no file's; ``mode`` and ``file_owner`` of that file,
 mode -1 if it is gone; ``directory`` in which it was bound by a relative name, "" if it was not, or if that is the program's own;
 ``root``: the root directory from which its whole name leads, "" for the machine's; ``covered`` true where the file is there,
-but a mount hides it (mode -1, too).
+but a mount hides it (mode -1, too), or it was moved to another directory (``away``); ``moved`` true where it has another name
+beside the one that it was bound to (`moved_names`).
 
 Source: unix(7), bind(2).
 """
@@ -30,14 +31,16 @@ from checkpoint.linux import procfs
 from checkpoint.linux.call_table import AT_FDCWD, CallTable
 from checkpoint.linux.unix_sockets import ESTABLISHED, bound_file
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile
+from checkpoint.resources import OpenFile, moved_names
+from checkpoint.resources.moved_names import leads_to
 from checkpoint.resources.rebuilding import number_of
 
 CAPABILITIES: Final = (
     refused(
         Area.SOCKETS,
         "a unix socket whose name a mount hides (not an accepted one), or was given from a directory that was left (../name)",
-        "let the program bind a name that stays",
+        "let the program bind a name that stays, or give its file another one in the same directory only",
+        "than it was bound in",
         "is a unix socket whose name a mount hides",
         "is a unix socket whose name is something else",
         "from a directory that it has left",
@@ -86,14 +89,22 @@ def observe(held: OpenFile, looked: socket.socket, name: bytes) -> dict[str, Fac
             os.close(opened)
     is_there = about is not None and about.st_nlink > 0 and not is_covered
     mode, owner = (about.st_mode, [about.st_uid, about.st_gid]) if about is not None and is_there else (GONE, [])
-    directory = "" if os.path.isabs(told) else os.path.normpath(path).removesuffix(f"/{os.path.normpath(told)}") or "/"
+    began = root if _began_at(root, told, path) and not _leads_to_it(held.pid, told, path, about) else ""
+    is_moved = is_there and opened is not None and moved_names.has_moved(held.pid, told, path, about, began, working)
+    bound = moved_names.beside(path, told) if is_moved else os.path.normpath(path)
+    directory = "" if os.path.isabs(told) else bound.removesuffix(f"/{os.path.normpath(told)}") or "/"
+    is_away = is_moved and not moved_names.lies_beside(held.pid, told, bound, began)
+    if is_away:
+        is_covered, is_moved, mode, owner = True, False, GONE, []
     return {
         "path": path,
         "mode": mode,
         "file_owner": list(owner),
         "directory": "" if directory == working else directory,
-        "root": root if _began_at(root, told, path) and not _leads_to_it(held.pid, told, path, about) else "",
+        "root": began,
         "covered": is_covered,
+        "moved": is_moved,
+        "away": is_away,
     }
 
 
@@ -106,8 +117,10 @@ def _place_of(pid: int, opened: int) -> tuple[str, os.stat_result, bool]:
         path, about = os.readlink(f"/proc/self/fd/{opened}"), os.fstat(opened)
         if not about.st_nlink:
             return path.removesuffix(DELETED), about, False
-        if _leads_to(f"{procfs.outlook(pid)}{path}", about):
+        if leads_to(f"{procfs.outlook(pid)}{path}", about):
             return path, about, False
+        if path.endswith(DELETED) and (other := moved_names.name_beside(procfs.outlook(pid), path, about)):
+            return other, about, False
     return path, about, True
 
 
@@ -118,15 +131,7 @@ def _began_at(root: str, told: str, path: str) -> bool:
 
 def _leads_to_it(pid: int, told: str, path: str, about: os.stat_result | None) -> bool:
     """Whether it leads from the machine's root to its file: it was given before its process got another one."""
-    return told == path or (about is not None and _leads_to(f"{procfs.outlook(pid)}{told}", about))
-
-
-def _leads_to(path: str, about: os.stat_result) -> bool:
-    """Whether a path leads to a certain file."""
-    with contextlib.suppress(OSError):
-        found = os.lstat(path)
-        return (found.st_dev, found.st_ino) == (about.st_dev, about.st_ino)
-    return False
+    return told == path or (about is not None and leads_to(f"{procfs.outlook(pid)}{told}", about))
 
 
 def _socket_at(path: str) -> os.stat_result | None:
@@ -147,6 +152,9 @@ def refuse(held: OpenFile) -> str | None:
     if seen["mode"] == GONE and os.geteuid() and os.path.isabs(told) and _is_something_else(f"{procfs.outlook(held.pid)}{path}"):
         return f"{held.name} is a unix socket whose name is something else by now ({path}): bind another, or protect it as root"
     is_reached_by_name = seen["state"] != ESTABLISHED or seen["type"] == socket.SOCK_DGRAM
+    if seen.get("away") and is_reached_by_name:
+        what = f"{held.name} is a unix socket whose file was moved to another directory"
+        return f"{what} than it was bound in (from {told} to {path}): let the program bind it there"
     if seen.get("covered") and is_reached_by_name:
         return f"{held.name} is a unix socket whose name a mount hides ({path}): let the program bind another one"
     return None
@@ -172,6 +180,12 @@ def mismatches(held: Resource) -> Iterator[str]:
         yield f"the abstract name {_told(name)!r} of the unix socket {held.name} is another process's here: end that first"
     if not path or _is_hidden(held):
         return
+    yield from _not_had(held, path)
+    if moved_names.is_moved(held.facts) and (bound := moved_names.place_of(held.facts, _told(name))) != path:
+        yield from _not_had(held, bound)
+
+
+def _not_had(held: Resource, path: str) -> Iterator[str]:
     if is_ghost(held) and not os.path.isdir(os.path.dirname(path)):
         return  # which is made for the while that it takes
     if not os.path.isdir(os.path.dirname(path)):
@@ -291,8 +305,15 @@ class Naming:
         place = table.place_path(path)
         table.attempt("", "unlinkat", AT_FDCWD, place, 0)
         root = _root_of(one)
+        bound = table.place_path(moved_names.place_of(one.facts, _told(one.facts["name"])))
+        is_moved = moved_names.is_moved(one.facts)
+        if is_moved:
+            table.attempt("", "unlinkat", AT_FDCWD, bound, 0)
         with self._inside(directory), self._below(root):
             self._bind(one, made)
+        if is_moved:
+            table.call(f"give the unix socket its name {path}", "linkat", AT_FDCWD, bound, AT_FDCWD, place, 0)
+            table.call("remove the name that it was bound to", "unlinkat", AT_FDCWD, bound, 0)
         made_file = table.open(path, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC)  # a link may have taken its place meanwhile
         owner = one.facts.get("file_owner")
         if isinstance(owner, list) and owner:
@@ -302,7 +323,7 @@ class Naming:
         again = table.place_path(f"/proc/self/fd/{made_file}")
         table.call(f"set the mode of {path}", "fchmodat", AT_FDCWD, again, number_of(one.facts["mode"]) & 0o7777)
         table.close(made_file)
-        if directory or root:
+        if directory or root or is_moved:
             self._keep(one, path)
 
     def _bind_ghost(self, one: Resource, made: int) -> None:

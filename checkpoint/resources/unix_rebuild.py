@@ -14,7 +14,7 @@ from typing import Final
 from checkpoint.linux.call_table import AT_FDCWD, CallTable
 from checkpoint.linux.unix_sockets import ESTABLISHED, LISTENING
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import sockets
+from checkpoint.resources import moved_names, sockets
 from checkpoint.resources.rebuilding import number_of
 from checkpoint.resources.sockets import Way
 from checkpoint.resources.unix_makers import Disguise
@@ -72,7 +72,7 @@ class Work:
     def run(self) -> dict[int, int]:
         """Make them all."""
         alone = [one for one in self._held.values() if self._stands_alone(one)]
-        for one in sorted(alone, key=is_ghost, reverse=True):
+        for one in sorted(alone, key=lambda one: (is_ghost(one), moved_names.is_moved(one.facts)), reverse=True):
             self._alone(one)
         for inode, one in self._held.items():
             if inode not in self._made and one.facts.get("not_accepted", NOT_WAITING) == NOT_WAITING:

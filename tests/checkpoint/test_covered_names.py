@@ -84,7 +84,7 @@ def test_a_named_pipe_that_is_not_below_the_mount_here_is_named(compiled: Compil
 def test_a_socket_whose_file_goes_away_while_it_is_looked_at_is_below_no_mount(
     act: Callable[[Path], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looks, leads_to = [0], unix_names._leads_to
+    looks, leads_to = [0], unix_names.leads_to
 
     def look(path: str, about: os.stat_result) -> bool:
         if not looks[0]:
@@ -92,7 +92,7 @@ def test_a_socket_whose_file_goes_away_while_it_is_looked_at_is_below_no_mount(
         looks[0] += 1
         return leads_to(path, about)
 
-    monkeypatch.setattr(unix_names, "_leads_to", look)
+    monkeypatch.setattr(unix_names, "leads_to", look)
     with socket.socket(socket.AF_UNIX) as made:
         made.bind(str(tmp_path / "name"))
         seen = unix_names.observe(OpenFile(os.getpid(), ()), made, os.fsencode(made.getsockname()) + b"\0")
