@@ -111,6 +111,7 @@ class TreeRestore:
         self._registers = first.registers()
         estate = self._make_estate(vessel)
         self._instruction = estate.base + stubs.CALL_LOOP.index(cpu.SYSCALL)
+        self._come_to_session()
         self._take_terminal(self._state.process.pid)
         for step in births.steps_of(self._state, kinship.taken_pids(first.pid)):
             self._take(step, estate.base)
@@ -239,6 +240,14 @@ class TreeRestore:
 
     # Births and ends
 
+    def _come_to_session(self) -> None:
+        """Have the first process lead what it led before others are born into it; a vessel may do so from the beginning."""
+        process = self._state.process
+        if process.sid == process.pid:
+            self._try(process.pid, "setsid")
+        elif process.pgid == process.pid:
+            self._try(process.pid, "setpgid", 0, 0)
+
     def _take(self, step: Step, base: int) -> None:
         match step:
             case Birth(parent, pid, exit_signal, flags):
@@ -285,11 +294,13 @@ class TreeRestore:
         self._call(pid, "close a terminal", "close", slave)
 
     def _call(self, pid: int, what: str, name: str, *arguments: int) -> int:
-        number = stubs.SYSTEM_CALLS[name]
-        result = call_table.single_call(self._born[pid], self._registers, self._instruction, number, *arguments)
+        result = self._try(pid, name, *arguments)
         if result < 0:
             raise RestoreError(f"cannot {what}: {os.strerror(-result)}")
         return result
+
+    def _try(self, pid: int, name: str, *arguments: int) -> int:
+        return call_table.single_call(self._born[pid], self._registers, self._instruction, stubs.SYSTEM_CALLS[name], *arguments)
 
     def _exit(self, pid: int, status: int) -> None:
         tracee = self._born[pid]

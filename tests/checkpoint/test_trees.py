@@ -13,14 +13,17 @@ from pathlib import Path
 import pytest
 
 from checkpoint import tree
-from checkpoint.engine import CaptureOrder
+from checkpoint.engine import CaptureOrder, RestoreOptions
 from checkpoint.engines.probe import probe
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import kinship, procfs
+from checkpoint.linux.vessel import Birth, spawn_vessel
 from checkpoint.model import Resource, Snapshot
 from checkpoint.resources import OpenFile, Surroundings, pidfds
 from tests.checkpoint.round_trip import (
+    ENGINE,
     Program,
+    captured,
     captured_at_last,
     ended,
     expect_ok,
@@ -124,6 +127,23 @@ def test_a_shell_loop_with_pipelines_counts_on(tmp_path: Path) -> None:
         program.tell()
         assert program.finish() == 0
         assert program.output == "".join(f"{i + 1}\n" for i in range(program.output.count("\n")))
+
+
+def test_a_family_comes_back_in_its_session_from_a_vessel_that_leads_none(tmp_path: Path) -> None:
+    program = start(["/bin/sh", "-c", "sleep 600 & echo ready; wait"], tmp_path)
+    program.wait_for_line("ready")
+    for _ in range(2):
+        snapshot = captured(program)
+        (child,) = kinship.descendants(program.pid)
+        program.kill()
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)  # it has come to us
+        assert [(one.process.sid, one.process.pgid) for one in snapshot.processes] == [(program.pid, program.pid)] * 2
+        born = spawn_vessel(Birth(inner_pid=program.pid, own_session=False))  # as `failover restore --wait` has it
+        ENGINE.restore(born.pid, snapshot, RestoreOptions()).resume()
+        program = Program(born, tmp_path)
+    program.kill()
+    os.kill(child, signal.SIGKILL)
 
 
 def processor_time(pid: int) -> int:
