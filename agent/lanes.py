@@ -122,7 +122,8 @@ class Lanes(Switchboard):
             self._task(self._keep_what_goes())
         found = await self._find_guards(records)
         await self._mend_logs(found)
-        self._nursery.prepare()
+        if found:
+            self._nursery.begin()
         return Inventory(_held(store), found)
 
     async def stop_work(self) -> None:

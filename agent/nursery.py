@@ -1,6 +1,7 @@
 """Guards and keepers are born here, in advance: a takeover does not wait for an interpreter to start.
 
-As many pairs wait as there are components that this robot may have to take over, up to `SPARES_MAX`, and always one.
+As many pairs wait as there are components that this robot may have to take over, up to `SPARES_MAX`, and always one from the
+first component on: an agent that has nothing to protect has no memory taken by them.
 """
 
 from __future__ import annotations
@@ -82,15 +83,22 @@ class Nursery:
         """
         self._sockets = sockets
         self._starter = starter
-        self._wanted = 1
+        self._wanted = self._least = 0
         self._guards: deque[asyncio.Task[GuardLink]] = deque()
         self._keepers: deque[asyncio.Task[KeeperLink]] = deque()
         self._children: list[subprocess.Popen[bytes]] = []
         self._closed = False
 
+    def begin(self) -> None:
+        """There is a component: have a pair born, both at the same time, for who is given a guard asks for a keeper next."""
+        if not self._least:
+            self._least = 1
+            self._wanted = max(self._wanted, self._least)
+            self._prepare_if_possible()
+
     def expect(self, components: int) -> None:
         """This robot may have to take over so many components."""
-        self._wanted = max(1, min(components, SPARES_MAX))
+        self._wanted = max(self._least, min(components, SPARES_MAX))
         self._prepare_if_possible()
 
     def prepare(self) -> None:
@@ -107,6 +115,7 @@ class Nursery:
         Raises:
             GuardError: it cannot be started.
         """
+        self.begin()
         self._refill()
         while self._guards:
             with contextlib.suppress(GuardError):
@@ -121,6 +130,7 @@ class Nursery:
         Raises:
             KeeperLostError: it cannot be started.
         """
+        self.begin()
         self._refill()
         while self._keepers:
             with contextlib.suppress(KeeperLostError):
