@@ -89,7 +89,8 @@ class ComponentConfig:
         portable: a level of processors that it must be able to go on at, see ``checkpoint.portable``; true for the usual one;
             "" for the agent's own.
         warm: a program that keeps its state itself is started here in advance, where this robot is its standby, and waits.
-        ready_copy: of any other program the newest checkpoint's memory stands ready here, where this robot is its standby.
+        ready_copy: of any other program the newest checkpoint's memory stands ready here, where this robot is its standby and has
+            room for it.
         command: a program that keeps its state itself is started here again by this; () for the command line of `failover run`.
         directory: and in this one, an absolute path; "" for that of `failover run`.
         environment: and with these variables besides, or instead.
@@ -111,7 +112,7 @@ class ComponentConfig:
     freeze_budget_ms: float = 0
     portable: Portable = ""
     warm: bool = True
-    ready_copy: bool = False
+    ready_copy: bool = True
     command: tuple[str, ...] = field(default_factory=tuple)
     directory: str = ""
     environment: dict[str, str] = field(default_factory=dict)

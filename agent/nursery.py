@@ -1,7 +1,7 @@
 """Guards and keepers are born here, in advance: a takeover does not wait for an interpreter to start.
 
-As many pairs wait as there are components that this robot may have to take over, up to `SPARES_MAX`, and always one from the
-first component on: an agent that has nothing to protect has no memory taken by them.
+As many pairs wait as there are components that this robot may have to take over and has no ready copy of (that has its pair), up
+to `SPARES_MAX`, and always one from the first component on: an agent that has nothing to protect has no memory taken by them.
 """
 
 from __future__ import annotations
@@ -83,7 +83,8 @@ class Nursery:
         """
         self._sockets = sockets
         self._starter = starter
-        self._wanted = self._least = 0
+        self._expected = self._least = 0
+        self._relieved: set[str] = set()
         self._guards: deque[asyncio.Task[GuardLink]] = deque()
         self._keepers: deque[asyncio.Task[KeeperLink]] = deque()
         self._children: list[subprocess.Popen[bytes]] = []
@@ -93,13 +94,24 @@ class Nursery:
         """There is a component: have a pair born, both at the same time, for who is given a guard asks for a keeper next."""
         if not self._least:
             self._least = 1
-            self._wanted = max(self._wanted, self._least)
             self._prepare_if_possible()
 
     def expect(self, components: int) -> None:
         """This robot may have to take over so many components."""
-        self._wanted = max(self._least, min(components, SPARES_MAX))
+        self._expected = components
         self._prepare_if_possible()
+
+    def relieve(self, component: str, is_ready: bool) -> None:
+        """A component has a guard and a keeper already, by which it would be taken over, or has them no more."""
+        if is_ready:
+            self._relieved.add(component)
+        elif component in self._relieved:
+            self._relieved.discard(component)
+            self._refill()
+
+    @property
+    def _wanted(self) -> int:
+        return max(self._least, min(self._expected - len(self._relieved), SPARES_MAX))
 
     def prepare(self) -> None:
         """Have as many wait as are wanted."""

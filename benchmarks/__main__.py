@@ -52,7 +52,7 @@ def _restore(quick: bool, directory: Path) -> Findings:
     return Findings(
         "Restore",
         "From the snapshot in memory to the program running: all of it brought back; the takeover: the order to a standby that "
-        "has the memory in a stopped process already (`ready_copy = true`). gcore's files cannot be restored.",
+        "has the memory in a stopped process already (as by default). gcore's files cannot be restored.",
         tuple(sorted([*ours, *theirs], key=lambda figure: int(figure.case.split()[0]))),
         absent,
     )

@@ -26,7 +26,7 @@ OTHERS_CUTS: Final = 20
 
 NAME: Final = "count"
 COMPONENT: Final = "/demo/robot1/count"
-READY: Final = f'[components."{COMPONENT}"]\nready_copy = true\n'
+CHAIN_ALONE: Final = f'[components."{COMPONENT}"]\nready_copy = false\n'
 COUNTING: Final = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.01)\n"
 """Prints every 10 ms."""
 
@@ -62,7 +62,7 @@ class Case:
     quick_cuts: int
 
 
-CASES: Final = (Case("with a ready copy", READY, True, 100, 3), Case("from the checkpoints alone", "", False, 20, 2))
+CASES: Final = (Case("with a ready copy", "", True, 100, 3), Case("from the checkpoints alone", CHAIN_ALONE, False, 20, 2))
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Final
 
-from checkpoint import carried, chain, differences, pages
+from checkpoint import carried, chain, differences, pages, room
 from checkpoint.differences import Rows
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import restore_checks, restore_kinds, restore_memory, restore_process, restore_vdso
@@ -95,11 +95,13 @@ def lay(vessel_pid: int, base: Snapshot, options: RestoreOptions) -> ReadyCopy:
     """Map and fill everything of a base in a vessel, and leave it standing there.
 
     Raises:
-        UnsupportedError: the program can have no ready copy.
+        UnsupportedError: the program can have no ready copy, or this machine has no room for it.
         MismatchError: this machine lacks a file that is mapped.
         RestoreError: it did not work; the caller kills the vessel.
     """
     require_covered(base)
+    if reasons := room.refuse_copy(pages.total_size(pages.extents(base.runs))):
+        raise UnsupportedError(f"{base.component} can have no ready copy here: {'; '.join(reasons)}", reasons)
     copy = ReadyCopy(Tracee(vessel_pid), base, options)
     try:
         copy.lay()

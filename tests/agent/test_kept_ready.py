@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 from agent.figures import Figures
+from agent.nursery import Nursery
 from agent.ready_copy import Ready, ReadyCopy
 
 
@@ -22,9 +24,10 @@ class Slow:
         self.is_undone = True
 
 
-def test_a_copy_that_is_being_ended_is_ended_whole_when_none_is_wanted_any_more() -> None:
+def test_a_copy_that_is_being_ended_is_ended_whole_when_none_is_wanted_any_more(tmp_path: Path) -> None:
     async def story() -> None:
-        copy, component = ReadyCopy("/test/one", cast(Any, SimpleNamespace()), Figures()), Slow()
+        around = SimpleNamespace(places=SimpleNamespace(nursery=Nursery(tmp_path, "")))
+        copy, component = ReadyCopy("/test/one", cast(Any, around), Figures()), Slow()
         copy._ready = Ready(cast(Any, component), cast(Any, None))
         copy._work = copy._task(copy._end("its chain has begun anew"))
         await component.began.wait()

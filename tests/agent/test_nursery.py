@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import psutil
+import pytest
 
+from agent import nursery as nursery_module
 from agent.nursery import Nursery
 
 PATIENCE_S = 60.0
@@ -57,6 +59,20 @@ def test_with_the_first_guard_that_is_given_a_keeper_is_born(tmp_path: Path) -> 
         nursery.expect(0)
         await until({"agent.guard": 2, "keeper": 1})  # one more than the one that was given
         guard.dialogue.close()
+
+    live(tmp_path, story)
+
+
+def test_what_has_a_ready_copy_needs_no_pair_besides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nursery_module, "REFILL_S", 0.0)
+
+    async def story(nursery: Nursery) -> None:
+        for name in ("one", "other"):
+            nursery.relieve(name, True)
+        nursery.expect(3)
+        await until({"agent.guard": 1, "keeper": 1})
+        nursery.relieve("other", False)
+        await until({"agent.guard": 2, "keeper": 2})
 
     live(tmp_path, story)
 

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from checkpoint import channel, format
+from checkpoint import channel, format, room
 from checkpoint.engine import COPY_CLOCKS_AHEAD_NS, CaptureOrder, RestoreOptions, Session
 from checkpoint.engines import ready_copy, restore_memory
 from checkpoint.engines.ready_copy import ReadyCopy
@@ -196,6 +196,23 @@ def test_a_program_with_a_shared_file_can_have_none_and_is_told_why(compiled: Co
         try:
             with pytest.raises(UnsupportedError, match=r"maps .* shared"):
                 ready_copy.lay(born.pid, base, RestoreOptions())
+        finally:
+            discard(born)
+
+
+def test_none_is_laid_that_takes_more_than_half_of_what_is_free(
+    compiled: Compiled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ended(start_tracee(compiled("heap", "-O2"), tmp_path, isolate=True)) as tracee:
+        base = captured(tracee)
+        held = sum(run.size for run in base.runs)
+        born = vessel_for(base, tmp_path)
+        try:
+            monkeypatch.setattr(room, "free", lambda: 2 * held - 1)
+            with pytest.raises(UnsupportedError, match="more than half of the"):
+                ready_copy.lay(born.pid, base, RestoreOptions())
+            monkeypatch.setattr(room, "free", lambda: 2 * held)
+            assert ready_copy.lay(born.pid, base, RestoreOptions()).position == base.position
         finally:
             discard(born)
 

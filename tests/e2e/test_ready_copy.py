@@ -9,7 +9,7 @@ from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_takeover import numbers, start_counting
 
-READY = '[components."/demo/robot1/count"]\nready_copy = true\n'
+CHAIN_ALONE = '[components."/demo/robot1/count"]\nready_copy = false\n'
 
 
 def copy_at(robot: RobotMachine) -> dict[str, Any]:
@@ -31,7 +31,7 @@ def count_goes_on(robot: RobotMachine) -> None:
 
 
 def test_a_takeover_lets_the_ready_copy_go(tmp_path: Path) -> None:
-    with robots.two_robots(tmp_path, READY) as (first, second):
+    with robots.two_robots(tmp_path) as (first, second):
         start_counting(first, 1_000_000)
         shown = until_ready(second)
         assert shown["size"] > 1_000_000, "an interpreter has some megabytes"
@@ -43,8 +43,8 @@ def test_a_takeover_lets_the_ready_copy_go(tmp_path: Path) -> None:
         robots.until(lambda: "taking the ready copy" in robots.failover(second, "why", "count").stdout, "the story to tell of it")
 
 
-def test_without_the_option_the_checkpoints_alone_are_kept_and_a_takeover_uses_them(tmp_path: Path) -> None:
-    with robots.two_robots(tmp_path) as (first, second):
+def test_where_it_is_not_wanted_the_checkpoints_alone_are_kept_and_a_takeover_uses_them(tmp_path: Path) -> None:
+    with robots.two_robots(tmp_path, CHAIN_ALONE) as (first, second):
         start_counting(first, 1_000_000)
         robots.until(lambda: robots.checkpoints(second, "count") >= 5, "checkpoints at robot2")
         assert not copy_at(second)["ready"]
