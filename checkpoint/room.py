@@ -34,9 +34,6 @@ CAPABILITIES: Final = (
 COPIES: Final = 2
 """Of everything, in a keeper that takes a base: as it was read, and in the order of the snapshot."""
 
-COPY_SHARE: Final = 2
-"""What is free must hold a ready copy so many times."""
-
 GB: Final = 10**9
 _KIB: Final = 1024
 _FREE: Final = re.compile(r"^(?:MemAvailable|SwapFree):\s+(\d+) kB$", re.MULTILINE)
@@ -75,14 +72,6 @@ def refuse_capture(pids: Iterable[int]) -> tuple[str, ...]:
         f"its processes hold {told[0]:.1f} GB together, and copying them takes {told[1]:.1f} GB; {told[2]:.1f} GB are free: "
         "start fewer, or give this machine, or the agent's control group, memory or swap",
     )
-
-
-def refuse_copy(size: int) -> tuple[str, ...]:
-    """Why a ready copy of so many bytes is not laid here: what runs here needs room more than what may have to."""
-    room = free()
-    if COPY_SHARE * size <= room:
-        return ()
-    return (f"it holds {size / GB:.2f} GB, more than half of the {room / GB:.2f} GB that this machine has free",)
 
 
 def refuse_restore(state: Snapshot) -> tuple[str, ...]:

@@ -46,6 +46,9 @@ ROOM: Final = 16 << 20
 TIME_NAMESPACE: Final = "/proc/self/ns/time"
 """There is none on a kernel without CONFIG_TIME_NS."""
 
+SHARE: Final = 2
+"""What is free must hold a copy so many times."""
+
 AHEAD_NS: Final = 60_000_000_000
 """How far the clocks of a copy may be ahead of where the program's have got to, before it is laid again: nobody knows how long a
 checkpoint was on its way."""
@@ -91,6 +94,18 @@ def require_covered(state: Snapshot) -> None:
         raise UnsupportedError(f"{state.component} can have no ready copy: {'; '.join(reasons)}", reasons)
 
 
+def require_room(base: Snapshot) -> None:
+    """Refuse a copy that takes more than its share of what is free: what runs here needs room more than what may have to.
+
+    Raises:
+        UnsupportedError: with the reason.
+    """
+    size, free = pages.total_size(pages.extents(base.runs)), room.free()
+    if SHARE * size > free:
+        reason = f"it holds {size / room.GB:.2f} GB, more than half of the {free / room.GB:.2f} GB that this machine has free"
+        raise UnsupportedError(f"{base.component} can have no ready copy here: {reason}", (reason,))
+
+
 def lay(vessel_pid: int, base: Snapshot, options: RestoreOptions) -> ReadyCopy:
     """Map and fill everything of a base in a vessel, and leave it standing there.
 
@@ -100,8 +115,7 @@ def lay(vessel_pid: int, base: Snapshot, options: RestoreOptions) -> ReadyCopy:
         RestoreError: it did not work; the caller kills the vessel.
     """
     require_covered(base)
-    if reasons := room.refuse_copy(pages.total_size(pages.extents(base.runs))):
-        raise UnsupportedError(f"{base.component} can have no ready copy here: {'; '.join(reasons)}", reasons)
+    require_room(base)
     copy = ReadyCopy(Tracee(vessel_pid), base, options)
     try:
         copy.lay()

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from checkpoint.errors import ProbeError, ProcessGoneError
-from checkpoint.linux import abi
+from checkpoint.errors import ProcessGoneError
+from checkpoint.linux import abi, procfs
 from checkpoint.linux.own_calls import FIRST_ARGUMENT, NUMBER, RESULT_TO, ROW_SIZE, OwnCalls, row
 from checkpoint.linux.procfs import READ_SIZE, parse_fields
 from checkpoint.linux.spokesman import pidfd_of
@@ -124,9 +124,8 @@ def descriptor_numbers(pid: int) -> list[int]:
     except (FileNotFoundError, ProcessLookupError) as error:
         raise ProcessGoneError(f"cannot list descriptors: there is no process {pid}") from error
     except PermissionError as error:
-        raise ProbeError(
-            f"cannot list descriptors of pid {pid}: not permitted; run as the same user or with CAP_SYS_PTRACE"
-        ) from error
+        what = f"cannot list descriptors of pid {pid}: not permitted"
+        raise procfs.denied(pid, f"{what}; run as the same user or with CAP_SYS_PTRACE") from error
 
 
 def descriptor(pid: int, number: int) -> Descriptor | None:
@@ -143,9 +142,8 @@ def _opened(pid: int, name: str) -> Iterator[int]:
     except (FileNotFoundError, ProcessLookupError) as error:
         raise ProcessGoneError(f"cannot list descriptors: there is no process {pid}") from error
     except PermissionError as error:
-        raise ProbeError(
-            f"cannot list descriptors of pid {pid}: not permitted; run as the same user or with CAP_SYS_PTRACE"
-        ) from error
+        what = f"cannot list descriptors of pid {pid}: not permitted"
+        raise procfs.denied(pid, f"{what}; run as the same user or with CAP_SYS_PTRACE") from error
     try:
         yield directory
     finally:

@@ -60,9 +60,23 @@ def _explained(pid: int, name: str) -> Iterator[None]:
             raise ProbeError(f"cannot read {path}: this kernel does not offer it") from error
         raise ProcessGoneError(f"cannot read {path}: there is no such process or thread") from error
     except PermissionError as error:
-        raise ProbeError(
-            f"cannot read {path}: not permitted; run as the same user or with CAP_SYS_PTRACE, see systemd/failover-agent.service"
-        ) from error
+        cure = "run as the same user or with CAP_SYS_PTRACE, see systemd/failover-agent.service"
+        raise denied(pid, f"cannot read {path}: not permitted; {cure}") from error
+
+
+def denied(pid: int, sentence: str) -> ProbeError | ProcessGoneError:
+    """Why an ordinary user was not let at what /proc says of a process: it is another's, or has ended, for what is left of it is
+    root's until its parent takes note.
+
+    Args:
+        sentence: what to say of one that lives.
+
+    Source: task_dump_owner() in fs/proc/base.c.
+    """
+    with contextlib.suppress(OSError), open(f"/proc/{pid}/stat", "rb") as file:
+        if file.read().rpartition(b")")[2].split()[:1] in ([b"Z"], [b"X"]):
+            return ProcessGoneError(f"pid {pid} has ended")
+    return ProbeError(sentence)
 
 
 def _read_whole(descriptor: int) -> bytes:
@@ -131,9 +145,8 @@ def read_link(pid: int, name: str) -> str:
     except (FileNotFoundError, ProcessLookupError) as error:
         raise ProcessGoneError(f"cannot read the link /proc/{pid}/{name}: it is not there (any more)") from error
     except PermissionError as error:
-        raise ProbeError(
-            f"cannot read the link /proc/{pid}/{name}: not permitted; run as the same user or with CAP_SYS_PTRACE"
-        ) from error
+        what = f"cannot read the link /proc/{pid}/{name}: not permitted"
+        raise denied(pid, f"{what}; run as the same user or with CAP_SYS_PTRACE") from error
 
 
 def head_of_program(pid: int, size: int) -> bytes:
@@ -149,7 +162,8 @@ def head_of_program(pid: int, size: int) -> bytes:
     except (FileNotFoundError, ProcessLookupError) as error:
         raise ProcessGoneError(f"cannot read the program file of pid {pid}: it has ended, or becomes another program") from error
     except PermissionError as error:
-        raise ProbeError(f"cannot read the program file of pid {pid}: not permitted; run as the same user or as root") from error
+        what = f"cannot read the program file of pid {pid}: not permitted"
+        raise denied(pid, f"{what}; run as the same user or as root") from error
 
 
 def outlook(pid: int) -> str:

@@ -74,9 +74,12 @@ class FlagKind(Kind):
                 raise self.misfit(name, place, f"its members are {', '.join(list(self._cls.__members__)[:8])}")
             bits |= self._cls.__members__[name].value
         try:
-            return self._cls(bits)
+            found = self._cls(bits)
         except ValueError as error:
             raise self.misfit(wire, place, str(error)) from error
+        if 0 <= bits != found.value:  # Python 3.11.2 drops bits that a strict Flag does not know
+            raise self.misfit(wire, place, f"it has no member for some bits of {bits:#x}")
+        return found
 
     def description(self) -> str:
         return f"{self.name}({' | '.join(self._cls.__members__)})"

@@ -192,6 +192,7 @@ def test_a_filter_under_which_rights_could_be_gained_is_roots_alone() -> None:
         check_rights("/lab/r1/mapper", confined(free, [[tid, False, [0]]]), SOMEBODY, None)
 
 
+@as_root
 @pytest.mark.parametrize(("bits", "allowed"), [(0, True), (1 << 4, True), (1 << 2, False), (0b1111, False)])
 def test_securebits_are_roots_alone(bits: int, allowed: bool) -> None:
     outline = running_as(replace(credentials(SOMEBODY), securebits=bits))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pytest
@@ -11,6 +11,9 @@ import pytest
 from checkpoint.engines import probe
 from checkpoint.errors import ProcessGoneError
 from checkpoint.linux import procfs
+from checkpoint.linux.descriptors import descriptor_numbers
+from checkpoint.resources import glance
+from tests.checkpoint.round_trip import as_nobody
 
 
 @contextmanager
@@ -28,6 +31,19 @@ def test_the_program_of_who_has_ended_cannot_be_read() -> None:
     assert procfs.head_of_program(os.getpid(), 5) == b"\x7fELF\x02"
     with zombie() as pid, pytest.raises(ProcessGoneError, match=f"program file of pid {pid}"):
         procfs.head_of_program(pid, 5)
+
+
+@pytest.mark.root
+@pytest.mark.parametrize("look", [lambda pid: procfs.read_bytes(pid, "environ"), descriptor_numbers, glance])
+def test_to_an_ordinary_user_too_who_has_ended_is_gone_and_not_forbidden(look: Callable[[int], object]) -> None:
+    """What is left of it is root's."""
+
+    def story() -> str:
+        with zombie() as pid:
+            look(pid)
+        return "read"
+
+    assert as_nobody(story).startswith("ProcessGoneError: ")
 
 
 def test_who_ends_in_the_middle_of_a_look_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:

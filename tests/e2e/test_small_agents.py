@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from pathlib import Path
 
 from tests.e2e import robots
@@ -13,7 +14,7 @@ def test_a_heart_and_its_lanes_do_without_openssl_and_the_tables_of_names(tmp_pa
     with robots.two_robots(tmp_path) as (first, _):
         parts = {name: mapped_by(first, name) for name in ("agent.main", "agent.lanes")}
         for mapped in parts.values():
-            assert "_blake2" in mapped
+            assert "_blake2" in sys.builtin_module_names or "_blake2" in mapped
             assert not [name for name in ("libcrypto", "libssl", "liblzma", "multiarray") if name in mapped]
         assert "unicodedata" not in parts["agent.main"], "there it is locked"
 
