@@ -167,6 +167,7 @@ class Component:
     reason: str = ""
     spec: ComponentSpec | None = None
     claimed: bool = False
+    begun: bool = False
 
     held: list[Position] = field(default_factory=list)
     autostart: bool = False
@@ -248,6 +249,11 @@ class Component:
         return self.state in HOLDING
 
     @property
+    def has_begun(self) -> bool:
+        """Whether a checkpoint of it is here, or was ever given away, as far as is known."""
+        return self.begun or bool(self.entrusted or self.trusted or self.held)
+
+    @property
     def named(self) -> str:
         """The robot that beats tell of as entrusted."""
         if self.unprotected and self.holding:
@@ -292,6 +298,7 @@ class Component:
             self.reason,
             self.spec,
             self.claimed,
+            self.has_begun,
         )
 
     @classmethod
@@ -309,6 +316,7 @@ class Component:
             record.reason,
             record.spec,
             record.claimed,
+            record.begun,
         )
 
 

@@ -50,7 +50,7 @@ def _chosen(component: Component, turn: Turn, mine: Position | None) -> bool:
     best = max((position for _, entry in entries if (position := entry.position)), default=None)
     if mine is None:
         first = all(_starts_before(component, turn.me, robot) for robot in majority.starters(component, turn))
-        return best is None and first and may_start_afresh(component)
+        return best is None and first and may_start_afresh(component, turn)
     if best is not None and mine < best:
         return False
     return component.primary == turn.me if component.waits else first_of_equals(component, turn, entries, mine)

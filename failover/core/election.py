@@ -15,6 +15,7 @@ from checkpoint.model import Position
 from failover.core import acts, lease
 from failover.core.component import LOST_MAX, Cause, Component, Turn
 from failover.core.consent import grants, state_of
+from failover.core.membership import Peer
 from failover.core.messages import HOLDS, UNPROTECTED, Entry
 from failover.core.names import Weight, weight
 from failover.core.types import ENDED, HOLDING, MS, PEERS_MAX, Resumption, State
@@ -42,7 +43,7 @@ def consider(component: Component, turn: Turn) -> None:
     if component.waits and component.held:
         chosen = component.primary == turn.me and mine is not None and (best is None or best <= mine)
     elif mine is None:
-        chosen = best is None and may_start_afresh(component)
+        chosen = best is None and may_start_afresh(component, turn)
     else:
         chosen = best is None or best < mine or (best == mine and first_of_equals(component, turn, entries, mine))
     if chosen and _may_go_on(component, turn):
@@ -77,6 +78,7 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     """Open a new epoch as its primary-to-be. The ballot holds it before anybody hears of it."""
     component.alone_right = not component.freezes or _right_to_act_alone(component, turn)
     component.claimed = not component.alone_right
+    component.begun = component.has_begun
     component.move(Cause.CLAIM)
     component.epoch = max(component.epoch, component.seen) + 1
     component.resumption = _resumption(component, turn, is_planned=is_planned)
@@ -121,6 +123,7 @@ def begin(component: Component, turn: Turn) -> None:
     lease_ns = lease.first_ns(component, turn)
     if component.plan is None:
         assert component.spec is not None, f"{component.name}: claimed without knowing what to start"
+        component.begun = False
         component.move(Cause.START)
         turn.order(acts.Start(component.name, component.epoch, component.spec, lease_ns, generation_of(component, turn)))
     else:
@@ -190,10 +193,24 @@ def living_entries(component: Component, turn: Turn) -> list[tuple[str, Entry]]:
     return [(robot, entry) for robot, entry in found if entry is not None]
 
 
-def may_start_afresh(component: Component) -> bool:
-    """Configured to run, and no checkpoint of it was ever given away or is here, perhaps one that cannot be used just now."""
-    is_new = not (component.entrusted or component.trusted or component.held)
+def may_start_afresh(component: Component, turn: Turn) -> bool:
+    """Configured to run, and no checkpoint of it was ever given away or is here, perhaps one that cannot be used just now.
+
+    What was known before a claim of our own in vain, or while a disk was there that was lost since, still counts; but where
+    everybody is back and has none, all of them are lost.
+    """
+    is_new = not component.has_begun or _is_nowhere(component, turn)
     return component.autostart and component.spec is not None and is_new
+
+
+def _is_nowhere(component: Component, turn: Turn) -> bool:
+    """Whether every member of the team is heard, and none has a checkpoint of it."""
+    return not component.held and all(_has_none(component, turn, robot, peer) for robot, peer in turn.team.peers.items())
+
+
+def _has_none(component: Component, turn: Turn, robot: str, peer: Peer) -> bool:
+    entry = peer.entry(component.name)
+    return turn.alive(robot) and (peer.complete if entry is None else entry.position is None)
 
 
 def first_of_equals(component: Component, turn: Turn, entries: list[tuple[str, Entry]], mine: Position) -> bool:
@@ -286,6 +303,7 @@ def _may_switch(component: Component, turn: Turn, sender: str, entry: Entry) -> 
 
 
 def accept(component: Component, turn: Turn, primary: str, epoch: int) -> None:
+    component.begun = component.has_begun
     component.epoch, component.primary = epoch, primary
     component.entrusted, component.trusted = (), False
     component.ordered = component.claimed = False
@@ -376,6 +394,7 @@ def admit(component: Component, turn: Turn, sender: str, epoch: int | None = Non
 
 def drop(component: Component, turn: Turn, why: str) -> None:
     """Forget the checkpoints that this robot keeps."""
+    component.begun = False
     if not component.held:
         return
     component.held.clear()

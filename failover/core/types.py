@@ -353,6 +353,7 @@ class Record:
         status: exit status (waitpid's) of a finished component.
         reason: why it failed.
         claimed: this robot's claim of ``epoch`` needs consent that it did not have yet.
+        begun: there is a checkpoint of it, or there was one when this robot heard last: it is not to begin anew.
     """
 
     name: str
@@ -366,6 +367,7 @@ class Record:
     reason: str = ""
     spec: ComponentSpec | None = None
     claimed: bool = False
+    begun: bool = False
 
 
 @dataclass(frozen=True, slots=True)

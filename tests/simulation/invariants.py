@@ -66,6 +66,7 @@ class Invariants:
                 self._acknowledged(world, robot, what)
             case acts.Start():
                 self._one_primary(world, robot, what)
+                self._nothing_is_held(world, robot, what)
             case acts.Restore():
                 self._one_primary(world, robot, what)
                 self._not_older(world, robot, what)
@@ -144,6 +145,20 @@ class Invariants:
         if elsewhere:
             before = self.acknowledged.get(act.component)
             self.acknowledged[act.component] = act.position if before is None else max(before, act.position)
+
+    def _is_held(self, world: World, component: str, position: Position) -> bool:
+        """Whether any disk still has as much as that."""
+        values = [world.values[one] for other in world.robots.values() for one in other.store.get(component, [])]
+        return max(values, default=-1) >= world.values[position]
+
+    def _nothing_is_held(self, world: World, robot: str, act: acts.Start) -> None:
+        """Who begins anew loses nothing that was acknowledged, but what was lost with its disks."""
+        safe_from = self.acknowledged.get(act.component)
+        if safe_from is None or (act.component, act.epoch) in self.ordered or act.component in self.split:
+            return
+        if self._is_held(world, act.component, safe_from):
+            raise _broken(world, f"{robot} begins {act.component} anew, of which {safe_from} was acknowledged")
+        del self.acknowledged[act.component]
 
     def _not_older(self, world: World, robot: str, act: acts.Restore) -> None:
         if act.component in self.last:

@@ -391,7 +391,7 @@ NEAR: dict[str, int] = {
     "double_voting": 22,
     "no_margin": 435,
     "disloyal_voter": 19,
-    "anybody_may_have_it": 29,
+    "anybody_may_have_it": 132,
     "named_in_advance": 132,
     "best_lease_counts": 19,
     "lease_from_strangers": 52,

@@ -35,6 +35,17 @@ def after(world: World, pause_ns: int) -> None:
     world.run(world.now_ns + pause_ns)
 
 
+def until_the_server_has_all(world: World) -> None:
+    """Until no robot has a newer checkpoint of either."""
+    while any(newest(world, "server1", name) < newest(world, robot, name) for robot in ("robot1", "robot2") for name in (A, B)):
+        after(world, MS)
+
+
+def newest(world: World, robot: str, component: str) -> int:
+    """What its newest checkpoint counts."""
+    return world.values[world.robots[robot].store[component][-1]]
+
+
 def acting(world: World) -> dict[str, list[str]]:
     return {name: world.acting(name) for name in (A, B)}
 
@@ -85,6 +96,7 @@ def test_two_that_choose_safety_and_are_cut_from_each_other_stand_still_and_exch
 
 def test_both_are_dead_one_is_back_with_a_new_disk_and_the_server_returns_both_components() -> None:
     world = neighbours(servers=1)
+    until_the_server_has_all(world)  # what the robot that stays away has besides would be lost
     kept = {name: world.values[world.robots["server1"].store[name][-1]] for name in (A, B)}
     world.power_off("robot2")
     world.power_off("robot1")

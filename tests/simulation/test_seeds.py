@@ -6,6 +6,7 @@ import os
 
 import pytest
 
+from tests.simulation.__main__ import FAULTS_A_LIFE
 from tests.simulation.chaos import TEAMS, life
 from tests.simulation.invariants import Broken
 from tests.simulation.mutants import ELECTIVE_MUTANTS, MUTANTS, NEAR, Mutant, mistaken
@@ -15,6 +16,8 @@ BLOCK = 50
 """Seeds a test, so that a failure names a narrow range and the story names the seed."""
 
 SEEDS_TO_CATCH = 450
+ONCE_BROKEN = (98, 368)
+"""A robot whose store was lost after a claim in vain began a program anew, of which another one that was just away had all."""
 
 PAIR = TEAMS[0]
 VOTERS = tuple(team for team in TEAMS if team != PAIR)
@@ -27,6 +30,11 @@ def test_every_promise_holds_whatever_goes_wrong(first: int) -> None:
             life(seed)
         except Broken as story:
             raise Broken(f"seed {seed} (again: python -m tests.simulation --first {seed} --seeds 1): {story}") from None
+
+
+@pytest.mark.parametrize("seed", ONCE_BROKEN)
+def test_a_long_life_that_broke_a_promise_once_keeps_it_now(seed: int) -> None:
+    life(seed, faults=FAULTS_A_LIFE)
 
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.__name__)
