@@ -30,6 +30,8 @@ CAPABILITIES: Final = (
 
 _MAPPED: Final = re.compile(rb"^\S+ ...s \S+ (\S+ [1-9]\d*) +(/dev/shm/.*|.* \(deleted\))$", re.MULTILINE)
 """Device and inode number, and the name."""
+FOREBEARS: Final = 8
+"""Of a process that are looked at: who is born while a component is looked at has few."""
 _ANONYMOUS: Final = b"/dev/zero (deleted)"
 
 
@@ -42,12 +44,24 @@ def refuse(pid: int, kin: Collection[int] = ()) -> Iterator[str]:
     asker = min(kin, default=pid)
     for key, name in dict(_objects(pid)).items():
         mappers = _mappers(asker, time.monotonic_ns() // 1_000_000_000).get(key, ())
-        others = [other for other in mappers if other != pid and other not in kin]
+        others = [other for other in mappers if other != pid and other not in kin and not _belongs(other, {pid, *kin})]
         if others:
             yield (
                 f"the shared memory {os.fsdecode(name)} is mapped by pid {others[0]} too, which stays behind: protect the "
                 "program when that has ended"
             )
+
+
+def _belongs(other: int, kin: Collection[int]) -> bool:
+    """Whether a process was born of these since they were looked at, or has ended since."""
+    try:
+        for _ in range(FOREBEARS):
+            if other in kin:
+                return True
+            other = procfs.stat(other).ppid
+    except ProcessGoneError:
+        return True
+    return False
 
 
 def _objects(pid: int) -> Iterator[tuple[bytes, bytes]]:

@@ -53,6 +53,8 @@ def _why_not_run(component: Component, turn: Turn) -> str:
         return f"cannot run {name}: {turn.me} runs nothing; ask at a robot"
     heard, voters = 1 + len(turn.team.living(turn.now_ns)), len(turn.config.peers) + 1
     if turn.config.by_majority and (heard < turn.config.quorum or not majority.is_free(component, turn)):
+        if heard >= turn.config.quorum and not turn.team.rested(turn.now_ns):
+            return f"cannot run {name}: {turn.me} has just started and may be bound by what it said before; ask again in a moment"
         return (
             f"cannot run {name}: of {voters} that vote {turn.me} hears {heard} and needs {turn.config.quorum}; start the others"
         )
