@@ -54,13 +54,14 @@ def refuse(pid: int, kin: Collection[int] = ()) -> Iterator[str]:
 
 def _belongs(other: int, kin: Collection[int]) -> bool:
     """Whether a process was born of these since they were looked at, or has ended since."""
+    forebear, is_there = other, False
     try:
         for _ in range(FOREBEARS):
-            if other in kin:
+            if forebear in kin:
                 return True
-            other = procfs.stat(other).ppid
+            forebear, is_there = procfs.stat(forebear).ppid, True
     except ProcessGoneError:
-        return True
+        return not is_there  # else it is a forebear that has ended, or there is none
     return False
 
 
