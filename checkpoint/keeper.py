@@ -27,6 +27,7 @@ from checkpoint.engine import CaptureOrder, Copy, Engine, ProtectOrder, Restored
 from checkpoint.errors import CaptureError, CheckpointError, FormatError, RestoreError, StoreError
 from checkpoint.hot_pages import Sender
 from checkpoint.linux.address import address_of
+from checkpoint.linux.waking import waking
 from checkpoint.model import Position, Snapshot
 from checkpoint.needs import names_of_contents, needs
 
@@ -77,8 +78,10 @@ class Keeper:
     def serve(self) -> None:
         """Answer until the peer hangs up; then let go."""
         try:
-            while True:
-                self._serve_one()
+            with waking() as await_readable:  # who is held and killed meanwhile waits for us
+                while True:
+                    await_readable(self._link.fileno())
+                    self._serve_one()
         except ChannelClosedError:
             pass
         finally:
