@@ -28,8 +28,9 @@ from checkpoint.gathering import Copy
 from checkpoint.linux import abi, digests, pagetables, tracking
 from checkpoint.linux.digests import SharedPages
 from checkpoint.linux.guards import Guards
+from checkpoint.linux.maps_reader import MapsReader
 from checkpoint.linux.memory import Memory
-from checkpoint.linux.procfs import MapsLine, MapsReader
+from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.remote import BorrowedPages
 from checkpoint.linux.tracking import NONE, Scan, Tracker
 from checkpoint.model import Position
@@ -139,6 +140,7 @@ class MemoryCapture:
 
     def close(self) -> None:
         """Stop following; the process is not changed."""
+        self._maps.close()
         self._tracker.close()
         self._shared.close()
         self._page_tables.close()
@@ -249,7 +251,8 @@ class MemoryCapture:
 
     def take(self, copied: RunningCopy, *, base: bool) -> Taken:
         """Copy what is not copied yet, or not any more. The program stands still."""
-        self.refresh()
+        if self._maps.refresh_if_moved():
+            self._sort()
         scan = self._scan()
         self._guards.named(scan)
         self._unacknowledged.append(Unacknowledged(None, scan.written, scan.cleared))
@@ -309,8 +312,11 @@ class MemoryCapture:
 
     def refresh(self) -> None:
         """Read and sort the mappings; that they have changed is kept until the tracker has been told."""
-        if not self._maps.refresh():
-            return
+        if self._maps.refresh():
+            self._sort()
+        self._maps.prepare()
+
+    def _sort(self) -> None:
         self._has_moved = True
         self.lines = tuple(line for line in self._maps.lines if not self.borrowed.holds(line.start))
         self._private = [line for line in self.lines if tracking.is_private(line)]

@@ -246,28 +246,6 @@ def parse_maps(text: str) -> tuple[MapsLine, ...]:
     return tuple(map(parse_maps_line, text.splitlines()))
 
 
-class MapsReader:
-    """Reads one process's maps again and again; lines that did not change are not parsed again."""
-
-    def __init__(self, pid: int) -> None:
-        self._pid = pid
-        self._text = b""
-        self._lines: dict[bytes, MapsLine] = {}
-        self.lines: tuple[MapsLine, ...] = ()
-
-    def refresh(self) -> bool:
-        """Read the maps; answers whether anything changed. ``lines`` then holds what is there."""
-        text = read_bytes(self._pid, "maps")
-        if text == self._text:
-            return False
-        known = self._lines
-        fresh = {}
-        for line in text.splitlines():
-            fresh[line] = known.get(line) or parse_maps_line(os.fsdecode(line))
-        self._text, self._lines, self.lines = text, fresh, tuple(fresh.values())
-        return True
-
-
 # The process
 
 

@@ -20,9 +20,10 @@ from checkpoint import pages
 from checkpoint.linux import abi, dirty, write_protection
 from checkpoint.linux.digests import DigestTracker
 from checkpoint.linux.dirty import SoftDirtyTracker
+from checkpoint.linux.maps_reader import MapsReader
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.pagetables import PageScanner
-from checkpoint.linux.procfs import MapsLine, MapsReader
+from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.tracking import NONE, Scan, Tracker, extents_of
 from checkpoint.linux.write_protection import PagemapTracker
 
