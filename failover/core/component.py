@@ -168,6 +168,7 @@ class Component:
     spec: ComponentSpec | None = None
     claimed: bool = False
     begun: bool = False
+    bare: bool = False
 
     held: list[Position] = field(default_factory=list)
     autostart: bool = False
@@ -299,6 +300,7 @@ class Component:
             self.spec,
             self.claimed,
             self.has_begun,
+            self.bare,
         )
 
     @classmethod
@@ -317,6 +319,7 @@ class Component:
             record.spec,
             record.claimed,
             record.begun,
+            record.bare,
         )
 
 

@@ -78,7 +78,7 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     """Open a new epoch as its primary-to-be. The ballot holds it before anybody hears of it."""
     component.alone_right = not component.freezes or _right_to_act_alone(component, turn)
     component.claimed = not component.alone_right
-    component.begun = component.has_begun
+    component.begun, component.bare = component.has_begun, False
     component.move(Cause.CLAIM)
     component.epoch = max(component.epoch, component.seen) + 1
     component.resumption = _resumption(component, turn, is_planned=is_planned)
@@ -303,7 +303,7 @@ def _may_switch(component: Component, turn: Turn, sender: str, entry: Entry) -> 
 
 
 def accept(component: Component, turn: Turn, primary: str, epoch: int) -> None:
-    component.begun = component.has_begun
+    component.begun, component.bare = component.has_begun, False
     component.epoch, component.primary = epoch, primary
     component.entrusted, component.trusted = (), False
     component.ordered = component.claimed = False

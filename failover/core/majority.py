@@ -122,14 +122,15 @@ def starters(component: Component, turn: Turn) -> Iterator[str]:
             yield peer.robot
 
 
-def _sure(component: Component) -> tuple[str, ...]:
-    """The robots that hold what was acknowledged: the primary and whom it has entrusted."""
-    return tuple(robot for robot in (component.primary, *component.entrusted) if robot)
+def _sure(component: Component, turn: Turn) -> tuple[str, ...]:
+    """The robots that hold what was acknowledged: the primary and whom it has entrusted; this one not, if it has lost it."""
+    lost = turn.me if component.bare else ""
+    return tuple(robot for robot in (component.primary, *component.entrusted) if robot not in ("", lost))
 
 
 def holds_all(component: Component, turn: Turn, robot: str, position: Position | None) -> bool:
     """Whether a robot is one of those, or has at least what one of them has."""
-    return _covers(component, turn, _sure(component), robot, position)
+    return _covers(component, turn, _sure(component, turn), robot, position)
 
 
 def _covers(component: Component, turn: Turn, sure: tuple[str, ...], robot: str, position: Position | None) -> bool:
@@ -150,7 +151,7 @@ def _position_at(component: Component, turn: Turn, robot: str) -> Position | Non
 
 def _all_gone(component: Component, turn: Turn) -> bool:
     """Whether those who hold what was acknowledged were waited for long enough, or are back without it."""
-    return all(_lost(component, turn, robot) for robot in _sure(component))
+    return all(_lost(component, turn, robot) for robot in _sure(component, turn))
 
 
 def _lost(component: Component, turn: Turn, robot: str) -> bool:

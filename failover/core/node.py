@@ -192,6 +192,8 @@ class Node:
             elif found is not None and component.state not in ENDED:
                 component.state = State.STOPPING
                 turn.order(acts.Stop(component.name, component.epoch))
+            if found is None and not component.held and turn.me in (component.primary, *component.entrusted):
+                component.bare = component.has_begun
         for stray in self._found.values():
             turn.order(acts.Stop(stray.component, stray.epoch))
         self._found.clear()

@@ -256,6 +256,7 @@ def stored(component: Component, turn: Turn, event: Stored) -> None:
         return
     supersede(component, turn, event.position)
     component.hold(event.position)
+    component.bare &= event.sender != component.primary
     component.spec, component.keeps_state, component.stored_ns = event.spec, event.keeps_state, turn.now_ns
     component.needs_base, component.unable, component.tries, component.unstored = False, "", 0, ""
     if event.position.sequence % HISTORY_MAX == 0:

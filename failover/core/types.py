@@ -354,6 +354,7 @@ class Record:
         reason: why it failed.
         claimed: this robot's claim of ``epoch`` needs consent that it did not have yet.
         begun: there is a checkpoint of it, or there was one when this robot heard last: it is not to begin anew.
+        bare: this robot was among those who held what was acknowledged, and has lost its checkpoints: others hold it.
     """
 
     name: str
@@ -368,6 +369,7 @@ class Record:
     spec: ComponentSpec | None = None
     claimed: bool = False
     begun: bool = False
+    bare: bool = False
 
 
 @dataclass(frozen=True, slots=True)

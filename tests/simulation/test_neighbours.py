@@ -106,3 +106,23 @@ def test_both_are_dead_one_is_back_with_a_new_disk_and_the_server_returns_both_c
     after(world, RETURN_NS)
     assert acting(world) == {A: ["robot2"], B: ["robot2"]}
     assert all(world.robots["robot2"].programs[name].value >= kept[name] for name in (A, B))
+
+
+def test_a_robot_that_lost_its_store_waits_for_the_standby_before_it_goes_on_from_what_the_server_has() -> None:
+    world = neighbours(servers=1)
+    until_the_server_has_all(world)
+    world.network.cuts = {way for one in ("robot1", "robot2") for way in (("server1", one), (one, "server1"))}
+    after(world, ABSENCE_NS)
+    kept = newest(world, "robot2", A)
+    assert newest(world, "server1", A) < kept
+    world.power_off("robot2")
+    world.power_off("robot1")
+    world.new_disk("robot1", ballot=False)
+    world.network.cuts.clear()
+    world.power_on("robot1")
+    after(world, 700 * MS)
+    assert acting(world) == {A: [], B: []}
+    world.power_on("robot2")
+    after(world, RETURN_NS)
+    assert acting(world) == AT_HOME
+    assert world.robots["robot1"].programs[A].value >= kept
