@@ -253,7 +253,7 @@ class MemoryCapture:
         """Copy what is not copied yet, or not any more. The program stands still."""
         if self._maps.refresh_if_moved():
             self._sort()
-        scan = self._scan()
+        scan = self._scan(everywhere=base)
         self._guards.named(scan)
         self._unacknowledged.append(Unacknowledged(None, scan.written, scan.cleared))
         try:
@@ -263,6 +263,10 @@ class MemoryCapture:
         except CaptureError:  # a page that has become a guard cannot be read
             guards = self._guards.found_everywhere(self._mapped, self._tracker.watched)
             return self._taken(copied, scan, guards, base=base)
+
+    def confirm(self) -> bool:
+        """Whether the last look took everything; see `Tracker.confirm`."""
+        return self._tracker.confirm()
 
     def _taken(self, copied: RunningCopy, scan: Scan, guards: Words, *, base: bool) -> Taken:
         owed = pages.intersection(pages.difference(copied.owed, scan.cleared), self._mapped)
@@ -327,10 +331,10 @@ class MemoryCapture:
         self._mapped = tracking.extents_of([line for line in self.lines if line.name not in tracking.NOT_CARRIED])
         self._vdso = tracking.extents_of([line for line in self.lines if line.name == VDSO])
 
-    def _scan(self) -> Scan:
+    def _scan(self, *, everywhere: bool) -> Scan:
         """What was written since the last scan. One that fails half-way has protected pages that it tells nobody of."""
         try:
-            scan = self._tracker.scan(self._private, changed=self._has_moved)
+            scan = self._tracker.scan(self._private, changed=self._has_moved, everywhere=everywhere)
         except CaptureError:
             self.start_over()
             raise

@@ -257,7 +257,7 @@ class PtraceSession:
                 self._tree.copy_running(base=base, enough=enough)
                 frozen = self._frozen_look(copied, base=base, hold=order.hold)
                 if not order.hold:
-                    self._require_owners_asked(frozen.first, frozen.others)
+                    self._require_whole(frozen.first, frozen.others)
                 if frozen.others:
                     frozen.others.describe()
                 return frozen
@@ -309,7 +309,7 @@ class PtraceSession:
             seen = self._carried.look(self._shared_inodes(first, others)) if self._carried else Seen()
             segments = system_v_memory.here(_lines_of_all(first, others))  # whoever runs may attach them, and be born
             if hold:
-                self._require_owners_asked(first, others)
+                self._require_whole(first, others)
             if hold and self._surroundings.connections:
                 self._departing = carried_connections.depart(self._opened(first, others))
         except BaseException:
@@ -321,13 +321,17 @@ class PtraceSession:
             self._thaw()
         return Frozen(first, others, (time.perf_counter_ns() - began) // NS_PER_US, seen, self._departing, segments)
 
-    def _require_owners_asked(self, first: Look, others: SeenOthers | None) -> None:
-        """Whatever has an owner of its signals was asked for it while it stood still.
+    def _require_whole(self, first: Look, others: SeenOthers | None) -> None:
+        """Nothing was left out that must be asked while it stands still; the first thing to be done when it runs again.
 
         Raises:
-            MovedError: one was not: it is known now.
+            MovedError: something was: it is known now.
         """
         for process, seen in ((self._first, first), *(others.looks() if others else ())):
+            if not process.memory.confirm():
+                raise MovedError(
+                    f"pid {process.pid} gave up pages that it had written in the mapping of a file; capture it again"
+                )
             if held := process.onlooker.overlooked(seen.standing.opened):
                 raise MovedError(
                     f"{held.name} of pid {process.pid} was given an owner of its signals (F_SETOWN); capture it again"

@@ -45,13 +45,17 @@ class DigestTracker:
         """See `Tracker.arm`: nothing is known, so that the first scan finds everything."""
         self._known = PageMap.empty()
 
-    def scan(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
+    def scan(self, lines: Sequence[MapsLine], *, changed: bool, everywhere: bool = False) -> Scan:
         """See `Tracker.scan`."""
         existing = self.existing(lines)
         addresses = pages.addresses_of(existing, abi.PAGE_SIZE)
         digests = digests_of(self._memory, existing)
         before, self._known = self._known, PageMap(addresses, digests)
         return compared(before, self._known)
+
+    def confirm(self) -> bool:
+        """See `Tracker.confirm`."""
+        return True
 
     def backlog(self, lines: Sequence[MapsLine], limit: int, *, changed: bool) -> int:
         """See `Tracker.backlog`."""

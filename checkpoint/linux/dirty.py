@@ -47,7 +47,7 @@ class SoftDirtyTracker:
         self._clear()
         self._existed = self.existing(lines)
 
-    def scan(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
+    def scan(self, lines: Sequence[MapsLine], *, changed: bool, everywhere: bool = False) -> Scan:
         """See `Tracker.scan`."""
         existing = self.existing(lines)
         dirty = self._pagemap.soft_dirty(extents_of(lines))
@@ -56,6 +56,10 @@ class SoftDirtyTracker:
         self._existed = existing
         self._clear()
         return Scan(pages.union(pages.intersection(dirty, existing), fresh), gone)
+
+    def confirm(self) -> bool:
+        """See `Tracker.confirm`."""
+        return True
 
     def backlog(self, lines: Sequence[MapsLine], limit: int, *, changed: bool) -> int:
         """See `Tracker.backlog`."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +72,20 @@ class _Orders:
             self._calls.run(first, last)
         else:
             self._loop(self._calls.address + first * ROW_SIZE, self._calls.address + last * ROW_SIZE)
+
+
+class Private(NamedTuple):
+    """A process's own pages: neither holes nor unchanged ones of a file.
+
+    Attributes:
+        present: in memory.
+        swapped: they have an entry and are not in memory: swapped out, on the move, or no page at all, only a protected hole.
+        written: those of both that were written since they were last protected, or never were.
+    """
+
+    present: Words
+    swapped: Words
+    written: Words
 
 
 class PageScanner:
@@ -167,13 +181,24 @@ class PageScanner:
             own: leave out unchanged pages of files and the shared page of zeros.
         """
         unwanted = (abi.PAGE_IS_FILE | abi.PAGE_IS_PFNZERO if own else abi.PAGE_IS_PFNZERO) | self._guard
-        wanted = abi.PAGE_IS_PRESENT | abi.PAGE_IS_SWAPPED
-        self._orders.want(0, unwanted, wanted, inverted=unwanted, anyof=wanted)
-        found = self._collect(ranges)
+        found = self._there(ranges, unwanted)
         marker = (found[:, 2] & np.uint64(abi.PAGE_IS_PRESENT) == 0) & (found[:, 1] - found[:, 0] >= MARKER_RUN)
         if marker.any() and not procfs.swapped_size(self._pid):
             found = found[~marker]
         return pages_joined(found[:, :2])
+
+    def private(self, ranges: Words) -> Private:
+        """The process's own pages. Of those that are swapped out some may be nothing but what marks a hole as protected."""
+        found = self._there(ranges, abi.PAGE_IS_FILE | abi.PAGE_IS_PFNZERO | self._guard, abi.PAGE_IS_WRITTEN)
+        present, written = (found[:, 2] & np.uint64(one) != 0 for one in (abi.PAGE_IS_PRESENT, abi.PAGE_IS_WRITTEN))
+        extents = found[:, :2]
+        return Private(pages_joined(extents[present]), pages_joined(extents[~present]), pages_joined(extents[written]))
+
+    def _there(self, ranges: Words, unwanted: int, told: int = 0) -> Words:
+        """Regions of pages that are present or swapped out, and what is to be told of them besides."""
+        wanted = abi.PAGE_IS_PRESENT | abi.PAGE_IS_SWAPPED
+        self._orders.want(0, unwanted, wanted | told, inverted=unwanted, anyof=wanted)
+        return self._collect(ranges)
 
     def guards(self, ranges: Words) -> Words:
         """Pages that MADV_GUARD_INSTALL has made guards; none on a kernel that cannot tell (before Linux 6.15).

@@ -57,13 +57,18 @@ class Tracker(Protocol):
         """Begin to follow: whatever is written from now on is in the next scan. The process may run."""
         ...
 
-    def scan(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
+    def scan(self, lines: Sequence[MapsLine], *, changed: bool, everywhere: bool = False) -> Scan:
         """Find what was written since `arm` or the last scan, and begin anew. The process stands still.
 
         Args:
             lines: every private mapping that is followed, in address order.
             changed: whether the lines differ from those of the last call.
+            everywhere: take the time to find all of it, so that `confirm` finds nothing.
         """
+        ...
+
+    def confirm(self) -> bool:
+        """Whether the last `scan` has told everything; the process may run again. If not, the next one does."""
         ...
 
     def backlog(self, lines: Sequence[MapsLine], limit: int, *, changed: bool) -> int:

@@ -14,6 +14,7 @@ import numpy as np
 
 from checkpoint import pages
 from checkpoint.linux import abi
+from checkpoint.linux.memory import Memory
 from checkpoint.linux.pagetables import PageScanner, pages_joined
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.tracking import NONE, Scan, extents_of
@@ -61,6 +62,11 @@ class PagemapTracker:
     Invariants: every page that exists in a followed mapping lies in ``_armed`` or is found by looking at the rest; a mapping
     without registration is fresh, whatever maps says, and is copied whole; one that cannot be registered is fresh each time.
 
+    Private copies of a file's pages that the program has dropped (MADV_DONTNEED) are looked for by name, for the file shows
+    again: the kernel leaves such a page protected (zap_install_uffd_wp_if_needed() in mm/memory.c), so that no scan tells. To
+    look for all of them (``_owned``) takes a tenth of a freeze, and next to none is ever dropped. So while the process stands
+    still only those are looked for that it writes as soon as it runs (``_restless``), and the others afterwards (`confirm`).
+
     Args:
         faults: a userfaultfd of the process's memory; the tracker owns it, once it is made.
     """
@@ -72,6 +78,7 @@ class PagemapTracker:
     def __init__(self, pid: int, faults: int) -> None:
         enable_write_protection(faults)
         self._faults = faults
+        self._memory = Memory(pid)
         self._scanner = PageScanner(pid)
         self._armed: Words = NONE
         self._tracked: Words = NONE
@@ -80,8 +87,11 @@ class PagemapTracker:
         self._doubtful: Words = NONE
         self._files: Words = NONE
         self._owned: Words = NONE
-        self._around_owned: tuple[Words, Words] = (NONE, NONE)
+        self._around: tuple[Words, Words] = (NONE, NONE)
         self._stubborn: set[tuple[int, int]] = set()
+        self._restless: Words = NONE
+        self._looked_for: Words | None = None
+        self._looks_everywhere = False
 
     @property
     def watched(self) -> Words:
@@ -99,9 +109,27 @@ class PagemapTracker:
         self._owned = pages.intersection(self._scanner.existing(self._files), self._files)
         self._let_writers_finish()
 
-    def scan(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
+    def scan(self, lines: Sequence[MapsLine], *, changed: bool, everywhere: bool = False) -> Scan:
         """See `Tracker.scan`."""
+        self._looks_everywhere |= everywhere
         return self._found(lines, changed=changed, is_running=False)
+
+    def confirm(self) -> bool:
+        """See `Tracker.confirm`.
+
+        A private copy that is there, and was not written since the scan, was there then. One that has gone may have gone before;
+        one that was written may have come back.
+        """
+        if self._looked_for is None:
+            return True
+        owned = pages.difference(pages.intersection(self._owned, self._armed), self._looked_for)
+        found = self._scanner.private(surroundings_of(owned))
+        written = pages.intersection(found.written, owned)
+        if pages.covers(found.present, owned) and not len(written):
+            return True
+        self._restless = pages.union(self._restless, written)
+        self._looks_everywhere = True
+        return False
 
     def catch_up(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
         """See `Tracker.catch_up`.
@@ -151,7 +179,8 @@ class PagemapTracker:
         if len(doubtful):
             cleared = pages.union(cleared, doubtful)
             copied = pages.union(copied, self._scanner.existing(doubtful))
-        written, emptied = self._sift(written, copied)
+        written, emptied = self._sift(written, copied, everywhere=is_running or self._looks_everywhere)
+        self._looks_everywhere &= is_running
         return Scan(written, pages.union(cleared, emptied))
 
     def _written(self, ranges: Words, lines: Sequence[MapsLine], *, is_running: bool) -> Words:
@@ -191,6 +220,7 @@ class PagemapTracker:
         self._doubtful = pages.intersection(self._doubtful, self._tracked)
         self._files = extents_of([line for line in followed if line.has_file])
         self._owned = pages.intersection(self._owned, self._files)
+        self._restless = pages.intersection(self._restless, self._owned)
         self._spans = extents_of(lines)
 
     def _lost(self, lines: Sequence[MapsLine], start: int, end: int) -> list[MapsLine]:
@@ -235,34 +265,53 @@ class PagemapTracker:
         unmark = abi.UffdWriteProtect(line.start, line.size, 0)
         return int(abi.ioctl(self._faults, abi.UFFDIO_WRITEPROTECT, ctypes.addressof(unmark))) == 0
 
-    def _sift(self, written: Words, copied: Words) -> tuple[Words, Words]:
+    def _sift(self, written: Words, copied: Words, *, everywhere: bool) -> tuple[Words, Words]:
         """Tell pages that hold something from holes and from a file's own: (to read, to clear).
-
-        Private copies of a file's pages that the program has dropped (MADV_DONTNEED) are looked for by name, for the file shows
-        again: the kernel leaves such a page protected (zap_install_uffd_wp_if_needed() in mm/memory.c), so that no scan tells.
 
         Args:
             copied: exist, and are to be read in any case.
+            everywhere: look for all private copies that may have been dropped.
         """
         is_doubtful = (written[:, 1] - written[:, 0]) > LONG_RUN
         if len(self._files):
             is_doubtful |= touching(written, self._files)
-        doubtful = written[is_doubtful]
-        doubtful = self._owned if pages.covers(self._owned, doubtful) else pages.union(doubtful, self._owned)
-        real = self._scanner.existing(self._surroundings_of(doubtful))
-        if doubtful is self._owned and not len(copied) and pages.covers(real, doubtful):
+        doubtful, suspects = written[is_doubtful], self._owned if everywhere else self._restless
+        doubtful = suspects if pages.covers(suspects, doubtful) else pages.union(doubtful, suspects)
+        self._looked_for = None if everywhere else pages.union(written, doubtful)
+        real, copied = self._present(doubtful, copied)
+        if doubtful is suspects and not len(copied) and pages.covers(real, doubtful):
             return written, NONE
-        empty = pages.difference(doubtful, real)
-        self._owned = pages.intersection(pages.union(real, copied), self._files)
+        empty = pages.difference(doubtful, pages.union(real, copied))
+        kept = NONE if everywhere else pages.difference(self._owned, empty)
+        self._owned = pages.union(kept, pages.intersection(pages.union(real, copied), self._files))
+        self._restless = pages.intersection(self._restless, self._owned)
         return pages.union(pages.difference(written, empty), copied), empty
+
+    def _present(self, doubtful: Words, copied: Words) -> tuple[Words, Words]:
+        """Which pages of a set, and around it, are there; and those that are to be read.
+
+        What seems to be swapped out is looked at (read): a page comes back, and a hole of a file's mapping becomes a page of the
+        file. One that is away again by then is read with the others.
+        """
+        if not len(doubtful):
+            return NONE, copied
+        around = self._surroundings_of(doubtful)
+        found = self._scanner.private(around)
+        away = pages.intersection(found.swapped, doubtful)
+        if not len(away):
+            return found.present, copied
+        readable, _ = self._memory.readable_pages(away)
+        found = self._scanner.private(around)
+        return found.present, pages.union(copied, pages.intersection(found.swapped, readable))
 
     def _surroundings_of(self, doubtful: Words) -> Words:
         """Those of the private copies are the same from scan to scan."""
-        if doubtful is not self._owned:
-            return surroundings_of(doubtful)
-        if self._around_owned[0] is not doubtful:
-            self._around_owned = doubtful, surroundings_of(doubtful)
-        return self._around_owned[1]
+        if doubtful is not self._around[0]:
+            around = doubtful, surroundings_of(doubtful)
+            if doubtful is not self._owned and doubtful is not self._restless:
+                return around[1]
+            self._around = around
+        return self._around[1]
 
 
 def surroundings_of(extents: Words) -> Words:

@@ -428,3 +428,40 @@ def test_a_mapping_that_came_before_a_second_base_is_followed(tmp_path: Path) ->
         (tmp_path / "after written again").touch()
         assert back.finish() == 0, back.complaints
         assert back.output.splitlines()[-1] == "1 2"
+
+
+GIVER_UP = """
+import mmap, os, sys, time
+def step(name):
+    print(name, flush=True)
+    while not os.path.exists(os.path.join(sys.argv[1], "after " + name)):
+        time.sleep(0.002)
+with open("content", "wb") as file:
+    file.write(b"f" * (1 << 20))
+with open("content", "rb") as file:
+    mapped = mmap.mmap(file.fileno(), 0, flags=mmap.MAP_PRIVATE, prot=mmap.PROT_READ | mmap.PROT_WRITE)
+mapped[:] = b"y" * len(mapped)
+step("ready")
+for page in (2, 3, 100):
+    mapped.madvise(mmap.MADV_DONTNEED, page * 4096, 4096)
+step("given up")
+print("".join(chr(mapped[page * 4096]) for page in (1, 2, 3, 4, 99, 100, 101)), flush=True)
+"""
+
+
+def test_where_a_program_gave_up_its_copy_of_a_files_page_it_finds_the_file_again(tmp_path: Path) -> None:
+    """Nothing has looked at the page since, so it is not there, and looks as if it were swapped out."""
+    with ended(start([sys.executable, "-c", GIVER_UP, tmp_path], tmp_path)) as program, protected(program) as session:
+        program.wait_for_line("ready")
+        chain = [transported(captured_at_last(session, CaptureOrder(sequence=1)))]
+        session.acknowledge(chain[0].position)
+        chain.append(transported(captured_at_last(session, CaptureOrder(base=False, sequence=2))))
+        session.acknowledge(chain[1].position)
+        (tmp_path / "after ready").touch()
+        program.wait_for_line("given up")
+        chain.append(transported(captured_at_last(session, CaptureOrder(base=False, sequence=3))))
+        program.kill()
+    with ended(restored(chain, tmp_path)) as back:
+        (tmp_path / "after given up").touch()
+        assert back.finish() == 0
+        assert back.output.splitlines()[-1] == "yffyyfy"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import random
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -71,6 +72,11 @@ for order in sys.stdin:
         away = libc.mmap(None, 4096, 3, 0x22, -1, 0)
         for old, new in ((place + first * 4096, away), (place + size * 4096, place + first * 4096), (away, place + size * 4096)):
             assert libc.mremap(old, 4096, 4096, 3, new) == new
+    elif verb == "file":
+        large = next(line.split()[-1] for line in open("/proc/self/maps") if "libc" in line)
+        file = os.open(large, os.O_RDONLY)
+        assert os.fstat(file).st_size > count * 4096
+        assert libc.mmap(place, count * 4096, 3, 0x12, file, 0) == place
     elif verb == "seal":
         libc.mprotect(place, count * 4096, 1)
     elif verb == "open":
@@ -355,3 +361,80 @@ def test_the_stack_of_a_thread_is_protected_around_what_exists_and_a_library_who
 
 def test_the_scan_structure_is_as_the_kernel_has_it() -> None:
     assert ctypes.sizeof(abi.PageScan) == 96
+
+
+@pytest.fixture
+def copies(child: Child) -> Child:
+    """The child, with a file mapped for itself, pages 0 to 9 of which it has written."""
+    child.order("file")
+    child.order("write 0 10")
+    child.scan()
+    child.tracker.confirm()
+    child.scan()
+    assert child.tracker.confirm()
+    return child
+
+
+def told(child: Child) -> Scan:
+    """A scan, and the next one where it may have left something out."""
+    first = child.scan()
+    if child.tracker.confirm():
+        return first
+    then = child.scan()
+    assert child.tracker.confirm()
+    return Scan(pages.union(first.written, then.written), pages.union(first.cleared, then.cleared))
+
+
+def test_a_private_copy_of_a_files_page_that_is_given_up_is_told(copies: Child) -> None:
+    for page in (2, 7):
+        copies.order(f"forget {page}")
+        scan = told(copies)
+        assert page in copies.numbers(scan.written) | copies.numbers(scan.cleared)
+        assert not copies.numbers(told(copies).cleared)
+
+
+def test_a_private_copy_that_is_given_up_and_made_anew_behind_the_scan_is_told(copies: Child) -> None:
+    copies.order("forget 2")
+    scan = copies.scan()
+    copies.order("write 2")
+    if copies.numbers(scan.written) | copies.numbers(scan.cleared):  # it has told already
+        assert copies.numbers(copies.scan().written) == {2}
+        return
+    assert not copies.tracker.confirm()
+    assert 2 in copies.numbers(copies.scan().written)
+    assert copies.tracker.confirm()
+
+
+def test_what_is_written_behind_every_scan_is_doubted_once(copies: Child) -> None:
+    """The kernel tells that such a page is there; it could have gone before the scan, and come since."""
+    confirmed = []
+    for _ in range(6):
+        copies.scan()
+        copies.order("write 3 2")
+        confirmed.append(copies.tracker.confirm())
+        copies.scan()
+        assert copies.tracker.confirm()
+    assert confirmed.count(False) <= 1
+    copies.order("forget 3")
+    scan = copies.scan()
+    assert 3 in copies.numbers(scan.written) | copies.numbers(scan.cleared)
+    assert copies.tracker.confirm()
+
+
+def test_whatever_is_written_and_given_up_is_told(copies: Child) -> None:
+    if not copies.tracker.sees_every_write:
+        pytest.skip(f"{copies.tracker.name} does not see what is changed back")
+    dice = random.Random(5)
+    state = dict.fromkeys(range(10), True)
+    for _ in range(60):
+        seen: set[int] = set()
+        before = dict(state)
+        for _ in range(dice.randrange(4)):
+            page, writes = dice.randrange(10), dice.random() < 0.5
+            copies.order(f"{'write' if writes else 'forget'} {page}")
+            state[page] = writes
+            seen.add(page)
+        scan = told(copies)
+        written, cleared = copies.numbers(scan.written), copies.numbers(scan.cleared)
+        for page in seen:
+            assert page in written if state[page] else page in cleared or page in written or not before[page]
