@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import os
 import socket
 import struct
 from dataclasses import dataclass
@@ -17,15 +18,34 @@ from checkpoint.linux import sock_diag
 SIOCUNIXFILE: Final = 0x89E0
 _REQUEST: Final = struct.Struct("<BBHIIIII")
 _ANSWER: Final = struct.Struct("<BBBxIII")
-_SHOW: Final = 1 | 4 | 8 | 16
-"""Name, peer, who waits to be accepted, lengths."""
+_SHOW: Final = 1 | 2 | 4 | 8 | 16
+"""Name, file, peer, who waits to be accepted, lengths."""
 _NO_COOKIE: Final = 0xFFFFFFFF
 _ANY_STATE: Final = 0xFFFFFFFF
-_NAME, _PEER, _WAITING, _LENGTHS, _SHUTDOWN = 0, 2, 3, 4, 6
+_NAME, _FILE, _PEER, _WAITING, _LENGTHS, _SHUTDOWN = 0, 1, 2, 3, 4, 6
+_MINOR_BITS: Final = 20
+"""Of a device number as the kernel has it. Source: linux/kdev_t.h."""
 
 ESTABLISHED: Final = 1
 CLOSED: Final = 7
 LISTENING: Final = 10
+
+
+@dataclass(frozen=True, slots=True)
+class BoundFile:
+    """The file that a socket was bound to, as everybody may ask for it: it has this number still when it has no name.
+
+    Attributes:
+        number: the lower 32 bits of its inode's.
+        device: of its file system, as stat(2) tells it of most: btrfs and some overlays tell another one.
+    """
+
+    number: int
+    device: int
+
+    def may_be(self, inode: int) -> bool:
+        """Whether an inode of its file system has its number, as far as that is known."""
+        return inode & 0xFFFFFFFF == self.number
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +60,7 @@ class UnixSocket:
         clients: whose connections wait to be accepted, in their order: inode numbers of sockets, 0 for one that has gone. The
             kernel tells nothing else of such a connection.
         shutdown: 1 what it reads, 2 what it sends.
+        file: that it is bound to, for an accepted one its listener's; None without one.
     """
 
     type: int
@@ -49,6 +70,7 @@ class UnixSocket:
     backlog: int
     clients: tuple[int, ...]
     shutdown: int
+    file: BoundFile | None = None
 
 
 def answer_about(inode: int) -> bytes:
@@ -85,7 +107,15 @@ def parsed(answer: bytes) -> UnixSocket | None:
         backlog=lengths[1] if state == LISTENING else 0,
         clients=tuple(number for (number,) in struct.iter_unpack("<I", found.get(_WAITING, b""))),
         shutdown=int.from_bytes(found.get(_SHUTDOWN, b""), "little"),
+        file=_file_of(found.get(_FILE, b"")),
     )
+
+
+def _file_of(told: bytes) -> BoundFile | None:
+    if not told:
+        return None
+    number, device = struct.unpack("<II", told)
+    return BoundFile(number, os.makedev(device >> _MINOR_BITS, device & ((1 << _MINOR_BITS) - 1)))
 
 
 def bound_file(looked: socket.socket) -> int | None:

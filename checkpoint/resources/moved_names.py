@@ -2,7 +2,8 @@
 
 So a program puts its listener where clients look for it, ready and with its rights, at one stroke (supervisord, OpenSSH). The
 kernel follows a file that is renamed; of one that was linked it tells the name that is gone, and the other is looked for beside
-that. A restore binds the old name, links the file to the other one, and removes the old one.
+that. Who may not ask it for the file, but for its number, looks beside the name for both. A restore binds the old name, links
+the file to the other one, and removes the old one.
 
 Source: unix(7), rename(2), link(2); d_path() in fs/d_path.c.
 """
@@ -11,32 +12,71 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping
+import stat
+from collections.abc import Callable, Mapping
 from itertools import islice
 from typing import Final
 
 from checkpoint.linux import procfs
+from checkpoint.linux.unix_sockets import BoundFile
 from checkpoint.model import Fact
 
 ENTRIES_MAX: Final = 4096
 """Of a directory so many are looked through for another name."""
 
 
-def name_beside(outlook: str, path: str, about: os.stat_result) -> str:
+def name_beside(outlook: str, path: str, may_be: Callable[[int], bool], device: int) -> str:
     """The name that a file has in the directory of one that it had; "" without one.
 
     Args:
         outlook: what leads to where the program's paths begin.
+        may_be: whether an inode of its file system's ``device`` is its.
     """
     directory = os.path.dirname(path)
     try:
         with os.scandir(f"{outlook}{directory}") as entries:
             for entry in islice(entries, ENTRIES_MAX):
-                if entry.inode() == about.st_ino and entry.stat(follow_symlinks=False).st_dev == about.st_dev:
+                if may_be(entry.inode()) and _is_socket_of(entry.stat(follow_symlinks=False), device):
                     return os.path.join(directory, entry.name)
     except OSError:  # it is gone, or closed to us
         return ""
     return ""
+
+
+def _is_socket_of(about: os.stat_result, device: int) -> bool:
+    return about.st_dev == device and stat.S_ISSOCK(about.st_mode)
+
+
+def socket_at(path: str) -> os.stat_result | None:
+    """What lies there, if it is a socket."""
+    with contextlib.suppress(OSError):
+        about = os.stat(path)
+        return about if stat.S_ISSOCK(about.st_mode) else None
+    return None
+
+
+def by_number(outlook: str, path: str, file: BoundFile | None) -> tuple[str, os.stat_result | None]:
+    """Where a file lies, and what is told of it; None if it has no name here.
+
+    An ordinary user may not ask a socket for its file, but for the number of that. Where it is nowhere beside the name that it
+    was bound to, nobody tells him whether it has another one far away or none.
+
+    Args:
+        path: the name that it was bound to; it counts where the number says nothing: on a file system that tells others.
+    """
+    about = socket_at(f"{outlook}{path}")
+    if file is None or _device_of(f"{outlook}{os.path.dirname(path)}") != file.device:
+        return path, about
+    if about is not None and about.st_dev == file.device and file.may_be(about.st_ino):
+        return path, about
+    other = name_beside(outlook, path, file.may_be, file.device)
+    return (other, socket_at(f"{outlook}{other}")) if other else (path, None)
+
+
+def _device_of(path: str) -> int:
+    with contextlib.suppress(OSError):
+        return os.stat(path).st_dev
+    return 0
 
 
 def beside(path: str, told: str) -> str:

@@ -29,7 +29,7 @@ from typing import Final
 from checkpoint.capability import Area, refused
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import AT_FDCWD, CallTable
-from checkpoint.linux.unix_sockets import ESTABLISHED, bound_file
+from checkpoint.linux.unix_sockets import ESTABLISHED, BoundFile, bound_file
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile, moved_names
 from checkpoint.resources.moved_names import leads_to
@@ -68,20 +68,21 @@ REMOVE_DIRECTORY: Final = 0x200
 """AT_REMOVEDIR of unlinkat(2)."""
 
 
-def observe(held: OpenFile, looked: socket.socket, name: bytes) -> dict[str, Fact]:
+def observe(held: OpenFile, looked: socket.socket, name: bytes, file: BoundFile | None = None) -> dict[str, Fact]:
     """Where the file of a name lies.
 
     Args:
         name: as the kernel tells it, in full.
+        file: as the kernel tells of it, whoever asks.
     """
     if not name or name[:1] == b"\0":
         return {"path": "", "mode": GONE, "file_owner": [], "directory": "", "root": ""}
     told = os.fsdecode(name.rstrip(b"\0"))
     working, root = procfs.read_link(held.pid, "cwd"), procfs.read_link(held.pid, "root").rstrip("/")
     opened = bound_file(looked)
-    if opened is None:  # we may not ask the socket: then the name counts, as the program would look for it now
-        path = root + told if os.path.isabs(told) else os.path.join(working, told)
-        about, is_covered = _socket_at(f"{procfs.outlook(held.pid)}{path}"), False
+    if opened is None:  # we may not ask the socket: then the name counts, as the program would look for it now, and the number
+        path, is_covered = root + told if os.path.isabs(told) else os.path.join(working, told), False
+        path, about = moved_names.by_number(procfs.outlook(held.pid), path, file)
     else:
         try:
             path, about, is_covered = _place_of(held.pid, opened)
@@ -90,7 +91,8 @@ def observe(held: OpenFile, looked: socket.socket, name: bytes) -> dict[str, Fac
     is_there = about is not None and about.st_nlink > 0 and not is_covered
     mode, owner = (about.st_mode, [about.st_uid, about.st_gid]) if about is not None and is_there else (GONE, [])
     began = root if _began_at(root, told, path) and not _leads_to_it(held.pid, told, path, about) else ""
-    is_moved = is_there and opened is not None and moved_names.has_moved(held.pid, told, path, about, began, working)
+    is_known = opened is not None or file is not None
+    is_moved = is_there and is_known and moved_names.has_moved(held.pid, told, path, about, began, working)
     bound = moved_names.beside(path, told) if is_moved else os.path.normpath(path)
     directory = "" if os.path.isabs(told) else bound.removesuffix(f"/{os.path.normpath(told)}") or "/"
     is_away = is_moved and not moved_names.lies_beside(held.pid, told, bound, began)
@@ -119,8 +121,10 @@ def _place_of(pid: int, opened: int) -> tuple[str, os.stat_result, bool]:
             return path.removesuffix(DELETED), about, False
         if leads_to(f"{procfs.outlook(pid)}{path}", about):
             return path, about, False
-        if path.endswith(DELETED) and (other := moved_names.name_beside(procfs.outlook(pid), path, about)):
-            return other, about, False
+        if path.endswith(DELETED):
+            other = moved_names.name_beside(procfs.outlook(pid), path, about.st_ino.__eq__, about.st_dev)
+            if other:
+                return other, about, False
     return path, about, True
 
 
@@ -132,13 +136,6 @@ def _began_at(root: str, told: str, path: str) -> bool:
 def _leads_to_it(pid: int, told: str, path: str, about: os.stat_result | None) -> bool:
     """Whether it leads from the machine's root to its file: it was given before its process got another one."""
     return told == path or (about is not None and leads_to(f"{procfs.outlook(pid)}{told}", about))
-
-
-def _socket_at(path: str) -> os.stat_result | None:
-    with contextlib.suppress(OSError):
-        about = os.stat(path)
-        return about if stat.S_ISSOCK(about.st_mode) else None
-    return None
 
 
 def refuse(held: OpenFile) -> str | None:

@@ -93,7 +93,7 @@ def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: socket
     queue = sockets.queue_of(looked, held.first.number, noted, identify) if has_queue else sockets.NOTHING
     return (
         facts
-        | unix_names.observe(held, looked, told.name)
+        | unix_names.observe(held, looked, told.name, told.file)
         | unix_makers.observe(looked)
         | {
             "state": told.state,
@@ -124,8 +124,9 @@ def again(held: OpenFile, facts: Mapping[str, Fact], opened: Opened) -> Mapping[
     name = facts["name"]
     assert isinstance(name, bytes)
     if name and name[:1] != b"\0":
+        told = parsed(opened.listings.unix_answer(held.first.inode))
         with sockets.looked_into(held.pid, held.first.number) as looked:
-            found |= unix_names.observe(held, looked, name)
+            found |= unix_names.observe(held, looked, name, told.file if told else None)
     return found if found != facts else facts
 
 

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import os
 import socket
-import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 
 from checkpoint.engine import CaptureOrder, ProtectOrder
 from checkpoint.errors import MismatchError, UnsupportedError
+from checkpoint.linux.unix_sockets import BoundFile, answer_about, parsed
+from checkpoint.resources import moved_names
 from tests.checkpoint.round_trip import (
     ENGINE,
+    NOBODY,
     Program,
+    as_nobody,
     captured_and_killed,
     captured_at_last,
     ended,
@@ -71,27 +75,33 @@ def answers(directory: Path) -> list[bytes]:
 
 
 def moving(directory: Path, how: str, *, whole: bool = True, aim: str = "door") -> Program:
-    program = start([sys.executable, "-c", ANSWERS, how, f"{directory}/" if whole else "", aim], directory)
+    program = start(["/usr/bin/python3", "-S", "-c", ANSWERS, how, f"{directory}/" if whole else "", aim], directory)
     program.wait_for_line("ready")
     return program
 
 
-@pytest.mark.parametrize("is_whole", [True, False], ids=["whole", "relative"])
-@pytest.mark.parametrize("how", ["rename", "link"])
-def test_a_listener_whose_file_was_moved_is_found_where_it_was(how: str, is_whole: bool, tmp_path: Path) -> None:
-    program = moving(tmp_path, how, whole=is_whole)
-    before, names = answers(tmp_path), sorted(os.listdir(tmp_path))
+def three_lives(directory: Path, how: str, *, whole: bool) -> str:
+    """Both listeners are where they were, and answer, after each of three restores; "" if all of it holds."""
+    program = moving(directory, how, whole=whole)
+    before, names = answers(directory), sorted(os.listdir(directory))
     for life in range(3):
         with ended(program), protected(program) as session:
             snapshot = transported(captured_at_last(session, CaptureOrder(hold=True)))
             program.kill()
         if life == 1:  # as on another robot
             for name in ("door", "door2", "new"):
-                (tmp_path / name).unlink()
-        program = restored(snapshot, tmp_path)
-        assert answers(tmp_path) == before
-        assert sorted(os.listdir(tmp_path)) == names
+                (directory / name).unlink()
+        program = restored(snapshot, directory)
+        assert answers(directory) == before
+        assert sorted(os.listdir(directory)) == names
     program.kill()
+    return ""
+
+
+@pytest.mark.parametrize("is_whole", [True, False], ids=["whole", "relative"])
+@pytest.mark.parametrize("how", ["rename", "link"])
+def test_a_listener_whose_file_was_moved_is_found_where_it_was(how: str, is_whole: bool, tmp_path: Path) -> None:
+    assert three_lives(tmp_path, how, whole=is_whole) == ""
 
 
 def test_a_listener_that_was_moved_to_another_directory_is_refused_by_name(tmp_path: Path) -> None:
@@ -111,3 +121,31 @@ def test_a_name_that_a_moved_listener_was_bound_to_is_not_taken_from_others(tmp_
     with pytest.raises(MismatchError, match="is something else here"):
         restored(snapshot, tmp_path)
     assert (tmp_path / "new").read_text() == "somebody's"
+
+
+@pytest.mark.parametrize("is_whole", [True, False], ids=["whole", "relative"])
+@pytest.mark.parametrize("how", ["rename", "link"])
+def test_an_ordinary_user_finds_it_too(how: str, is_whole: bool) -> None:
+    """He may not ask a socket for its file, but for the number of that."""
+    with tempfile.TemporaryDirectory() as place:
+        os.chown(place, NOBODY, NOBODY)
+        assert as_nobody(lambda: three_lives(Path(place), how, whole=is_whole)) == ""
+
+
+def test_a_name_that_another_file_has_by_now_is_not_its_for_an_ordinary_user(tmp_path: Path) -> None:
+    """Its own file is gone: of that one only the number is left, which no other has."""
+    with socket.socket(socket.AF_UNIX) as gone, socket.socket(socket.AF_UNIX) as other:
+        for made in (gone, other):
+            (tmp_path / "name").unlink(missing_ok=True)
+            made.bind(str(tmp_path / "name"))
+        files = [parsed(answer_about(os.fstat(made.fileno()).st_ino)) for made in (gone, other)]
+        found = [moved_names.by_number("", str(tmp_path / "name"), one.file if one else None)[1] for one in files]
+        assert [about is not None for about in found] == [False, True]
+
+
+def test_on_a_file_system_that_tells_other_numbers_the_name_counts(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as made:
+        made.bind(str(tmp_path / "name"))
+        about = (tmp_path / "name").stat()
+        elsewhere = BoundFile(about.st_ino + 1, about.st_dev + 1)
+        assert moved_names.by_number("", str(tmp_path / "name"), elsewhere) == (str(tmp_path / "name"), about)
