@@ -95,6 +95,8 @@ CAPABILITIES: Final = (
 )
 
 _FAR: str = "bring it here from the machine that ran the program"
+_CARRIED: str = f"{_FAR}; or, as the program writes to it, let it travel: --carry, for it or its folder"
+"""While the program runs no copy would do for long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -354,7 +356,8 @@ def _of_open_file(held: Resource, path: str, same_boot: bool, digest_of: DigestO
     try:
         about = os.stat(path, follow_symlinks=not number_of(held.facts["flags"]) & rebuild.O_PATH)
     except OSError as error:
-        yield f"{path}, open as {held.name}, cannot be used ({error.strerror}): {_FAR}"
+        cure = _CARRIED if rebuild.is_written(held) else _FAR
+        yield f"{path}, open as {held.name}, cannot be used ({error.strerror}): {cure}"
         return
     if stat.S_IFMT(about.st_mode) != stat.S_IFMT(number_of(held.facts["mode"])):
         yield f"{path}, open as {held.name}, is of another type here (a directory, a device …); {_FAR}"
@@ -366,7 +369,8 @@ def _of_open_file(held: Resource, path: str, same_boot: bool, digest_of: DigestO
     grows, digest = rebuild.grows_at_its_end(held), facts.get("digest", b"")
     same_file = same_boot and (about.st_dev, about.st_ino) == (facts["device"], facts["inode"])
     if about.st_size < size or (about.st_size > size and not grows):
-        yield f"{named} has {about.st_size} bytes here and {size} there; {_FAR}, or {shared}"
+        cure = _CARRIED if rebuild.is_written(held) else _FAR
+        yield f"{named} has {about.st_size} bytes here and {size} there; {cure}, or {shared}"
     elif same_file and about.st_mtime_ns != facts["mtime_ns"] and rebuild.is_written(held) and not grows:
         yield f"{named} was written to since the snapshot, and not only at its end; end the program with the capture, or {shared}"
     elif digest and digest_of(path) != digest:

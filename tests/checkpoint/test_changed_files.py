@@ -62,7 +62,14 @@ def test_a_log_that_shrank_is_refused(compiled: Compiled, tmp_path: Path) -> Non
 def test_a_file_that_is_missing_is_refused(compiled: Compiled, tmp_path: Path) -> None:
     snapshot = _snapshot(compiled, tmp_path, "read_offset")
     (tmp_path / "in").unlink()
-    _expect_refusal(snapshot, tmp_path, tmp_path / "in")
+    _expect_refusal(snapshot, tmp_path, tmp_path / "in", "bring it here")
+
+
+def test_a_file_that_the_program_writes_and_that_is_missing_is_to_be_carried(compiled: Compiled, tmp_path: Path) -> None:
+    """On another robot it always is, and while the program runs no copy would do for long."""
+    snapshot = _snapshot(compiled, tmp_path, "append")
+    (tmp_path / "log").unlink()
+    _expect_refusal(snapshot, tmp_path, tmp_path / "log", "--carry")
 
 
 def test_a_file_that_became_a_directory_is_refused(compiled: Compiled, tmp_path: Path) -> None:
