@@ -77,9 +77,8 @@ from checkpoint.resources.rebuild import deleted_directory, open_here, rebuild_a
 from checkpoint.resources.rebuilding import number_of
 from checkpoint.resources.system_v_memory import Segments
 
-PTRACE_O_TRACESYSGOOD: Final = 1
 PTRACE_EVENT_EXEC: Final = 4
-OPTIONS: Final = abi.PTRACE_O_EXITKILL | PTRACE_O_TRACESYSGOOD | abi.PTRACE_O_TRACEEXEC | abi.PTRACE_O_TRACECLONE
+OPTIONS: Final = abi.PTRACE_O_EXITKILL | abi.PTRACE_O_TRACESYSGOOD | abi.PTRACE_O_TRACEEXEC | abi.PTRACE_O_TRACECLONE
 
 NOBODY_YET: Final = 0
 REFUGE_SIZE: Final = 1 << 20

@@ -30,8 +30,9 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
+from checkpoint.arch import cpu as arch
 from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError
-from checkpoint.linux import procfs, second_stops
+from checkpoint.linux import entered_calls, procfs, second_stops
 from checkpoint.linux.burial import Burial, bury
 from checkpoint.linux.tasks import thread_count, thread_ids
 from checkpoint.linux.together import Together
@@ -357,6 +358,8 @@ class Threads:
             try:
                 if self._mend and tracee.is_as_found:
                     self._mend(tracee)
+                if arch.FORGETS_CALLS and not tracee.is_as_found:
+                    entered_calls.enter(tracee)
                 if len(held) < FEW:
                     tracee.detach()
                 else:

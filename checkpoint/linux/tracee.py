@@ -29,6 +29,8 @@ from checkpoint.model import Rseq
 PTRACE_EVENT_STOP: Final = 128
 PLAIN_STOP: Final = PTRACE_EVENT_STOP << 16 | signal.SIGTRAP << 8 | 0x7F
 """Wait status of a thread that was asked to stop, and stands for no other reason. Source: wait(2), ptrace(2)."""
+CALL_STOP: Final = 0x80
+"""In the signal of a stop at a system call (PTRACE_O_TRACESYSGOOD)."""
 REGISTERS_SIZE: Final = 4096
 """Bytes offered for the general registers: more than any processor has."""
 STATE_SETS: Final = processor.state_sets()
@@ -64,7 +66,7 @@ class Stop:
     @property
     def is_delivery(self) -> bool:
         """Whether a signal was taken from the queue and waits to be handed back by `Tracee.cont`."""
-        return self.event == 0
+        return self.event == 0 and not self.signal & CALL_STOP
 
 
 def _is_dead(pid: int) -> bool:
