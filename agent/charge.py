@@ -64,7 +64,8 @@ class Charge:
     _queue: asyncio.Queue[Act | asyncio.Future[None]] = field(default_factory=asyncio.Queue)
     """A future is done once everything before it has been carried out, or was in vain."""
     _tasks: set[asyncio.Task[None]] = field(default_factory=set)
-    _stopping: bool = False
+    _cleared: asyncio.Event = field(default_factory=asyncio.Event)
+    """Not while a copy is being ended that is none of ours any more."""
     _coming: Component | None = None
     """One that is being restored: it has a lease already."""
     _lease_until_ns: int = 0
@@ -77,6 +78,7 @@ class Charge:
     """Why the order to let it go was in vain; None: it was not, or somebody has been told."""
 
     def __post_init__(self) -> None:
+        self._cleared.set()
         self.standby = Standby(self.name, self.around.places)
         self.copy = ReadyCopy(self.name, self.around, self.figures)
         self._snapshots = Snapshots(self.name, self.around, self.figures)
@@ -401,14 +403,19 @@ class Charge:
         component, self.component = self.component, None
         if component is None:
             return
-        self._stopping = True
+        self._cleared.clear()
         try:
             await component.stop(signal.SIGKILL)
             await component.forget()
         finally:
-            self._stopping = False
+            self._cleared.set()
             self.around.records.forget(self.name)
             component.close()
+
+    async def cleared(self, patience_s: float) -> None:
+        """Wait, for so long at most, until a copy that is being ended here holds nothing any more."""
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._cleared.wait(), patience_s)
 
     async def _let_go(self) -> None:
         component, self.component = self.component, None
@@ -470,7 +477,7 @@ class Charge:
         except AgentError as trouble:
             log.error("%s: its guard is gone: %s", self.name, trouble)
             status = KILLED
-        if self.component is component and not self._stopping:
+        if self.component is component and self._cleared.is_set():
             self.figures.crashes += bool(status and os.WIFSIGNALED(status))
             refusal = comeback.refusal(component, status or 0)
             if refusal:

@@ -25,6 +25,9 @@ from checkpoint.errors import CheckpointError, MismatchError, StoreError
 PATIENCE_S: Final = 15.0
 """How long another robot may take to look what it lacks: it reads files."""
 
+CLEARING_S: Final = 5.0
+"""How long is waited for a copy that is being ended here: what it holds, a name or a port, the next one does not lack."""
+
 log = logging.getLogger("failover.lacks")
 
 
@@ -48,6 +51,7 @@ async def look(around: Surroundings, charges: Iterable[Charge]) -> Mapping[str, 
     keeper: KeeperLink | None = None
     try:
         for charge in charges:
+            await charge.cleared(CLEARING_S)
             keeper = keeper or await around.places.nursery.onlooker()
             try:
                 found[charge.name] = await _compared(around, charge, keeper)

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import pytest
 
-from agent import comeback
+from agent import comeback, lacks
 from agent.charge import Charge
 from agent.clock import Laps
 from agent.component import Component
@@ -210,3 +210,49 @@ def test_a_release_is_answered_once_the_guard_has_been_told(tmp_path: Path) -> N
 def test_a_release_that_the_guard_was_not_told_of_is_not_said_to_be_one(tmp_path: Path) -> None:
     told = released(tmp_path, GuardError("its guard is gone"))
     assert str(told) == f"cannot let {NAME} go: its guard is gone"
+
+
+class Ending(Guarded):
+    """Its program takes a while to end."""
+
+    async def stop(self, _: int) -> None:
+        await self.answers.wait()
+
+    async def forget(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+def test_what_is_lacking_is_looked_at_once_the_copy_that_was_here_has_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a handover it holds its ports and names for a moment yet, which were told as another process's for half a minute."""
+    nothing = cast(Any, None)
+
+    async def run() -> None:
+        guard = Ending()
+
+        async def compared(*_: object) -> tuple[str, ...]:
+            return () if guard.answers.is_set() else ("its port is another process's here",)
+
+        async def onlooker() -> Any:
+            return SimpleNamespace(end=lambda: None)
+
+        monkeypatch.setattr(lacks, "_compared", compared)
+        nursery = SimpleNamespace(onlooker=onlooker, relieve=lambda *_: None)
+        places = cast(Any, SimpleNamespace(nursery=nursery))
+        around = Surroundings(places, nothing, Records(tmp_path), lambda _: None, nothing, nothing, lambda _: ComponentConfig())
+        charge = Charge(NAME, around, cast(Component, guard), epoch=3)
+        charge.begin()
+        charge.order(acts.Stop(NAME, 4))
+        await settled()
+        found = asyncio.create_task(lacks.look(around, [charge]))
+        await settled()
+        guard.answers.set()
+        assert await found == {NAME: ()}
+        for task in tuple(charge._tasks):
+            task.cancel()
+
+    asyncio.run(run())
