@@ -328,10 +328,12 @@ class PtraceSession:
             MovedError: something was: it is known now.
         """
         for process, seen in ((self._first, first), *(others.looks() if others else ())):
-            if not process.memory.confirm():
-                raise MovedError(
-                    f"pid {process.pid} gave up pages that it had written in the mapping of a file; capture it again"
-                )
+            try:
+                is_whole = process.memory.confirm()
+            except ProcessGoneError as error:
+                raise MovedError(f"process {process.pid} ended as soon as it ran again; capture it again") from error
+            if not is_whole:
+                raise MovedError(f"pid {process.pid} may have given up what it wrote to its mapping of a file; capture it again")
             if held := process.onlooker.overlooked(seen.standing.opened):
                 raise MovedError(
                     f"{held.name} of pid {process.pid} was given an owner of its signals (F_SETOWN); capture it again"
