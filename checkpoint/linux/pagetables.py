@@ -79,7 +79,8 @@ class Private(NamedTuple):
 
     Attributes:
         present: in memory.
-        swapped: they have an entry and are not in memory: swapped out, on the move, or no page at all, only a protected hole.
+        swapped: they have an entry and are not in memory: swapped out, on the move, or (a few at a time) no pages, only protected
+            holes.
         written: those of both that were written since they were last protected, or never were.
     """
 
@@ -181,11 +182,7 @@ class PageScanner:
             own: leave out unchanged pages of files and the shared page of zeros.
         """
         unwanted = (abi.PAGE_IS_FILE | abi.PAGE_IS_PFNZERO if own else abi.PAGE_IS_PFNZERO) | self._guard
-        found = self._there(ranges, unwanted)
-        marker = (found[:, 2] & np.uint64(abi.PAGE_IS_PRESENT) == 0) & (found[:, 1] - found[:, 0] >= MARKER_RUN)
-        if marker.any() and not procfs.swapped_size(self._pid):
-            found = found[~marker]
-        return pages_joined(found[:, :2])
+        return pages_joined(self._there(ranges, unwanted)[:, :2])
 
     def private(self, ranges: Words) -> Private:
         """The process's own pages. Of those that are swapped out some may be nothing but what marks a hole as protected."""
@@ -198,7 +195,11 @@ class PageScanner:
         """Regions of pages that are present or swapped out, and what is to be told of them besides."""
         wanted = abi.PAGE_IS_PRESENT | abi.PAGE_IS_SWAPPED
         self._orders.want(0, unwanted, wanted | told, inverted=unwanted, anyof=wanted)
-        return self._collect(ranges)
+        found = self._collect(ranges)
+        marker = (found[:, 2] & np.uint64(abi.PAGE_IS_PRESENT) == 0) & (found[:, 1] - found[:, 0] >= MARKER_RUN)
+        if marker.any() and not procfs.swapped_size(self._pid):
+            found = found[~marker]
+        return found
 
     def guards(self, ranges: Words) -> Words:
         """Pages that MADV_GUARD_INSTALL has made guards; none on a kernel that cannot tell (before Linux 6.15).

@@ -278,7 +278,7 @@ class PagemapTracker:
         doubtful, suspects = written[is_doubtful], self._owned if everywhere else self._restless
         doubtful = suspects if pages.covers(suspects, doubtful) else pages.union(doubtful, suspects)
         self._looked_for = None if everywhere else pages.union(written, doubtful)
-        real, copied = self._present(doubtful, copied)
+        real, copied = self._existing(doubtful, copied)
         if doubtful is suspects and not len(copied) and pages.covers(real, doubtful):
             return written, NONE
         empty = pages.difference(doubtful, pages.union(real, copied))
@@ -287,22 +287,23 @@ class PagemapTracker:
         self._restless = pages.intersection(self._restless, self._owned)
         return pages.union(pages.difference(written, empty), copied), empty
 
-    def _present(self, doubtful: Words, copied: Words) -> tuple[Words, Words]:
-        """Which pages of a set, and around it, are there; and those that are to be read.
+    def _existing(self, doubtful: Words, copied: Words) -> tuple[Words, Words]:
+        """Which pages of a set, and around it, are there; and those that are to be read in any case.
 
-        What seems to be swapped out is looked at (read): a page comes back, and a hole of a file's mapping becomes a page of the
-        file. One that is away again by then is read with the others.
+        A page of a file's mapping that seems to be swapped out is looked at (read): a private copy comes back, and a protected
+        hole becomes a page of the file. One that is away again by then is read with the others.
         """
         if not len(doubtful):
             return NONE, copied
         around = self._surroundings_of(doubtful)
         found = self._scanner.private(around)
-        away = pages.intersection(found.swapped, doubtful)
+        away = pages.intersection(pages.intersection(found.swapped, doubtful), self._files) if len(found.swapped) else NONE
         if not len(away):
-            return found.present, copied
+            return pages.union(found.present, found.swapped), copied
         readable, _ = self._memory.readable_pages(away)
         found = self._scanner.private(around)
-        return found.present, pages.union(copied, pages.intersection(found.swapped, readable))
+        elsewhere = pages.difference(found.swapped, away)
+        return pages.union(found.present, elsewhere), pages.union(copied, pages.intersection(found.swapped, readable))
 
     def _surroundings_of(self, doubtful: Words) -> Words:
         """Those of the private copies are the same from scan to scan."""

@@ -438,3 +438,17 @@ def test_whatever_is_written_and_given_up_is_told(copies: Child) -> None:
         written, cleared = copies.numbers(scan.written), copies.numbers(scan.cleared)
         for page in seen:
             assert page in written if state[page] else page in cleared or page in written or not before[page]
+
+
+def test_holes_are_not_filled_by_looking_at_them(child: Child, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not isinstance(child.tracker, PagemapTracker):
+        pytest.skip(f"{child.tracker.name} has no holes that look like pages")
+    asked: list[int] = []
+    monkeypatch.setattr(Memory, "readable_pages", lambda _, extents: asked.append(len(extents)))
+    child.order("again")
+    for page in range(0, COUNT, 40):  # between them holes that are protected: a few, and many at a time
+        child.order(f"write {page} 3")
+    told(child)
+    child.order("forget 80 30")
+    told(child)
+    assert not asked
