@@ -34,6 +34,8 @@ LONG_RUN: Final = 16 * abi.PAGE_SIZE
 
 NOWHERE: Final = 1 << 20
 """An address below all that programs have. A mapping there would be registered, which it is in any case."""
+SETBACK_MAX: Final = 64
+"""After a scan that left something out at most so many look everywhere; one that does costs less than another freeze."""
 SMALL_GAP: Final = 64 * abi.PAGE_SIZE
 """Extents that are no farther apart are looked at together."""
 
@@ -91,7 +93,8 @@ class PagemapTracker:
         self._stubborn: set[tuple[int, int]] = set()
         self._restless: Words = NONE
         self._looked_for: Words | None = None
-        self._looks_everywhere = False
+        self._wary = 0
+        self._setback = 1
 
     @property
     def watched(self) -> Words:
@@ -111,8 +114,9 @@ class PagemapTracker:
 
     def scan(self, lines: Sequence[MapsLine], *, changed: bool, everywhere: bool = False) -> Scan:
         """See `Tracker.scan`."""
-        self._looks_everywhere |= everywhere
-        return self._found(lines, changed=changed, is_running=False)
+        everywhere = everywhere or self._wary > 0
+        self._wary = max(self._wary - 1, 0)
+        return self._found(lines, changed=changed, is_running=False, everywhere=everywhere)
 
     def confirm(self) -> bool:
         """See `Tracker.confirm`.
@@ -126,9 +130,10 @@ class PagemapTracker:
         found = self._scanner.private(surroundings_of(owned))
         written = pages.intersection(found.written, owned)
         if pages.covers(found.present, owned) and not len(written):
+            self._setback = max(self._setback - 1, 1)
             return True
         self._restless = pages.union(self._restless, written)
-        self._looks_everywhere = True
+        self._wary, self._setback = self._setback, min(2 * self._setback, SETBACK_MAX)
         return False
 
     def catch_up(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
@@ -162,7 +167,7 @@ class PagemapTracker:
             count += pages.total_size(self._scanner.existing(self._open)) // abi.PAGE_SIZE
         return min(count, limit)
 
-    def _found(self, lines: Sequence[MapsLine], *, changed: bool, is_running: bool) -> Scan:
+    def _found(self, lines: Sequence[MapsLine], *, changed: bool, is_running: bool, everywhere: bool = True) -> Scan:
         if changed:
             self._learn(lines)
         fresh = [line for start, end in self._scanner.unprotected(self._spans) for line in self._lost(lines, start, end)]
@@ -179,8 +184,7 @@ class PagemapTracker:
         if len(doubtful):
             cleared = pages.union(cleared, doubtful)
             copied = pages.union(copied, self._scanner.existing(doubtful))
-        written, emptied = self._sift(written, copied, everywhere=is_running or self._looks_everywhere)
-        self._looks_everywhere &= is_running
+        written, emptied = self._sift(written, copied, everywhere=everywhere)
         return Scan(written, pages.union(cleared, emptied))
 
     def _written(self, ranges: Words, lines: Sequence[MapsLine], *, is_running: bool) -> Words:
