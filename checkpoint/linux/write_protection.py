@@ -292,7 +292,7 @@ class PagemapTracker:
         return pages.union(pages.difference(written, empty), copied), empty
 
     def _existing(self, doubtful: Words, copied: Words) -> tuple[Words, Words]:
-        """Which pages of a set, and around it, are there; and those that are to be read in any case.
+        """Which pages of a set are there, and which of those around it are in memory; and those that are to be read in any case.
 
         A page of a file's mapping that seems to be swapped out is looked at (read): a private copy comes back, and a protected
         hole becomes a page of the file. One that is away again by then is read with the others.
@@ -301,13 +301,14 @@ class PagemapTracker:
             return NONE, copied
         around = self._surroundings_of(doubtful)
         found = self._scanner.private(around)
-        away = pages.intersection(pages.intersection(found.swapped, doubtful), self._files) if len(found.swapped) else NONE
+        swapped = pages.intersection(found.swapped, doubtful)  # around them it may be protected holes
+        away = pages.intersection(swapped, self._files)
         if not len(away):
-            return pages.union(found.present, found.swapped), copied
+            return pages.union(found.present, swapped), copied
         readable, _ = self._memory.readable_pages(away)
         found = self._scanner.private(around)
-        elsewhere = pages.difference(found.swapped, away)
-        return pages.union(found.present, elsewhere), pages.union(copied, pages.intersection(found.swapped, readable))
+        real = pages.union(found.present, pages.difference(swapped, away))
+        return real, pages.union(copied, pages.intersection(found.swapped, readable))
 
     def _surroundings_of(self, doubtful: Words) -> Words:
         """Those of the private copies are the same from scan to scan."""
