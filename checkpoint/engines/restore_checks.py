@@ -353,10 +353,10 @@ def _of_open_file(held: Resource, path: str, same_boot: bool, digest_of: DigestO
     Args:
         same_boot: it may be the very same file, and its times can be compared.
     """
+    cure = _CARRIED if rebuild.is_written(held) else _FAR
     try:
         about = os.stat(path, follow_symlinks=not number_of(held.facts["flags"]) & rebuild.O_PATH)
     except OSError as error:
-        cure = _CARRIED if rebuild.is_written(held) else _FAR
         yield f"{path}, open as {held.name}, cannot be used ({error.strerror}): {cure}"
         return
     if stat.S_IFMT(about.st_mode) != stat.S_IFMT(number_of(held.facts["mode"])):
@@ -369,7 +369,6 @@ def _of_open_file(held: Resource, path: str, same_boot: bool, digest_of: DigestO
     grows, digest = rebuild.grows_at_its_end(held), facts.get("digest", b"")
     same_file = same_boot and (about.st_dev, about.st_ino) == (facts["device"], facts["inode"])
     if about.st_size < size or (about.st_size > size and not grows):
-        cure = _CARRIED if rebuild.is_written(held) else _FAR
         yield f"{named} has {about.st_size} bytes here and {size} there; {cure}, or {shared}"
     elif same_file and about.st_mtime_ns != facts["mtime_ns"] and rebuild.is_written(held) and not grows:
         yield f"{named} was written to since the snapshot, and not only at its end; end the program with the capture, or {shared}"
