@@ -68,8 +68,6 @@ CAPABILITIES: Final = (
 SIGCHLD: Final = 17
 GENERATIONS_MAX: Final = 200
 """In how many generations processes may descend from one another: whoever gives birth to one plans for its children, too."""
-PIDS_EVERYWHERE: Final = 1 << 15
-"""Pids below this can be had on every machine (/proc/sys/kernel/pid_max)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +75,7 @@ class Birth:
     """``parent`` gives birth to ``pid``.
 
     Attributes:
+        pid: below zero: of a stand-in, which the steps know by it and which may have any of `spare_pids` instead.
         exit_signal: what the parent is sent at its end.
         flags: of clone(2): what both share from then on.
     """
@@ -145,12 +144,19 @@ def steps_of(state: Snapshot, is_taken: Callable[[int], bool]) -> list[Step]:
     """Every step, beginning with the first process alone.
 
     Args:
-        is_taken: whether somebody else has a pid, so that no stand-in can have it.
+        is_taken: whether somebody else has a pid, so that nobody can stand in for a leader who had it.
 
     Raises:
         NoWayError: there is none.
     """
-    return steps(_person(state.process), _persons(state.members, state.zombies), _numbers(state), is_taken)
+    return steps(_person(state.process), _persons(state.members, state.zombies), is_taken)
+
+
+def spare_pids(state: Snapshot, end: int) -> Iterator[int]:
+    """Pids below ``end`` that nobody of the component is known by, the highest first: those above its own are lent next."""
+    persons = [_person(state.process), *_persons(state.members, state.zombies)]
+    wanted = {number for one in persons for number in (one.pid, one.pgid, one.sid)} | _thread_ids(state)
+    return (number for number in range(end - 1, 1, -1) if number not in wanted)
 
 
 def _persons(members: Sequence[Member], zombies: Sequence[Zombie]) -> list[Person]:
@@ -162,8 +168,7 @@ def _person(process: ProcessState, exit_signal: int = SIGCHLD, flags: int = 0) -
     return Person(process.pid, process.ppid, process.pgid, process.sid, exit_signal, flags)
 
 
-def _numbers(state: Snapshot) -> set[int]:
-    """Ids that are wanted for something."""
+def _thread_ids(state: Snapshot) -> set[int]:
     threads = [*state.threads, *(thread for member in state.members for thread in member.threads)]
     return {thread.tid for thread in threads}
 
@@ -181,7 +186,7 @@ def refuse(first: Status, members: Sequence[Member], zombies: Sequence[Zombie], 
 def refuse_persons(first: Status, others: Sequence[Person], is_taken: Callable[[int], bool]) -> Iterator[str]:
     """The same of those of whom no more is known."""
     try:
-        steps(Person(first.pids[-1], 0, first.pgids[-1], first.sids[-1]), others, set(), is_taken)
+        steps(Person(first.pids[-1], 0, first.pgids[-1], first.sids[-1]), others, is_taken)
     except NoWayError as error:
         yield str(error)
 
@@ -192,22 +197,16 @@ def persons(statuses: Sequence[Status]) -> list[Person]:
     return [Person(one.pids[-1], inner.get(one.ppid, 0), one.pgids[-1], one.sids[-1]) for one in statuses]
 
 
-def steps(
-    first: Person, others: Sequence[Person], numbers: set[int], is_taken: Callable[[int], bool] = lambda _: False
-) -> list[Step]:
-    """As `steps_of`.
-
-    Args:
-        numbers: ids that no stand-in may take, besides those of the processes.
-    """
+def steps(first: Person, others: Sequence[Person], is_taken: Callable[[int], bool] = lambda _: False) -> list[Step]:
+    """As `steps_of`."""
     _require_few_generations({one.pid: one.ppid for one in others})
     try:
-        return _Plan(first, others, numbers, is_taken).made()
+        return _Plan(first, others, is_taken).made()
     except NoWayError:
         places = birth_places.found(_wanted(first), {one.pid: one for one in _wanted_of(first, others)})
         if places is None:
             raise
-        return _Plan(first, others, numbers, is_taken).made_at(places)
+        return _Plan(first, others, is_taken).made_at(places)
 
 
 def _wanted(person: Person) -> Wanted:
@@ -242,7 +241,6 @@ class _Plan:
 
     first: Person
     others: Sequence[Person]
-    numbers: set[int]
     is_taken: Callable[[int], bool]
     steps: list[Step] = field(default_factory=list)
     session: dict[int, int] = field(default_factory=dict)
@@ -266,19 +264,12 @@ class _Plan:
 
     def _begin(self) -> None:
         self._everybody = {person.pid: person for person in (self.first, *self.others)}
-        self._spare = self._free(max((*self._everybody, *self.numbers, *(one.sid for one in self.others))))
         self.session[self.first.pid] = self.first.sid
 
     _everybody: dict[int, Person] = field(default_factory=dict)
-    _spare: Iterator[int] = field(default_factory=itertools.count)
+    _spare: Iterator[int] = field(default_factory=lambda: itertools.count(-1, -1))
     _children: dict[int, list[Person]] = field(default_factory=lambda: defaultdict(list))
     _needs: dict[int, int | None] = field(default_factory=dict)
-
-    def _free(self, last: int) -> Iterator[int]:
-        """Numbers for stand-ins: above all that are wanted, else between them."""
-        wanted = {*self._everybody, *self.numbers, *(number for one in self.others for number in (one.sid, one.pgid))}
-        numbers = itertools.chain(range(last + 1, PIDS_EVERYWHERE), range(2, last), itertools.count(last + 1))
-        return (number for number in numbers if number not in wanted and not self.is_taken(number))
 
     # Sessions
 

@@ -208,14 +208,9 @@ def surroundings_of(pid: int, streams: Streams | None, terms: Terms = NO_TERMS) 
     Raises:
         ProbeError: that is no process.
     """
-    if not 0 < pid <= _largest_pid():
+    if not 0 < pid < procfs.pid_max():
         raise ProbeError(f"cannot look at pid {pid}: that is not the number of a process")
     return Surroundings(pipes_of(streams.outputs) if streams else {}, terms.devices, terms.connections)
-
-
-def _largest_pid() -> int:
-    with open("/proc/sys/kernel/pid_max") as file:
-        return int(file.read())
 
 
 def _require_permission(pid: int, status: Status) -> None:

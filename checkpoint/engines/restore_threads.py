@@ -40,6 +40,10 @@ _ARGUMENTS: Final = struct.Struct("<10Q")
 """struct clone_args of linux/sched.h, as far as set_tid_size: the ids wanted are a list of their own."""
 
 
+class IdInUseError(RestoreError):
+    """Somebody has the id that a thread or process was to have."""
+
+
 def spawn(leader: Tracee, registers: bytes, base: int, tid: int) -> Tracee:
     """Have the first thread give birth to one with the id ``tid``; it stands still at its first instruction.
 
@@ -61,6 +65,9 @@ def spawn_process(parent: Tracee, registers: bytes, base: int, pid: int, exit_si
     Args:
         exit_signal: what the parent is sent when it ends.
         flags: of clone(2): what both share.
+
+    Raises:
+        IdInUseError: somebody has that id.
     """
     process = Tracee(_birth(parent, registers, base, (flags, exit_signal, pid), f"process {pid}"))
     process.wait(call_table.RUN_TIMEOUT_S)
@@ -125,7 +132,9 @@ def _birth(parent: Tracee, registers: bytes, base: int, wanted: tuple[int, int, 
             parent.request("step", abi.PTRACE_SYSCALL)
             parent.wait(call_table.RUN_TIMEOUT_S)
     if not born:
-        raise RestoreError(f"cannot restore its {what}: {_reason(-stubs.call_result(parent.registers()))}")
+        number = -stubs.call_result(parent.registers())
+        kind = IdInUseError if number == errno.EEXIST else RestoreError
+        raise kind(f"cannot restore its {what}: {_reason(number)}")
     return born
 
 

@@ -70,6 +70,8 @@ class TreeRestore:
         self._options = options
         self._first = Tracee(vessel_pid)
         self._born: dict[int, Tracee] = {state.process.pid: self._first}
+        self._standins: dict[int, int] = {}
+        self._spare = births.spare_pids(state, procfs.pid_max())
         self._restoring: list[ProcessRestore] = []
         self._notes: list[str] = []
         self._legacies: tuple[Legacy, ...] = ()
@@ -250,6 +252,8 @@ class TreeRestore:
 
     def _take(self, step: Step, base: int) -> None:
         match step:
+            case Birth(parent, pid) if pid < 0:
+                self._born[pid], self._standins[pid] = self._stand_in(self._born[parent], base)
             case Birth(parent, pid, exit_signal, flags):
                 mother = self._born[parent]
                 self._born[pid] = restore_threads.spawn_process(mother, self._registers, base, pid, exit_signal, flags)
@@ -263,8 +267,15 @@ class TreeRestore:
                 self._call(pid, what, "prctl", abi.PR_SET_CHILD_SUBREAPER, int(is_one))
             case End(parent, pid):
                 self._exit(pid, 0)
-                self._call(parent, f"take note of the end of {pid}", "wait4", pid, 0, WALL, 0)
+                self._call(parent, f"take note of the end of {pid}", "wait4", self._standins.pop(pid, pid), 0, WALL, 0)
                 del self._born[pid]
+
+    def _stand_in(self, mother: Tracee, base: int) -> tuple[Tracee, int]:
+        """Somebody of any pid, and that: whoever is born or restored beside us may have taken some."""
+        for pid in self._spare:
+            with contextlib.suppress(restore_threads.IdInUseError):
+                return restore_threads.spawn_process(mother, self._registers, base, pid, 0, 0), pid
+        raise RestoreError(f"cannot restore {self._state.component}: no pid is left for a stand-in of one that has ended")
 
     def _take_terminal(self, pid: int) -> None:
         """Give a session its controlling terminal, which all who are born into it from now on have as well."""

@@ -59,7 +59,7 @@ class MapsReader:
             return False
         known = self._lines
         fresh = {}
-        for line in text.splitlines():
+        for line in filter(None, text.split(b"\n")):  # see `procfs.lines_of`
             fresh[line] = known.get(line) or parse_maps_line(os.fsdecode(line))
         self._text, self._lines, self.lines = text, fresh, tuple(fresh.values())
         self._question = None

@@ -14,6 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from checkpoint.linux.procfs import lines_of
+
 UNLIMITED: Final = 1 << 60
 """Version 1 says "no limit" by a number that is about the largest there is; this is less, and more than any machine has."""
 _CACHED: Final = {2: ("inactive_file", "active_file"), 1: ("total_inactive_file", "total_active_file")}
@@ -46,13 +48,8 @@ def left(free_swap: int, proc: Path = Path("/proc/self")) -> int:
     return max(min(limits), 0)
 
 
-def _lines(text: str) -> list[str]:
-    """As the kernel ends them: in a path, which whoever mounts something may choose, `str.splitlines` sees ends of its own."""
-    return [line for line in text.split("\n") if line]
-
-
 def _hierarchies(mounts: str) -> Iterator[_Hierarchy]:
-    for line in _lines(mounts):
+    for line in lines_of(mounts):
         before, _, after = line.partition(" - ")
         _, _, _, root, point, *_ = before.split(" ")
         kind, _, options = after.split(" ", 2)
@@ -64,7 +61,7 @@ def _hierarchies(mounts: str) -> Iterator[_Hierarchy]:
 
 def _groups(hierarchy: _Hierarchy, groups: str) -> Iterator[Path]:
     """The directories of our group and of those around it that can be seen, from the inside out."""
-    for line in _lines(groups):
+    for line in lines_of(groups):
         _, controllers, path = line.split(":", 2)
         if (hierarchy.version == 2) if not controllers else (hierarchy.version == 1 and "memory" in controllers.split(",")):
             inside = os.path.relpath(path, hierarchy.root)

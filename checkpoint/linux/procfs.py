@@ -235,6 +235,15 @@ def parse_maps_line(line: str) -> MapsLine:
     )
 
 
+def lines_of(text: str) -> list[str]:
+    """The lines of a text as the kernel ends them.
+
+    `str.splitlines` sees ends of its own (a carriage return, for one) in the name of a process or file, which whoever gave it
+    chose: a process could tell lines about itself.
+    """
+    return [line for line in text.split("\n") if line]
+
+
 def parse_maps(text: str) -> tuple[MapsLine, ...]:
     """Read the mappings of one process, in address order.
 
@@ -243,7 +252,7 @@ def parse_maps(text: str) -> tuple[MapsLine, ...]:
 
     Source: proc_pid_maps(5).
     """
-    return tuple(map(parse_maps_line, text.splitlines()))
+    return tuple(map(parse_maps_line, lines_of(text)))
 
 
 # The process
@@ -252,7 +261,7 @@ def parse_maps(text: str) -> tuple[MapsLine, ...]:
 def parse_fields(text: str) -> dict[str, str]:
     """Read "Key:\tvalue" lines, as of /proc/PID/status and fdinfo; the first of several lines of one key counts."""
     fields: dict[str, str] = {}
-    for line in text.splitlines():
+    for line in lines_of(text):
         key, colon, value = line.partition(":")
         if colon:
             fields.setdefault(key, value.strip())
@@ -297,6 +306,16 @@ class Status:
         return self.state in "ZX" and self.threads <= 1
 
 
+_ESCAPED: Final = re.compile(r"\\n|\\\\")
+"""Of a name: a line feed and a backslash. Source: proc_task_name() in fs/proc/array.c."""
+
+
+def _name_in(status: str) -> str:
+    """The name of a process, with the spaces at its ends; the kernel escapes two characters of it."""
+    name = status.partition("\n")[0].partition("\t")[2]
+    return _ESCAPED.sub(lambda found: "\n" if found[0] == r"\n" else "\\", name)
+
+
 def parse_status(text: str) -> Status:
     """Read /proc/PID/status.
 
@@ -308,7 +327,7 @@ def parse_status(text: str) -> Status:
         return tuple(int(word, base) for word in fields.get(key, "").split())
 
     return Status(
-        name=fields.get("Name", ""),
+        name=_name_in(text),
         state=fields.get("State", "?")[:1],
         umask=int(fields.get("Umask", "0"), 8),
         tgid=int(fields["Tgid"]),
@@ -356,6 +375,12 @@ def swapped_size(pid: int) -> int:
     text = read_bytes(pid, "status")
     begin = text.find(b"\nVmSwap:")
     return int(text[begin + len(b"\nVmSwap:") :].split(maxsplit=1)[0]) * 1024 if begin >= 0 else 0
+
+
+def pid_max() -> int:
+    """What every pid is smaller than."""
+    with open("/proc/sys/kernel/pid_max") as file:
+        return int(file.read())
 
 
 def status(pid: int) -> Status:

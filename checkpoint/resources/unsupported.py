@@ -64,6 +64,13 @@ CAPABILITIES: Final = (
         "own userfaultfd write-protects",
     ),
     refused(Area.MEMORY, "shadow stacks", "run it without", "a shadow stack"),
+    refused(
+        Area.MEMORY,
+        "memory with tags and code with guarded branch targets (MTE, BTI; arm64)",
+        "boot with arm64.nomte or arm64.nobti",
+        "memory with tags",
+        "code whose branch targets are guarded",
+    ),
     preserved(
         Area.MEMORY,
         "mapped files that were replaced or deleted since the program started",
@@ -141,6 +148,8 @@ _VM_FLAGS: Final[Mapping[str, str]] = {
     "pf": "memory of a device",
     "io": "memory of a device",
     "ss": "a shadow stack",
+    "mt": "memory with tags (PROT_MTE)",
+    "bt": "code whose branch targets are guarded (PROT_BTI)",
 }
 """VmFlags of proc_pid_smaps(5) that no fresh mapping can be given."""
 
@@ -347,10 +356,15 @@ def _refuse_namespaces(pid: int) -> Iterator[str]:
 
 
 def _has_other_for_children(pid: int, kind: str) -> bool:
-    """Whether those whom it gives birth to live in another namespace than it; the link leads nowhere before the first one."""
+    """Whether those whom it gives birth to live in another namespace than it; the link leads nowhere before the first one.
+
+    Source: exit_task_namespaces() in do_exit(): of a process that ends, long before it is told, no link but those of ``pid`` and
+    ``user`` leads anywhere.
+    """
     try:
         return os.readlink(f"/proc/{pid}/ns/{kind}_for_children") != os.readlink(f"/proc/{pid}/ns/{kind}")
     except FileNotFoundError:
-        return os.path.lexists(f"/proc/{pid}/ns/{kind}_for_children")
+        lives = os.path.exists(f"/proc/{pid}/ns/mnt")
+        return lives and os.path.lexists(f"/proc/{pid}/ns/{kind}_for_children")
     except OSError:  # gone, or not ours to look at: others say so
         return False

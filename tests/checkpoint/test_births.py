@@ -13,7 +13,7 @@ def played(others: list[Person], first: Person = FIRST) -> dict[int, Person]:
     """What the kernel would make of a plan: who is there at its end."""
     world = {first.pid: first}
     reapers: set[int] = set()
-    for step in steps(first, others, set()):
+    for step in steps(first, others):
         _play(world, reapers, step)
     assert not reapers, "who asks for orphans is said later"
     return world
@@ -86,14 +86,14 @@ def test_everybody_is_what_it_was(others: list[Person]) -> None:
 
 def test_a_session_that_nobody_can_be_born_into_is_refused() -> None:
     with pytest.raises(NoWayError, match="process 4 is of session 3"):
-        steps(FIRST, [Person(3, 4, 3, 3), Person(4, 2, 3, 3)], set())
+        steps(FIRST, [Person(3, 4, 3, 3), Person(4, 2, 3, 3)])
 
 
 def test_a_session_or_group_of_somebody_else_is_refused() -> None:
     with pytest.raises(NoWayError, match="session 3 is that of another program"):
-        steps(FIRST, [Person(4, 2, 3, 3)], set(), lambda pid: pid == 3)
+        steps(FIRST, [Person(4, 2, 3, 3)], lambda pid: pid == 3)
     with pytest.raises(NoWayError, match="process group 3 is that of another program"):
-        steps(FIRST, [Person(4, 2, 3, 2)], set(), lambda pid: pid == 3)
+        steps(FIRST, [Person(4, 2, 3, 2)], lambda pid: pid == 3)
 
 
 @pytest.mark.parametrize("led", [False, True])
@@ -102,4 +102,4 @@ def test_many_generations_are_born_again_and_too_many_are_refused(led: bool) -> 
     assert played(line) == {one.pid: one for one in (FIRST, *line)}
     last = line[-1].pid
     with pytest.raises(NoWayError, match="which is the limit"):
-        steps(FIRST, [*line, Person(last + 1, last, 2, 2), *(Person(pid, pid - 1, 2, 2) for pid in range(last + 2, 2000))], set())
+        steps(FIRST, [*line, Person(last + 1, last, 2, 2), *(Person(pid, pid - 1, 2, 2) for pid in range(last + 2, 2000))])

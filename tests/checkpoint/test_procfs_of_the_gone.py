@@ -12,7 +12,7 @@ from checkpoint.engines import probe
 from checkpoint.errors import ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.descriptors import descriptor_numbers
-from checkpoint.resources import glance
+from checkpoint.resources import glance, unsupported
 from tests.checkpoint.round_trip import as_nobody
 
 
@@ -53,3 +53,9 @@ def test_who_ends_in_the_middle_of_a_look_is_gone(monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr(procfs, "read_bytes", lambda *_: b"")
         with pytest.raises(ProcessGoneError, match="becomes another program"):
             probe._require_permission(pid, status)
+
+
+def test_who_has_ended_is_not_taken_for_one_whose_children_are_to_live_elsewhere() -> None:
+    """Of it the links of most namespaces lead nowhere, as one does of a program that has called unshare(2)."""
+    with zombie() as pid:
+        assert [reason for reason in unsupported._refuse_namespaces(pid) if "its children" in reason] == []

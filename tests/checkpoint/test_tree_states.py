@@ -15,6 +15,7 @@ from checkpoint import room
 from checkpoint.engine import CaptureOrder
 from checkpoint.errors import UnsupportedError
 from checkpoint.linux import kinship, procfs
+from checkpoint.linux.vessel import Birth, discard, spawn_vessel
 from tests.checkpoint.round_trip import (
     Program,
     captured_at_last,
@@ -506,7 +507,8 @@ print("ok", flush=True)
 """
 
 
-def test_processes_that_have_lost_their_parent_are_told_by_their_session(tmp_path: Path) -> None:
+@pytest.mark.parametrize("crowded", [False, True], ids=["", "where stand-ins find their pids taken"])
+def test_processes_that_have_lost_their_parent_are_told_by_their_session(crowded: bool, tmp_path: Path) -> None:
     program = start([sys.executable, "-c", PREAMBLE + STRAYS], tmp_path)
     with ended(program):
         program.wait_for_line("ready")
@@ -521,7 +523,13 @@ def test_processes_that_have_lost_their_parent_are_told_by_their_session(tmp_pat
         for pid in strays | set(everybody):
             with contextlib.suppress(ChildProcessError):
                 os.waitpid(pid, 0)
-    again = restored(snapshot, tmp_path)
+    last = procfs.pid_max() - 1
+    there = [spawn_vessel(Birth(inner_pid=last - n)) for n in range(2 if crowded else 0)]
+    try:
+        again = restored(snapshot, tmp_path)
+    finally:
+        for one in there:
+            discard(one)
     with ended(again):
         again.tell()
         expect_ok(again)
