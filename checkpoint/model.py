@@ -401,7 +401,7 @@ class Snapshot:
         runs: the pages that this snapshot carries, in address order, disjoint.
         contents: the bytes of ``runs``, concatenated in the same order; ``sum(run.size)`` bytes.
         epoch: number of the primacy under which it was taken; 0 for a one-shot capture.
-        freeze_us: how long the program stood still for it.
+        freeze_us: how long the program stood still for it; where that was several times, the longest.
         members, zombies: of a component of several processes, those besides the first, which the other fields are of.
         copies: pages that it carries by naming others that it carries, of processes that have memory in common since a fork.
         differences: those of ``runs`` whose bytes in ``contents`` are to be XORed with what the parent's state holds there

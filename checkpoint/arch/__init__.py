@@ -1,7 +1,7 @@
 """Processors as data: files of the same names in the same order; this machine's are `cpu`, `stubs`, `extended` and `levels`.
 
 How to add one stands in ARCHITECTURE.md. On a machine whose processor has no files here, those of x86-64 are what `cpu` and the
-others are: nothing of them is used there, as `require_supported` and `number_of` see to.
+others are: nothing of them is used there, as `why_unsupported` and `number_of` see to.
 """
 
 from __future__ import annotations
@@ -12,15 +12,13 @@ from collections.abc import Mapping
 from types import ModuleType
 from typing import TYPE_CHECKING, Final
 
-from checkpoint.errors import ProbeError
-
 if TYPE_CHECKING:  # the others have the same names
     from checkpoint.arch import x86_64 as cpu
     from checkpoint.arch import x86_64_levels as levels
     from checkpoint.arch import x86_64_stub as stubs
     from checkpoint.arch import x86_64_xstate as extended
 
-__all__ = ["SUPPORTED", "cpu", "extended", "levels", "number_of", "require_supported", "stubs", "why_unsupported"]
+__all__ = ["SUPPORTED", "cpu", "extended", "levels", "number_of", "stubs", "why_unsupported"]
 
 KNOWN: Final = ("x86_64", "aarch64")
 """Those that there are files for, as uname(2) calls them."""
@@ -29,6 +27,9 @@ UNPROVED: Final = ("aarch64",)
 TRY_UNPROVED: Final = "FAILOVER_TRY_UNPROVED_PROCESSOR"
 """Variable of the environment by which those who complete one run it; never for a program that matters."""
 SUPPORTED: Final = tuple(name for name in KNOWN if name not in UNPROVED or os.environ.get(TRY_UNPROVED))
+
+EVERY_LEVEL: Final = ("x86-64-v1", "x86-64-v2", "x86-64-v3", "x86-64-v4", "armv8-a")
+"""The levels of all of them (`levels.LEVELS`): one file of configuration may serve a mixed team."""
 
 _MACHINE: Final = os.uname().machine
 _HERE: Final = _MACHINE if _MACHINE in KNOWN else KNOWN[0]
@@ -56,23 +57,13 @@ def number_of(call: str) -> int | None:
 
 
 def why_unsupported() -> str:
-    """Why programs that nobody prepared cannot be kept on this machine's processor; "": they can."""
+    """Why programs that nobody prepared cannot be kept on this kind of processor; "": they can.
+
+    What this machine's has besides is asked by `checkpoint.linux.processor`.
+    """
     if _MACHINE in SUPPORTED:
         return ""
     return (
         f"the processor is {_MACHINE}, and only {', '.join(SUPPORTED)} is supported so far: use such a machine, or have the "
         "program keep its state itself, which works on any (docs/decorator.md)"
     )
-
-
-def require_supported(what: str) -> None:
-    """Check that this machine's processor is one that we have.
-
-    Args:
-        what: was tried, for the message: "capture pid 412".
-
-    Raises:
-        ProbeError: it is not.
-    """
-    if reason := why_unsupported():
-        raise ProbeError(f"cannot {what}: {reason}")

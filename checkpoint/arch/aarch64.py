@@ -26,6 +26,8 @@ AUDIT_ARCHITECTURE: Final = 0xC00000B7
 """AUDIT_ARCH_AARCH64 of linux/audit.h, which filters of seccomp(2) look at."""
 FEATURES_LINE: Final = "Features"
 """How the line of /proc/cpuinfo begins that names what the processor has."""
+WRITE_PROTECTION_SINCE: Final = "6.10"
+"""The first Linux that tells of it what was written (PAGEMAP_SCAN, userfaultfd's write protection)."""
 
 # Registers
 
@@ -74,9 +76,13 @@ NO_CALL: Final = _WORD
 """As `CALL_NUMBER`, unsigned."""
 OUTSIDE_OF_CALLS: Final[tuple[tuple[int, int], ...]] = ()
 """Words of NT_PRSTATUS, by place, that say that the thread is in no call: there is none."""
-LOST_IN_A_CALL: Final[tuple[str, ...]] = ()
-"""What every system call changes, besides its result."""
+STEPPING: Final[tuple[tuple[int, int], ...]] = ()
+"""No program steps through itself: only the kernel can set that bit."""
+LOST_IN_A_CALL: Final = ("mark",)
+"""What every system call changes, besides its result: nothing but what is no register, see `recalled`."""
 ARGUMENTS: Final = ("x0", "x1", "x2", "x3", "x4", "x5")
+ENDED_ARGUMENTS: Final = ("first", *ARGUMENTS[1:])
+"""Where the arguments of a call are that has ended: a result has taken the place of the first one, see `recalled`."""
 
 # System calls
 
@@ -167,28 +173,77 @@ SOCKET_TIMEOUT: Final[Mapping[str, Timeout]] = {
 }
 """Calls that do so only at a socket that has a timeout. connect(2) is not made again: it would answer EALREADY."""
 CALL_NUMBER_BITS: Final = 0
-"""No room for a mark by which a call is known again."""
+"""Marks by which a call is known again lie in the upper half of its first argument, where that is a number of 32 bits: the kernel
+takes the lower half, and the call's result takes the place of both (`has_room_for_mark`)."""
 MARK_LIMIT: Final = 1 << 31
 """Marks are smaller."""
+_BEGIN_WITH_A_POINTER: Final = ("rt_sigtimedwait", "io_getevents")
+NUMBER: Final = "x8"
+"""Where a program puts the number of a call, which stays there."""
+CALL_SET: Final[int | None] = 0x404
+"""NT_ARM_SYSTEM_CALL of linux/elf.h, 32 bits: the number that the kernel knows of the call that a thread stands in."""
 
 
 def call_number(registers: Mapping[str, int]) -> int:
-    """The number of the system call that a thread stands in; -1: of none, always."""
+    """The number of the system call that a thread stands in, if that was `recalled`; else -1."""
     word = registers[CALL_NUMBER]
     return -1 if word >> 63 else word
 
 
 def mark_of(registers: Mapping[str, int]) -> int:
-    """The mark of the system call that a thread stands in: 0, it has none."""
-    return 0
+    """The mark of the call that a thread stands in, if that was `recalled`; 0: it has none."""
+    return registers.get("mark", 0)
 
 
 def marked(number: int, mark: int) -> int:
-    """A call's number with a mark: there is no room for one."""
+    """A call's number with a mark: as it is, marks lie elsewhere."""
     return number
 
 
+def has_room_for_mark(registers: Mapping[str, int]) -> bool:
+    """Whether the call that a thread stands in has room for a mark."""
+    return SYSCALL_NAMES.get(call_number(registers)) not in _BEGIN_WITH_A_POINTER
+
+
+def recalled(registers: Registers, number: int, first_argument: int) -> Registers:
+    """The registers of a thread in which a call has just ended, with what they do not say: which, of what, with which mark.
+
+    Args:
+        registers: the ``svc`` is the instruction before where they stand.
+    """
+    told = {**registers, CALL_NUMBER: number, "first": first_argument, "mark": 0}
+    if has_room_for_mark(told):
+        told["mark"], told["first"] = divmod(first_argument, 1 << 32)
+    return told
+
+
+def made_again(registers: Registers, mark: int) -> Registers:
+    """Have a call made again that has ended with EINTR: see `checkpoint.linux.entered_calls` for signals that come first.
+
+    Args:
+        registers: as `recalled`.
+    """
+    place = registers[INSTRUCTION_POINTER] - len(SYSCALL)
+    first = mark << 32 | registers["first"]
+    return {**registers, RESULT: first, INSTRUCTION_POINTER: place, CALL_NUMBER: NO_CALL}
+
+
 RESTART_BLOCK_USERS: Final = ("clock_nanosleep", "nanosleep", "futex")
+
+
+def may_go_on(registers: Mapping[str, int]) -> bool:
+    """Whether the call that a thread is about to make may be one that the kernel has interrupted, and remembers the end of.
+
+    Not so where its time is told by the clock: made again it ends as it would have.
+
+    Source: clock_nanosleep(2), futex(2): FUTEX_WAIT is operation 0.
+    """
+    name = SYSCALL_NAMES.get(registers[NUMBER])
+    if name == "clock_nanosleep":
+        return not registers["x1"] & 1
+    if name == "futex":
+        return not registers["x1"] & 0x7F and bool(registers["x3"])
+    return name == "nanosleep"
 
 
 def call_number_before(code: bytes) -> int | None:

@@ -172,6 +172,7 @@ SYSTEM_CALLS: Final = {
     "pkey_alloc": 289,
     "pkey_free": 290,
     "pkey_mprotect": 288,
+    "ppoll": 73,
     "prctl": 167,
     "pread64": 67,
     "prlimit64": 261,

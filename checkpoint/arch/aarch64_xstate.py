@@ -32,6 +32,9 @@ _SIZES: Final = {VECTORS: 528, THREAD_POINTER: 8, ADDRESS_KEYS: 64, GENERIC_KEY:
 _NEEDED: Final = {VECTORS: "fp", THREAD_POINTER: "fp", ADDRESS_KEYS: "paca", GENERIC_KEY: "pacg"}
 """Features without which there is no such set; every processor that runs our kernels has the first."""
 """The kernel tells a set only to who asks for it by number, so all of them are asked for, one by one."""
+UNKEPT: Final = {"sve": "scalable vectors (SVE: arm64.nosve)", "sme": "scalable matrices (SME: arm64.nosme)"}
+"""Features of which a thread has registers that are not kept, and that a call of ours would clear: what a message calls each,
+with the parameter that has the kernel leave it alone. Source: Documentation/arch/arm64/sve.rst; kernel-parameters.txt."""
 PERMISSIONS: Final[tuple[tuple[str, str, tuple[int, ...]], ...]] = ()
 """What a process asks for before it may use some of it: feature, call, arguments. Nothing."""
 

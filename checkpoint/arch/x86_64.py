@@ -21,6 +21,8 @@ AUDIT_ARCHITECTURE: Final = 0xC000003E
 """AUDIT_ARCH_X86_64 of linux/audit.h, which filters of seccomp(2) look at."""
 FEATURES_LINE: Final = "flags"
 """How the line of /proc/cpuinfo begins that names what the processor has."""
+WRITE_PROTECTION_SINCE: Final = "6.7"
+"""The first Linux that tells of it what was written (PAGEMAP_SCAN, userfaultfd's write protection)."""
 
 # Registers
 
@@ -71,9 +73,13 @@ NO_CALL: Final = _WORD
 """As `CALL_NUMBER`, unsigned: the thread is not in a system call, so the kernel has none to restart."""
 OUTSIDE_OF_CALLS: Final = ((REGISTER_NAMES.index(CALL_NUMBER), NO_CALL),)
 """Words of NT_PRSTATUS, by place, that say that the thread is in no call."""
+STEPPING: Final = ((REGISTER_NAMES.index("eflags"), 1 << 8),)
+"""Words of NT_PRSTATUS, by place, and the bit of each by which a program steps through itself: the trap flag."""
 LOST_IN_A_CALL: Final = ("rcx", "r11")
 """What every system call changes, besides its result. Source: psABI, A.2.1."""
 ARGUMENTS: Final = ("rdi", "rsi", "rdx", "r10", "r8", "r9")
+ENDED_ARGUMENTS: Final = ARGUMENTS
+"""Where the arguments of a call are that has ended."""
 
 # System calls
 
@@ -161,9 +167,13 @@ SOCKET_TIMEOUT: Final[Mapping[str, Timeout]] = {
 """Calls that do so only at a socket that has a timeout. connect(2) is not made again: it would answer EALREADY."""
 CALL_NUMBER_BITS: Final = 32
 """Of the register with a call's number newer kernels look at the lower half only, and keep both in `CALL_NUMBER`: the upper one
-can hold a mark by which a call is known again, until its result takes that place. 0: no room for a mark."""
+can hold a mark by which a call is known again, until its result takes that place. 0: marks lie elsewhere."""
 MARK_LIMIT: Final = 1 << 31
 """Marks are smaller: the highest bit says that the thread is in no call."""
+NUMBER: Final = "rax"
+"""Where a program puts the number of a call."""
+CALL_SET: Final[int | None] = None
+"""The register set that tells the number of a call: there is none, the general registers do."""
 
 
 def call_number(registers: Mapping[str, int]) -> int:
@@ -182,7 +192,27 @@ def marked(number: int, mark: int) -> int:
     return mark << CALL_NUMBER_BITS | number
 
 
+def has_room_for_mark(registers: Mapping[str, int]) -> bool:
+    """Whether the call that a thread stands in has room for a mark, where any has."""
+    return True
+
+
+def recalled(registers: Registers, number: int, first_argument: int) -> Registers:
+    """The registers of a thread in which a call has just ended, with what they do not say: they say all of it."""
+    return registers
+
+
+def made_again(registers: Registers, mark: int) -> Registers:
+    """Have the kernel make a call again as soon as the program runs, unless a signal handler comes first."""
+    return {**registers, RESULT: ERESTARTNOHAND, CALL_NUMBER: marked(call_number(registers), mark)}
+
+
 RESTART_BLOCK_USERS: Final = ("clock_nanosleep", "nanosleep", "poll", "futex")
+
+
+def may_go_on(registers: Mapping[str, int]) -> bool:
+    """Whether a call may be one that the kernel remembers the end of without saying so: it says so, by `RESTART_BLOCK`."""
+    return False
 
 
 def call_number_before(code: bytes) -> int | None:

@@ -216,7 +216,7 @@ SYSTEM_CALLS: Final = {
     "pkey_alloc": 330,
     "pkey_free": 331,
     "pkey_mprotect": 329,
-    "poll": 7,
+    "ppoll": 271,
     "prctl": 157,
     "pread64": 17,
     "prlimit64": 302,

@@ -49,6 +49,8 @@ PKRU_OF_LINUX: Final = 0x55555554
 HIGHEST: Final = 62
 AMX: Final = (17, 18)
 """Only for a process that has asked for it, and 8 KiB a thread: kept while its tiles are released, as between computations."""
+UNKEPT: Final[dict[str, str]] = {}
+"""Features of which a thread has registers that are not kept: none, whatever XSAVE knows is."""
 PERMISSIONS: Final = (("amx_tile", "arch_prctl", (0x1023, 18)),)
 """What a process asks for before it may use some of it: feature, call, arguments (ARCH_REQ_XCOMP_PERM: the tiles of AMX).
 

@@ -13,7 +13,7 @@ from checkpoint.arch import cpu as arch
 from checkpoint.engines.confinements import Confinements
 from checkpoint.engines.restart import Interruptions, outside_critical_section
 from checkpoint.errors import CaptureError, UnsupportedError
-from checkpoint.linux import confinement, dirty, entry, procfs, remote
+from checkpoint.linux import confinement, dirty, ended_calls, entry, procfs, remote
 from checkpoint.linux.confinement import FILTERED
 from checkpoint.linux.digests import DigestTracker
 from checkpoint.linux.dirty import SoftDirtyTracker
@@ -155,18 +155,27 @@ def where_it_stands(tracee: Tracee, registers: bytes, rseq: Callable[[], Rseq | 
         rseq: answers with its registration for restartable sequences; it may be in one if it is in no call.
     """
     _, result, number = arch.stand_of(registers)
-    if number < 0:
-        registration = rseq()
-        if registration is None:
-            return registers
-        decoded = arch.decode_registers(registers)
-        found = outside_critical_section(decoded, tracee.memory, registration.address)
-    else:
-        interruption = interruptions.of(tracee)
-        if not interruption.is_disturbed(result):
-            return registers
-        decoded = arch.decode_registers(registers)
-        found = interruption.undisturbed(decoded)
+    if number >= 0:
+        is_disturbed = interruptions.of(tracee).is_disturbed(result)
+        return _undisturbed(tracee, registers, interruptions) if is_disturbed else registers
+    if arch.FORGETS_CALLS:
+        registers = _undisturbed(tracee, registers, interruptions)
+    registration = rseq()
+    if registration is None:
+        return registers
+    decoded = arch.decode_registers(registers)
+    found = outside_critical_section(decoded, tracee.memory, registration.address)
+    return registers if found is decoded else arch.encode_registers(found)
+
+
+def _undisturbed(tracee: Tracee, registers: bytes, interruptions: Interruptions) -> bytes:
+    interruption = interruptions.of(tracee)
+    if arch.FORGETS_CALLS:
+        registers = interruption.going_on(tracee, registers)
+    decoded = arch.decode_registers(registers)
+    if arch.FORGETS_CALLS:
+        decoded = ended_calls.told(tracee, decoded)
+    found = interruption.undisturbed(decoded)
     return registers if found is decoded else arch.encode_registers(found)
 
 
@@ -182,7 +191,7 @@ def _tracker_for(pid: int, entered: entry.Entered) -> tuple[Tracker, tuple[str, 
                 raise
             why = str(error)
     tracker: Tracker = SoftDirtyTracker(pid) if dirty.has_soft_dirty() else DigestTracker(pid)
-    return tracker, (f"written pages are found by {tracker.name}, which takes longer: no write protection ({why})",)
+    return tracker, (f"written pages are found by {tracker.name}: {tracker.cost}; no write protection ({why})",)
 
 
 @contextlib.contextmanager

@@ -5,7 +5,6 @@ Imported by the keeper alone, and at once: a keeper that waits in advance must n
 
 from __future__ import annotations
 
-from checkpoint.arch import require_supported
 from checkpoint.contents import digest_of_file
 from checkpoint.digests_of_files import DigestOf
 from checkpoint.engine import PTRACE, Copy, ProtectOrder, Report, Restored, RestoreOptions, Session
@@ -13,6 +12,7 @@ from checkpoint.engines import ready_copy, restore_checks
 from checkpoint.engines.probe import probe
 from checkpoint.engines.ptrace_capture import PtraceSession
 from checkpoint.engines.ptrace_restore import restore
+from checkpoint.linux.processor import require_supported
 from checkpoint.model import Snapshot
 
 

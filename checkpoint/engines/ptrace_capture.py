@@ -72,7 +72,7 @@ class Frozen:
     Attributes:
         first: of the first process.
         others: what was seen of the others; None where there are none.
-        freeze_us: how long the program stood still.
+        freeze_us: how long the program stood still; of several times, which a capture that is made again has, the longest.
         seen: its carried files.
         departing: its connections, where it may stand still for good.
         segments: System V shared memory of this machine, where any of them has some attached.
@@ -119,6 +119,7 @@ class PtraceSession:
         self._totals_at: dict[Position, Totals] = {}
         self._refused = False
         self._held = False
+        self._longest_us = 0
         self._collects = False
         self._precedence = Precedence()
         self._budget = FreezeBudget(order.terms.freeze_budget_ns)
@@ -247,6 +248,7 @@ class PtraceSession:
     def _frozen(self, order: CaptureOrder, *, base: bool) -> Frozen:
         """One freeze; again where processes came and went in the middle of it."""
         deadline = time.monotonic() + MOVED_S
+        self._longest_us = 0
         while True:
             try:
                 self._tree.admit(held=self._held)
@@ -314,12 +316,18 @@ class PtraceSession:
                 self._departing = carried_connections.depart(self._opened(first, others))
         except BaseException:
             self._thaw()
+            self._stood_since(began)
             raise
         if hold:
             self._hold()
         else:
             self._thaw()
-        return Frozen(first, others, (time.perf_counter_ns() - began) // NS_PER_US, seen, self._departing, segments)
+        return Frozen(first, others, self._stood_since(began), seen, self._departing, segments)
+
+    def _stood_since(self, began: int) -> int:
+        """Note how long it stood still; the longest time of this capture, in µs."""
+        self._longest_us = max(self._longest_us, (time.perf_counter_ns() - began) // NS_PER_US)
+        return self._longest_us
 
     def _require_whole(self, first: Look, others: SeenOthers | None) -> None:
         """Nothing was left out that must be asked while it stands still; the first thing to be done when it runs again.

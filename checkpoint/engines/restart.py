@@ -17,8 +17,9 @@ from typing import Final
 
 from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import Registers
-from checkpoint.engines.waits import Waiting, made_again
+from checkpoint.engines.waits import Waiting
 from checkpoint.errors import CaptureError
+from checkpoint.linux import ended_calls, entered_calls, restart_blocks
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.tracee import Tracee
 
@@ -28,6 +29,9 @@ CODE_LOOKED_AT = 32
 Place = tuple[int, ...]
 """Instruction pointer, stack pointer and arguments: the same while one call is restarted again and again."""
 _OF_PLACE: Final = (arch.INSTRUCTION_POINTER, arch.STACK_POINTER, *arch.ARGUMENTS)
+_RESTART: Final = arch.SYSCALLS["restart_syscall"]
+_BEHIND: Final = len(arch.SYSCALL) if arch.FORGETS_CALLS else 0
+"""Bytes from where a thread stands that is stopped in a call to where the call's instruction ends."""
 _place_in: Final = operator.itemgetter(*map(arch.REGISTER_NAMES.index, _OF_PLACE))
 
 
@@ -59,12 +63,29 @@ class Interruption:
             return registers
         number, registers = self._interrupted(registers, arch.call_number(registers))
         known = arch.SYSCALL_NAMES.get(number) in arch.RESTART_BLOCK_USERS
-        return made_again({**registers, arch.CALL_NUMBER: number}, 0) if known else registers
+        return arch.made_again({**registers, arch.CALL_NUMBER: number}, 0) if known else registers
+
+    def going_on(self, tracee: Tracee, registers: bytes) -> bytes:
+        """The registers that a thread gets back which is about to make a call: by which it goes on as if it had not been stopped.
+
+        Where the registers of a stop inside a call say so themselves this is not asked.
+
+        Args:
+            tracee: stands where it has come to by itself, if anything is to be found out.
+        """
+        decoded = arch.decode_registers(registers)
+        number = decoded[arch.NUMBER]
+        if not tracee.is_as_found or (number != _RESTART and (self.begins_anew or not arch.may_go_on(decoded))):
+            return registers
+        if not entered_calls.is_before_a_call(tracee, decoded):
+            return registers
+        self._interrupted(decoded, number)
+        return registers if number == _RESTART or tracee.stopped_by else restart_blocks.shown(tracee, decoded)
 
     def remembers(self, registers: bytes) -> bool:
         """Whether `settled` needs to ask the program nothing, for these registers as `Tracee.registers` gives them."""
         _, result, number = arch.stand_of(registers)
-        if result != arch.RESTART_BLOCK or number != arch.SYSCALLS["restart_syscall"]:
+        if result != arch.RESTART_BLOCK or number != _RESTART:
             return True
         return bool(_place_in(arch.words_of(registers)) == self._place)
 
@@ -73,12 +94,27 @@ class Interruption:
         number = arch.call_number(registers)
         result = ctypes.c_int64(registers[arch.RESULT]).value
         if number < 0:
-            return registers, ""
+            return self._of_forgotten(registers) if arch.FORGETS_CALLS else registers, ""
         if result in arch.RESTARTABLE:
             return _again(registers, number)
         if result == arch.RESTART_BLOCK:
             return self._from_restart_block(registers, number)
         return registers, ""
+
+    def _of_forgotten(self, registers: Registers) -> Registers:
+        """As `settled`, of a thread that is told as standing in no call, and may be about to go on with one."""
+        number = registers[arch.NUMBER]
+        place = tuple(registers[name] for name in _OF_PLACE)
+        if number != _RESTART:
+            self._place, self._number = place, number
+            return registers
+        if place != self._place:
+            return registers
+        number, registers = self._interrupted(registers, number)
+        if arch.SYSCALL_NAMES.get(number) in arch.RESTART_BLOCK_USERS:
+            return {**registers, arch.NUMBER: number}
+        behind = registers[arch.INSTRUCTION_POINTER] + len(arch.SYSCALL)
+        return {**registers, arch.RESULT: -errno.EINTR, arch.INSTRUCTION_POINTER: behind}
 
     def _from_restart_block(self, registers: Registers, number: int) -> tuple[Registers, str]:
         number, registers = self._interrupted(registers, number)
@@ -90,8 +126,8 @@ class Interruption:
     def _interrupted(self, registers: Registers, number: int) -> tuple[int, Registers]:
         """The call itself, and the registers with which it waits for what is left of its time."""
         place = tuple(registers[name] for name in _OF_PLACE)
-        if number == arch.SYSCALLS["restart_syscall"]:
-            number = self._number if place == self._place else self._read_from_code(registers[arch.INSTRUCTION_POINTER])
+        if number == _RESTART:
+            number = self._number if place == self._place else self._read_from_code(registers[arch.INSTRUCTION_POINTER] + _BEHIND)
         self._place, self._number = place, number
         name = arch.SYSCALL_NAMES.get(number, "")
         if name in arch.REMAINING_TIME:
@@ -133,6 +169,8 @@ class Interruptions:
     def mend(self, tracee: Tracee) -> None:
         """Let a thread that stands still, and has not been given registers, go on as if it had not been stopped."""
         found = arch.decode_registers(tracee.registers())
+        if arch.FORGETS_CALLS:
+            found = ended_calls.told(tracee, found)
         mended = self.of(tracee).undisturbed(found)
         if mended != found:
             tracee.set_registers(arch.encode_registers(mended))

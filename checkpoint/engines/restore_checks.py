@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from checkpoint import carried, portable, tree
-from checkpoint.arch import cpu, extended, why_unsupported
+from checkpoint.arch import cpu, extended
 from checkpoint.capability import Area, by_rule, refused
 from checkpoint.contents import DIGEST_SIZE, digest_of_file, path_in
 from checkpoint.digests_of_files import DigestOf
@@ -140,7 +140,7 @@ def _compare(state: Snapshot, options: RestoreOptions, digest_of: DigestOf = dig
         reason = f"it was taken on {state.machine.architecture}, this machine is {architecture}: restore it on such a machine"
         reason += "; a program that keeps its state itself goes on on either (docs/decorator.md)"
         return (reason,), Brought()
-    if unsupported_here := why_unsupported():
+    if unsupported_here := processor.why_unsupported():
         return (unsupported_here,), Brought()
     run: dict[str, str] = {}
     opened: dict[str, str] = {}

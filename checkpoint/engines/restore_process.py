@@ -9,6 +9,7 @@ Sources: prctl(2), rt_sigaction(2), timer_create(2), sched(7), credentials(7), c
 from __future__ import annotations
 
 import ctypes
+import dataclasses
 import os
 import signal
 import struct
@@ -276,7 +277,8 @@ def posix_timers(
             _create_timer(table, PosixTimer(next_id, 1, 1, 0, 0, 0, 0, 0), inner_pid)
             table.call(f"delete timer {next_id}", "timer_delete", next_id)
             next_id += 1
-        _create_timer(table, timer, timer.tid if timer.tid in others else inner_pid)
+        known = dataclasses.replace(timer, clock=_clock_here(timer.clock, process.pid, inner_pid))
+        _create_timer(table, known, timer.tid if timer.tid in others else inner_pid)
         next_id = timer.timer_id + 1
     if chosen_ids:
         table.call("stop choosing timer numbers", "prctl", PR_TIMER_CREATE_RESTORE_IDS, 0)
@@ -285,6 +287,14 @@ def posix_timers(
             left_ns = 1 if timer.interval_ns and timer.timer_id in overdue else _left_of(timer, elapsed_ns)
             packed = struct.pack("<4q", *divmod(timer.interval_ns, _NS_PER_S), *divmod(left_ns, _NS_PER_S))
             table.call(f"arm timer {timer.timer_id}", "timer_settime", timer.timer_id, 0, table.place(packed), 0)
+
+
+def _clock_here(clock: int, pid: int, inner_pid: int) -> int:
+    """The number of a clock that may count the processor time of the process itself, by a PID that is another one here.
+
+    Source: linux/posix-timers_types.h: the complement of the PID, shifted by three bits.
+    """
+    return clock - (~pid << 3) + (~inner_pid << 3) if clock < 0 and ~(clock >> 3) == pid else clock
 
 
 def timer_numbers_can_be_chosen() -> bool:

@@ -8,12 +8,12 @@ is over. At a stop inside such a call::
     marked as we left it, its time over        it has timed out: that is its result
     any other                                  seen for the first time: its time begins now; made again, with a mark of its own
 
-The mark lies where a call's number has room (`arch.CALL_NUMBER_BITS`) and nobody but the kernel and we can see it: the program
-sets the whole register for each call that it makes, and finds the result there. So a mark that is found proves that this is the
-very call that was made again, without having come back between. No call times out too early: it began before we saw it. It may
-do so late, by less than its timeout and by less than the time between three captures. A signal handler that runs ends it with
-EINTR, as ever. If we die, a system call is left that times out by itself; only in the middle of a stop, before it was made
-again, the EINTR of that stop is left.
+The mark lies where a call's number has room, or its first argument (`arch.CALL_NUMBER_BITS`), and nobody but the kernel and we
+can see it: the program sets the whole register for each call that it makes, and finds the result there. So a mark that is found
+proves that this is the very call that was made again, without having come back between. No call times out too early: it began
+before we saw it. It may do so late, by less than its timeout and by less than the time between three captures. A signal handler
+that runs ends it with EINTR, as ever. If we die, a system call is left that times out by itself; only in the middle of a stop,
+before it was made again, the EINTR of that stop is left.
 
 Programs that make such a call again themselves, with what is left of its time, do that more exactly than we can: of theirs only
 those without a timeout are made again here (`makes_calls_again`).
@@ -80,9 +80,9 @@ class Wait:
 
 @functools.cache
 def has_room_for_marks() -> bool:
-    """Whether this kernel makes a call whose number has a mark."""
+    """Whether this kernel makes a call whose number has a mark, where that is the place of marks."""
     if not arch.CALL_NUMBER_BITS:
-        return False
+        return True
     libc = ctypes.CDLL(None)
     libc.syscall.restype = ctypes.c_long
     return int(libc.syscall(ctypes.c_long(arch.marked(arch.SYSCALLS["getpid"], 1)))) == os.getpid()
@@ -105,19 +105,23 @@ class Waiting:
         return result == -errno.EINTR or self._wait is not None
 
     def undisturbed(self, registers: Registers) -> Registers:
-        """The registers that the live program gets back: without what our stop alone has brought about."""
+        """The registers that the live program gets back: without what our stop alone has brought about.
+
+        Args:
+            registers: with what `checkpoint.linux.ended_calls` finds out, where they do not say enough themselves.
+        """
         before, self._wait = self._wait, None
         if ctypes.c_int64(registers[arch.RESULT]).value != -errno.EINTR:
             return registers
         name = arch.SYSCALL_NAMES.get(arch.call_number(registers), "")
         timeout = arch.ENDED_BY_A_STOP.get(name, arch.SOCKET_TIMEOUT.get(name))
         if timeout is None:
-            return made_again(registers, 0) if name in arch.ENDED_BY_A_STOP else registers
+            return arch.made_again(registers, 0) if name in arch.ENDED_BY_A_STOP else registers
         asked_ns = self._asked_ns(registers, timeout)
         if asked_ns is None:
             return registers
         if asked_ns < 0:
-            return made_again(registers, 0)
+            return arch.made_again(registers, 0)
         if self._makes_again:
             return registers
         decided, self._wait = decide(registers, before, asked_ns, timeout.at_end, time.monotonic_ns())
@@ -125,7 +129,7 @@ class Waiting:
 
     def _asked_ns(self, registers: Registers, timeout: Timeout) -> int | None:
         """How long the call was told to wait, negative for ever; None if that cannot be known."""
-        argument = registers[arch.ARGUMENTS[timeout.argument]]
+        argument = registers[arch.ENDED_ARGUMENTS[timeout.argument]]
         if timeout.form == MILLISECONDS:
             return ctypes.c_int32(argument & 0xFFFFFFFF).value * NS_PER_MS
         if timeout.form == SOCKET:
@@ -160,18 +164,12 @@ def decide(registers: Registers, before: Wait | None, asked_ns: int, at_end: int
     mark = arch.mark_of(registers)
     is_known = before is not None and before.place == place and before.mark == mark
     if before is None or not is_known or (not mark and now_ns - before.seen_ns >= asked_ns):
-        fresh = _fresh_mark() if has_room_for_marks() else 0
-        return made_again(registers, fresh), Wait(fresh, place, now_ns + asked_ns, now_ns)
+        fresh = _fresh_mark() if has_room_for_marks() and arch.has_room_for_mark(registers) else 0
+        return arch.made_again(registers, fresh), Wait(fresh, place, now_ns + asked_ns, now_ns)
     if now_ns < before.deadline_ns:
-        return made_again(registers, mark), replace(before, seen_ns=now_ns)
+        return arch.made_again(registers, mark), replace(before, seen_ns=now_ns)
     return ({**registers, arch.RESULT: at_end, arch.CALL_NUMBER: arch.NO_CALL} if mark else registers), None
 
 
 def _fresh_mark() -> int:
     return 1 + secrets.randbelow(arch.MARK_LIMIT - 1)
-
-
-def made_again(registers: Registers, mark: int) -> Registers:
-    """Have the kernel make a call again as soon as the program runs, unless a signal handler comes first."""
-    number = arch.marked(arch.call_number(registers), mark)
-    return {**registers, arch.RESULT: arch.ERESTARTNOHAND, arch.CALL_NUMBER: number}

@@ -14,6 +14,7 @@ import signal
 from dataclasses import dataclass, field
 from typing import Final
 
+from checkpoint.arch import cpu
 from checkpoint.arch import stubs as arch
 from checkpoint.errors import RestoreError
 from checkpoint.linux import abi
@@ -29,7 +30,10 @@ AT_FDCWD: Final = -100
 
 _LOWEST_ADDRESS: Final = 0x10000000000
 _HIGHEST_ADDRESS: Final = 0x7000_0000_0000
-"""Where a hole is looked for first: above every non-PIE program, below where the kernel maps libraries."""
+"""Where a hole is looked for: above every non-PIE program, below where the kernel maps libraries."""
+_STEP: Final = 1 << 36
+_WIDTH: Final = 47
+"""Bits of the smallest address space of which that holds; in a smaller one it is looked for at the same parts of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +166,9 @@ def find_hole(taken: list[tuple[int, int]], size: int) -> int:
         RestoreError: the address space is full.
     """
     room = 1 << 30  # on either side, for stacks and heaps to grow into
-    for start in range(_LOWEST_ADDRESS, _HIGHEST_ADDRESS, 1 << 36):
+    highest = max((end for _, end in taken), default=1 << _WIDTH)
+    missing = max(_WIDTH - (cpu.user_end(highest) - 1).bit_length(), 0)
+    for start in range(*(number >> missing for number in (_LOWEST_ADDRESS, _HIGHEST_ADDRESS, _STEP))):
         if all(end <= start - room or begin >= start + size + room for begin, end in taken):
             return start
     raise RestoreError(f"cannot restore: no {size >> 20} MiB of address space are free between the program's mappings")

@@ -9,19 +9,27 @@ call begins with the signal pending, and the kernel decides again.
 A signal that comes on the way shows itself by a stop of its own. It is put back into its queue, which the kernel does when it is
 blocked by then. *Killed between that and the call:* the thread goes on with every signal blocked; some ten µs, and only then.
 
-Source: ptrace(2), "Syscall-stops"; kernel/signal.c, ptrace_signal(); arch/arm64/kernel/signal.c, do_signal().
+Whoever is let go where a call begins starts it as if a signal had come. The kernel makes most calls again by itself then; those
+of `ENDED_BY_A_STOP` would end with EINTR. Such a one is not begun: the thread is brought to its end, with what says that it
+is to be made again unless a handler runs. Nothing but the kernel looks at that.
+
+Source: ptrace(2), "Syscall-stops"; kernel/ptrace.c, __ptrace_unlink(); kernel/signal.c, ptrace_signal();
+arch/arm64/kernel/signal.c, do_signal(), and syscall.c, el0_svc_common(): no call is made where its number is -1 by then.
 """
 
 from __future__ import annotations
 
 import signal
+import struct
 from typing import Final
 
 from checkpoint.arch import cpu as arch
+from checkpoint.arch.calls import Registers
 from checkpoint.errors import CaptureError
 from checkpoint.linux import abi
 from checkpoint.linux.tracee import Stop, Tracee
 
+_NUMBER: Final = struct.Struct("<i")
 PATIENCE_S: Final = 10.0
 """How long a thread may take for the one instruction, whose signals are blocked meanwhile."""
 
@@ -33,19 +41,46 @@ def enter(tracee: Tracee) -> None:
         ProcessGoneError: it has ended.
         CaptureError: it has not come there in time, and runs.
     """
-    if tracee.stopped_by or not _is_before_a_call(tracee):
+    registers = arch.decode_registers(tracee.registers())
+    if tracee.stopped_by or not is_before_a_call(tracee, registers):
         return
     tracee.request("set options of", abi.PTRACE_SETOPTIONS, 0, abi.PTRACE_O_TRACESYSGOOD)
     stop = _step(tracee)
     while stop.event and stop.signal == signal.SIGTRAP:  # it had been asked to stop twice
         stop = _step(tracee)
-    if not stop.is_delivery:
-        return
-    mask = tracee.signal_mask()
-    tracee.set_signal_mask(abi.ALL_SIGNALS)
-    while stop.is_delivery:
-        stop = _step(tracee, stop.signal)
-    tracee.set_signal_mask(mask)
+    if stop.is_delivery:
+        mask = tracee.signal_mask()
+        tracee.set_signal_mask(abi.ALL_SIGNALS)
+        while stop.is_delivery:
+            stop = _step(tracee, stop.signal)
+        tracee.set_signal_mask(mask)
+    if _is_ended_by_a_stop(registers):
+        _leave_as_stopped(tracee, registers)
+
+
+def _is_ended_by_a_stop(registers: Registers) -> bool:
+    """Whether the next call is such a one: a socket's, if it bears a mark, for only those with a timeout are marked."""
+    name = arch.SYSCALL_NAMES.get(registers[arch.NUMBER] & 0xFFFFFFFF, "")
+    is_marked = bool(registers[arch.ARGUMENTS[0]] >> 32)
+    return name in arch.ENDED_BY_A_STOP or (name in arch.SOCKET_TIMEOUT and is_marked)
+
+
+def _leave_as_stopped(tracee: Tracee, registers: Registers) -> None:
+    """Bring a thread from the beginning of a call to its end, as if it had been stopped in it.
+
+    Killed after any of these, it makes the call.
+
+    Args:
+        registers: those before the call.
+    """
+    assert arch.CALL_SET is not None
+    tracee.set_register_set(arch.CALL_SET, _NUMBER.pack(-1))
+    tracee.set_registers(arch.encode_registers(registers))
+    _step(tracee)
+    tracee.set_register_set(arch.CALL_SET, _NUMBER.pack(registers[arch.NUMBER] & 0x7FFFFFFF))
+    behind = registers[arch.INSTRUCTION_POINTER] + len(arch.SYSCALL)
+    stopped = {**registers, arch.RESULT: arch.ERESTARTNOHAND, arch.INSTRUCTION_POINTER: behind}
+    tracee.set_registers(arch.encode_registers(stopped))
 
 
 def _step(tracee: Tracee, number: int = 0) -> Stop:
@@ -53,9 +88,9 @@ def _step(tracee: Tracee, number: int = 0) -> Stop:
     return tracee.wait(PATIENCE_S)
 
 
-def _is_before_a_call(tracee: Tracee) -> bool:
-    pointer, _, _ = arch.stand_of(tracee.registers())
+def is_before_a_call(tracee: Tracee, registers: Registers) -> bool:
+    """Whether the next instruction makes a call."""
     try:
-        return tracee.memory.read(pointer, len(arch.SYSCALL)) == arch.SYSCALL
+        return tracee.memory.read(registers[arch.INSTRUCTION_POINTER], len(arch.SYSCALL)) == arch.SYSCALL
     except CaptureError:  # it will fault there
         return False

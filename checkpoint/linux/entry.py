@@ -95,6 +95,8 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
     there = arch.decode_registers(registers)
     there[arch.INSTRUCTION_POINTER] = place + arch.ENTRY_CODE_OFFSET
     there[arch.CALL_NUMBER] = arch.NO_CALL
+    for index, bit in arch.STEPPING:
+        there[arch.REGISTER_NAMES[index]] &= ~bit
     tracee.set_registers(arch.encode_registers(there))
     tracee.set_signal_mask(abi.ALL_SIGNALS)
     tracee.cont()

@@ -14,7 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from checkpoint import arch
 from checkpoint.arch import cpu, extended
+from checkpoint.errors import ProbeError
 
 
 @functools.cache
@@ -25,6 +27,32 @@ def xstate_layout() -> extended.Layout:
             return extended.layout_here(features, lambda code: pages.enter_context(_instructions(code)))
         except OSError:
             return ()
+
+
+def why_unsupported() -> str:
+    """Why programs that nobody prepared cannot be kept on this machine's processor; "": they can."""
+    if reason := arch.why_unsupported():
+        return reason
+    has = features() if extended.UNKEPT else ()
+    if unkept := [called for name, called in extended.UNKEPT.items() if name in has]:
+        return (
+            f"the processor has {' and '.join(unkept)}, whose registers are not kept so far: boot with that parameter of the "
+            "kernel, or have the program keep its state itself (docs/decorator.md)"
+        )
+    return ""
+
+
+def require_supported(what: str) -> None:
+    """Check that programs that nobody prepared can be kept on this machine's processor.
+
+    Args:
+        what: was tried, for the message: "capture pid 412".
+
+    Raises:
+        ProbeError: they cannot.
+    """
+    if reason := why_unsupported():
+        raise ProbeError(f"cannot {what}: {reason}")
 
 
 @functools.cache

@@ -85,6 +85,8 @@ class Round:
         self._words[:count, _Layout.there // WORD + _POINTER] = np.array(codes, dtype=np.uint64)
         for place, word in arch.OUTSIDE_OF_CALLS:
             self._words[:count, _Layout.there // WORD + place] = word
+        for place, bit in arch.STEPPING:  # our code would end the program: every signal is blocked, and this one forced
+            self._words[:count, _Layout.there // WORD + place] &= ~np.uint64(bit)
         self._words[:count, _Layout.mask // WORD] = np.array(masks, dtype=np.uint64)
         return not any(self._run(START))
 

@@ -308,6 +308,10 @@ class Tracee:
         """
         return self._getregset("read registers of", kind, self._xstate)
 
+    def set_register_set(self, kind: int, content: bytes) -> None:
+        """Write another register set."""
+        self._setregset("write registers of", kind, content, self._xstate)
+
     def set_xstate(self, content: bytes) -> None:
         """Write what `xstate` reads."""
         for kind, part in extended.parts(content, processor.xstate_layout()):

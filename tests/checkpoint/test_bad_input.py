@@ -11,8 +11,10 @@ from pathlib import Path
 import pytest
 
 from checkpoint import arch, chain, format
+from checkpoint.arch import extended
 from checkpoint.engine import ProtectOrder
 from checkpoint.errors import ChainError, CheckpointError, FormatError, ProbeError
+from checkpoint.linux import processor, procfs
 from checkpoint.model import Resource, Snapshot
 from tests.checkpoint.round_trip import ENGINE, Program, captured_and_killed, ended, restored, start, start_tracee
 from tests.conftest import children
@@ -58,6 +60,20 @@ def test_a_processor_that_is_not_supported_is_said_so_before_anything_is_touched
         assert tracee.finish() == 0
 
 
+def test_registers_that_are_not_kept_are_said_so_before_anything_is_touched(
+    compiled: Callable[..., Path], snapshot: Snapshot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ended(start_tracee(compiled("heap", "-O2"), tmp_path)) as tracee:
+        monkeypatch.setattr(extended, "UNKEPT", {processor.features()[0]: "wide ones", "absent": "others"})
+        sentence = "the processor has wide ones, whose registers are not kept so far.*docs/decorator.md"
+        for act in (lambda: ENGINE.probe(tracee.pid), lambda: ENGINE.protect(tracee.pid, ProtectOrder("/test/tracee"))):
+            with pytest.raises(ProbeError, match=sentence):
+                act()
+        _expect_nothing_started(snapshot, tmp_path, sentence)
+        tracee.tell()
+        assert tracee.finish() == 0
+
+
 def test_a_processor_that_lacks_a_feature_is_said_so(snapshot: Snapshot, tmp_path: Path) -> None:
     if "avx512f" in snapshot.machine.features:
         pytest.skip("this processor has AVX-512")
@@ -81,8 +97,7 @@ def start_tracee_beside(directory: Path) -> Program:
 
 def free_id() -> int:
     """An id that nobody has, and that nobody is given soon."""
-    largest = int(Path("/proc/sys/kernel/pid_max").read_text())
-    return next(number for number in range(largest - 1, 1, -1) if not Path(f"/proc/{number}").exists())
+    return next(number for number in range(procfs.pid_max() - 1, 1, -1) if not Path(f"/proc/{number}").exists())
 
 
 def test_a_snapshot_without_its_first_thread_is_said_so(snapshot: Snapshot, tmp_path: Path) -> None:

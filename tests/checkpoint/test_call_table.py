@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from checkpoint.arch import aarch64
 from checkpoint.engines.ptrace_restore import OPTIONS
 from checkpoint.engines.restore_memory import kernel_pages
 from checkpoint.errors import RestoreError
@@ -102,6 +103,18 @@ def test_a_hole_is_far_from_everything() -> None:
     taken = [(0x10000000000 - 0x1000, 0x10000000000), (0x7FF000000000, 0x7FF000001000)]
     start = call_table.find_hole(taken, AREA_SIZE)
     assert all(end + MIB <= start or start + AREA_SIZE + MIB <= begin for begin, end in taken)
+
+
+def test_a_hole_lies_within_the_address_space_of_a_small_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a Raspberry Pi: 39 bits; a program that is not position-independent, one that is, libraries and the stack."""
+    monkeypatch.setattr(call_table, "cpu", aarch64)
+    program, position_independent = (0x40_0000, 0x4000_0000), (0x55_5555_5000, 0x55_9555_5000)
+    taken = [program, position_independent, (0x7F_B000_0000, 0x7F_B800_0000), (0x7F_FFFD_E000, 0x7F_FFFF_F000)]
+    start = call_table.find_hole(taken, AREA_SIZE)
+    assert start % 0x10000 == 0
+    assert program[1] + (1 << 30) <= start and start + AREA_SIZE + (1 << 30) <= position_independent[0]
+    with pytest.raises(RestoreError, match="no 64 MiB of address space"):
+        call_table.find_hole([(0, 1 << 39)], AREA_SIZE)
 
 
 def test_no_hole_is_an_error_in_words() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,9 +13,10 @@ import pytest
 from checkpoint.engine import CaptureOrder, ProtectOrder, Terms
 from checkpoint.engines import capture_memory
 from checkpoint.engines.capture_memory import MemoryCapture, RunningCopy
+from checkpoint.engines.captured_process import CapturedProcess
 from checkpoint.engines.freeze_budget import FIRST_PAGE_NS, FIRST_REST_NS, FreezeBudget
 from checkpoint.engines.ptrace_capture import PtraceSession
-from tests.checkpoint.round_trip import ENGINE, Program, at_last, ended, start
+from tests.checkpoint.round_trip import ENGINE, Program, at_last, ended, protected, start
 from tests.checkpoint.test_deltas import OBEDIENT
 
 MS = 1_000_000
@@ -114,3 +116,24 @@ def test_a_program_that_cannot_be_caught_up_with_is_captured_all_the_same(
         one.program.kill()
     assert capture_memory.PASS_LIMIT < len(passes) < capture_memory.BUDGET_PASS_LIMIT, "it was seen to be of no use"
     assert one.session.frozen_size >= 2000 * PAGE
+
+
+def test_what_a_capture_tells_is_the_longest_time_that_the_program_stood_still(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks = 0
+    confirm = MemoryCapture.confirm
+    look = CapturedProcess.look
+
+    def slow_at_first(self: CapturedProcess, *arguments: object, **named: object) -> object:
+        nonlocal looks
+        looks += 1
+        time.sleep(0.2 if looks == 1 else 0)
+        return look(self, *arguments, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(CapturedProcess, "look", slow_at_first)
+    monkeypatch.setattr(MemoryCapture, "confirm", lambda self: confirm(self) and looks > 1)
+    with ended(start(["sleep", "600"], tmp_path)) as program, protected(program) as session:
+        snapshot = session.capture(CaptureOrder(base=True, sequence=1))
+        assert looks == 2, "the first look was not whole"
+        assert snapshot.freeze_us >= 200_000

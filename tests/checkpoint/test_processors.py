@@ -25,6 +25,7 @@ from checkpoint.linux.remote import Plan
 
 SOURCES = Path(__file__).parents[2] / "checkpoint"
 PARTS = {"cpu": "", "stubs": "_stub", "extended": "_xstate", "levels": "_levels"}
+EINTR = -4 & (1 << 64) - 1
 OBJDUMP = "aarch64-linux-gnu-objdump"
 
 
@@ -69,12 +70,61 @@ def test_what_others_use_of_a_processor_is_in_each_ones_file_in_the_same_order(p
     importlib.import_module(f"checkpoint.arch.{processor}{PARTS[part]}")
 
 
+def test_the_levels_of_all_processors_are_known_on_every_machine() -> None:
+    each = [importlib.import_module(f"checkpoint.arch.{name}{PARTS['levels']}").LEVELS for name in arch.KNOWN]
+    assert [level for levels in each for level in levels] == list(arch.EVERY_LEVEL)
+
+
 def test_registers_are_the_same_after_they_were_read_and_written() -> None:
     content = struct.pack("<34Q", *(number << 32 | number for number in range(34)))
     decoded = aarch64.decode_registers(content)
     assert aarch64.encode_registers(decoded) == content
     assert aarch64.stand_of(content) == (decoded["pc"], decoded["x0"], -1)
     assert aarch64.words_of(content)[aarch64.REGISTER_NAMES.index("sp")] == decoded["sp"]
+
+
+def test_a_call_that_a_stop_has_ended_is_made_again_with_the_argument_that_its_result_has_covered() -> None:
+    waiting = dict.fromkeys(aarch64.REGISTER_NAMES, 0) | {
+        "x0": EINTR,
+        "x8": 22,
+        "pc": 0x1004,
+        "call": aarch64.NO_CALL,
+    }
+    found = aarch64.recalled(waiting, 22, 99 << 32 | 5)
+    assert (aarch64.call_number(found), aarch64.mark_of(found), found[aarch64.ENDED_ARGUMENTS[0]]) == (22, 99, 5)
+    again = aarch64.made_again(found, 7)
+    assert aarch64.encode_registers(again) == aarch64.encode_registers({**waiting, "x0": 7 << 32 | 5, "pc": 0x1000})
+    pointer = aarch64.recalled(waiting, aarch64.SYSCALLS["rt_sigtimedwait"], 0xFFFF_1234_5678)
+    assert not aarch64.has_room_for_mark(pointer)
+    assert aarch64.made_again(pointer, 0)["x0"] == 0xFFFF_1234_5678
+
+
+@pytest.mark.parametrize(
+    ("call", "arguments", "may"),
+    [
+        ("nanosleep", {}, True),
+        ("clock_nanosleep", {"x1": 0}, True),
+        ("clock_nanosleep", {"x1": 1}, False),  # TIMER_ABSTIME
+        ("futex", {"x1": 128, "x3": 0x1000}, True),  # FUTEX_WAIT | FUTEX_PRIVATE_FLAG
+        ("futex", {"x1": 128, "x3": 0}, False),
+        ("futex", {"x1": 9, "x3": 0x1000}, False),  # FUTEX_WAIT_BITSET
+        ("read", {}, False),
+    ],
+)
+def test_only_a_wait_with_a_relative_time_is_asked_for_what_the_kernel_remembers(
+    call: str, arguments: dict[str, int], may: bool
+) -> None:
+    registers = dict.fromkeys(aarch64.REGISTER_NAMES, 0) | {"x8": aarch64.SYSCALLS[call], **arguments}
+    assert aarch64.may_go_on(registers) == may
+
+
+def test_the_kernel_of_x86_64_makes_a_call_again_that_is_marked_in_its_number() -> None:
+    waiting = dict.fromkeys(x86_64.REGISTER_NAMES, 0) | {"rax": EINTR, "orig_rax": 232, "rip": 0x1002}
+    assert x86_64.made_again(x86_64.recalled(waiting, 232, 5), 7) == {
+        **waiting,
+        "rax": x86_64.ERESTARTNOHAND,
+        "orig_rax": 7 << 32 | 232,
+    }
 
 
 def test_a_system_call_is_found_where_an_instruction_begins() -> None:
@@ -168,6 +218,13 @@ def test_numbers_of_our_own_calls_are_those_of_the_processor(processor: str) -> 
     cpu, stubs = (importlib.import_module(f"checkpoint.arch.{processor}{PARTS[part]}") for part in ("cpu", "stubs"))
     for name, number in arch._NUMBERS[processor].items():
         assert number == stubs.SYSTEM_CALLS.get(name, cpu.SYSCALLS.get(name)), name
+
+
+def test_every_processor_knows_the_same_calls_to_make() -> None:
+    """Whoever fills a table names a call, whatever the processor; but for those that only one has."""
+    of_one = {"arch_prctl"}
+    names = [set(importlib.import_module(f"checkpoint.arch.{name}_stub").SYSTEM_CALLS) - of_one for name in arch.KNOWN]
+    assert all(found == names[0] for found in names)
 
 
 def test_a_number_that_is_not_known_is_never_made_up(monkeypatch: pytest.MonkeyPatch) -> None:

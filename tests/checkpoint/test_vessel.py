@@ -16,6 +16,8 @@ from checkpoint.linux.vessel import Birth, Born
 from checkpoint.model import Clocks
 
 DAY_NS = 86_400 * 1_000_000_000
+OF_THE_C_LIBRARY = 3 << 31
+"""Signals 32 and 33, of which it lets nobody say what they do. One may be ignored where pytest has workers."""
 PATIENCE_S = 20.0
 
 
@@ -123,7 +125,10 @@ def test_clocks_go_on_from_a_reading_of_a_machine_with_another_uptime(days: int)
 
 def test_a_fresh_program_starts_with_default_signals_and_no_descriptor_of_ours() -> None:
     text, _ = output_of(["sh", "-c", "grep -E 'SigBlk|SigIgn' /proc/self/status; ls /proc/self/fd | wc -l"], Birth())
-    assert text.split() == ["SigBlk:", "0" * 16, "SigIgn:", "0" * 16, "4"]  # ls itself has the directory open
+    _, blocked, _, ignored, count = text.split()
+    assert int(blocked, 16) == 0
+    assert int(ignored, 16) & ~OF_THE_C_LIBRARY == 0
+    assert count == "4"  # ls itself has the directory open
 
 
 @pytest.mark.parametrize("isolate", [False, pytest.param(True, marks=pytest.mark.user_namespaces)])

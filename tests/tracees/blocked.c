@@ -77,7 +77,7 @@ static void arm_clock(void) {
 
 static long wait_for_events(void) {
     struct epoll_event event;
-    return syscall(SYS_epoll_wait, epoll, &event, 1, -1) == 1 ? (long)event.data.u32 : -1;
+    return syscall(SYS_epoll_pwait, epoll, &event, 1, -1, NULL, 8) == 1 ? (long)event.data.u32 : -1;
 }
 static void make_event(void) { EXPECT_EQUAL("sent", send(pair[0], "ab", 2, 0), 2); }
 

@@ -145,7 +145,7 @@ static void tune(const char *what) {
     cpu_set_t one;
     CPU_ZERO(&one);
     CPU_SET(sched_getcpu(), &one);
-    if (!strcmp(what, "name")) prctl(PR_SET_NAME, "odd ) name(");
+    if (!strcmp(what, "name")) prctl(PR_SET_NAME, " )\n\\n\rUid:0( ");
     if (!strcmp(what, "umask")) umask(0135);
     if (!strcmp(what, "nice") && nice(7) == -1) cannot("be nice");
     if (!strcmp(what, "limits")) {

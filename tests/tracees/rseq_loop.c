@@ -12,6 +12,38 @@ static uint64_t aborted;
 static struct rseq_cs section __attribute__((aligned(32)));
 
 /* One try: counts `started` before, `committed` as the last instruction of the section. */
+#ifdef __aarch64__
+static int attempt(struct rseq *area) {
+    int failed = 0;
+    __asm__ volatile(
+        "adr x9, 1f\n\t"
+        "str x9, [%[section], #8]\n\t"
+        "adr x10, 2f\n\t"
+        "sub x10, x10, x9\n\t"
+        "str x10, [%[section], #16]\n\t"
+        "adr x9, 4f\n\t"
+        "str x9, [%[section], #24]\n\t"
+        "str %[section], [%[pointer]]\n\t"
+        "1:\n\t"
+        "mov w10, #300\n\t"
+        "5: subs w10, w10, #1\n\t"
+        "b.ne 5b\n\t"
+        "ldr x9, [%[committed]]\n\t"
+        "add x9, x9, #1\n\t"
+        "str x9, [%[committed]]\n\t"
+        "2:\n\t"
+        "b 6f\n\t"
+        ".inst 0xd428bc00\n\t" /* RSEQ_SIG */
+        "4:\n\t"
+        "mov w9, #1\n\t"
+        "str w9, [%[failed]]\n\t"
+        "6:\n\t"
+        :
+        : [failed] "r"(&failed), [committed] "r"(&committed), [section] "r"(&section), [pointer] "r"(&area->rseq_cs)
+        : "x9", "x10", "memory", "cc");
+    return failed;
+}
+#else
 static int attempt(struct rseq *area) {
     int failed = 0;
     __asm__ volatile(
@@ -41,6 +73,7 @@ static int attempt(struct rseq *area) {
         : "rax", "rcx", "memory", "cc");
     return failed;
 }
+#endif
 
 int main(void) {
     if (!__rseq_size) cannot("find a registered rseq area in this C library");
@@ -58,7 +91,7 @@ int main(void) {
     }
     EXPECT_EQUAL("sections", committed + aborted, started);
     uint32_t length = 32;
-    EXPECT(syscall(SYS_rseq, area, length, 0, 0x53053053) == -1 && errno == EBUSY,
+    EXPECT(syscall(SYS_rseq, area, length, 0, RSEQ_SIG) == -1 && errno == EBUSY,
            "the area is not registered: %s", strerror(errno));
     cpu_set_t all;
     sched_getaffinity(0, sizeof all, &all);

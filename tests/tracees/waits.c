@@ -42,6 +42,7 @@ static struct wait of_epoll(int limit_ms) {
 }
 
 /* As a compiler may do it: the registers of the arguments are loaded once, for many calls. The kernel changes rcx and r11 only. */
+#ifdef __x86_64__
 static struct wait of_inline_code(void) {
     static struct epoll_event events[4];
     struct wait found = {0, 0, LONG_MS};
@@ -59,6 +60,26 @@ static struct wait of_inline_code(void) {
     found.error = result < 0 ? (int)-result : 0;
     return found;
 }
+
+#else
+/* There the kernel changes nothing but the result. */
+static struct wait of_inline_code(void) {
+    static struct epoll_event events[4];
+    struct wait found = {0, 0, LONG_MS};
+    register long number __asm__("x8") = SYS_epoll_pwait, result __asm__("x0") = epoll, count __asm__("x2") = 4;
+    register long limit __asm__("x3") = LONG_MS, mask __asm__("x4") = 0, size __asm__("x5") = 8, spare __asm__("x6") = 0x6666;
+    register void *where __asm__("x1") = events;
+    __asm__ volatile("svc #0"
+                     : "+r"(number), "+r"(result), "+r"(where), "+r"(count), "+r"(limit), "+r"(mask), "+r"(size), "+r"(spare)
+                     :
+                     : "memory");
+    EXPECT(number == SYS_epoll_pwait && where == events && count == 4 && limit == LONG_MS, "x8, x1, x2 or x3 has changed");
+    EXPECT(!mask && size == 8 && spare == 0x6666, "x4, x5, x6 have become %lx, %lx, %lx", mask, size, spare);
+    found.result = result < 0 ? -1 : (int)result;
+    found.error = result < 0 ? (int)-result : 0;
+    return found;
+}
+#endif
 
 static struct wait of_pwait2(void) {
     struct epoll_event events[4];
