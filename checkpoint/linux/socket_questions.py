@@ -148,8 +148,9 @@ def questions(subject: Subject) -> Questions:
         SETTINGS, "getsockopt", (0, socket.SOL_SOCKET, SO_ATTACH_FILTER, 0, 0), {5: (SETTINGS, plan.room(SETTINGS, bytes(8)))}
     )
     info = _ask_state(plan, subject)
+    at_once = plan.room(ASIDE, bytes(16))
     polled = plan.room(ASIDE, _POLL.pack(0, POLLED, 0))
-    plan.ask(STATE, "poll", (0, 1, 0), {1: (ASIDE, polled)})  # its descriptor stands elsewhere
+    plan.ask(STATE, "ppoll", (0, 1, 0, 0, 0), {1: (ASIDE, polled), 3: (ASIDE, at_once)})  # its descriptor stands elsewhere
     first = len(plan.images[ASIDE])
     for level, number in buffers:
         plan.option(ASIDE, level, number, bytes(4))

@@ -172,11 +172,18 @@ def leave_behind(looked: socket.socket) -> None:
 
 def _require_plain(looked: socket.socket) -> None:
     """Refuse what has more to it than the kernel tells."""
-    with contextlib.suppress(OSError):
-        if looked.getsockopt(socket.IPPROTO_TCP, TCP_ULP, 16).strip(b"\0"):
-            raise CannotCarryError("the kernel encrypts it (TCP_ULP)")
+    if is_encrypted(looked):
+        raise CannotCarryError("the kernel encrypts it (TCP_ULP)")
     if looked.getsockopt(socket.SOL_SOCKET, SO_PEEK_OFF) >= 0:
         raise CannotCarryError("the program looks ahead in it (SO_PEEK_OFF)")
+
+
+def is_encrypted(looked: socket.socket) -> bool:
+    """Whether the kernel has a protocol of its own between the program and TCP (kTLS)."""
+    try:
+        return bool(looked.getsockopt(socket.IPPROTO_TCP, TCP_ULP, 16).strip(b"\0"))
+    except OSError:
+        return False
 
 
 def _asked(looked: socket.socket, question: int) -> int:

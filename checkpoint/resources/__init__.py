@@ -65,6 +65,7 @@ class OpenFile:
         content: what waits in a pipe, read while the process stood still; None where that was not needed.
         capacity: of a pipe, in bytes.
         both_ends: of a pipe: the process itself has another descriptor for its other end, or nobody has.
+        is_its_own: the former alone.
         observed: facts that only the process standing still could tell, as its kind's ``observe`` found them.
         kin: the other processes of its component.
         description: the number of an open file that several processes of a component share (`sharing`); 0: it is this one's.
@@ -79,6 +80,7 @@ class OpenFile:
     content: bytes | None = None
     capacity: int = 0
     both_ends: bool = False
+    is_its_own: bool = False
     observed: Mapping[str, Fact] = field(default_factory=dict)
     kin: Kin = ALONE
     description: int = 0
@@ -211,9 +213,10 @@ def gather(pid: int, kept: Kept | None = None, owners: Owners | None = None) -> 
 def _opened_of(groups: Sequence[tuple[Descriptor, ...]], pid: int, owners: Owners | None = None) -> tuple[OpenFile, ...]:
     ends = {(group[0].target, group[0].flags & os.O_ACCMODE) for group in groups}
     other = {os.O_RDONLY: os.O_WRONLY, os.O_WRONLY: os.O_RDONLY}
+    own = [(group[0].target, other.get(group[0].flags & os.O_ACCMODE)) in ends for group in groups]
     return tuple(
-        OpenFile(pid, group, both_ends=(group[0].target, other.get(group[0].flags & os.O_ACCMODE)) in ends, owners=owners)
-        for group in groups
+        OpenFile(pid, group, both_ends=is_own, is_its_own=is_own, owners=owners)
+        for group, is_own in zip(groups, own, strict=True)
     )
 
 

@@ -30,7 +30,7 @@ from checkpoint.linux.descriptors import copy_of
 from checkpoint.linux.silence import Connection
 from checkpoint.linux.tcp_repair import CannotCarryError, InUseError, Kept
 from checkpoint.model import Fact, Resource, Snapshot
-from checkpoint.resources import OpenFile, internet_sockets, tcp_connections
+from checkpoint.resources import OpenFile, internet_addresses, tcp_connections
 from checkpoint.resources.rebuilding import number_of
 from checkpoint.resources.tcp_connections import KIND, LEFT, TAKEN
 
@@ -192,7 +192,7 @@ class Arriving:
         """Of those that it takes up, and of those that have ended: this machine resets them, also where it was to be silent."""
         self._arrivals = tuple(arrivals)
         self._ended = tuple(ended)
-        self.notes = tuple(_missing(one) for one in self._arrivals if not internet_sockets.is_ours(_ends(one.resource)[0]))
+        self.notes = tuple(_missing(one) for one in self._arrivals if not internet_addresses.is_ours(_ends(one.resource)[0]))
         self._made: list[tuple[socket.socket, _Arrival, int]] = []
 
     def connect(self, pids: Sequence[int]) -> None:

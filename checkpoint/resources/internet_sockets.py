@@ -8,7 +8,8 @@ Facts besides those of every socket: ``state`` of tcp(7), `CLOSED` for UDP; ``ad
 port, flow, scope], empty if there is none; ``backlog``; ``waiting``: connections not accepted yet; ``sources``: addresses from
 which what is in the queue came; ``groups``: a list of [interface, group, filter as MCAST_MSFILTER takes it]; ``shutdown`` of a
 socket for datagrams: 1 what it reads, 2 what it sends; ``lost``: something waits in one that is raw or of ICMP; ``failed``: an
-error does; ``foreign``: the machine does not have its address (any more).
+error does; ``corks``: UDP_CORK is set; ``unfinished``: a datagram was begun, and is not sent yet; ``foreign``: the machine does
+not have its address (any more).
 
 Source: tcp(7), udp(7), ip(7); linux/in.h for group_filter.
 """
@@ -28,7 +29,8 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.engine import NOTED, Finding
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import Opened, OpenFile, Surroundings, elsewhere, sockets
+from checkpoint.resources import Opened, OpenFile, Surroundings, elsewhere, sockets, waiting_datagrams
+from checkpoint.resources.internet_addresses import in_words, is_ours, level_of, size_of, sockaddr, unpacked
 from checkpoint.resources.listings import Group, Listings
 from checkpoint.resources.rebuilding import number_of
 from checkpoint.resources.unix_makers import Disguise
@@ -50,6 +52,12 @@ CAPABILITIES: Final = (
         "with address, groups, filters and options; what waits in them is lost, as the network may lose it",
     ),
     refused(
+        Area.SOCKETS,
+        "a UDP socket with a datagram that is not finished (UDP_CORK)",
+        "it is kept as soon as that is sent",
+        "begun and not sent yet (UDP_CORK)",
+    ),
+    refused(
         Area.THERE,
         "an address or an interface that a socket is bound to is missing",
         "bind to all addresses (0.0.0.0, ::), or give it to the machine",
@@ -66,6 +74,8 @@ PINGS: Final = (socket.IPPROTO_ICMP, socket.IPPROTO_ICMPV6)
 CLOSED: Final = 7
 LISTENING: Final = 10
 _TCP_INFO: Final = struct.Struct("<B7x4I2I")
+_SEGMENT: Final = 536
+"""TCP_MSS_DEFAULT: what a socket tells that has not been connected, and whose program has chosen nothing."""
 MCAST_JOIN_GROUP: Final = 42
 MCAST_MSFILTER: Final = 48
 IP_FREEBIND: Final = 15
@@ -90,6 +100,12 @@ def is_kept(family: int, kind: int, protocol: int) -> bool:
     return kind == socket.SOCK_RAW or protocol == socket.IPPROTO_TCP
 
 
+def is_of_tcp(facts: Mapping[str, Fact]) -> bool:
+    """Whether this is a socket of TCP: raw ones, and those of other families, may have a protocol of the same number."""
+    form = (facts.get("type"), facts.get("protocol"))
+    return facts.get("family") in FAMILIES and form == (socket.SOCK_STREAM, socket.IPPROTO_TCP)
+
+
 def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: sockets.Noted | None) -> dict[str, Fact]:
     """Its state, its addresses and what waits in it.
 
@@ -101,8 +117,11 @@ def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: socket
     """
     facts = sockets.general_facts(held, looked, opened)
     state, waiting, backlog = CLOSED, 0, 0
-    if looked.proto == socket.IPPROTO_TCP:
-        state, *_, waiting, backlog = _TCP_INFO.unpack(looked.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size))
+    if is_of_tcp(facts):
+        state, _, _, segment, _, waiting, backlog = _TCP_INFO.unpack(
+            looked.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size)
+        )
+        facts["options"] = [*_list(facts["options"]), *_segment(looked, state, segment)]
     is_datagram = looked.type != socket.SOCK_STREAM
     may_queue = looked.type == socket.SOCK_DGRAM and looked.proto in DATAGRAMS
     queue = sockets.queue_of(looked, held.first.number, noted) if may_queue else sockets.NOTHING
@@ -116,9 +135,38 @@ def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: socket
         "sources": [list(source) for source in queue.sources if isinstance(source, tuple)],
         "groups": list(_groups(looked, opened.listings.groups(held.pid, looked.family))) if is_datagram else [],
         "shutdown": _shutdown(held, looked, opened) if is_datagram else 0,
+        "corks": may_queue
+        and (corks := any(tuple(option[:2]) == sockets.UDP_CORK for option in map(_list, _list(facts["options"])))),
+        "unfinished": may_queue and corks and bool(sockets.unsent(looked)),
         "failed": may_queue and bool(sockets.readiness(looked) & select.POLLERR),
         "lost": is_datagram and not may_queue and bool(sockets.readiness(looked)),
     }
+
+
+def may_tell_segment(facts: Mapping[str, Fact]) -> bool:
+    """Whether a socket of TCP tells the size of segments that its program wants; a connection tells the one that it has."""
+    return is_of_tcp(facts) and facts["state"] in (CLOSED, LISTENING)
+
+
+def _segment(looked: socket.socket, state: int, current: int) -> list[Fact]:
+    """TCP_MAXSEG as an option where the program has chosen it.
+
+    Args:
+        current: the size in use, 0 of a listener.
+
+    Source: do_tcp_getsockopt() in net/ipv4/tcp.c.
+    """
+    if state not in (CLOSED, LISTENING):
+        return []
+    place = (socket.IPPROTO_TCP, socket.TCP_MAXSEG)
+    value = looked.getsockopt(*place, 4)
+    is_chosen = int.from_bytes(value, "little") != (current or _SEGMENT)
+    return [[*place, value]] if is_chosen else []
+
+
+def _list(fact: Fact) -> list[Fact]:
+    assert isinstance(fact, list)
+    return fact
 
 
 def _shutdown(held: OpenFile, looked: socket.socket, opened: Opened) -> int:
@@ -137,31 +185,18 @@ def _bound(address: Sequence[Fact]) -> list[Fact]:
     return list(address) if address[1] else []
 
 
-def in_words(address: Sequence[Fact]) -> str:
-    return f"{address[0]!s} port {address[1]!s}"
-
-
 def _peer(held: OpenFile, looked: socket.socket, listings: Listings) -> list[Fact]:
     """Whom it is, or was, connected with."""
     with contextlib.suppress(OSError):
         return list(looked.getpeername())
-    if looked.proto == socket.IPPROTO_TCP:
+    if looked.type == socket.SOCK_STREAM:
         with contextlib.suppress(OSError):  # a connection that has ended tells it this way alone
             size = 28 if looked.family == socket.AF_INET6 else 16
-            return _unpacked(looked.getsockopt(socket.SOL_SOCKET, SO_PEERNAME, size))
+            return unpacked(looked.getsockopt(socket.SOL_SOCKET, SO_PEERNAME, size))
     elif looked.type == socket.SOCK_RAW or looked.proto in PINGS:  # no port, and so no peer for getpeername(2)
         table = "raw" if looked.type == socket.SOCK_RAW else "icmp"
         return listings.peer(held.pid, table, looked.family, held.first.inode)
     return []
-
-
-def _unpacked(packed: bytes) -> list[Fact]:
-    """An address that the kernel wrote."""
-    family, port = struct.unpack_from("<H", packed)[0], struct.unpack_from(">H", packed, 2)[0]
-    if family == socket.AF_INET:
-        return [socket.inet_ntoa(packed[4:8]), port]
-    flow, scope = struct.unpack_from(">I", packed, 4)[0], struct.unpack_from("<I", packed, 24)[0]
-    return [socket.inet_ntop(socket.AF_INET6, packed[8:24]), port, flow, scope]
 
 
 def _groups(looked: socket.socket, known: Sequence[Group]) -> Iterator[list[Fact]]:
@@ -177,22 +212,6 @@ def _groups(looked: socket.socket, known: Sequence[Group]) -> Iterator[list[Fact
             count = _FILTER.unpack_from(packed)[3]
             with contextlib.suppress(OSError):  # the interface has just gone
                 yield [socket.if_indextoname(interface), group, bytes(packed[: _FILTER.size + ADDRESS_SIZE * count])]
-
-
-def level_of(group: str) -> int:
-    """By which a multicast group is joined, whatever the socket's family."""
-    return socket.IPPROTO_IPV6 if ":" in group else socket.IPPROTO_IP
-
-
-def sockaddr(address: Sequence[Fact]) -> bytes:
-    """An address as bind(2) takes it, 128 bytes."""
-    host, port = str(address[0]), number_of(address[1])
-    if ":" not in host:
-        return struct.pack("<H", socket.AF_INET) + (struct.pack(">H", port) + socket.inet_aton(host)).ljust(126, b"\0")
-    scope = number_of(address[3]) if len(address) > 3 else 0
-    flow = number_of(address[2]) if len(address) > 2 else 0
-    packed = struct.pack(">HI", port, flow) + socket.inet_pton(socket.AF_INET6, host.partition("%")[0])
-    return struct.pack("<H", socket.AF_INET6) + (packed + struct.pack("<I", scope)).ljust(126, b"\0")
 
 
 def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
@@ -218,6 +237,10 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     seen = held.observed
     kinds = {int(socket.SOCK_STREAM): "a TCP socket", int(socket.SOCK_DGRAM): "a UDP socket"}
     name = kinds.get(number_of(seen["type"]), "a raw socket")
+    if seen["unfinished"]:
+        return (
+            f"{held.name} is a UDP socket with a datagram that was begun and not sent yet (UDP_CORK): it is kept as soon as it is"
+        )
     return sockets.refuse_filter(held) or elsewhere.refuse(held, name)
 
 
@@ -241,7 +264,7 @@ def mismatches(held: Resource) -> Iterator[str]:
     """Why its address could not be had here."""
     address = held.facts["address"]
     assert isinstance(address, list)
-    may_be_foreign = held.facts.get("foreign") or _has_option(held, socket.IPPROTO_IP, IP_FREEBIND)
+    may_be_foreign = held.facts.get("foreign") or sockets.has_option(held, socket.IPPROTO_IP, IP_FREEBIND)
     if address and not may_be_foreign and not is_ours(address):
         yield (
             f"{held.name} is bound to {in_words(address)}, and this machine does not have that address: give it to one of its "
@@ -250,23 +273,6 @@ def mismatches(held: Resource) -> Iterator[str]:
     for interface, group, _ in _joined(held):
         if interface not in (name for _, name in socket.if_nameindex()):
             yield f"{held.name} has joined the group {group} at interface {interface}, which is missing here: rename or add it"
-
-
-def _has_option(held: Resource, level: int, number: int) -> bool:
-    return any((its_level, its_number) == (level, number) for its_level, its_number, _ in sockets.options_of(held))
-
-
-def is_ours(address: Sequence[Fact]) -> bool:
-    """Whether a socket can be bound to the address on this machine, at some port."""
-    family = socket.AF_INET6 if ":" in str(address[0]) else socket.AF_INET
-    if family == socket.AF_INET and socket.inet_aton(str(address[0]))[0] in range(224, 240):
-        return True
-    with socket.socket(family, socket.SOCK_DGRAM) as tried:
-        try:
-            tried.bind((str(address[0]), 0, *address[2:]))
-        except OSError:
-            return False
-    return True
 
 
 def _joined(held: Resource) -> Iterator[tuple[str, str, bytes]]:
@@ -301,7 +307,7 @@ def prepare(table: CallTable, held: Sequence[Resource], first: int, disguise: Di
     for number in shared:
         _allow(table, number, socket.SO_REUSEPORT, 0)
     for one in held:
-        _send_again(table, one, held, made)
+        waiting_datagrams.send_again(table, one, held, made)
     for one in held:
         number, peer = made[number_of(one.facts["socket"])], one.facts["peer"]
         assert isinstance(peer, list)
@@ -313,13 +319,9 @@ def prepare(table: CallTable, held: Sequence[Resource], first: int, disguise: Di
     return made
 
 
-def size_of(address: Sequence[Fact]) -> int:
-    return 28 if ":" in str(address[0]) else 16
-
-
 def _shares_its_port(one: Resource, held: Sequence[Resource]) -> bool:
     """Whether another one is bound to the same address, which this one did not mind when it was bound, but would now."""
-    if not one.facts["address"] or _has_option(one, socket.SOL_SOCKET, socket.SO_REUSEPORT):
+    if not one.facts["address"] or sockets.has_option(one, socket.SOL_SOCKET, socket.SO_REUSEPORT):
         return False
     return any(other is not one and all(other.facts[fact] == one.facts[fact] for fact in ("address", "type")) for other in held)
 
@@ -328,10 +330,10 @@ def _place(table: CallTable, one: Resource, made: int) -> None:
     """Bind it, let it listen, join its groups."""
     address = one.facts["address"]
     assert isinstance(address, list)
-    shares = number_of(one.facts["state"]) == LISTENING and not _has_option(one, socket.SOL_SOCKET, socket.SO_REUSEADDR)
+    shares = number_of(one.facts["state"]) == LISTENING and not sockets.has_option(one, socket.SOL_SOCKET, socket.SO_REUSEADDR)
     if shares:  # its port with connections of the program that are there already
         _allow(table, made, socket.SO_REUSEADDR, 1)
-    is_free = bool(one.facts.get("foreign")) and not _has_option(one, socket.IPPROTO_IP, IP_FREEBIND)
+    is_free = bool(one.facts.get("foreign")) and not sockets.has_option(one, socket.IPPROTO_IP, IP_FREEBIND)
     if is_free:  # it had the option when it was bound, or the machine had the address
         _allow(table, made, IP_FREEBIND, 1, socket.IPPROTO_IP)
     if address:
@@ -358,58 +360,3 @@ def _allow(table: CallTable, made: int, option: int, value: int, level: int = so
     """Set SO_REUSEADDR, SO_REUSEPORT or IP_FREEBIND for the while that it takes to bind."""
     place = table.place(value.to_bytes(4, "little"))
     table.call("let a socket be bound", "setsockopt", made, level, option, place, 4)
-
-
-def _send_again(table: CallTable, one: Resource, held: Sequence[Resource], made: Mapping[int, int]) -> None:
-    """Send the datagrams that waited, each from the address that it came from, if that is this machine's."""
-    messages, sources, address = one.facts["queue"], one.facts["sources"], one.facts["address"]
-    assert isinstance(messages, list) and isinstance(sources, list) and isinstance(address, list)
-    if not address:
-        return
-    target = _reachable(address)
-    ours = {
-        tuple(bound): made[number_of(each.facts["socket"])]
-        for each in held
-        if isinstance(bound := each.facts["address"], list) and bound
-    }
-    for message, source in zip(messages, sources, strict=True):
-        assert isinstance(message, bytes) and isinstance(source, list)
-        sender = ours.get(tuple(source))
-        if sender is None and not _is_free(source, number_of(one.facts["protocol"])):
-            continue
-        lent = sender if sender is not None else _sender(table, one, source)
-        arguments = (
-            lent,
-            table.place(message),
-            len(message),
-            socket.MSG_DONTWAIT,
-            table.place(sockaddr(target)),
-            size_of(target),
-        )
-        table.attempt(f"a datagram that waited in {one.name} is lost", "sendto", *arguments)
-        if sender is None:
-            table.close(lent)
-
-
-def _reachable(address: list[Fact]) -> list[Fact]:
-    """Where to send to what is bound to an address: itself, if that is all of this machine's."""
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(str(address[0]), address[0])
-    return [host, *address[1:]]
-
-
-def _is_free(source: Sequence[Fact], protocol: int) -> bool:
-    family = socket.AF_INET6 if ":" in str(source[0]) else socket.AF_INET
-    with socket.socket(family, socket.SOCK_DGRAM, protocol) as tried:
-        try:
-            tried.bind(tuple(source))
-        except (OSError, OverflowError):
-            return False
-    return True
-
-
-def _sender(table: CallTable, one: Resource, source: list[Fact]) -> int:
-    family = socket.AF_INET6 if ":" in str(source[0]) else socket.AF_INET
-    form = (family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC, number_of(one.facts["protocol"]))
-    made = table.obtain(f"make a sender for {one.name}", "socket", *form)
-    table.call(f"bind a sender for {one.name}", "bind", made, table.place(sockaddr(source)), size_of(source))
-    return made

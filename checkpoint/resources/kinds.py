@@ -139,7 +139,7 @@ def _observe_internet_socket(
     held: OpenFile, looked: socket.socket, opened: Opened, noted: sockets.Noted | None
 ) -> Mapping[str, Fact]:
     facts = internet_sockets.observe(held, looked, opened, noted)
-    if looked.proto == socket.IPPROTO_TCP and facts["state"] == internet_sockets.CLOSED:
+    if internet_sockets.is_of_tcp(facts) and facts["state"] == internet_sockets.CLOSED:
         facts["ends"] = tcp_connections.ends_of(looked)
     return (
         facts | tcp_connections.observe(held, looked, facts, opened.listings) if tcp_connections.is_connection(facts) else facts

@@ -22,7 +22,17 @@ from checkpoint.linux.descriptors import Copier, copy_of
 from checkpoint.linux.second_thread import SecondThread
 from checkpoint.linux.socket_questions import WORTH_SHARING, Asking, Subject, Told, events
 from checkpoint.model import Fact
-from checkpoint.resources import Opened, OpenFile, Recalled, internet_sockets, pipes, sockets, tcp_connections, unix_sockets
+from checkpoint.resources import (
+    Opened,
+    OpenFile,
+    Recalled,
+    internet_addresses,
+    internet_sockets,
+    pipes,
+    sockets,
+    tcp_connections,
+    unix_sockets,
+)
 from checkpoint.resources.listings import Group
 from checkpoint.resources.rebuilding import number_of
 
@@ -307,8 +317,10 @@ def _has_no_path(facts: Mapping[str, Fact]) -> bool:
 
 def _subject(facts: Mapping[str, Fact], groups: Sequence[Group]) -> Subject:
     form = sockets.Form(*(number_of(facts[name]) for name in ("family", "type", "protocol")))
-    packed = tuple((interface, internet_sockets.sockaddr([group, 0, 0, 0])) for interface, group in groups)
+    packed = tuple((interface, internet_addresses.sockaddr([group, 0, 0, 0])) for interface, group in groups)
     options = socket_questions.sized(sockets.fresh_options(form))
+    if internet_sockets.may_tell_segment(facts):
+        options += ((socket.IPPROTO_TCP, socket.TCP_MAXSEG, socket_questions.NUMBER_SIZE),)
     return Subject(form.family, form.type, form.protocol, options, packed)
 
 
@@ -350,7 +362,7 @@ def _may_hold_something(state: bytes, facts: Mapping[str, Fact]) -> bool:
 
 def _is_quiet(facts: Mapping[str, Fact]) -> bool:
     """Whether a socket is of a kind whose every fact follows from its answers, as long as nothing waits in it."""
-    if any(facts.get(name) for name in ("queue", "urgent", "too_long", "failed", "lost", "groups", "unread", "waiting")):
+    if any(facts.get(name) for name in ("queue", "urgent", "too_long", "failed", "lost", "groups", "unread", "waiting", "corks")):
         return False
     if facts["family"] == socket.AF_UNIX:
         return facts["not_accepted"] == unix_sockets.NOT_WAITING

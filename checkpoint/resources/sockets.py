@@ -66,35 +66,57 @@ SO_LOCK_FILTER: Final = 44
 UNTOLD: Final = b"?"
 """In place of a filter: it is of extended BPF, which the kernel does not tell."""
 SO_PEEK_OFF: Final = 42
-_GENERAL: Final = (2, 5, 6, 9, 10, 11, 12, 13, 15, 16, 18, 20, 21, 25, 29, 34, 35, 36, 37, 40, SO_PEEK_OFF, 46, 47, 60, 69)
+_USUAL: Final = (2, 5, 6, 9, 10, 11, 12, 13, 15, 16, 18, 20, 21, 25, 29, 34, 35, 36, 37, 40, SO_PEEK_OFF, 46, 47, 60, 69)
 """SO_REUSEADDR, DONTROUTE, BROADCAST, KEEPALIVE, OOBINLINE, NO_CHECK, PRIORITY, LINGER, REUSEPORT, PASSCRED, RCVLOWAT, RCVTIMEO,
 SNDTIMEO, BINDTODEVICE, TIMESTAMP, PASSSEC, TIMESTAMPNS, MARK, TIMESTAMPING, RXQ_OVFL, PEEK_OFF, BUSY_POLL, MAX_PACING_RATE,
 ZEROCOPY, PREFER_BUSY_POLL."""
+_GENERAL: Final = (1, *_USUAL, 43, 45, 61, 63, 64, 65, 74, 75, 76, 82, 83)
+"""SO_DEBUG, NOFCS, SELECT_ERR_QUEUE, TXTIME, TIMESTAMP_NEW, TIMESTAMPNS_NEW, TIMESTAMPING_NEW, TXREHASH, RCVMARK, PASSPIDFD,
+RCVPRIORITY, PASSRIGHTS besides."""
 _BUFFERS: Final = {socket.SO_SNDBUF: 1, socket.SO_RCVBUF: 2}
 """Which bit of SO_BUF_LOCK says that the program has set it; else the kernel chooses. It doubles what it is told."""
 SO_BUF_LOCK: Final = 72
 _FORCED: Final = {socket.SO_SNDBUF: 32, socket.SO_RCVBUF: 33}
 """SO_SNDBUFFORCE and SO_RCVBUFFORCE."""
-_IP: Final = (1, 2, 4, 8, 10, 11, 12, 13, 15, 19, 20, 21, 24, 32, 33, 34, 49, 50, 51)
+_OF_IP: Final = (6, 7, 18, 23, 25, 26)
+"""IP_RECVOPTS, RETOPTS, PASSSEC, CHECKSUM, RECVFRAGSIZE, RECVERR_RFC4884: what comes with a datagram."""
+_IP: Final = (1, 2, 4, 8, 10, 11, 12, 13, 15, 19, 20, 21, 24, 32, 33, 34, 49, 50, 51, *_OF_IP)
 """IP_TOS, TTL, OPTIONS, PKTINFO, MTU_DISCOVER, RECVERR, RECVTTL, RECVTOS, FREEBIND, TRANSPARENT, ORIGDSTADDR, MINTTL,
 BIND_ADDRESS_NO_PORT, MULTICAST_IF, MULTICAST_TTL, MULTICAST_LOOP, MULTICAST_ALL, UNICAST_IF, LOCAL_PORT_RANGE."""
-_OF_DATAGRAMS: Final = tuple((level, number) for level, numbers in ((0, (32, 33)), (41, (17, 18))) for number in numbers)
-"""Options that a stream shows and cannot be given: whereby and how far it would send to groups."""
-_IPV6: Final = (16, 17, 18, 19, 23, 25, 26, 29, 49, 51, 53, 54, 56, 57, 58, 59, 60, 62, 66, 67, 70, 72, 73, 74, 75, 76, 78)
+_OF_IPV6: Final = (2, 3, 4, 5, 8, 11, 30, 31, 33, 77)
+"""IPV6_2292PKTINFO, 2292HOPOPTS, 2292DSTOPTS, 2292RTHDR, 2292HOPLIMIT, FLOWINFO, ROUTER_ALERT_ISOLATE, RECVERR_RFC4884,
+FLOWINFO_SEND, RECVFRAGSIZE: the same there."""
+_IPV6: Final = (
+    *(16, 17, 18, 19, 23, 25, 26, 29, 49, 51, 53, 54, 56, 57, 58, 59, 60, 62, 66, 67, 70, 72, 73, 74, 75, 76, 78),
+    *_OF_IPV6,
+)
 """IPV6_UNICAST_HOPS, MULTICAST_IF, MULTICAST_HOPS, MULTICAST_LOOP, MTU_DISCOVER, RECVERR, V6ONLY, MULTICAST_ALL, RECVPKTINFO,
 RECVHOPLIMIT, RECVHOPOPTS, HOPOPTS, RECVRTHDR, RTHDR, RECVDSTOPTS, DSTOPTS, RECVPATHMTU, DONTFRAG, RECVTCLASS, TCLASS,
 AUTOFLOWLABEL, ADDR_PREFERENCES, MINHOPCOUNT, ORIGDSTADDR, TRANSPARENT, UNICAST_IF, FREEBIND."""
-_TCP: Final = (1, 3, 4, 5, 6, 7, 8, 9, 10, 13, 18, 23, 25, 30, 36, 37)
-"""TCP_NODELAY, CORK, KEEPIDLE, KEEPINTVL, KEEPCNT, SYNCNT, LINGER2, DEFER_ACCEPT, WINDOW_CLAMP, CONGESTION, USER_TIMEOUT,
-FASTOPEN, NOTSENT_LOWAT, FASTOPEN_CONNECT, INQ, TX_DELAY."""
-_UDP: Final = (1, 101, 102, 103, 104)
-"""UDP_CORK, NO_CHECK6_TX, NO_CHECK6_RX, SEGMENT, GRO."""
+_OF_DATAGRAMS: Final = tuple(
+    (level, number)
+    for level, numbers in (
+        (socket.SOL_SOCKET, (43, 61, 63, 64, 65)),
+        (socket.IPPROTO_IP, (32, 33, *_OF_IP)),
+        (socket.IPPROTO_IPV6, (17, 18, *_OF_IPV6)),
+    )
+    for number in numbers
+)
+"""Options that a stream shows and cannot be given, whereby and how far it would send to groups; and those that mean nothing to
+it: a program may have a thousand streams, and stands still while they are asked."""
+_TCP: Final = (1, 3, 4, 5, 6, 7, 8, 9, 10, 13, 16, 18, 23, 25, 27, 30, 34, 36, 37, 44, 45, 46)
+"""TCP_NODELAY, CORK, KEEPIDLE, KEEPINTVL, KEEPCNT, SYNCNT, LINGER2, DEFER_ACCEPT, WINDOW_CLAMP, CONGESTION, THIN_LINEAR_TIMEOUTS,
+USER_TIMEOUT, FASTOPEN, NOTSENT_LOWAT, SAVE_SYN, FASTOPEN_CONNECT, FASTOPEN_NO_COOKIE, INQ, TX_DELAY, RTO_MAX_MS, RTO_MIN_US,
+DELACK_MAX_US."""
+_UDP: Final = (1, 100, 101, 102, 103, 104)
+"""UDP_CORK, ENCAP, NO_CHECK6_TX, NO_CHECK6_RX, SEGMENT, GRO."""
 _UDPLITE: Final = 136
 _SOL_RAW: Final = 255
 _NETLINK: Final = (3, 4, 5, 8, 10, 11, 12)
 """NETLINK_PKTINFO, BROADCAST_ERROR, NO_ENOBUFS, LISTEN_ALL_NSID, CAP_ACK, EXT_ACK, GET_STRICT_CHK."""
-_PACKET: Final = (8, 9, 10, 12, 14, 15, 17, 19, 20, 23)
-"""PACKET_AUXDATA, ORIGDEV, VERSION, RESERVE, LOSS, VNET_HDR, TIMESTAMP, TX_HAS_OFF, QDISC_BYPASS, IGNORE_OUTGOING."""
+_PACKET: Final = (7, 8, 9, 10, 12, 14, 15, 17, 19, 20, 23)
+"""PACKET_COPY_THRESH, AUXDATA, ORIGDEV, VERSION, RESERVE, LOSS, VNET_HDR, TIMESTAMP, TX_HAS_OFF, QDISC_BYPASS,
+IGNORE_OUTGOING."""
 _OF_FAMILY: Final = {socket.AF_NETLINK: (270, _NETLINK), socket.AF_PACKET: (263, _PACKET)}
 """SOL_NETLINK and SOL_PACKET."""
 
@@ -122,6 +144,7 @@ class Queue:
         sources: of each message its sender's address, as recvmsg(2) tells it.
         too_long: more than `QUEUE_LIMIT` bytes.
         urgent: an out-of-band byte waits, too.
+        reset: nothing waits, but that its peer has gone without reading everything (ECONNRESET): a look would take that away.
     """
 
     messages: tuple[bytes, ...] = ()
@@ -129,6 +152,7 @@ class Queue:
     passed: tuple[tuple[int, ...], ...] = ()
     too_long: bool = False
     urgent: bool = False
+    reset: bool = False
 
 
 NOTHING: Final = Queue()
@@ -270,7 +294,10 @@ def _of_protocol(form: Form) -> list[tuple[int, tuple[int, ...]]]:
             socket.IPPROTO_ICMP: (_SOL_RAW, (1,)),
             socket.IPPROTO_ICMPV6: (socket.IPPROTO_ICMPV6, (1,)),
         }  # which types it hears
-        return [(socket.IPPROTO_IP, (3,)), *([own[form.protocol]] if form.protocol in own else [])]  # IP_HDRINCL
+        levels: list[tuple[int, tuple[int, ...]]] = [(socket.IPPROTO_IP, (3, 5, 22))]  # IP_HDRINCL, ROUTER_ALERT, NODEFRAG
+        if form.family == socket.AF_INET6:
+            levels.append((socket.IPPROTO_IPV6, (7, 36)))  # IPV6_CHECKSUM, HDRINCL
+        return [*levels, *([own[form.protocol]] if form.protocol in own else [])]
     own_numbers = {socket.IPPROTO_TCP: _TCP, socket.IPPROTO_UDP: _UDP, _UDPLITE: (*_UDP, 10, 11)}  # which part has a checksum
     return [(form.protocol, own_numbers.get(form.protocol, ()))]
 
@@ -296,6 +323,10 @@ def queue_of(looked: socket.socket, number: int, noted: Noted | None, identify: 
         OSError: this socket cannot be looked into, or an error waits in it, which our look would take away.
     """
     ready = readiness(looked)
+    if looked.family == socket.AF_UNIX and looked.type != socket.SOCK_DGRAM and ready & select.POLLERR:
+        if _unread(looked):
+            raise OSError(errno.EBUSY, "an error waits in it behind what the program has not read yet")
+        return Queue(reset=True)
     if looked.type != socket.SOCK_STREAM and ready & select.POLLERR:
         if looked.family == socket.AF_UNIX:
             raise OSError(errno.EBUSY, "an error waits in it, which the program has not been told yet")
@@ -333,8 +364,19 @@ def readiness(looked: socket.socket) -> int:
 
 def _is_all(looked: socket.socket, first: Queue) -> bool:
     """Whether nothing waits behind the first message, which is no datagram. Source: unix(7), SIOCINQ."""
-    waiting = int.from_bytes(fcntl.ioctl(looked.fileno(), termios.FIONREAD, bytes(4)), "little")
-    return waiting <= sum(map(len, first.messages))
+    return _unread(looked) <= sum(map(len, first.messages))
+
+
+def _unread(looked: socket.socket) -> int:
+    return int.from_bytes(fcntl.ioctl(looked.fileno(), termios.FIONREAD, bytes(4)), "little")
+
+
+def unsent(looked: socket.socket) -> int:
+    """How much of what it sent has not left it yet, or was not read by a unix socket's peer, in bytes of the kernel's memory.
+
+    Source: unix(7), udp(7), SIOCOUTQ.
+    """
+    return int.from_bytes(fcntl.ioctl(looked.fileno(), termios.TIOCOUTQ, bytes(4)), "little")
 
 
 def _peeked(looked: socket.socket, count: int, identify: Identify) -> Queue:
@@ -385,6 +427,7 @@ def make(table: CallTable, held: Resource) -> int:
     return made
 
 
+UDP_CORK: Final = (socket.IPPROTO_UDP, 1)
 V6ONLY: Final = (socket.IPPROTO_IPV6, socket.IPV6_V6ONLY)
 
 
@@ -415,6 +458,11 @@ def options_of(held: Resource) -> Iterator[tuple[int, int, bytes]]:
     for one in options:
         assert isinstance(one, list) and isinstance(one[2], bytes)
         yield number_of(one[0]), number_of(one[1]), one[2]
+
+
+def has_option(held: Resource, level: int, number: int) -> bool:
+    """Whether an option is not as in a fresh socket."""
+    return any((its_level, its_number) == (level, number) for its_level, its_number, _ in options_of(held))
 
 
 def _set_filter(table: CallTable, held: Resource, made: int) -> None:

@@ -1,7 +1,8 @@
 """Standard input, output and error: streams of the component, not of a robot.
 
 A terminal, pipe or socket at 0, 1 or 2 becomes the restored side's own stream of that number; what the guard of a component
-holds the other end of is told by its pipes. A regular file or a device there is no stream but itself.
+holds the other end of is told by its pipes. A regular file or a device there is no stream but itself, and so is a pipe or
+socket of which the program has the other end, too.
 
 Facts: ``descriptors``; ``stream``, 0, 1 or 2: which of the vessel's own it becomes; ``flags`` of open(2) and fcntl(2).
 """
@@ -47,8 +48,9 @@ def _stream_of(held: OpenFile, surroundings: Surroundings) -> int | None:
     guarded = surroundings.pipes.get(held.first.target)
     if guarded is not None:
         return guarded
-    if not surroundings.is_first or held.first.target in held.kin.pipes or (held.kin.pids and held.observed.get("peer_is_ours")):
-        return None  # the component's own: it leads from one of its processes to another
+    leads_to_itself = held.is_its_own and stat.S_ISFIFO(held.first.mode)
+    if not surroundings.is_first or leads_to_itself or held.first.target in held.kin.pipes or held.observed.get("peer_is_ours"):
+        return None  # the component's own: it leads from one of its processes to another, or to itself
     standard = next((one.number for one in held.descriptors if one.number in STANDARD), None)
     if standard is not None and (stat.S_ISFIFO(held.first.mode) or stat.S_ISSOCK(held.first.mode) or _is_terminal(held)):
         return standard

@@ -13,8 +13,9 @@ What a program takes along when it moves, as its operator may have it, is in ``c
 are `TAKEN`, `LEFT` and `MAY_MOVE`.
 
 Facts besides those of ``internet_sockets``: ``local``: both addresses are one machine's; ``queue``: what waits to be read in a
-local one, one message; ``unread``: bytes that wait; ``urgent``: an out-of-band one does; ``sent`` and ``received``: bytes that
-went over it; ``unsent``: bytes still to be sent; ``ends``: what poll(2) says of its end, `READ_ENDED` and `FAILED`.
+local one, one message; ``unread``: bytes that wait; ``urgent``: an out-of-band one does; ``encrypted``: the kernel does so;
+``deaf``: its program wants to read no more of it; ``sent`` and ``received``: bytes that went over it; ``unsent``: bytes still
+to be sent; ``ends``: what poll(2) says of its end, `READ_ENDED` and `FAILED`.
 
 Source: tcp(7), tcp_ioctl() and tcp_poll() in net/ipv4/tcp.c; linux/tcp.h for struct tcp_info.
 """
@@ -37,7 +38,8 @@ from checkpoint.linux import connection_remains, tcp_repair
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import OpenFile, Surroundings, elsewhere, internet_sockets, sockets
-from checkpoint.resources.internet_sockets import CLOSED, LISTENING, in_words, size_of, sockaddr
+from checkpoint.resources.internet_addresses import in_words, is_ours, size_of, sockaddr
+from checkpoint.resources.internet_sockets import CLOSED, LISTENING
 from checkpoint.resources.listings import Listings
 from checkpoint.resources.rebuilding import number_of
 
@@ -64,8 +66,15 @@ CAPABILITIES: Final = (
         "in which more than {} MiB wait",
         "in which an out-of-band byte waits (MSG_OOB)",
     ),
+    refused(
+        Area.SOCKETS,
+        "a TCP connection of the program with itself that the kernel encrypts (kTLS)",
+        "have the program's library encrypt it",
+        "which the kernel encrypts (TCP_ULP)",
+    ),
 )
 
+ESTABLISHED: Final = 1
 SYN_SENT: Final = 2
 FIN_WAIT_1: Final = 4
 FIN_WAIT_2: Final = 5
@@ -73,6 +82,7 @@ CLOSE_WAIT: Final = 8
 LAST_ACK: Final = 9
 CLOSING: Final = 11
 _WE_ENDED: Final = (CLOSED, FIN_WAIT_1, FIN_WAIT_2, LAST_ACK, CLOSING)
+_PEER_SPEAKS: Final = (ESTABLISHED, FIN_WAIT_1, FIN_WAIT_2)
 _PEER_ENDED: Final = (CLOSE_WAIT, LAST_ACK, CLOSING)
 
 TAKEN: Final = "carried"
@@ -123,7 +133,9 @@ def observe(held: OpenFile, looked: socket.socket, facts: Mapping[str, Fact], li
         "local": is_local,
         "queue": [_peek(looked, unread)] if is_local and 0 < unread <= sockets.QUEUE_LIMIT else [],
         "unread": unread,
+        "deaf": facts["state"] in _PEER_SPEAKS and bool(ends_of(looked) & READ_ENDED),
         "urgent": is_local and bool(sockets.readiness(looked) & select.POLLPRI),
+        "encrypted": is_local and tcp_repair.is_encrypted(looked),
         "sent": sent - again,
         "received": _RECEIVED.unpack_from(told, _RECEIVED_AT)[0],
         "unsent": int.from_bytes(told[_UNSENT_AT : _UNSENT_AT + 4], "little"),
@@ -152,7 +164,7 @@ def _peek(looked: socket.socket, size: int) -> bytes:
 
 def is_connection(facts: Mapping[str, Fact]) -> bool:
     """Whether a TCP socket is or was connected, or is on its way there."""
-    if facts.get("protocol") != socket.IPPROTO_TCP or facts.get("state") == LISTENING:
+    if not internet_sockets.is_of_tcp(facts) or facts["state"] == LISTENING:
         return False
     return facts["state"] != CLOSED or bool(facts.get("ends"))
 
@@ -204,6 +216,8 @@ def _refuse_end(one: Resource, other: Resource) -> Iterator[str]:
     what = f"{one.name} is a TCP connection of the program with itself"
     if one.facts.get("urgent"):
         yield f"{what}, in which an out-of-band byte waits (MSG_OOB): it is kept as soon as that is read"
+    if one.facts.get("encrypted"):
+        yield f"{what}, which the kernel encrypts (TCP_ULP): have the program's library do so"
     if one.facts["state"] == CLOSED:
         return
     underway = _number(one, "unsent") + _number(one, "sent") - _number(other, "received") + (other.facts["state"] in _PEER_ENDED)
@@ -241,11 +255,7 @@ def pairs(held: Iterable[Resource]) -> dict[int, Resource]:
     found = {}
     for (address, peer), one in by_ends.items():
         other = by_ends.get((peer, address))
-        if (
-            other is not None
-            and other is not one
-            and all(internet_sockets.is_ours(_address(one, end)) for end in ("address", "peer"))
-        ):
+        if other is not None and other is not one and all(is_ours(_address(one, end)) for end in ("address", "peer")):
             found[_number(one, "socket")] = other
     return found
 
@@ -370,7 +380,8 @@ class _Work:
             place = table.place(_RESET_AT_CLOSE)
             table.call(f"reset {one.name}", "setsockopt", accepted, socket.SOL_SOCKET, socket.SO_LINGER, place, 8)
         table.close(accepted)
-        table.call(f"wait for the end of {one.name}", "poll", table.place(struct.pack("<ihh", made, select.POLLRDHUP, 0)), 1, -1)
+        polled = table.place(struct.pack("<ihh", made, select.POLLRDHUP, 0))
+        table.call(f"wait for the end of {one.name}", "ppoll", polled, 1, 0, 0, 0)
         if _has_told(one):
             table.call(f"shut {one.name} down", "shutdown", made, socket.SHUT_RDWR)
         self._keep(one, made)
@@ -416,6 +427,8 @@ def settle(table: CallTable, held: Sequence[Resource], made: Mapping[int, int]) 
         number = made[_number(one, "socket")]
         if _number(one, "socket") in others and one.facts["state"] in _WE_ENDED:
             table.call(f"end the side of {one.name}", "shutdown", number, socket.SHUT_WR)
+        if _number(one, "socket") in others and one.facts.get("deaf"):
+            table.call(f"have {one.name} read the end", "shutdown", number, socket.SHUT_RD)
         sockets.set_flags(table, one, number)
 
 

@@ -237,6 +237,9 @@ class Work:
     def _fill(self, one: Resource) -> None:
         """Send what waits in one of them, each datagram from the name that it came from."""
         messages = _list(one.facts["queue"])
+        if one.facts.get("reset"):  # the end that is closed soon has something unread, as it had
+            number, byte = self._made[_of(one, "socket")], self._table.place(bytes(1))
+            self._table.attempt("", "sendto", number, byte, 1, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL, 0, 0)
         if not messages:
             return
         told = one.facts["sources"] or []  # versions before said False where none has any

@@ -8,7 +8,8 @@ Facts besides those of every socket, of ``unix_names`` and of ``unix_makers``: `
 ``name``; ``peer``: inode number of its other end, 0 when that is gone; ``peer_name``; ``backlog``; ``shutdown``; ``clients``:
 whose connections wait to be accepted, inode numbers in their order; ``passed``: of each message in the queue the descriptors
 that came with it, as numbers of the program's own, or of ``travelling``; no list if none has any; ``too_long``: the queue;
-``urgent``: an out-of-band byte waits; ``sources``: of each message in the queue the name of its sender; no list if none has
+``urgent``: an out-of-band byte waits; ``reset``: its peer has gone without reading all, of which it has not been told yet
+(ECONNRESET); ``sources``: of each message in the queue the name of its sender; no list if none has
 any; ``not_accepted``: of one whose connection waits itself, how much of what it sent is unread, -1 of any other.
 
 Source: unix(7).
@@ -16,10 +17,8 @@ Source: unix(7).
 
 from __future__ import annotations
 
-import fcntl
 import os
 import socket
-import termios
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Final
@@ -104,11 +103,12 @@ def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: socket
             "backlog": told.backlog,
             "shutdown": told.shutdown,
             "clients": list(told.clients),
-            "not_accepted": _unread(looked) if _waits(told) else NOT_WAITING,
+            "not_accepted": sockets.unsent(looked) if _waits(told) else NOT_WAITING,
             "queue": list(queue.messages),
             "passed": [list(numbers) for numbers in queue.passed] if any(queue.passed) else [],
             "too_long": queue.too_long,
             "urgent": queue.urgent,
+            "reset": queue.reset,
             "sources": list(map(_packed_name, queue.sources)) if told.type == socket.SOCK_DGRAM and any(queue.sources) else [],
         }
     )
@@ -137,11 +137,6 @@ def _is_ours(peer: int, held: OpenFile, opened: Opened) -> bool:
 def _waits(told: UnixSocket) -> bool:
     """Whether a socket is connected and waits to be accepted: its other end has no number yet."""
     return told.state == ESTABLISHED and told.type != socket.SOCK_DGRAM and not told.peer and told.shutdown != BOTH_DIRECTIONS
-
-
-def _unread(looked: socket.socket) -> int:
-    """How much of what it sent was not read yet, in bytes of the kernel's memory. Source: unix(7), SIOCOUTQ."""
-    return int.from_bytes(fcntl.ioctl(looked.fileno(), termios.TIOCOUTQ, bytes(4)), "little")
 
 
 def _packed_name(source: object) -> bytes:

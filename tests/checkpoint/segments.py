@@ -68,6 +68,8 @@ def committing_child() -> Iterator[tuple[int, int]]:
     pid = os.fork()
     if pid == 0:
         try:
+            for first, end in ((3, theirs.fileno()), (theirs.fileno() + 1, os.sysconf("SC_OPEN_MAX"))):
+                os.closerange(first, end)  # segments of tests before this one among them
             _commit_for_ever(theirs)
         finally:
             os._exit(1)

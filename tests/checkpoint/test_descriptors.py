@@ -49,7 +49,7 @@ CASES = {
     ),
     "path_descriptors": (
         "inotify_directories inotify_gaps inotify_deleted fifo_both fifo_reader fifo_deleted fifo_signals pipe_reopened "
-        "path_only kernel_files file_locks leases pipe_of_packets"
+        "path_only kernel_files file_locks leases pipe_of_packets own_streams"
     ),
     "memory_objects": "memfd_executed memfd_content memfd_sealed memfd_mapped posix_named posix_unlinked",
     "sockets": (
@@ -59,10 +59,14 @@ CASES = {
         "udp_options udp_group udp_group_of_other_family filtered tcp_shared_port"
     ),
     "unix_sockets": (
-        "ghost_left ghost_directory name_taken_again waiting_stream waiting_packets named_senders named_pair makers travelling"
+        "ghost_left ghost_directory name_taken_again waiting_stream waiting_packets named_senders named_pair makers travelling "
+        "reset_stream reset_packets"
     ),
     "kernel_sockets": "netlink raw light_datagrams packets",
     "aio": "aio_events aio_around",
+    "socket_settings": (
+        "of_datagrams of_datagrams_6 of_streams of_listeners of_unix of_raw of_raw_6 numbered_like_tcp wide_senders"
+    ),
     "internet_sockets": "udp_shut_down foreign_address rare_options closed_connection_4 closed_connection_6",
 }
 

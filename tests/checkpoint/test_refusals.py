@@ -45,6 +45,7 @@ REFUSED = {
     "unix_waiting_data": "accepted with data",
     "unix_waiting_gone": "client has gone",
     "unix_urgent": "out-of-band",
+    "udp_corked": "begun and not sent yet",
     "netlink_socket": "netlink socket of family 12",
     "netlink_answer": "answer of the kernel waits",
     "vsock": "a socket (vsock",

@@ -28,7 +28,7 @@ pytestmark = [pytest.mark.compiler, pytest.mark.root]
 Compiled = Callable[..., Path]
 
 ROUNDS = 3
-WITH_ITSELF = ["itself_4", "itself_6", "itself_much", "itself_half_closed", "itself_ended"]
+WITH_ITSELF = ["itself_4", "itself_6", "itself_much", "itself_half_closed", "itself_deaf", "itself_ended"]
 WITH_OTHERS = ["other_reset", "other_told", "other_ended_unread", "other_ended"]
 
 
@@ -93,9 +93,14 @@ def test_a_connection_that_was_asked_for_is_asked_for_anew(compiled: Compiled, t
                 expect_ok(tracee)
 
 
-def test_a_connection_with_itself_that_is_full_is_refused_by_name(compiled: Compiled, tmp_path: Path) -> None:
-    with ended(start_tracee(compiled("tcp_connections", "-O2"), tmp_path, "itself_full")) as tracee:
-        with pytest.raises(UnsupportedError, match="bytes of which have not arrived"):
+@pytest.mark.parametrize(
+    ("case", "named"), [("full", "bytes of which have not arrived"), ("encrypted", "which the kernel encrypts")]
+)
+def test_a_connection_with_itself_that_cannot_be_made_again_is_refused_by_name(
+    case: str, named: str, compiled: Compiled, tmp_path: Path
+) -> None:
+    with ended(start_tracee(compiled("tcp_connections", "-O2"), tmp_path, f"itself_{case}")) as tracee:
+        with pytest.raises(UnsupportedError, match=named):
             captured(tracee)
         tracee.tell()
         expect_ok(tracee)

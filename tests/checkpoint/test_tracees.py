@@ -74,8 +74,9 @@ OF_X86 = [
     *cases("avx512", told=BY_SIGNAL),
     *cases("rseq_loop", told=BY_SIGNAL),
     *cases("segments"),
+    *cases("single_steps"),
 ]
-OF_PROCESSOR = {"aarch64": cases("registers_aarch64", told=BY_SIGNAL)}
+OF_PROCESSOR = {"aarch64": [*cases("registers_aarch64", told=BY_SIGNAL), *cases("rseq_loop", told=BY_SIGNAL)]}
 """What is written in instructions of one processor; `OF_X86` for those that have none of their own."""
 REGISTERS = [
     *OF_PROCESSOR.get(os.uname().machine, OF_X86),

@@ -4,6 +4,7 @@
 #include <poll.h>
 #include <sys/file.h>
 #include <sys/inotify.h>
+#include <sys/socket.h>
 
 static const char *go;
 
@@ -94,6 +95,20 @@ static void pipe_of_packets(void) {
     EXPECT_EQUAL("third packet", read(ends[0], found, sizeof found), 1);
     EXPECT(read(ends[0], found, sizeof found) == -1 && errno == EAGAIN, "there are more");
     EXPECT(write(once[1], "two", 3) == 3 && read(once[0], found, sizeof found) == 5, "two packets are one");
+}
+
+/* Standard input and error that lead to the program itself. */
+static void own_streams(void) {
+    int ends[2], pair[2];
+    char found[20] = "";
+    if (pipe(ends) || socketpair(AF_UNIX, SOCK_STREAM, 0, pair)) cannot("make a pipe");
+    if (dup2(ends[0], 0) || dup2(pair[0], 2) != 2 || close(ends[0]) || close(pair[0])) cannot("replace the streams");
+    if (write(ends[1], "to itself", 9) != 9 || write(2, "errors", 6) != 6) cannot("write");
+    wait_here();
+    EXPECT(read(0, found, 9) == 9 && !strcmp(found, "to itself"), "it reads '%s'", found);
+    memset(found, 0, sizeof found);
+    EXPECT(recv(pair[1], found, 19, MSG_DONTWAIT) == 6 && !strcmp(found, "errors"), "it hears '%s'", found);
+    EXPECT(write(2, "more", 4) == 4 && recv(pair[1], found, 19, MSG_DONTWAIT) == 4, "it does not hear itself");
 }
 
 static void fifo_signals(void) {
@@ -309,7 +324,7 @@ int main(int count, char **arguments) {
         void (*act)(void);
     } cases[] = {{"inotify_directories", inotify_directories}, {"inotify_gaps", inotify_gaps}, {"fifo_both", fifo_both},
                  {"fifo_reader", fifo_reader}, {"fifo_gone", fifo_gone},
-                 {"leases", leases}, {"pipe_of_packets", pipe_of_packets}, {"fifo_signals", fifo_signals}, {"fifo_deleted", fifo_deleted}, {"inotify_deleted", inotify_deleted},
+                 {"leases", leases}, {"pipe_of_packets", pipe_of_packets}, {"own_streams", own_streams}, {"fifo_signals", fifo_signals}, {"fifo_deleted", fifo_deleted}, {"inotify_deleted", inotify_deleted},
                  {"pipe_reopened", pipe_reopened}, {"covered", covered},
                  {"path_only", path_only}, {"kernel_files", kernel_files}, {"file_locks", file_locks}};
     go = arguments[1];

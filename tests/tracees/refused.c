@@ -11,6 +11,7 @@
 #include <linux/perf_event.h>
 #include <linux/userfaultfd.h>
 #include <mqueue.h>
+#include <netinet/in.h>
 #include <pthread.h>
 #include <sys/fanotify.h>
 #include <sys/file.h>
@@ -160,6 +161,14 @@ static void take_unix_urgent(void) {
     int ends[2];
     if (socketpair(AF_UNIX, SOCK_STREAM, 0, ends) || send(ends[0], "ab", 2, MSG_OOB) != 2) cannot("send out of band");
     keep(ends[1], "a socket");
+}
+
+static void take_udp_corked(void) {
+    struct sockaddr_in address = {.sin_family = AF_INET, .sin_port = htons(9), .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};
+    int on = 1;
+    keep(socket(AF_INET, SOCK_DGRAM, 0), "a socket");
+    if (connect(opened, (struct sockaddr *)&address, sizeof address) || setsockopt(opened, IPPROTO_UDP, 1, &on, sizeof on)) cannot("cork");
+    if (send(opened, "begun", 5, 0) != 5) cannot("send");
 }
 
 static void take_netlink_socket(void) { keep(socket(AF_NETLINK, SOCK_RAW, 12 /* NETLINK_NETFILTER */), "a socket"); }
@@ -379,6 +388,7 @@ static const struct kind {
              {"unix_waiting_data", take_unix_waiting_data},
              {"unix_waiting_gone", take_unix_waiting_gone},
              {"unix_urgent", take_unix_urgent},
+             {"udp_corked", take_udp_corked},
              {"netlink_socket", take_netlink_socket},
              {"netlink_answer", take_netlink_answer},
              {"vsock", take_vsock},

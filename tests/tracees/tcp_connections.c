@@ -140,6 +140,14 @@ static void itself_full(void) {
     wait_here();
 }
 
+/* With a layer of the kernel's between the program and TCP, which only a kernel with CONFIG_TLS has. */
+static void itself_encrypted(void) {
+    int ends[2];
+    connect_with_itself(AF_INET, ends);
+    if (setsockopt(ends[1], IPPROTO_TCP, 31 /* TCP_ULP */, "tls", sizeof "tls")) cannot("have the kernel encrypt");
+    wait_here();
+}
+
 static void itself_half_closed(void) {
     int ends[2];
     connect_with_itself(AF_INET, ends);
@@ -149,6 +157,17 @@ static void itself_half_closed(void) {
     expect_text(ends[1], "last"), expect_end(ends[1]);
     say(ends[1], "back"), expect_text(ends[0], "back");
     EXPECT(send(ends[0], "x", 1, MSG_NOSIGNAL) == -1 && errno == EPIPE, "it can be written to");
+}
+
+/* One side reads no more, and the other one has not ended; both can be written to. */
+static void itself_deaf(void) {
+    int ends[2];
+    connect_with_itself(AF_INET, ends);
+    shutdown(ends[0], SHUT_RD);
+    wait_here();
+    expect_end(ends[0]);
+    say(ends[0], "spoken"), poll(&(struct pollfd){ends[1], POLLIN, 0}, 1, 5000), expect_text(ends[1], "spoken");
+    EXPECT(poll(&(struct pollfd){ends[1], POLLRDHUP, 0}, 1, 0) == 0, "the other side reads the end, too");
 }
 
 static void itself_ended(void) {
@@ -234,7 +253,8 @@ int main(int count, char **arguments) {
                  {"itself_6", itself_6, NULL},
                  {"itself_much", itself_much, NULL},
                  {"itself_full", itself_full, NULL},
-                 {"itself_half_closed", itself_half_closed, NULL},
+                 {"itself_encrypted", itself_encrypted, NULL},
+                 {"itself_half_closed", itself_half_closed, NULL}, {"itself_deaf", itself_deaf, NULL},
                  {"itself_ended", itself_ended, NULL},
                  {"other_reset", NULL, other_reset},
                  {"other_told", NULL, other_told},

@@ -264,6 +264,20 @@ static void travelling(void) {
     EXPECT_EQUAL("what is open", open("/dev/null", O_RDONLY), same + 1);
 }
 
+/* The other end was closed before all was read there; nobody has been told yet. */
+static void reset(int kind) {
+    int ends[2];
+    char byte;
+    if (socketpair(AF_UNIX, kind, 0, ends)) cannot("make a pair");
+    say(ends[1], "unread"), close(ends[0]);
+    wait_here();
+    EXPECT(recv(ends[1], &byte, 1, 0) == -1 && errno == ECONNRESET, "it is not told: %s", strerror(errno));
+    EXPECT_EQUAL("end", recv(ends[1], &byte, 1, 0), 0);
+}
+
+static void reset_stream(void) { reset(SOCK_STREAM); }
+static void reset_packets(void) { reset(SOCK_SEQPACKET); }
+
 int main(int count, char **arguments) {
     static const struct socket_case cases[] = {
         {"ghost_left", ghost_left},
@@ -274,6 +288,8 @@ int main(int count, char **arguments) {
         {"named_senders", named_senders},
         {"named_pair", named_pair},
         {"makers", makers},
+        {"reset_stream", reset_stream},
+        {"reset_packets", reset_packets},
         {"travelling", travelling},
     };
     return run_case(count, arguments, cases, sizeof cases / sizeof *cases);
