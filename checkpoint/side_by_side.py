@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
@@ -28,7 +29,8 @@ def in_order(work: Callable[[A], B], pieces: Iterable[A], threads: int) -> Gener
     """What ``work`` answers for each piece, in their order; one thread is our own alone.
 
     What a piece raises is raised in its place, and so is what the iterable raises: after the answers of all pieces before it.
-    No thread is left when the generator is exhausted, closed or has raised.
+    No thread is left when the generator is exhausted, closed or has raised. Each has the precedence that ours has at the first
+    piece: who waits for others comes no sooner than they do.
     """
     if threads < 2:
         yield from map(work, pieces)
@@ -38,7 +40,7 @@ def in_order(work: Callable[[A], B], pieces: Iterable[A], threads: int) -> Gener
     begun: deque[Future[B]] = deque()
     rest = iter(pieces)
     trouble: Exception | None = None
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(threads, initializer=_come_as, initargs=(os.sched_getscheduler(0), os.sched_getparam(0))) as pool:
         try:
             while True:
                 while trouble is None and len(begun) < threads * AHEAD:
@@ -58,6 +60,13 @@ def in_order(work: Callable[[A], B], pieces: Iterable[A], threads: int) -> Gener
                 one.cancel()
     if trouble is not None:
         raise trouble
+
+
+def _come_as(policy: int, priority: os.sched_param) -> None:
+    """Have the calling thread scheduled as another one is: real-time policies may not be inherited (SCHED_RESET_ON_FORK)."""
+    if policy != os.sched_getscheduler(0):
+        with contextlib.suppress(OSError):  # an ordinary user, or a container
+            os.sched_setscheduler(0, policy, priority)
 
 
 def _begin(pool: ThreadPoolExecutor, work: Callable[[A], B], piece: A) -> Future[B]:

@@ -8,12 +8,13 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import threading
 from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
 
-from checkpoint import pages
+from checkpoint import pages, side_by_side
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.pagetables import existence
@@ -22,12 +23,17 @@ from checkpoint.linux.tracking import NONE, Scan, extents_of, is_orphan, is_shar
 from checkpoint.pages import PageMap, Words
 
 READ_CHUNK: Final = 8 << 20
+DIGESTED: Final = 1 << 20
+"""Bytes that are read, and then digested, at a time."""
+PIECES_FOR_THREADS: Final = 8
+"""Fewer are read by the time that threads are born."""
 
 
 class DigestTracker:
     """Reads everything that exists and compares digests. Needs nothing of the kernel."""
 
     name = "digest"
+    cost = "it stands still while all of its memory is read, a tenth of its time at most, by longer periods"
     sees_every_write = False
     scans_running = False
 
@@ -86,11 +92,19 @@ def compared(before: PageMap, now: PageMap) -> Scan:
 
 
 def digests_of(memory: Memory, existing: Words) -> Words:
-    """The digest of each page, read in chunks."""
-    found = []
-    for chunk in chunks_of(existing):
-        content = memory.read_pages(chunk)
-        found.append(pages.digest_pages(content, pages.addresses_of(chunk, abi.PAGE_SIZE), abi.PAGE_SIZE))
+    """The digest of each page. Much is read by several threads, each into a buffer that stays in its processor's cache."""
+    buffers = threading.local()
+
+    def digested(piece: Words) -> Words:
+        if not hasattr(buffers, "own"):
+            buffers.own = memoryview(bytearray(DIGESTED))
+        addresses = pages.addresses_of(piece, abi.PAGE_SIZE)
+        memory.read_pages_into(piece, buffers.own)
+        return pages.digest_pages(buffers.own[: len(addresses) * abi.PAGE_SIZE], addresses, abi.PAGE_SIZE)
+
+    pieces = chunks_of(existing, DIGESTED)
+    threads = side_by_side.thread_count() if len(pieces) >= PIECES_FOR_THREADS else 1
+    found = list(side_by_side.in_order(digested, pieces, threads))
     return np.concatenate(found) if found else NONE
 
 

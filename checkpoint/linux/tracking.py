@@ -39,12 +39,14 @@ class Tracker(Protocol):
     """Finds written pages.
 
     Attributes:
+        cost: what following with it costs a program, a clause.
         sees_every_write: a page that was changed and changed back counts as written. Otherwise a copy that was made between two
             scans is of no use.
         scans_running: `backlog` and `catch_up` are there.
     """
 
     name: str
+    cost: str
     sees_every_write: bool
     scans_running: bool
 

@@ -74,6 +74,7 @@ class PagemapTracker:
     """
 
     name = "pagemap"
+    cost = "a fault for each page that it writes, once between two captures"
     sees_every_write = True
     scans_running = True
 

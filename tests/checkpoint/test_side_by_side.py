@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator
 
@@ -22,6 +23,11 @@ def square(number: int) -> int:
     if number == 70:
         raise ValueError("70")
     return number * number
+
+
+def scheduled() -> tuple[int, int]:
+    """Policy and priority of the calling thread."""
+    return os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
 
 
 @pytest.mark.parametrize("threads", [1, 2, 4])
@@ -54,3 +60,14 @@ def test_where_no_thread_may_be_born_the_work_is_done_all_the_same(monkeypatch: 
 
     monkeypatch.setattr(threading.Thread, "start", refuse)
     assert list(side_by_side.in_order(square, pieces(60), 2)) == [n * n for n in range(60)]
+
+
+@pytest.mark.root
+def test_those_that_work_for_who_comes_first_come_first_too() -> None:
+    before = os.sched_getscheduler(0)
+    os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(3))
+    try:
+        found = set(side_by_side.in_order(lambda _: scheduled(), range(20), 2))
+    finally:
+        os.sched_setscheduler(0, before & ~os.SCHED_RESET_ON_FORK, os.sched_param(0))
+    assert found == {(os.SCHED_RR | os.SCHED_RESET_ON_FORK, 3)}
