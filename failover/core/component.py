@@ -137,6 +137,7 @@ class Component:
         born: epoch under which the present process was started or restored.
         crashed: wait status of a program that died while it was held still; it is resumed when it may act.
         took_ns: from the order of the last delta until it was a checkpoint, 0 if that was none; no other is taken meanwhile.
+        freeze_us: how long it stood still for the last snapshot; ``still_us``: the shorter of the last two times.
         due_ns: next capture; ``until_ns``: when the present claim, start or restore is overdue.
         resumed_ns: when the state was captured that this primacy began with, -1 for a fresh start; ``resumed_age_ns``: how old
             it was then.
@@ -190,6 +191,7 @@ class Component:
     acked_ns: int = -1
     took_ns: int = 0
     freeze_us: int = 0
+    still_us: int = 0
     degraded: str = ""
     awaited: str = ""
     undelivered: str = ""

@@ -17,6 +17,12 @@ from failover.core.messages import NEEDS_BASE, Entry
 from failover.core.names import weight
 from failover.core.types import HISTORY_MAX, MS, OnUnsupported
 
+NS_PER_US = 1_000
+
+STILL_SHARE = 10
+"""One part in so many of its time is what a program stands still at most for its snapshots: where nobody tells which pages were
+written, all of its memory is read meanwhile."""
+
 
 def choose_standby(component: Component, turn: Turn) -> None:
     """The operator's choice, else the least loaded living robot, else the lesser name. Under ``freeze`` it stays for good."""
@@ -70,6 +76,7 @@ def captured(component: Component, turn: Turn, event: Captured) -> None:
     if flight is None or flight.position is not None or not _current(component, event.epoch, event.position):
         return
     component.hold(event.position)
+    component.still_us = min(component.freeze_us or event.freeze_us, event.freeze_us)
     component.freeze_us, component.degraded, component.awaited = event.freeze_us, "", ""
     component.base_wanted = False
     flight.position, flight.parent = event.position, event.parent
@@ -212,9 +219,15 @@ def _checkpoint(component: Component, turn: Turn, position: Position, *, is_safe
 
 
 def _period_ns(component: Component, turn: Turn, flight: Flight) -> int:
-    """Between two captures: what the operator wants, or, while no standby takes them, seldom."""
+    """Between two captures: what the operator wants, or seldom: while no standby takes them, or its program bears no more."""
     is_alone = not flight.to or not turn.alive(component.standby)
-    return (turn.config.alone_period_ms if is_alone else component.rules.period_ms) * MS
+    wanted_ns = (turn.config.alone_period_ms if is_alone else component.rules.period_ms) * MS
+    return max(wanted_ns, least_period_ns(component))
+
+
+def least_period_ns(component: Component) -> int:
+    """Shorter, and the program would stand still for more than its share of the time."""
+    return STILL_SHARE * component.still_us * NS_PER_US
 
 
 def _give_up(component: Component, turn: Turn, why: str = "") -> None:

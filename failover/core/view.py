@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from failover.core import homecoming, promise
+from failover.core import homecoming, promise, replication
 from failover.core.component import Component, Turn
+from failover.core.consent import state_of
 from failover.core.types import MS, ComponentView, Protection, State, StatusView
 from failover.core.warmth import is_warm
 
 NS_PER_S = 10**9
+US_PER_MS = 1_000
 
 SLOW_FACTOR = 2
 """Deltas that take so many periods to become checkpoints are told of: fewer are taken, and each carries more."""
@@ -81,15 +83,20 @@ def _overdue(component: Component, turn: Turn) -> bool:
 
 
 def _slow(component: Component, turn: Turn) -> str:
-    """Where deltas take longer than their period allows: how seldom they are taken, and where they go; "" otherwise."""
+    """Where deltas take longer than their period allows: how seldom they are taken, and why; "" otherwise."""
     flight = component.flight
     under_way_ns = turn.now_ns - flight.started_ns if flight is not None and flight.parent is not None else 0
-    took_ns, period_ns = max(component.took_ns, under_way_ns), component.rules.period_ms * MS
-    if not turn.alive(component.standby) or took_ns <= SLOW_FACTOR * period_ns:
+    took_ns, least_ns = max(component.took_ns, under_way_ns), replication.least_period_ns(component)
+    period_ns = component.rules.period_ms * MS
+    if not turn.alive(component.standby) or max(took_ns, least_ns) <= SLOW_FACTOR * period_ns:
         return ""
+    why = f"it takes that long until {component.standby} has one"
+    if least_ns > took_ns:
+        still_ms, part = component.still_us / US_PER_MS, f"1/{replication.STILL_SHARE}"
+        why = f"it stands still for {still_ms:.0f} ms each time, and does so for no more than {part} of its time"
     return (
-        f"captured every {took_ns / NS_PER_S:.1f} s instead of every {period_ns / NS_PER_S:.1f} s: it takes that long until "
-        f"{component.standby} has one; what is written meanwhile travels in the next one, once"
+        f"captured every {max(took_ns, least_ns) / NS_PER_S:.1f} s instead of every {period_ns / NS_PER_S:.1f} s: {why}; what is "
+        "written meanwhile travels in the next one, once"
     )
 
 
@@ -107,6 +114,12 @@ def _age(component: Component, turn: Turn) -> str:
     )
 
 
+def _ending(component: Component, turn: Turn) -> list[str]:
+    """Living peers that are clearing away a copy of their own: a process that waits inside the kernel takes its time to end."""
+    entries = ((peer.robot, peer.entry(component.name)) for peer in turn.team.living(turn.now_ns))
+    return [robot for robot, entry in entries if entry is not None and state_of(entry) is State.STOPPING]
+
+
 def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
     notes = []
     if component.degraded and component.holding:
@@ -117,6 +130,8 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
         notes.append(f"snapshots do not arrive: {component.undelivered}; {_age(component, turn)}")
     if component.holding and (slow := _slow(component, turn)):
         notes.append(slow)
+    if _protection(component, turn) is Protection.NONE and component.holding and (ending := _ending(component, turn)):
+        notes.append(f"{' and '.join(ending)} cannot stand by yet: a copy of it that ran there is still being ended")
     if component.holding and component.resumed_age_ns >= STALE_NS:
         notes.append(f"it went on at {turn.me} from a checkpoint that was {component.resumed_age_ns / NS_PER_S:.1f} s old")
     if staying := homecoming.note(component):

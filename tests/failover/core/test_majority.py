@@ -173,6 +173,11 @@ def standby_of(talk: Talk) -> str:
     return component.standby
 
 
+def notes_of(talk: Talk) -> tuple[str, ...]:
+    (component,) = talk.node.status(talk.now_ns).components
+    return component.notes
+
+
 def test_a_standby_stays_while_its_word_is_due_in_a_later_beat_and_is_left_when_it_objects() -> None:
     talk = running(replace(ROBOT, peers=("robot2", "robot3", "witness1")))
     assert standby_of(talk) == "robot3", "the first robot that consented"
@@ -183,6 +188,17 @@ def test_a_standby_stays_while_its_word_is_due_in_a_later_beat_and_is_left_when_
     talk.hear("robot3", entry(State.STOPPING, 1, "robot1"))
     talk.tick(5)
     assert standby_of(talk) == "robot2"
+
+
+def test_why_nobody_stands_by_is_told_while_a_peer_ends_a_copy_of_its_own() -> None:
+    talk = running()
+    assert not notes_of(talk)
+    talk.hear("robot2", entry(State.STOPPING, 1, "robot1"))
+    talk.tick(5)
+    assert notes_of(talk) == ("robot2 cannot stand by yet: a copy of it that ran there is still being ended",)
+    talk.hear("robot2", entry(State.STANDBY, 1, "robot1"))
+    talk.tick(5)
+    assert not notes_of(talk)
 
 
 def test_a_primary_with_a_valid_lease_answers_a_later_epoch_by_one_above_it() -> None:

@@ -54,12 +54,12 @@ class Primary:
         self.step(Started(PART, 1))
         self.deliver(BEAT_MS)
 
-    def deliver(self, ms: int) -> None:
+    def deliver(self, ms: int, freeze_us: int = 0) -> None:
         """The next snapshot, which arrives so much later."""
         capture = self.ordered()
         parent = None if capture.base else self.held
         taken = Position(capture.generation, capture.sequence, b"d" * 16)
-        self.step(Captured(PART, 1, taken, parent))
+        self.step(Captured(PART, 1, taken, parent, freeze_us=freeze_us))
         self.pass_ms(ms)
         self.held = taken
         self.pass_ms(BEAT_MS)
@@ -97,3 +97,30 @@ def test_where_none_is_taken_any_more_that_is_said_and_nothing_else(slow: Primar
     slow.step(CaptureFailed(PART, 1, "fd 7 is a socket", unsupported=True))
     assert "not captured: fd 7 is a socket" in slow.notes()
     assert INSTEAD not in slow.notes()
+
+
+def ordered_after_ms(primary: Primary) -> int:
+    """How much later the next snapshot is ordered than now."""
+    now_ms = primary.now_ms
+    primary.captures.insert(0, primary.ordered())
+    return primary.now_ms - now_ms
+
+
+def test_a_program_stands_still_for_no_more_than_a_tenth_of_its_time() -> None:
+    primary = Primary()
+    primary.begin()
+    for _ in range(2):
+        primary.deliver(BEAT_MS, freeze_us=60_000)
+    assert "captured every 0.6 s instead of every 0.1 s: it stands still for 60 ms each time" in primary.notes()
+    assert 500 <= ordered_after_ms(primary) <= 600
+    primary.deliver(BEAT_MS, freeze_us=2_000)
+    assert INSTEAD not in primary.notes()
+    assert ordered_after_ms(primary) <= 100
+
+
+def test_one_long_freeze_among_short_ones_changes_nothing() -> None:
+    primary = Primary()
+    primary.begin()
+    for freeze_us in (2_000, 2_000, 90_000):
+        primary.deliver(BEAT_MS, freeze_us=freeze_us)
+    assert ordered_after_ms(primary) <= 100
