@@ -7,6 +7,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 import msgspec
 
 from agent.errors import RefusedError
+from checkpoint.arch import EVERY_LEVEL
 
 SIGNAL_MAX: Final = 64
 """The last real-time signal. Source: signal(7)."""
@@ -60,7 +61,7 @@ class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
     user: str = ""
     engine: Literal["auto", "ptrace", "cooperative"] = "auto"
     output: Literal["immediate", "committed"] = "immediate"
-    portable: Literal["", "no", "x86-64-v1", "x86-64-v2", "x86-64-v3", "x86-64-v4"] = ""
+    portable: Annotated[str, msgspec.Meta(pattern=f"^(no|{'|'.join(EVERY_LEVEL)})?$")] = ""
     hooks: dict[HookName, list[Text]] = {}
     carry: list[Text] = []
     devices: dict[Text, Text] = {}

@@ -12,6 +12,7 @@ from typing import Final, Literal
 
 from agent.errors import ConfigError
 from agent.hook_kinds import KINDS, check_told
+from checkpoint.arch import EVERY_LEVEL
 from checkpoint.device_rules import RULES_MAX, DeviceRule, checked, rule_from
 from checkpoint.engine import is_carriable
 from failover.client import strict_toml
@@ -30,9 +31,6 @@ KEEP_MAX: Final = 10_000
 
 HOOK_S_MAX: Final = 50
 """The rules give a restore a minute."""
-
-
-Portable = bool | Literal["", "x86-64-v1", "x86-64-v2", "x86-64-v3", "x86-64-v4"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +108,7 @@ class ComponentConfig:
     prefer: str = ""
     snapshot_period_ms: int = 0
     freeze_budget_ms: float = 0
-    portable: Portable = ""
+    portable: bool | str = ""
     warm: bool = True
     ready_copy: bool = True
     command: tuple[str, ...] = field(default_factory=tuple)
@@ -186,7 +184,7 @@ class Config:
     wireless: list[str] = field(default_factory=list)
     bring: bool = True
     bring_size: str = "1GB"
-    portable: Portable = False
+    portable: bool | str = False
     keep_checkpoints: int = 0
     keep_for: str = "7d"
     keep_size: str = ""
@@ -226,6 +224,7 @@ class Config:
             _check_quantity("xor_cache", size_bytes, self.xor_cache)
         if self.keep_size:
             _check_quantity("keep_size", size_bytes, self.keep_size)
+        _check_level(self.portable)
         if self.link_mbit_s < 0:
             raise ValueError(f"link_mbit_s is {self.link_mbit_s}; 0 means no cap")
 
@@ -235,6 +234,11 @@ def _check_quantity(key: str, read: Callable[[str], int], text: str) -> None:
         read(text)
     except ValueError as error:
         raise ValueError(f"{key}: {error}") from error
+
+
+def _check_level(portable: bool | str) -> None:
+    if portable not in ("", True, False, *EVERY_LEVEL):
+        raise ValueError(f"portable is {portable!r}; choose true, false or one of {', '.join(EVERY_LEVEL)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -319,6 +323,10 @@ def _check_components(path: Path, config: Config, members: Team) -> None:
             raise ConfigError(
                 f"{where}: freeze_budget_ms is {component.freeze_budget_ms:g}; at most {PERIOD_MS_MAX}; 0: as short as can be"
             )
+        try:
+            _check_level(component.portable)
+        except ValueError as error:
+            raise ConfigError(f"{where}: {error}") from error
         _check_command(where, component)
         _check_carry(where, component)
         _check_devices(where, component)

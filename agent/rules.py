@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Final
 
 from agent.config import ComponentConfig, Config, Settings
 from checkpoint import portable
@@ -12,6 +13,9 @@ from checkpoint.history import Retention
 from failover.client.quantities import size_bytes, span_ms
 from failover.core import types
 from failover.core.types import CARRY, Launch, OnCrash, OnLoss, OnUnsupported, Rule, Rules, WhenAlone
+
+NO_LEVEL: Final = "no"
+"""Of ``failover run --portable``: whatever this processor has, whatever the operator says."""
 
 
 def node_config(settings: Settings) -> types.Config:
@@ -65,13 +69,17 @@ def rules_for(config: Config, component: ComponentConfig) -> Rules:
 def level_of(wanted: str, config: Config, component: ComponentConfig) -> str:
     """The level of processors that a program is started for; "" for whatever this one has.
 
+    A level of another kind of processor means the usual one of this kind: a mixed team has the same words everywhere.
+
     Args:
         wanted: of ``failover run``: a level, "no", or "" for what this robot's operator says.
     """
     said: bool | str = wanted or (config.portable if component.portable == "" else component.portable)
     if isinstance(said, bool):
         return portable.DEFAULT if said else ""
-    return said if said in portable.LEVELS else ""
+    if said in ("", NO_LEVEL):
+        return ""
+    return said if said in portable.LEVELS else portable.DEFAULT
 
 
 def terms_here(launch: Launch | None, component: ComponentConfig) -> Terms:

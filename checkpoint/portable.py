@@ -16,6 +16,7 @@ VARIABLE: Final = "FAILOVER_PORTABLE"
 TUNABLES: Final = "GLIBC_TUNABLES"
 HWCAPS: Final = "glibc.cpu.hwcaps"
 LEVELS: Final = arch.LEVELS
+"""Those of this machine's processor, the lowest first."""
 DEFAULT: Final = arch.DEFAULT
 
 

@@ -94,7 +94,7 @@ def run(room: argparse.ArgumentParser) -> None:
         default="",
         metavar="LEVEL",
         help="have libraries choose code that every processor of a level can run, so that it can go on at robots with less: "
-        f"x86-64-v1 to v4, or no (default: as agent.toml says; without LEVEL: {portable.DEFAULT})",
+        f"{', '.join(portable.LEVELS)}, or no (default: as agent.toml says; without LEVEL: {portable.DEFAULT})",
     )
     room.add_argument(
         "--output",

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from checkpoint.arch import why_unsupported
+from checkpoint.arch import cpu
 from checkpoint.channel import Capture, Captured, Protect, Protected, Release, Released
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import vessel
+from checkpoint.linux.processor import why_unsupported
 from checkpoint.linux.vessel import Birth
 from failover.cli import render
 from failover.cli.agent import connect
@@ -121,7 +122,8 @@ def _ptrace_scope() -> str:
 def _tracking(notes: tuple[str, ...]) -> Offer:
     slower = [note for note in notes if note.startswith("written pages")]
     if slower:
-        return Offer("lesser", "written pages", f"{slower[0]}; use Linux 6.7 or later, and let programs call userfaultfd(2)")
+        cure = f"use Linux {cpu.WRITE_PROTECTION_SINCE} or later, and let programs call userfaultfd(2)"
+        return Offer("lesser", "written pages", f"{slower[0]}; {cure}")
     return Offer("good", "written pages", "found by write protection")
 
 

@@ -78,6 +78,13 @@ def test_the_level_of_processors_is_the_callers_then_the_components_then_the_rob
     assert level_of("no", settings.config, mapper) == ""
     assert level_of("", Config("robot1"), ComponentConfig()) == ""
     assert level_of("", settings.config, ComponentConfig(portable=False)) == ""
+    assert level_of("", settings.config, ComponentConfig(portable="armv8-a")) == "x86-64-v2"
+
+
+@pytest.mark.parametrize("lines", [('portable = "x86-64-v9"',), ('[components."/lab/robot1/mapper"]', 'portable = "x86-64-v9"')])
+def test_a_level_that_no_processor_has_is_refused_with_those_there_are(lines: tuple[str, ...], directory: Path) -> None:
+    with pytest.raises(ConfigError, match=r"portable is 'x86-64-v9'; choose true, false or one of x86-64-v1, .*armv8-a"):
+        configuration.load(written(directory, *lines))
 
 
 @pytest.mark.parametrize(
