@@ -197,8 +197,17 @@ def start_agent(robot: RobotMachine, **environment: str) -> None:
 
 def stop_agent(robot: RobotMachine) -> None:
     """End the robot's agent in order, as its service would; call `keep_on` first where nothing else keeps the robot alive."""
-    os.kill(host_pid(robot, robot.status()["pid"]), signal.SIGTERM)
-    until(lambda: not answers(robot), f"the agent of {robot.name} to end")
+    agent = host_pid(robot, robot.status()["pid"])
+    os.kill(agent, signal.SIGTERM)
+    until(lambda: has_ended(agent), f"the agent of {robot.name} to end")
+
+
+def has_ended(pid: int) -> bool:
+    """Whether a process has given everything back: an agent answers no more some time before that."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return True
 
 
 def answers(robot: RobotMachine) -> bool:

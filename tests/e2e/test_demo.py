@@ -15,6 +15,16 @@ from pathlib import Path
 
 import pytest
 
+SHORT_FIRST = """\
+import sys
+from failover.cli import main
+from failover.cli.demo import play
+
+play.LENGTHS = (0, 1)
+sys.exit(main.main(["demo"]))
+"""
+"""The demo on a machine so busy that its programs are over before they are protected."""
+
 COMMAND = [sys.executable, "-m", "failover.cli.main", "demo"]
 BOUND_S = 100.0
 NOBODY = 65534
@@ -77,7 +87,7 @@ def assert_outlived(ran: subprocess.CompletedProcess[str]) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(150)
+@pytest.mark.timeout(300)
 def test_the_programs_of_the_demo_outlive_their_robot(place: Path) -> None:
     ran = subprocess.run([*COMMAND, "--json"], env=environment(place), capture_output=True, text=True, check=False)
     assert_outlived(ran)
@@ -86,7 +96,7 @@ def test_the_programs_of_the_demo_outlive_their_robot(place: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.root
-@pytest.mark.timeout(150)
+@pytest.mark.timeout(300)
 def test_an_ordinary_user_sees_the_same(place: Path) -> None:
     if not may_run():
         pytest.skip(f"{sys.executable} cannot be run by an ordinary user here; run the tests as one to see it")
@@ -111,6 +121,21 @@ def may_run() -> bool:
         return subprocess.run(command, user=NOBODY, group=NOBODY, check=False, capture_output=True).returncode == 0
     except PermissionError:
         return False
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_programs_that_end_before_they_are_protected_are_shown_once_more_with_more_to_do(place: Path) -> None:
+    command = [sys.executable, "-c", SHORT_FIRST]
+    ran = subprocess.run(command, env=environment(place), capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    lines = ran.stdout.splitlines()
+    early = [index for index, line in enumerate(lines) if "came to its end at robot1, before the power was cut" in line]
+    assert len(early) == 1
+    assert lines[early[0]].endswith("; once more, with programs that take longer")
+    assert any("power cut" in line for line in lines[early[0] :])
+    assert lines[-1] == "the programs outlived their robot"
+    assert_nothing_left(place)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "terminated"])

@@ -8,7 +8,7 @@ import statistics
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +18,7 @@ from failover.cli.demo import programs, robots
 from failover.cli.demo.interruption import Interruption
 from failover.cli.demo.programs import Program
 from failover.cli.demo.robots import RobotMachine, Stage
+from failover.cli.demo.screen import LiveScreen, PlainScreen
 from failover.cli.demo.watch import Watcher, whole_output
 from failover.client.control import Control
 from failover.errors import FailoverError
@@ -32,6 +33,9 @@ TAKEOVER_S: Final = 60.0
 END_S: Final = 120.0
 """Bounds, far above what is usual, after which the demo says that it failed."""
 
+LENGTHS: Final = (1, 4, 16)
+"""How many times the usual time the programs take: the first; the next where one came to its end before it could be protected."""
+
 DEGRADED_S: Final = 20.0
 """How long a program may be degraded: on a busy machine its snapshots are late for a while."""
 
@@ -39,7 +43,6 @@ PLACE_LIMIT: Final = 45
 """Characters: a unix socket's path has at most 107 (unix(7)), and the longest of ours adds some 55."""
 
 DRAW_S: Final = 0.1
-COLUMNS: Final = ("program", "runs on", "state", "snapshots", "lag", "freeze", "output", "newest line")
 RESULT_COLUMNS: Final = ("program", "outage", "lag at the cut", "freeze median", "freeze max", "output", "equal")
 
 
@@ -73,18 +76,34 @@ class Act:
 def demo(arguments: argparse.Namespace) -> int:
     """Show a program outliving its robot; 0 only if its whole output equals an undisturbed run, byte for byte."""
     live = render.is_terminal() and not arguments.json
-    screen = _LiveScreen() if live else _PlainScreen(quiet=arguments.json)
+    screen = LiveScreen() if live else PlainScreen(quiet=arguments.json)
     interruption = Interruption()
-    with interruption.noted():
-        directory = Path(tempfile.mkdtemp(prefix="failover-demo-", dir=short_place()))
-        with screen, Stage(directory, robots.means(), interruption=interruption) as stage:
-            play = Play(stage, screen)
+    with interruption.noted(), screen:
+        for length in LENGTHS:
             try:
-                with interruption.allowed():
-                    play.perform()
-            finally:
-                play.end_references()
+                play = _performed(screen, interruption, length)
+                break
+            except EndedEarlyError as error:
+                if length == LENGTHS[-1]:
+                    raise
+                screen.say(f"{error}; once more, with programs that take longer")
     return _conclude(arguments, play, screen)
+
+
+def _performed(screen: PlainScreen, interruption: Interruption, length: int) -> Play:
+    directory = Path(tempfile.mkdtemp(prefix="failover-demo-", dir=short_place()))
+    with Stage(directory, robots.means(), interruption=interruption) as stage:
+        play = Play(stage, screen, length)
+        try:
+            with interruption.allowed():
+                play.perform()
+        finally:
+            play.end_references()
+    return play
+
+
+class EndedEarlyError(FailoverError):
+    """A program came to its end, in peace, before there was anything to show: the machine is too busy for its length."""
 
 
 def short_place() -> str:
@@ -93,62 +112,14 @@ def short_place() -> str:
     return usual if len(usual) <= PLACE_LIMIT else "/tmp"
 
 
-# --- The screen ------------------------------------------------------------------------------------------------------
-
-
-class _PlainScreen:
-    """Lines, each with the time since the beginning. ``transcript`` keeps them."""
-
-    def __init__(self, quiet: bool = False) -> None:
-        self.transcript: list[str] = []
-        self._quiet = quiet
-        self._began = time.monotonic()
-
-    def __enter__(self) -> _PlainScreen:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return None
-
-    def say(self, text: str) -> None:
-        """Tell one thing that happened."""
-        line = f"{time.monotonic() - self._began:6.2f} s  {text}"
-        self.transcript.append(line)
-        self.show_line(line)
-
-    def show_line(self, line: str) -> None:
-        """Put a line where the person looks."""
-        if not self._quiet:
-            print(line, flush=True)
-
-    def draw(self, lines: Sequence[Sequence[str]], share: float, caption: str) -> None:
-        """Nothing: what matters is said."""
-
-
-class _LiveScreen(_PlainScreen):
-    """A table redrawn in place, with the lines scrolling above it."""
-
-    def __enter__(self) -> _LiveScreen:
-        self._board = render.LiveBoard().__enter__()
-        return self
-
-    def __exit__(self, *reason: object) -> None:
-        self._board.__exit__(*reason)
-
-    def show_line(self, line: str) -> None:
-        self._board.say(line)
-
-    def draw(self, lines: Sequence[Sequence[str]], share: float, caption: str) -> None:
-        self._board.draw(COLUMNS, lines, share, caption)
-
-
 # --- The play --------------------------------------------------------------------------------------------------------
 
 
 class Play:
     """The acts on one stage. `perform` is the whole; afterwards ``acts`` holds what was seen."""
 
-    def __init__(self, stage: Stage, screen: _PlainScreen) -> None:
+    def __init__(self, stage: Stage, screen: PlainScreen, length: int = 1) -> None:
+        self._length = length
         self._stage = stage
         self._screen = screen
         self._caption = ""
@@ -159,10 +130,13 @@ class Play:
         """All of it, in order.
 
         Raises:
+            EndedEarlyError: a program ended before the standby could go on with it.
             FailoverError: something did not come about; says what, with the agents' last words.
         """
         try:
             self._perform()
+        except EndedEarlyError:
+            raise
         except FailoverError as error:
             words = "\n".join(f"  {robot.name} said last: {robot.last_words()}" for robot in self._stage.robots)
             raise FailoverError(f"{error}\n{words}" if words else str(error)) from error
@@ -190,7 +164,7 @@ class Play:
         environment = {"PATH": os.environ.get("PATH", os.defpath), "LANG": "C.UTF-8", "HOME": str(self._stage.directory)}
         work = self._stage.directory / "work"
         work.mkdir()
-        for program in programs.write(work):
+        for program in programs.write(work, self._length):
             wanted: dict[str, Any] = {"argv": program.argv, "name": program.name, "cwd": str(program.directory)}
             with Control.open(self._primary.socket) as link:
                 answer = link.ask("run", **wanted, env=environment, umask=0o022, isolate=True, wait=False)
@@ -222,6 +196,7 @@ class Play:
             if component is None:
                 continue
             _bear(act, component)
+            _still_runs(act, component, f"at {self._primary.name}, before the power was cut")
             act.lag_ms = component.get("lag_ms")
             act.snapshots = component.get("standby_sequence") or 0
             if component.get("freeze_us") is not None:
@@ -260,17 +235,23 @@ class Play:
             component = found.get(act.program.name, {})
             if act.running_ns is None and component.get("role") == "primary" and component.get("state") in ("running", "ended"):
                 act.running_ns = time.monotonic_ns()
+            told_all = component.get("state") == "ended" and act.after.size >= self._size_at_standby(act)
             arrived = act.after.first_after(act.running_ns) if act.running_ns is not None else None
             if act.outage_ms is None and arrived is not None:
                 act.outage_ms = (arrived - cut_ns) / 1e6
                 self._screen.say(
                     f"{act.program.title} goes on at {self._standby.name}: next output {act.outage_ms:.0f} ms after the cut"
                 )
+            if act.outage_ms is None and told_all:
+                _still_runs(act, component, f"before it was seen to go on at {self._standby.name}")
         return all(act.outage_ms is not None for act in self.acts)
+
+    def _size_at_standby(self, act: Act) -> int:
+        return len(whole_output(self._standby.socket, act.program.name)[0])
 
     def _await_end(self) -> None:
         self._caption = f"going on at {self._standby.name}"
-        self._await("the programs to end", self._see_end, DRAW_S, END_S)
+        self._await("the programs to end", self._see_end, DRAW_S, END_S * self._length)
 
     def _see_end(self) -> bool:
         found = {component["name"]: component for component in self._standby.status()["components"]}
@@ -344,6 +325,20 @@ def _bear(act: Act, component: dict[str, Any]) -> None:
         raise FailoverError(f"{act.program.name} is {component['state']}: {_why(component)}")
 
 
+def _still_runs(act: Act, component: dict[str, Any], when: str) -> None:
+    """
+    Raises:
+        EndedEarlyError: it has come to its end, as it should, but too early.
+        FailoverError: it has come to another end.
+    """
+    if component["state"] != "ended":
+        return
+    status = component.get("exit_status")
+    if status:
+        raise FailoverError(f"{act.program.name} came to an end {when}: {picture.ending(status)}")
+    raise EndedEarlyError(f"{act.program.title} came to its end {when}: {act.snapshots} snapshots of it had arrived")
+
+
 def _why(component: dict[str, Any]) -> str:
     return "; ".join(component.get("reasons") or component.get("notes") or ["?"])
 
@@ -361,7 +356,7 @@ def difference(output: bytes, expected: bytes, act: Act) -> str:
 # --- What came of it -------------------------------------------------------------------------------------------------
 
 
-def _conclude(arguments: argparse.Namespace, play: Play, screen: _PlainScreen) -> int:
+def _conclude(arguments: argparse.Namespace, play: Play, screen: PlainScreen) -> int:
     equal = bool(play.acts) and all(act.equal for act in play.acts)
     lines = [result_line(act) for act in play.acts]
     if arguments.json:

@@ -15,11 +15,13 @@ PAUSE_S: Final = 0.015
 
 PI_LINE_SIZE: Final = 39
 
-PI: Final = f'''\
+PI: Final = '''\
 """Ten digits of pi a line, by Gibbons' unbounded spigot, and a running digest over all of them so far."""
 
 import hashlib
 import time
+
+LINES, PAUSE = %d, %r
 
 
 def digits():
@@ -34,25 +36,28 @@ def digits():
 
 source = digits()
 digest = hashlib.sha256()
-for line in range(1, {LINES} + 1):
+for line in range(1, LINES + 1):
     ten = "".join(str(next(source)) for _ in range(10))
     digest.update(ten.encode())
-    print(f"pi {{line * 10:5}}  {{ten}}  {{digest.hexdigest()[:16]}}", flush=True)
-    time.sleep({PAUSE_S})
+    print(f"pi {line * 10:5}  {ten}  {digest.hexdigest()[:16]}", flush=True)
+    time.sleep(PAUSE)
 '''
 
 POINTS: Final = 400
+STEPS: Final = 3500
+"""Of arithmetic before each line of the other program: some ten seconds as well."""
+
 POINT_SIZE: Final = 63
 """Bytes of a line, on the average."""
 
-BC: Final = f"""\
+BC: Final = """\
 # The logistic map in its chaotic range: one wrong digit anywhere changes everything that follows.
 scale = 50
 x = 0.4
-for (i = 1; i <= {POINTS}; i++) {{
-  for (j = 0; j < 3500; j++) x = 3.99 * x * (1 - x)
+for (i = 1; i <= %d; i++) {
+  for (j = 0; j < %d; j++) x = 3.99 * x * (1 - x)
   print "chaos ", i, "  ", x, "\n"
-}}
+}
 quit
 """
 
@@ -94,13 +99,17 @@ class Program:
         return self.directory / f"{self.title}.undisturbed"
 
 
-def write(directory: Path) -> tuple[Program, ...]:
-    """Write the programs' files; returns those that this machine can run."""
+def write(directory: Path, length: int = 1) -> tuple[Program, ...]:
+    """Write the programs' files; returns those that this machine can run.
+
+    Args:
+        length: how many times the usual time they take. Their output stays as long.
+    """
     python = getattr(sys, "_base_executable", None) or sys.executable
-    (directory / "pi.py").write_text(PI)
+    (directory / "pi.py").write_text(PI % (LINES, PAUSE_S * length))
     found = [Program("/demo/pi", "pi", (python, "pi.py"), directory, LINES * PI_LINE_SIZE)]
     bc = shutil.which("bc")
     if bc is not None:
-        (directory / "chaos.bc").write_text(BC)
+        (directory / "chaos.bc").write_text(BC % (POINTS, STEPS * length))
         found.append(Program("/demo/chaos", "chaos", (bc, "-q", "chaos.bc"), directory, POINTS * POINT_SIZE))
     return tuple(found)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import random
 import shutil
 import signal
 import socket
@@ -38,6 +39,9 @@ ADDRESS: Final = "10.71.7.{}"
 
 CABLES: Final = (("wire", ADDRESS),)
 """Between the two, where they have networks of their own: each cable's name at both ends, and its addresses."""
+
+PORTS_FROM: Final = 10_000
+"""Of ports of the loopback for robots without a network of their own; the lower ones have names."""
 
 POLL_S: Final = 0.005
 
@@ -345,20 +349,29 @@ def run(command: list[str]) -> None:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports of the loopback that nobody uses now, as TCP and as UDP."""
+    """Ports of the loopback that nobody uses now, as TCP and as UDP, and that the system does not lend to whoever asks for any.
+
+    So a robot that was away for a while finds its own free when it comes back.
+    """
     held: list[socket.socket] = []
     ports: list[int] = []
     try:
         while len(ports) < count:
             stream = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
             held.append(stream)
-            stream.bind(("127.0.0.1", 0))
             datagram = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             held.append(datagram)
-            with contextlib.suppress(OSError):  # somebody has this one as UDP
+            with contextlib.suppress(OSError):  # somebody has this one
+                stream.bind(("127.0.0.1", _any_port()))
                 datagram.bind(stream.getsockname())
                 ports.append(stream.getsockname()[1])
     finally:
         for one in held:
             one.close()
     return ports
+
+
+def _any_port() -> int:
+    """One that is not lent, by chance; 0, which has the system choose, where it lends nearly all. Source: ip(7)."""
+    lent_from = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
+    return random.randrange(PORTS_FROM, lent_from) if lent_from >= 2 * PORTS_FROM else 0
