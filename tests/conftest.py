@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import functools
 import os
 import shutil
@@ -14,6 +15,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+
+from checkpoint.engines import entering
+from checkpoint.linux import abi, dirty
+from checkpoint.linux.tracking import Tracker
 
 if TYPE_CHECKING:
     from xdist.scheduler import LoadScopeScheduling
@@ -69,6 +74,41 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     reason = why_not(item)
     if reason is not None:
         pytest.skip(reason)
+
+
+# --- On which machine, and how written pages are found -----------------------------------------------------------------
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """The ways that this machine's kernel has besides the best one."""
+    parser.addoption("--tracking", choices=["soft-dirty", "digest"], help="how written pages are found, instead of the best way")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _tracking(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Have engines in our own process find written pages in another way, as if this kernel had no better one."""
+    wanted = request.config.getoption("--tracking")
+    with pytest.MonkeyPatch.context() as patched:
+        if wanted:
+            patched.setattr(entering, "PagemapTracker", _no_write_protection)
+        if wanted == "digest":
+            patched.setattr(dirty, "has_soft_dirty", lambda: False)
+        yield
+
+
+def _no_write_protection(pid: int, faults: int) -> Tracker:
+    raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _machine(request: pytest.FixtureRequest, record_testsuite_property: Callable[[str, object], None]) -> None:
+    """For ``--junitxml``, see ``tests/machines/seen.py``."""
+    about = os.uname()
+    record_testsuite_property("processor", about.machine)
+    record_testsuite_property("kernel", about.release)
+    record_testsuite_property("tracking", request.config.getoption("--tracking") or dirty.best_tracking())
+    record_testsuite_property("page_size", abi.PAGE_SIZE)
+    record_testsuite_property("on", time.strftime("%Y-%m-%d"))
 
 
 # --- Side by side ----------------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
-"""A machine with another processor, under software emulation: made once, booted for tests, spoken to over loopback.
+"""A machine with another processor or kernel, under software emulation: made once, booted for tests, spoken to over loopback.
 
-Debian for that processor with a newer kernel (backports), as files in one directory; nothing outside of it is changed. It takes
-root, and the packages in `PACKAGES`. An emulated machine is some twenty times slower than a real one: what must be in time on
+Debian for that processor with a kernel of its own choice, as files in one directory; nothing outside of it is changed. It takes
+root, and the packages of its kind. An emulated machine is some twenty times slower than a real one: what must be in time on
 a robot is not measured here.
 """
 
@@ -18,25 +18,16 @@ import tarfile
 import time
 import tomllib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 ROOT: Final = Path(__file__).parents[2]
-COMMANDS: Final = (
-    *("mmdebstrap", "qemu-system-aarch64", "qemu-aarch64-static", "aarch64-linux-gnu-gcc", "update-binfmts", "mke2fs"),
-    *("ssh", "ssh-keygen", "dpkg-deb", "cpio"),
-)
-PACKAGES: Final = (
-    "mmdebstrap qemu-user-static binfmt-support arch-test qemu-system-arm gcc-aarch64-linux-gnu libc6-dev-arm64-cross "
-    "e2fsprogs openssh-client cpio"
-)
+COMMANDS: Final = ("mmdebstrap", "mke2fs", "ssh", "ssh-keygen", "dpkg-deb", "cpio", "depmod")
+PACKAGES: Final = "mmdebstrap e2fsprogs openssh-client cpio kmod"
 INCLUDED: Final = "systemd,systemd-sysv,dbus,udev,python3,procps,iproute2,kmod,openssh-server,gcc,libc6-dev,bc"
-MODULES: Final = (
-    *("drivers/block/virtio_blk", "crypto/crc32c_generic", "lib/crc16", "fs/mbcache", "fs/jbd2/jbd2", "fs/ext4/ext4"),
-    *("net/core/failover", "drivers/net/net_failover", "drivers/net/virtio_net"),
-)
-"""Of the kernel, what it takes to reach disk and network, each after those that it needs."""
+MODULES: Final = ("virtio_pci", "virtio_blk", "crc32c_generic", "ext4", "virtio_net")
+"""Of the kernel, what it takes to reach disk and network, and what these need; some are part of it."""
 FOR_TESTS: Final = ("pytest", "pytest-timeout", "hypothesis")
 WHEELS: Final = ("manylinux2014", "manylinux_2_17", "manylinux_2_26", "manylinux_2_27", "manylinux_2_28")
 DISK_SIZE: Final = "3G"
@@ -45,27 +36,90 @@ BOOT_S: Final = 600.0
 SENT: Final = ("checkpoint", "failover", "agent", "tests", "pyproject.toml", "include", "examples", "docs", "README.md")
 
 
-def lacking() -> str:
-    """Why such a machine cannot be made or run here; "": it can."""
-    missing = [command for command in COMMANDS if shutil.which(command) is None]
-    if missing:
-        return f"needs {', '.join(missing)}: apt-get install {PACKAGES}"
-    return "" if os.geteuid() == 0 else "needs root, to make its disk"
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What is emulated.
+
+    Attributes:
+        processor: as uname(2) calls it; ``architecture``: as Debian does.
+        system: release of Debian; ``suite``: where its kernel comes from, ``kernel``: the package.
+        emulator: its command, as far as it says what machine it is; ``console``: the kernel's name of the serial line.
+        compiler: of a static program for it.
+        commands, packages: what else it takes.
+    """
+
+    processor: str
+    architecture: str
+    system: str
+    suite: str
+    kernel: str
+    emulator: tuple[str, ...]
+    console: str
+    compiler: str
+    commands: tuple[str, ...]
+    packages: str
+
+    @property
+    def name(self) -> str:
+        """For files and tests."""
+        return f"{self.processor}-{self.suite}{'-16k' * self.kernel.endswith('-16k')}"
+
+    @property
+    def python(self) -> str:
+        """The version of its Python."""
+        return {"bookworm": "3.11", "trixie": "3.13"}[self.system]
+
+    def lacking(self) -> str:
+        """Why such a machine cannot be made or run here; "": it can."""
+        needed = (*COMMANDS, *self.commands, self.emulator[0], self.compiler)
+        if missing := [command for command in needed if shutil.which(command) is None]:
+            return f"needs {', '.join(missing)}: apt-get install {PACKAGES} {self.packages}"
+        return "" if os.geteuid() == 0 else "needs root, to make its disk"
+
+
+_ARM: Final = Kind(
+    processor="aarch64",
+    architecture="arm64",
+    system="bookworm",
+    suite="bookworm-backports",
+    kernel="linux-image-arm64",
+    emulator=("qemu-system-aarch64", "-M", "virt", "-cpu", "cortex-a72"),
+    console="ttyAMA0",
+    compiler="aarch64-linux-gnu-gcc",
+    commands=("qemu-aarch64-static", "update-binfmts"),
+    packages="qemu-user-static binfmt-support arch-test qemu-system-arm gcc-aarch64-linux-gnu libc6-dev-arm64-cross",
+)
+KINDS: Final = (
+    _ARM,  # follows written pages by write protection
+    replace(_ARM, suite="bookworm"),  # 6.1: by digests
+    replace(_ARM, system="trixie", suite="trixie", kernel="linux-image-arm64-16k"),
+    Kind(  # 6.1: by the soft-dirty bit
+        processor="x86_64",
+        architecture="amd64",
+        system="bookworm",
+        suite="bookworm",
+        kernel="linux-image-amd64",
+        emulator=("qemu-system-x86_64", "-M", "q35", "-cpu", "max"),
+        console="ttyS0",
+        compiler="gcc",
+        commands=(),
+        packages="qemu-system-x86 gcc libc6-dev",
+    ),
+)
 
 
 @dataclass
 class Machine:
-    """An aarch64 machine.
+    """One emulated machine.
 
     Attributes:
         directory: that holds all of it.
         port: of loopback, by which its ssh is reached.
-        processor: that QEMU plays; ``max,pauth-impdef=on`` has SVE and pointer authentication.
     """
 
+    kind: Kind
     directory: Path
     port: int
-    processor: str = "cortex-a72"
 
     # Making
 
@@ -76,7 +130,8 @@ class Machine:
             return
         shutil.rmtree(self.directory, ignore_errors=True)
         self.directory.mkdir(parents=True)
-        _run("update-binfmts", "--enable", "qemu-aarch64")
+        if "update-binfmts" in self.kind.commands:
+            _run("update-binfmts", "--enable", f"qemu-{self.kind.processor}")
         _run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", self.directory / "key")
         self._lay_system()
         self._take_kernel()
@@ -92,43 +147,49 @@ class Machine:
 
     def _recipe(self) -> str:
         files = (Path(__file__), Path(__file__).with_name("first.c"), ROOT / "pyproject.toml")
-        return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+        return hashlib.sha256(repr(self.kind).encode() + b"".join(file.read_bytes() for file in files)).hexdigest()
 
     def _lay_system(self) -> None:
-        """Debian, and in /kernel the newest one of backports, unpacked: its scripts would take ten minutes under emulation."""
-        sources = Path("/etc/apt/sources.list.d/debian.sources").read_text()
-        listed = self.directory / "debian.sources"
-        listed.write_text(sources.replace("bookworm-updates", "bookworm-updates bookworm-backports"))
-        newest = "apt-cache depends -t bookworm-backports linux-image-arm64 | awk '/Depends:/ { print $2; exit }'"
-        fetch = f"cd /tmp && apt-get update -qq && apt-get download -qq -t bookworm-backports $({newest})"
+        """Debian 12, and in /kernel the one that is wanted, unpacked: its scripts would take ten minutes under emulation."""
+        sources = Path("/etc/apt/sources.list.d/debian.sources").read_text().replace("bookworm", self.kind.system)
+        listed, suite = self.directory / "debian.sources", self.kind.suite
+        if suite != self.kind.system:
+            sources = sources.replace(f"{self.kind.system}-updates", f"{self.kind.system}-updates {suite}")
+        listed.write_text(sources)
+        newest = f"apt-cache depends -t {suite} {self.kind.kernel} | awk '/Depends:/ {{ print $2; exit }}'"
+        fetch = f"cd /tmp && apt-get update -qq && apt-get download -qq -t {suite} $({newest})"
         unpack = 'for one in "$1"/tmp/linux-image-*.deb; do dpkg-deb -x "$one" "$1/kernel"; rm "$one"; done'
         self._system.mkdir()
         _run(
-            *("mmdebstrap", "--quiet", "--architectures=arm64", "--variant=minbase", f"--include={INCLUDED}"),
+            *("mmdebstrap", "--quiet", f"--architectures={self.kind.architecture}", "--variant=minbase", f"--include={INCLUDED}"),
             *(f"--customize-hook=chroot \"$1\" sh -c '{_quoted(fetch)}'", f"--customize-hook={unpack}"),
-            *("bookworm", self.directory / "system.tar", listed),
+            *(self.kind.system, self.directory / "system.tar", listed),
         )
         _run("tar", "-C", self._system, "-xpf", self.directory / "system.tar")
         (self.directory / "system.tar").unlink()
 
     def _take_kernel(self) -> None:
-        """The kernel, and what it begins with: our first program, and the modules in order."""
+        """The kernel, and what it begins with: our first program, and the modules in order. All others lie where it looks."""
         unpacked, beginning = self._system / "kernel", self.directory / "beginning"
         shutil.copy(next((unpacked / "boot").glob("vmlinuz-*")), self.directory / "kernel")
         beginning.mkdir()
         first = Path(__file__).with_name("first.c")
-        _run("aarch64-linux-gnu-gcc", "-O1", "-static", "-o", beginning / "init", first)
-        modules = next((unpacked / "lib/modules").iterdir()) / "kernel"
-        for number, name in enumerate(MODULES):
-            (beginning / f"{number}.ko").write_bytes(lzma.decompress((modules / f"{name}.ko.xz").read_bytes()))
+        _run(self.kind.compiler, "-O1", "-static", "-o", beginning / "init", first)
+        modules = next(path for path in (unpacked / "lib/modules", unpacked / "usr/lib/modules") if path.exists())
+        release = next(modules.iterdir()).name
+        _run("depmod", "-b", modules.parents[1], release)
+        for number, path in enumerate(_in_order(modules / release)):
+            content = path.read_bytes()
+            (beginning / f"{number}.ko").write_bytes(lzma.decompress(content) if path.suffix == ".xz" else content)
         _run("sh", "-c", "find . | cpio -o -H newc --quiet > ../initrd", cwd=beginning)
+        shutil.move(modules, self._system / "usr/lib/modules")
         shutil.rmtree(unpacked)
 
     def _lay_settings(self) -> None:
         key = self._system / "root/.ssh/authorized_keys"
         key.parent.mkdir(mode=0o700, exist_ok=True)
         shutil.copy(self.directory / "key.pub", key)
-        (self._system / "etc/hostname").write_text("robot-aarch64\n")
+        (self._system / "etc/hostname").write_text(f"robot-{self.kind.processor}\n")
         (self._system / "etc/fstab").write_text("/dev/vda / ext4 defaults 0 1\n")
         (self._system / "etc/systemd/network/10.network").write_text("[Match]\nName=e*\n[Network]\nDHCP=yes\n")
         _run("systemctl", f"--root={self._system}", "-q", "enable", "systemd-networkd")
@@ -137,9 +198,21 @@ class Machine:
 
     def _lay_packages(self) -> None:
         """What we depend on, built for that processor, in /opt/site."""
+        python = self.kind.python
         dependencies = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
-        platforms = [word for kind in WHEELS for word in ("--platform", f"{kind}_aarch64")]
-        tags = ("--implementation", "cp", "--python-version", "3.11", "--abi", "cp311", "--abi", "abi3", "--abi", "none")
+        platforms = [word for kind in WHEELS for word in ("--platform", f"{kind}_{self.kind.processor}")]
+        tags = (
+            "--implementation",
+            "cp",
+            "--python-version",
+            python,
+            "--abi",
+            f"cp{python.replace('.', '')}",
+            "--abi",
+            "abi3",
+            "--abi",
+            "none",
+        )
         into = ("--target", self._system / "opt/site", "--only-binary=:all:")
         _run("python3", "-m", "pip", "install", "-q", *into, *tags, *platforms, *dependencies, *FOR_TESTS)
 
@@ -155,9 +228,9 @@ class Machine:
         console = (self.directory / "console").open("wb")
         # -snapshot: what it writes is gone afterwards
         command = (
-            *("qemu-system-aarch64", "-M", "virt", "-cpu", self.processor, "-accel", "tcg,thread=multi", "-smp", "2"),
+            *(*self.kind.emulator, "-accel", "tcg,thread=multi", "-smp", "2"),
             *("-m", str(MEMORY_MB), "-nographic", "-no-reboot", "-kernel", "kernel", "-initrd", "initrd", "-snapshot"),
-            *("-append", "console=ttyAMA0 quiet loglevel=4 mitigations=off panic=-1"),
+            *("-append", f"console={self.kind.console} quiet loglevel=4 mitigations=off panic=-1"),
             *("-drive", "file=disk,format=raw,if=none,id=disk,cache=unsafe", "-device", "virtio-blk-pci,drive=disk"),
             *("-netdev", f"user,id=net,restrict=on,hostfwd=tcp:127.0.0.1:{self.port}-:22"),
             *("-device", "virtio-net-pci,netdev=net,romfile="),
@@ -207,6 +280,16 @@ class Machine:
 
 def _run(*words: str | Path, cwd: Path | None = None) -> None:
     subprocess.run([str(word) for word in words], check=True, cwd=cwd, stdin=subprocess.DEVNULL)
+
+
+def _in_order(modules: Path) -> list[Path]:
+    """Those of `MODULES` that are not part of the kernel, each after those that it needs. Source: modules.dep(5)."""
+    needs = {}
+    for line in (modules / "modules.dep").read_text().splitlines():
+        path, _, needed = line.partition(":")
+        needs[Path(path).name.partition(".")[0].replace("-", "_")] = [*reversed(needed.split()), path]
+    wanted = [path for name in MODULES for path in needs.get(name, [])]
+    return [modules / path for path in dict.fromkeys(wanted)]
 
 
 def _quoted(command: str) -> str:

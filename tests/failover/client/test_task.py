@@ -572,7 +572,8 @@ def program(folder: Path, text: str) -> Path:
 @contextmanager
 def started(path: Path) -> Iterator[subprocess.Popen[str]]:
     pipe = subprocess.PIPE
-    with subprocess.Popen([sys.executable, path], stdin=pipe, stdout=pipe, stderr=pipe, text=True, cwd=path.parent) as process:
+    command = [sys.executable, "-W", "ignore:This process:DeprecationWarning", path]  # of a fork, from Python 3.12 on
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, cwd=path.parent) as process:
         try:
             yield process
         finally:

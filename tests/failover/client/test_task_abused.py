@@ -98,7 +98,7 @@ INTERRUPTED = """
 
 @pytest.mark.parametrize(
     ("handler", "error"),
-    [("arm(); failover.commit()", "failover.TaskError"), ("raise InterruptedError", "InterruptedError")],
+    [("failover.commit(); arm()", "failover.TaskError"), ("raise InterruptedError", "InterruptedError")],
     ids=["which commits is refused", "which raises leaves the last commit"],
 )
 def test_a_signal_handler_in_the_middle_of_a_commit(folder: Path, handler: str, error: str) -> None:
