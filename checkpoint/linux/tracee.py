@@ -68,6 +68,11 @@ class Stop:
         """Whether a signal was taken from the queue and waits to be handed back by `Tracee.cont`."""
         return self.event == 0 and not self.signal & CALL_STOP
 
+    @property
+    def is_within_a_call(self) -> bool:
+        """Whether it is one of those that are asked for by options (PTRACE_O_TRACEEXEC), of which the call is not over yet."""
+        return self.event not in (0, PTRACE_EVENT_STOP)
+
 
 def _is_dead(pid: int) -> bool:
     """Whether a process has ended, reaped or not."""
@@ -176,7 +181,7 @@ class Tracee:
         return True
 
     def freeze(self, timeout_s: float = STOP_TIMEOUT_S) -> Stop:
-        """Stop it and return once it stands; a signal on its way is delivered first.
+        """Stop it and return once it stands; a signal on its way is delivered first, and a call of which it tells is finished.
 
         A program that stood still before it was seized (SIGSTOP) has reported that already, and is not interrupted once more.
 
@@ -189,18 +194,24 @@ class Tracee:
     def ask_to_stop(self) -> Stop | None:
         """The first half of `freeze`: where it stands already; None when `await_stop` must follow."""
         stood = self._standing()
-        if stood is not None and not stood.is_delivery:
+        if stood is not None and not stood.is_delivery and not stood.is_within_a_call:
             return stood
         self.interrupt()
         if stood is not None:
-            self.cont(stood.signal)  # a signal came just after it was seized
+            self.cont(0 if stood.is_within_a_call else stood.signal)  # a signal came just after it was seized
         return None
 
     def await_stop(self, timeout_s: float = STOP_TIMEOUT_S) -> Stop:
         """The second half of `freeze`."""
-        while (stop := self.wait(timeout_s)).is_delivery:
-            self.cont(stop.signal)
-        return stop
+        while True:
+            stop = self.wait(timeout_s)
+            if stop.is_delivery:
+                self.cont(stop.signal)
+            elif stop.is_within_a_call:
+                self.interrupt()  # any stop but a signal's is an answer to the one before
+                self.cont()
+            else:
+                return stop
 
     def wait(self, timeout_s: float = STOP_TIMEOUT_S) -> Stop:
         """Wait for its next stop.

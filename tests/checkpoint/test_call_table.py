@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from checkpoint.arch import aarch64
+from checkpoint.arch import aarch64, cpu, stubs
 from checkpoint.engines.ptrace_restore import OPTIONS
 from checkpoint.engines.restore_memory import kernel_pages
 from checkpoint.errors import RestoreError
@@ -77,6 +77,33 @@ def test_single_calls_work_while_every_signal_is_blocked_and_ignored() -> None:
         call_table.single_call(tracee, registers, place, umask, 0o77)
         assert call_table.single_call(tracee, registers, place, umask, 0o22) == 0o77
         assert procfs.status(tracee.pid).caught >> (signal.SIGTRAP - 1) & 1 == 0
+
+
+@pytest.mark.parametrize("has_stood_before", [True, False])
+def test_a_single_call_is_made_by_who_was_executing_when_it_was_stopped(has_stood_before: bool) -> None:
+    """As a vessel that was slow: its parent knows by a descriptor that closes in the middle of execve(2)."""
+    read_end, write_end = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.read(read_end, 1)
+        os.execv("/bin/sleep", ["sleep", "1000"])
+    try:
+        tracee = Tracee(child)
+        tracee.seize(OPTIONS)
+        os.write(write_end, b"x")
+        if has_stood_before:
+            os.waitid(os.P_PID, child, os.WSTOPPED | os.WNOWAIT)
+            tracee.freeze()
+        else:
+            tracee.await_stop()
+        vdso = kernel_pages(procfs.parse_maps(procfs.read_text(child, "maps")))[-1]
+        place = vdso.start + cpu.call_in(tracee.memory.read(vdso.start, vdso.size))
+        assert call_table.single_call(tracee, tracee.registers(), place, stubs.SYSTEM_CALLS["getpid"]) == child
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        os.close(read_end)
+        os.close(write_end)
 
 
 def test_a_vessel_dies_in_the_middle_when_its_tracer_does() -> None:
