@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from checkpoint.engine import CaptureOrder
-from checkpoint.errors import ProcessGoneError, UnsupportedError
+from checkpoint.errors import ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.model import Snapshot
 from tests.checkpoint.programs import CASES, PLAIN, Case
 from tests.checkpoint.round_trip import (
@@ -98,7 +98,7 @@ def three_lives(case: Case, prepared: Callable[[Case, str], Path], *, keep_pid: 
         disturbed = prepared(case, f"disturbed-{attempt}")
         try:
             ended_with = disturbed_life(case, disturbed, expected, keep_pid=keep_pid)
-        except ProcessGoneError:
+        except (ProcessGoneError, ProbeError):
             if attempt == ATTEMPTS or left_by(case, disturbed) != left_by(case, undisturbed):
                 raise
             continue
@@ -118,7 +118,7 @@ def disturbed_life(case: Case, disturbed: Path, expected: dict[str, int], *, kee
     """Run a program with three deaths; its exit code.
 
     Raises:
-        ProcessGoneError: it had ended before it could be captured.
+        ProcessGoneError, ProbeError: it had ended before it could be captured.
     """
     program = start(case.argv, disturbed, env=environment_of(case))
     size = 0
