@@ -190,6 +190,7 @@ SYSTEM_CALLS: Final = {
     "sched_getaffinity": 123,
     "sched_getparam": 121,
     "sched_getscheduler": 120,
+    "sched_getattr": 275,
     "sched_setaffinity": 122,
     "sched_setattr": 274,
     "sched_setscheduler": 119,

@@ -234,6 +234,7 @@ SYSTEM_CALLS: Final = {
     "sched_getaffinity": 204,
     "sched_getparam": 143,
     "sched_getscheduler": 145,
+    "sched_getattr": 315,
     "sched_setaffinity": 203,
     "sched_setattr": 314,
     "sched_setscheduler": 144,

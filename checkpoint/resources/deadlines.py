@@ -16,6 +16,7 @@ import struct
 from collections.abc import Iterable
 from typing import Final
 
+from checkpoint.arch import stubs
 from checkpoint.capability import Area, preserved
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import procfs
@@ -38,7 +39,6 @@ SCHED_DEADLINE: Final = 6
 FAIR: Final = (os.SCHED_OTHER, os.SCHED_BATCH)
 """Policies that have slices."""
 RESET_ON_FORK: Final = 1
-SCHED_GETATTR: Final = 315
 ATTRIBUTES: Final = struct.Struct("<IIQiIQQQ")
 """struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period."""
 _libc: Final = ctypes.CDLL(None, use_errno=True)
@@ -65,7 +65,7 @@ def describe(pid: int) -> tuple[Resource, ...]:
 def _asked(tid: int) -> tuple[int, int, int, int, int] | None:
     """(policy, nice, runtime, deadline, period) of a thread; 0 is the one that asks."""
     answer = ctypes.create_string_buffer(ATTRIBUTES.size)
-    if _libc.syscall(SCHED_GETATTR, tid, answer, ATTRIBUTES.size, 0) < 0:
+    if _libc.syscall(stubs.SYSTEM_CALLS["sched_getattr"], tid, answer, ATTRIBUTES.size, 0) < 0:
         return None
     _, policy, _, nice, _, runtime, deadline, period = ATTRIBUTES.unpack(answer.raw)
     return policy, nice, runtime, deadline, period

@@ -103,6 +103,8 @@ def observer_of(one: Descriptor, noted: sockets.Noted | None) -> Observer | None
     Args:
         noted: see `sockets.queue_of`; None for a process that runs.
     """
+    if one.target == eventfds.TARGET:
+        return eventfds.observe if noted is not None and not eventfds.is_told(one) else None
     if one.target.startswith(("anon_inode:", "pipe:")):
         return _OBSERVED.get(one.target)
     if sockets.is_socket(one):

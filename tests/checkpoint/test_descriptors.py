@@ -11,25 +11,28 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from checkpoint.engine import ProtectOrder, RestoreOptions
+from checkpoint.engine import CaptureOrder, ProtectOrder, RestoreOptions
 from checkpoint.engines import restore_checks
 from checkpoint.errors import CheckpointError, MismatchError, UnsupportedError
 from checkpoint.linux import mounts, procfs
-from checkpoint.resources import aio_rings, covered_files
+from checkpoint.linux.descriptors import Descriptor
+from checkpoint.resources import aio_rings, covered_files, eventfds
 from tests.checkpoint.round_trip import (
     ENGINE,
     captured_and_killed,
+    captured_at_last,
     covered,
     ended,
     expect_ok,
     expect_three_lives,
+    protected,
     restored,
     start,
     start_tracee,
@@ -77,6 +80,39 @@ def test_what_a_program_has_open_is_as_it_was_after_three_restores(
 ) -> None:
     tracee = start_tracee(compiled(program, "-O2"), tmp_path, case)
     expect_three_lives(tracee, tmp_path)
+
+
+@pytest.fixture
+def untold_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of event counters the kernel does not tell the kind, as before Linux 6.5."""
+    told = Descriptor.fields.fget
+    assert told is not None
+
+    def untold(one: Descriptor) -> Mapping[str, str]:
+        return {name: value for name, value in told(one).items() if name != "eventfd-semaphore"}
+
+    monkeypatch.setattr(Descriptor, "fields", property(untold))
+    monkeypatch.setattr(eventfds, "is_told", lambda one: False)
+
+
+@pytest.mark.parametrize("case", CASES["event_descriptors"].split()[:4])
+@pytest.mark.usefixtures("untold_kinds")
+def test_event_counters_are_as_they_were_where_the_kernel_does_not_tell_of_which_kind_they_are(
+    case: str, compiled: Compiled, tmp_path: Path
+) -> None:
+    expect_three_lives(start_tracee(compiled("event_descriptors", "-O2"), tmp_path, case), tmp_path)
+
+
+@pytest.mark.usefixtures("untold_kinds")
+def test_whoever_waits_for_an_event_counter_does_not_notice_that_it_was_asked_of_which_kind_it_is(
+    compiled: Compiled, tmp_path: Path
+) -> None:
+    with ended(start_tracee(compiled("blocked", "-O2", "-pthread"), tmp_path)) as tracee:
+        with protected(tracee) as session:
+            for _ in range(5):
+                captured_at_last(session, CaptureOrder())
+        tracee.tell()
+        expect_ok(tracee)
 
 
 def test_direct_requests_of_which_nobody_can_tell_that_they_are_done_are_refused(
