@@ -27,7 +27,7 @@ from agent.streams import discard, total_of
 from checkpoint import channel, epoch_variable, format
 from checkpoint.carried import paths_of
 from checkpoint.channel import Laid
-from checkpoint.engine import COOPERATIVE, COPY_CLOCKS_AHEAD_NS, NO_TERMS, PTRACE, Terms
+from checkpoint.engine import COOPERATIVE, COPY_CLOCKS_AHEAD_NS, NO_TERMS, PTRACE, Terms, pid_taken
 from checkpoint.engines.cooperative import age_ns as commit_age_ns
 from checkpoint.errors import ChainError, CheckpointError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
@@ -229,6 +229,8 @@ async def lay(
     try:
         keeper = await component.keeper.give()
         await _vessel(component, request, keeper)
+        if component.inner_pid != outline.process.pid:  # before all of it is read
+            raise pid_taken(outline.process.pid)
         order = channel.Lay(component.pid, name, age_ns, owner != ROOT, places.contents, component.keeper.terms)
         laid, _ = await component.keeper.ask(order, tuple(chain))
     except (CheckpointError, GuardError, KeeperLostError):

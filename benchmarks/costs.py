@@ -10,7 +10,7 @@ from typing import Final
 
 from benchmarks import interference
 from benchmarks.figures import OURS, Figure, Findings
-from benchmarks.interference import NAME, ON_LOOPBACK, UNPROTECTED, WINDOW_S
+from benchmarks.interference import NAME, NO_COPY, ON_LOOPBACK, UNPROTECTED, WINDOW_S
 from benchmarks.running import Running, running
 from failover.cli.demo.robots import RobotMachine, Stage
 
@@ -47,10 +47,10 @@ def costs(quick: bool, directory: Path) -> Findings:
     return Findings(
         "What protection takes",
         f"The work of a Python program with {RESIDENT_MB} MB resident that writes 4 MB/s, protected and released in turns, "
-        f"{WINDOW_S} s each, by snapshots a second, on a machine that plays both robots; processor time of the processes of the "
-        f"robot that runs it. Bytes of a delta's file, which is what travels, per byte of its pages: of a Python program with "
-        f"{CELLS:,} objects in a dictionary, {CHANGES} of them replaced each 50 ms. What an agent takes that protects nothing "
-        "(beats each 20 ms; guard and keeper wait in advance for the first program).",
+        f"{WINDOW_S} s each, by snapshots a second, on a machine that plays both robots, without a ready copy; processor time of "
+        "the processes of the robot that runs it. Bytes of a delta's file, which is what travels, per byte of its pages: of a "
+        f"Python program with {CELLS:,} objects in a dictionary, {CHANGES} of them replaced each 50 ms. What an agent takes that "
+        "protects nothing (beats each 20 ms; guard and keeper wait in advance for the first program).",
         tuple(figures),
     )
 
@@ -58,7 +58,7 @@ def costs(quick: bool, directory: Path) -> Findings:
 def _of_work(number: int, turns: int, directory: Path) -> list[Figure]:
     """At so many snapshots a second."""
     directory.mkdir()
-    settings = f"snapshot_period_ms = {1000 // number}\n"
+    settings = f"snapshot_period_ms = {1000 // number}\n{NO_COPY}"
     case = f"{number} snapshots a second"
     protected: list[float] = []
     released: list[float] = []

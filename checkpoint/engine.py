@@ -13,7 +13,7 @@ from typing import Final, Protocol
 
 from checkpoint.device_rules import DeviceRule
 from checkpoint.digests_of_files import DigestOf
-from checkpoint.errors import ProbeError
+from checkpoint.errors import ProbeError, RestoreError
 from checkpoint.model import Position, Snapshot
 
 PTRACE: Final = "ptrace"
@@ -272,6 +272,11 @@ class Restored(Protocol):
     def resume(self) -> None:
         """Let it go on."""
         ...
+
+
+def pid_taken(pid: int) -> RestoreError:
+    """Why no ready copy stands in a vessel that did not get the PID by which the program knows itself."""
+    return RestoreError(f"pid {pid}, by which it knows itself, is not free here")
 
 
 class Copy(Protocol):

@@ -25,7 +25,7 @@ from typing import Final
 
 from checkpoint import carried, chain, differences, pages, room
 from checkpoint.differences import Rows
-from checkpoint.engine import RestoreOptions
+from checkpoint.engine import RestoreOptions, pid_taken
 from checkpoint.engines import restore_checks, restore_kinds, restore_memory, restore_process, restore_vdso
 from checkpoint.engines.copy_mappings import Change
 from checkpoint.engines.ptrace_restore import RSEQ_SECTION_OFFSET, ProcessRestore, RestoredProgram, look_at_vessel, options_for
@@ -166,7 +166,7 @@ class ReadyCopy(ProcessRestore):
         self.prepare()
         self._vessel = vessel = look_at_vessel(self._tracee.pid)
         if vessel.inner_pid != self._state.process.pid:
-            raise RestoreError(f"pid {self._state.process.pid}, by which it knows itself, is not free here")
+            raise pid_taken(self._state.process.pid)
         if not vessel.may_choose_executable:
             self._execute_program()
         self._own_xstate = self._tracee.xstate()

@@ -49,6 +49,7 @@ def two_robots(
     prepare: Callable[[Path], None] = lambda _: None,
     *,
     own_network: bool = True,
+    own_pids: bool = True,
     cables: Sequence[tuple[str, str]] = CABLES,
 ) -> Iterator[tuple[RobotMachine, RobotMachine]]:
     """robot1 and robot2, beating and connected.
@@ -57,10 +58,11 @@ def two_robots(
         settings: lines added to their configurations.
         prepare: called with the directory in which each robot will have its own, before they start.
         own_network: of each robot, where that can be had; else they share the loopback, and outlive each other's cable.
+        own_pids: the same; else no two of their programs can have one PID.
         cables: between the two; needs networks of their own.
     """
     allowed = means()
-    allowed = replace(allowed, own_network=allowed.own_network and own_network)
+    allowed = replace(allowed, own_network=allowed.own_network and own_network, own_pids=allowed.own_pids and own_pids)
     with Stage(directory / "stage", allowed, settings, cables=cables) as stage:
         stage.directory.mkdir()
         prepare(stage.directory)

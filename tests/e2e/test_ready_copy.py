@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_takeover import numbers, start_counting
+from tests.e2e.test_verbs_protect import COUNT
 
 CHAIN_ALONE = '[components."/demo/robot1/count"]\nready_copy = false\n'
 
@@ -51,3 +56,18 @@ def test_where_it_is_not_wanted_the_checkpoints_alone_are_kept_and_a_takeover_us
         assert "ready_copy = false" in copy_at(second)["why"]
         first.cut_power()
         count_goes_on(second)
+
+
+@pytest.mark.root
+def test_where_its_pid_is_taken_there_is_none_and_status_says_so(tmp_path: Path) -> None:
+    with robots.two_robots(tmp_path, own_pids=False, own_network=False) as (first, second):
+        program = subprocess.Popen([sys.executable, "-S", "-c", COUNT], stdout=subprocess.DEVNULL, start_new_session=True)
+        try:
+            protected = robots.failover(first, "protect", str(program.pid), "--name", "count")
+            assert protected.returncode == 0, protected
+            reason = f"pid {program.pid}, by which it knows itself, is not free here"
+            robots.until(lambda: copy_at(second).get("why") == reason, "the reason")
+            assert reason in robots.failover(second, "status").stdout
+        finally:
+            program.kill()
+            program.wait()
