@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import functools
+import mmap
 import os
+from collections.abc import Callable
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
@@ -292,9 +295,23 @@ def pages_joined(found: Words) -> Words:
 _PRESENT: Final = np.uint64(1 << 63)
 _SWAPPED: Final = np.uint64(1 << 62)
 _FILE: Final = np.uint64(1 << 61)
+_EXCLUSIVE: Final = np.uint64(1 << 56)
+_FRAME: Final = np.uint64((1 << 55) - 1)
 SOFT_DIRTY: Final = np.uint64(1 << 55)
 PAGEMAP_CHUNK: Final = 1 << 16
 """Pages whose entries (8 bytes each) are read at once."""
+
+
+@functools.cache
+def zero_frame() -> int:
+    """The frame of the page of zeros that is shared by all; 0 where the kernel does not tell us frames (CAP_SYS_ADMIN)."""
+    with mmap.mmap(-1, abi.PAGE_SIZE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS) as page:
+        assert page[0] == 0  # now it is there
+        place = ctypes.c_char.from_buffer(page)
+        address = ctypes.addressof(place)
+        del place
+        with open("/proc/self/pagemap", "rb", buffering=0) as file:
+            return int.from_bytes(os.pread(file.fileno(), 8, address // abi.PAGE_SIZE * 8), "little") & int(_FRAME)
 
 
 class PagemapFile:
@@ -309,19 +326,33 @@ class PagemapFile:
         os.close(self._file)
 
     def existing(self, ranges: Words, *, own: bool = True) -> Words:
-        """As `PageScanner.existing`; the shared page of zeros counts, too."""
-        unwanted = _FILE if own else np.uint64(0)
-        return self._select(ranges, _PRESENT | _SWAPPED, unwanted)
+        """As `PageScanner.existing`; the shared page of zeros counts, too, where the kernel does not tell us which that is."""
+        unwanted, zeros = _FILE if own else np.uint64(0), zero_frame()
+        return self._select(
+            ranges,
+            lambda entries: (
+                (entries & (_PRESENT | _SWAPPED) != 0)
+                & (entries & unwanted == 0)
+                & ((entries & _FRAME != zeros) | (entries & _PRESENT == 0) | (zeros == 0))
+            ),
+        )
 
     def guards(self, ranges: Words) -> Words:
         """None: a kernel that knows guards has PAGEMAP_SCAN, too."""
         return NONE
 
     def soft_dirty(self, ranges: Words) -> Words:
-        """Pages whose soft-dirty bit is set."""
-        return self._select(ranges, SOFT_DIRTY, np.uint64(0))
+        """Pages whose soft-dirty bit is set, and those that may be the shared page of zeros.
 
-    def _select(self, ranges: Words, anyof: np.uint64, unwanted: np.uint64) -> Words:
+        That comes without the bit to where the program has forgotten a page (MADV_DONTNEED) and read what is there now. A page
+        that processes have in common since a fork looks the same to an ordinary user.
+        """
+        if zero_frame():
+            return self._select(ranges, lambda entries: entries & SOFT_DIRTY != 0)
+        told = _PRESENT | _FILE | _EXCLUSIVE
+        return self._select(ranges, lambda entries: (entries & SOFT_DIRTY != 0) | (entries & told == _PRESENT))
+
+    def _select(self, ranges: Words, is_chosen: Callable[[Words], NDArray[np.bool_]]) -> Words:
         found = []
         for start, end in ranges.tolist():
             for first in range(start // abi.PAGE_SIZE, end // abi.PAGE_SIZE, PAGEMAP_CHUNK):
@@ -331,7 +362,7 @@ class PagemapFile:
                     raise ProcessGoneError(
                         f"cannot read the page tables of pid {self._pid}: it has ended, or became another program"
                     )
-                chosen = np.flatnonzero((entries & anyof != 0) & (entries & unwanted == 0))
+                chosen = np.flatnonzero(is_chosen(entries))
                 found.append((chosen.astype(np.uint64) + np.uint64(first)) * np.uint64(abi.PAGE_SIZE))
         return pages.extents_of_addresses(np.concatenate(found), abi.PAGE_SIZE) if found else NONE
 

@@ -61,6 +61,8 @@ for order in sys.stdin:
             ctypes.memmove(place + page * 4096 + 8, value.to_bytes(8, "little"), 8)
     elif verb == "forget":
         libc.madvise(place + first * 4096, size * 4096, 4)
+    elif verb == "look":
+        assert not any(ctypes.string_at(place + first * 4096, size * 4096))
     elif verb == "guard" and libc.madvise(place + first * 4096, size * 4096, 102):  # MADV_GUARD_INSTALL
         print("unknown", flush=True)
         continue
@@ -192,6 +194,18 @@ def test_forgotten_pages_are_cleared_or_read_as_zeros(child: Child) -> None:
     assert {2, 3, 4, 5} <= told
     content = Memory(child.process.pid).read(child.place + 2 * PAGE, 4 * PAGE)
     assert not any(content)
+
+
+def test_forgotten_pages_that_are_read_again_are_cleared_or_read_as_zeros(child: Child) -> None:
+    """The kernel shows its shared page of zeros there, as a page that nobody has written to."""
+    child.order("forget 2 4")
+    child.order("look 2 4")
+    child.order("look 40 2")
+    found = child.scan()
+    assert {2, 3, 4, 5} <= child.numbers(found.written) | child.numbers(found.cleared)
+    child.order("forget 40 2")
+    child.order("write 41")
+    assert 41 in child.numbers(child.scan().written)
 
 
 def test_guards_are_told_and_do_not_exist(child: Child) -> None:
