@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from checkpoint import pages
-from checkpoint.linux import abi, dirty, write_protection
+from checkpoint.linux import abi, dirty, pagetables, write_protection
 from checkpoint.linux.digests import DigestTracker
 from checkpoint.linux.dirty import SoftDirtyTracker
 from checkpoint.linux.maps_reader import MapsReader
@@ -127,9 +127,11 @@ class Child:
         return {(address - self.place) // PAGE for address in pages.addresses_of(found, PAGE).tolist()}
 
 
-@pytest.fixture(params=["pagemap", "soft-dirty", "digest"])
-def child(request: pytest.FixtureRequest) -> Iterator[Child]:
+@pytest.fixture(params=["pagemap", "soft-dirty", "soft-dirty of an ordinary user", "digest"])
+def child(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Child]:
     """A child with pages 0 to 9 written, followed from then on."""
+    if request.param.endswith("user"):
+        monkeypatch.setattr(pagetables, "zero_frame", lambda: 0)
     process = subprocess.Popen(
         [sys.executable, "-c", CHILD, str(COUNT)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
@@ -154,7 +156,7 @@ def child(request: pytest.FixtureRequest) -> Iterator[Child]:
 def _tracker(kind: str, pid: int, faults: int) -> Tracker:
     if kind == "digest":
         return DigestTracker(pid)
-    if kind == "soft-dirty":
+    if kind.startswith("soft-dirty"):
         if not dirty.has_soft_dirty():
             pytest.skip("this kernel has no soft-dirty bit (CONFIG_MEM_SOFT_DIRTY)")
         return SoftDirtyTracker(pid)

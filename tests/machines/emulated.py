@@ -69,6 +69,17 @@ class Kind:
         """The version of its Python."""
         return {"bookworm": "3.11", "trixie": "3.13"}[self.system]
 
+    def unwanted(self) -> str:
+        """Why it is not asked for; "": it is."""
+        wanted = os.environ.get("FAILOVER_TEST_MACHINES", "")
+        if wanted == "all" or self.name in wanted.split(","):
+            return ""
+        return f"FAILOVER_TEST_MACHINES={self.name} has this machine emulated, =all has all of them"
+
+    def place(self, otherwise: Path) -> Path:
+        """Where it is made, and kept if it is to be kept."""
+        return Path(os.environ.get("FAILOVER_TEST_MACHINES_DIRECTORY") or otherwise) / self.name
+
     def lacking(self) -> str:
         """Why such a machine cannot be made or run here; "": it can."""
         needed = (*COMMANDS, *self.commands, self.emulator[0], self.compiler)
@@ -115,11 +126,13 @@ class Machine:
     Attributes:
         directory: that holds all of it.
         port: of loopback, by which its ssh is reached.
+        emulator: while it is `booted`.
     """
 
     kind: Kind
     directory: Path
     port: int
+    emulator: subprocess.Popen[bytes] | None = None
 
     # Making
 
@@ -144,6 +157,10 @@ class Machine:
     @property
     def _system(self) -> Path:
         return self.directory / "system"
+
+    @property
+    def _console(self) -> Path:
+        return self.directory / f"console-{self.port}"
 
     def _recipe(self) -> str:
         files = (Path(__file__), Path(__file__).with_name("first.c"), ROOT / "pyproject.toml")
@@ -219,13 +236,16 @@ class Machine:
     # Running
 
     @contextlib.contextmanager
-    def booted(self) -> Iterator[Machine]:
+    def booted(self, *wire: str) -> Iterator[Machine]:
         """Let it run for the body, with our sources in /root/failover.
+
+        Args:
+            wire: a second network interface of it, as options of the emulator.
 
         Raises:
             TimeoutError: it does not answer; its console says why.
         """
-        console = (self.directory / "console").open("wb")
+        console = self._console.open("wb")
         # -snapshot: what it writes is gone afterwards
         command = (
             *(*self.kind.emulator, "-accel", "tcg,thread=multi", "-smp", "2"),
@@ -234,11 +254,13 @@ class Machine:
             *("-drive", "file=disk,format=raw,if=none,id=disk,cache=unsafe", "-device", "virtio-blk-pci,drive=disk"),
             *("-netdev", f"user,id=net,restrict=on,hostfwd=tcp:127.0.0.1:{self.port}-:22"),
             *("-device", "virtio-net-pci,netdev=net,romfile="),
+            *wire,
         )
         with (
             console,
             subprocess.Popen(command, cwd=self.directory, stdin=subprocess.DEVNULL, stdout=console, stderr=console) as emulator,
         ):
+            self.emulator = emulator
             try:
                 self._await(emulator)
                 self.send()
@@ -250,7 +272,7 @@ class Machine:
         deadline = time.monotonic() + BOOT_S
         while self.run("true", timeout_s=20).returncode:
             if emulator.poll() is not None or time.monotonic() > deadline:
-                raise TimeoutError(f"it does not answer, see {self.directory / 'console'}")
+                raise TimeoutError(f"it does not answer, see {self._console}")
             time.sleep(1)
 
     def send(self) -> None:
@@ -262,14 +284,18 @@ class Machine:
         done = self.run("mkdir -p /root/failover && tar -C /root/failover -xz --no-same-owner", content=packed.getvalue())
         assert done.returncode == 0, done.stdout.decode(errors="replace")
 
+    def ssh(self, command: str, *more: str) -> list[str]:
+        """The command line by which it is told a command; ``more``: options of ssh(1)."""
+        options = [f"-o{one}" for one in ("StrictHostKeyChecking=no", "UserKnownHostsFile=/dev/null", "ConnectTimeout=10")]
+        return ["ssh", "-q", "-i", str(self.directory / "key"), "-p", str(self.port), *options, *more, "root@127.0.0.1", command]
+
     def run(self, command: str, *, content: bytes = b"", timeout_s: float = 600) -> subprocess.CompletedProcess[bytes]:
         """Run a shell command in it.
 
         Returns:
             Its exit status (255: it does not answer), and all that it wrote as ``stdout``.
         """
-        options = [f"-o{one}" for one in ("StrictHostKeyChecking=no", "UserKnownHostsFile=/dev/null", "ConnectTimeout=10")]
-        words = ("ssh", "-q", "-i", str(self.directory / "key"), "-p", str(self.port), *options, "root@127.0.0.1", command)
+        words = self.ssh(command)
         try:
             return subprocess.run(
                 words, input=content, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False, timeout=timeout_s

@@ -6,10 +6,8 @@ directory where they are kept for the next time.
 
 from __future__ import annotations
 
-import os
 import socket
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -17,8 +15,6 @@ from checkpoint.arch import TRY_UNPROVED, UNPROVED
 from tests.machines.emulated import KINDS, Kind, Machine
 
 pytestmark = pytest.mark.timeout(7200)
-
-WANTED = os.environ.get("FAILOVER_TEST_MACHINES", "")
 
 ENVIRONMENT = "PYTHONPATH=/opt/site:/root/failover PYTHONDONTWRITEBYTECODE=1"
 TESTS = (
@@ -36,14 +32,11 @@ TEST_S = 3600.0
 def machine(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
     """One that runs."""
     kind: Kind = request.param
-    if WANTED != "all" and kind.name not in WANTED.split(","):
-        pytest.skip(f"FAILOVER_TEST_MACHINES={kind.name} has this machine emulated, =all has all of them")
-    if reason := kind.lacking():
+    if reason := kind.unwanted() or kind.lacking():
         pytest.skip(reason)
-    kept = os.environ.get("FAILOVER_TEST_MACHINES_DIRECTORY")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = int(free.getsockname()[1])
-    made = Machine(kind, Path(kept or tmp_path_factory.mktemp("machine")) / kind.name, port)
+    made = Machine(kind, kind.place(tmp_path_factory.mktemp("machine")), port)
     made.make()
     with made.booted():
         yield made

@@ -251,7 +251,7 @@ class Stage:
             with self.interruption.held():
                 self.robots.append(self.start_robot(name))
         if self.means.own_network:
-            self._join()
+            self.join()
         for robot in self.robots:
             robot.switch_on()
         for robot in self.robots:
@@ -279,13 +279,7 @@ class Stage:
         for part in ("state", "run"):
             (directory / part).mkdir(exist_ok=True)  # a test may have put a disk of its own there
         config = directory / "agent.toml"
-        config.write_text(
-            f'robot = "{name}"\n'
-            f'team_directory = "{directory / "team"}"\n'
-            f'state_directory = "{directory / "state"}"\n'
-            f'runtime_directory = "{directory / "run"}"\n'
-            f"{self._pace}{self._settings}"
-        )
+        config.write_text(self.configuration(name, directory))
         command = self.command(name, config)
         if self.means.own_network:
             assert shutil.which("unshare")
@@ -294,11 +288,21 @@ class Stage:
             process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True)
         return RobotMachine(name, directory, process)
 
+    def configuration(self, name: str, directory: Path) -> str:
+        """What stands in a robot's agent.toml, whose things lie in this directory."""
+        return (
+            f'robot = "{name}"\n'
+            f'team_directory = "{directory / "team"}"\n'
+            f'state_directory = "{directory / "state"}"\n'
+            f'runtime_directory = "{directory / "run"}"\n'
+            f"{self._pace}{self._settings}"
+        )
+
     def command(self, _name: str, config: Path) -> list[str]:
         """The command line of a robot's host, with its agent."""
         return host_command(self.means.own_pids, agent_command(config))
 
-    def _join(self) -> None:
+    def join(self) -> None:
         """Lay the cables between the two network namespaces."""
         for robot in self.robots:
             wait_for_network(robot)
