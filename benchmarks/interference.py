@@ -34,7 +34,7 @@ IDLE: Final = "nothing on its way"
 
 ON_LOOPBACK: Final = Allowed(own_pids=False, own_network=False)
 """The measured program is started by us, so the robots must see our processes."""
-NO_COPY: Final = "ready_copy = false\n"
+NO_COPY: Final = f'[components."{NAME}"]\nready_copy = false\n'
 """Where robots share PIDs the program's own is not free for a copy, which would be begun again and again."""
 
 
