@@ -15,6 +15,7 @@ from __future__ import annotations
 import ctypes
 import os
 import re
+import select
 import struct
 import time
 from collections.abc import Mapping, Sequence
@@ -61,36 +62,58 @@ _libc = ctypes.CDLL(None, use_errno=True)
 def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
     """Its clock, how it was set, what is left and what was not read.
 
-    Asking winds a periodic timer up that went off and was not read, so that its unread expirations can be told: `timerfd_gettime`
-    changes nothing else.
+    It goes on meanwhile, and may go off between two questions. Asking winds a periodic timer up that went off and was not read,
+    so that its unread expirations can be told: `timerfd_gettime` changes nothing else.
 
     Raises:
         CaptureError: it cannot be asked.
     """
-    times = ctypes.create_string_buffer(_TIMES.size)
-    try:
-        with copy_of(held.pid, held.first.number) as timer:
-            if _libc.timerfd_gettime(timer, times):
-                abi.raise_errno("timerfd_gettime")
-            asked_ns = time.time_ns()
-    except OSError as error:
-        raise CaptureError(f"cannot ask the timerfd {held.name} of pid {held.pid}: {error.strerror}; try again") from error
-    interval_s, interval_ns, value_s, value_ns = _TIMES.unpack(times.raw)
     told = _TOLD.search(held.first.told)
     assert told is not None, "every kernel with fdinfo tells of timers so"
-    ticks = int(told[2])
-    if ticks and (interval_s or interval_ns):
-        again = descriptor(held.pid, held.first.number)
-        counted = _TICKS.search(again.told) if again else None
-        ticks = int(counted[1]) if counted else ticks
+    try:
+        with copy_of(held.pid, held.first.number) as timer:
+            interval_ns, value_ns, asked_ns = _times(timer)
+            ticks = int(told[2])
+            if not interval_ns:
+                ticks = ticks or (_ticks(held) if _went_off(timer) else 0)
+            before_ns = -1
+            while interval_ns and value_ns > before_ns:  # until it was not wound up between two questions
+                ticks, before_ns = _ticks(held) if _went_off(timer) else 0, value_ns
+                _, value_ns, asked_ns = _times(timer)
+    except OSError as error:
+        raise CaptureError(f"cannot ask the timerfd {held.name} of pid {held.pid}: {error.strerror}; try again") from error
     return {
         "clock": int(told[1]),
         "settings": int(told[3], 8),
-        "value_ns": value_s * _NS_PER_S + value_ns,
-        "interval_ns": interval_s * _NS_PER_S + interval_ns,
+        "value_ns": value_ns if interval_ns or not ticks else 0,
+        "interval_ns": interval_ns,
         "ticks": ticks,
         "asked_ns": asked_ns,
     }
+
+
+def _times(timer: int) -> tuple[int, int, int]:
+    """The interval, what is left, and when that was so, by the calendar; ns."""
+    times = ctypes.create_string_buffer(_TIMES.size)
+    if _libc.timerfd_gettime(timer, times):
+        abi.raise_errno("timerfd_gettime")
+    asked_ns = time.time_ns()
+    interval_s, interval_ns, value_s, value_ns = _TIMES.unpack(times.raw)
+    return interval_s * _NS_PER_S + interval_ns, value_s * _NS_PER_S + value_ns, asked_ns
+
+
+def _went_off(timer: int) -> bool:
+    """Whether it has expirations that were not read."""
+    asking = select.poll()
+    asking.register(timer, select.POLLIN)
+    return bool(asking.poll(0))
+
+
+def _ticks(held: OpenFile) -> int:
+    """How many expirations were not read, by now."""
+    again = descriptor(held.pid, held.first.number)
+    counted = _TICKS.search(again.told) if again else None
+    return int(counted[1]) if counted else 1
 
 
 def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:

@@ -6,11 +6,14 @@ One tracee for a family of kinds, one case for each thing that could be lost: se
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import fcntl
 import os
 import socket
+import struct
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +26,9 @@ from checkpoint.engines import restore_checks
 from checkpoint.errors import CheckpointError, MismatchError, UnsupportedError
 from checkpoint.linux import mounts, procfs
 from checkpoint.linux.descriptors import Descriptor
-from checkpoint.resources import aio_rings, covered_files, eventfds
+from checkpoint.linux.descriptors import descriptor as procfs_descriptor
+from checkpoint.resources import OpenFile, aio_rings, covered_files, eventfds, timerfds
+from checkpoint.resources.rebuilding import number_of
 from tests.checkpoint.round_trip import (
     ENGINE,
     captured_and_killed,
@@ -113,6 +118,46 @@ def test_whoever_waits_for_an_event_counter_does_not_notice_that_it_was_asked_of
                 captured_at_last(session, CaptureOrder())
         tracee.tell()
         expect_ok(tracee)
+
+
+@pytest.mark.parametrize(("interval_ms", "ticks"), [(0, 1), (20, 3)])
+def test_a_timer_that_goes_off_between_two_questions_has_gone_off(interval_ms: int, ticks: int) -> None:
+    timer = timerfd(1_000_000, interval_ms)
+    try:
+        seen = procfs_descriptor(os.getpid(), timer)
+        assert seen is not None and "ticks: 0" in seen.text
+        arm(timer, 20, interval_ms)
+        time.sleep(0.07)
+        found = timerfds.observe(OpenFile(os.getpid(), (seen,)), ())
+        assert found["ticks"] == ticks or (interval_ms and number_of(found["ticks"]) > ticks)
+        assert (number_of(found["value_ns"]) > 0) == bool(interval_ms)
+    finally:
+        os.close(timer)
+
+
+@pytest.mark.parametrize("interval_ms", [0, 20])
+def test_a_timer_that_has_not_gone_off_has_all_that_is_left(interval_ms: int) -> None:
+    timer = timerfd(50_000, interval_ms)
+    try:
+        seen = procfs_descriptor(os.getpid(), timer)
+        assert seen is not None
+        found = timerfds.observe(OpenFile(os.getpid(), (seen,)), ())
+        assert found["ticks"] == 0 and 0 < number_of(found["value_ns"]) <= 50_000_000_000
+    finally:
+        os.close(timer)
+
+
+def timerfd(first_ms: int, interval_ms: int) -> int:
+    """A timer of ours that runs."""
+    timer = int(ctypes.CDLL(None).timerfd_create(time.CLOCK_MONOTONIC, os.O_CLOEXEC))
+    assert timer >= 0
+    arm(timer, first_ms, interval_ms)
+    return timer
+
+
+def arm(timer: int, first_ms: int, interval_ms: int) -> None:
+    words = [word for ms in (interval_ms, first_ms) for word in divmod(ms * 1_000_000, 1_000_000_000)]
+    assert ctypes.CDLL(None).timerfd_settime(timer, 0, struct.pack("<4q", *words), None) == 0
 
 
 def test_direct_requests_of_which_nobody_can_tell_that_they_are_done_are_refused(
