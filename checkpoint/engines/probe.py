@@ -43,6 +43,9 @@ from checkpoint.resources import (
 LOOKS: Final = 10
 """How often a component whose processes come and go is looked at until it stays the same meanwhile."""
 LOOK_PAUSE_S: Final = 0.01
+EXECUTION_S: Final = 2.0
+EXECUTION_PAUSE_S: Final = 0.001
+"""How long a program that is being executed is waited for, and between two looks at it."""
 COMMAND_LENGTH: Final = 200
 """Characters of a command line that a report shows."""
 
@@ -67,6 +70,7 @@ def probe(pid: int, surroundings: Surroundings | None = None, *, files_kept: boo
 def _probe(pid: int, surroundings: Surroundings, files_kept: bool, first: int) -> Report:
     status = procfs.status(first)
     _require_permission(first, status)
+    _await_execution(first)
     kin, opened = _all_opened(pid, first, is_guarded=bool(surroundings.pipes))
     looked = _looked(opened, first, surroundings)
     findings = (
@@ -92,6 +96,7 @@ def reasons_of(pid: int, surroundings: Surroundings, *, files_kept: bool = False
 
 
 def _reasons_of(pid: int, surroundings: Surroundings, files_kept: bool, first: int) -> tuple[str, ...]:
+    _await_execution(first)
     kin, opened = _all_opened(pid, first, is_guarded=bool(surroundings.pipes))
     looked = _looked(opened, first, surroundings)
     others = [found.text for found in _others_findings(opened, pid, first, looked) if found.verdict == REFUSED]
@@ -224,6 +229,17 @@ def _require_permission(pid: int, status: Status) -> None:
         raise ProbeError(
             f"cannot look at pid {pid} ({status.name}) of uid {status.uids[0]}: not permitted; run as that user or as root"
         ) from error
+
+
+def _await_execution(pid: int) -> None:
+    """Until the program is there that a process is just becoming: who starts one is let go on by execve(2) before it has a vdso,
+    arguments or variables, the last of which the kernel notes last. A program whose file comes slowly is looked at as it is.
+
+    Source: create_elf_tables() in fs/binfmt_elf.c; begin_new_exec() in fs/exec.c closes what is to be closed long before.
+    """
+    deadline = time.monotonic() + EXECUTION_S
+    while not (stat := procfs.stat(pid)).env_end and stat.state not in "ZX" and time.monotonic() < deadline:
+        time.sleep(EXECUTION_PAUSE_S)
 
 
 def _process_findings(pid: int, status: Status, kin: tuple[int, ...], files_kept: bool) -> Iterator[Finding]:

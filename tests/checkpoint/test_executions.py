@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from checkpoint.engine import ProtectOrder
+from checkpoint import portable
+from checkpoint.engine import CaptureOrder, ProtectOrder
 from checkpoint.engines import entering
 from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
 from checkpoint.linux import procfs
@@ -63,6 +67,43 @@ def freeze_until_it_stands(threads: Threads) -> None:
         except CaptureError:
             if time.monotonic() > deadline:
                 raise
+
+
+@pytest.fixture
+def before_all_others() -> Iterator[None]:
+    """We have one processor for ourselves and all whom we start, who run there while we sleep: whoever we start is in the middle
+    of its execve(2) when that has let us go on."""
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+    yield
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    os.sched_setaffinity(0, allowed)
+
+
+@contextlib.contextmanager
+def just_started(**variables: str) -> Iterator[int]:
+    with subprocess.Popen(["sleep", "1000"], env={**os.environ, **variables}) as program:
+        try:
+            yield program.pid
+        finally:
+            program.kill()
+
+
+def test_a_program_that_has_just_been_started_is_looked_at_when_it_is_there(before_all_others: None) -> None:
+    level = next(iter(portable.LEVELS))
+    for _ in range(20):
+        with just_started(**{portable.VARIABLE: level}) as pid:
+            report = ENGINE.probe(pid)
+            assert not report.reasons
+            assert report.command == "sleep 1000"
+            assert any(f"started for {level}" in finding.text for finding in report.findings)
+
+
+def test_a_program_that_has_just_been_started_can_be_protected_at_once(before_all_others: None) -> None:
+    for _ in range(20):
+        with just_started() as pid, contextlib.closing(ENGINE.protect(pid, ProtectOrder("/test/sleeper"))) as session:
+            assert session.capture(CaptureOrder(sequence=1)).is_base
 
 
 @pytest.mark.parametrize("step", ["seize", "ask_to_stop", "has_stopped", "detach"])
