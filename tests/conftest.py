@@ -19,6 +19,7 @@ import pytest
 from checkpoint.engines import entering
 from checkpoint.linux import abi, dirty
 from checkpoint.linux.tracking import Tracker
+from checkpoint.linux.write_protection import PagemapTracker
 
 if TYPE_CHECKING:
     from xdist.scheduler import LoadScopeScheduling
@@ -63,6 +64,8 @@ def why_not(item: pytest.Item) -> str | None:
         return "needs a C compiler and its headers: apt-get install gcc libc6-dev"
     if item.get_closest_marker("user_namespaces") and not has_user_namespaces():
         return "needs user namespaces, which this system forbids to ordinary users"
+    if item.get_closest_marker("write_protection") and tracking_of(item.config) != PagemapTracker.name:
+        return f"needs write protection of single pages; here they are found by {tracking_of(item.config)}"
     for marker in item.iter_markers("command"):
         if shutil.which(marker.args[0]) is None:
             return f"needs {marker.args[0]}, which is not installed here"
@@ -96,6 +99,11 @@ def _tracking(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
+def tracking_of(config: pytest.Config) -> str:
+    """How written pages are found in these tests."""
+    return str(config.getoption("--tracking") or dirty.best_tracking())
+
+
 def _no_write_protection(pid: int, faults: int) -> Tracker:
     raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
 
@@ -106,7 +114,7 @@ def _machine(request: pytest.FixtureRequest, record_testsuite_property: Callable
     about = os.uname()
     record_testsuite_property("processor", about.machine)
     record_testsuite_property("kernel", about.release)
-    record_testsuite_property("tracking", request.config.getoption("--tracking") or dirty.best_tracking())
+    record_testsuite_property("tracking", tracking_of(request.config))
     record_testsuite_property("page_size", abi.PAGE_SIZE)
     record_testsuite_property("on", time.strftime("%Y-%m-%d"))
 

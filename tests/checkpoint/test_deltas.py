@@ -236,6 +236,7 @@ while True:
 """Writes as many pages, one after the other, as it is told to, says when it has; rests for as long as it is told."""
 
 
+@pytest.mark.write_protection
 @pytest.mark.parametrize("is_base", [True, False], ids=["base", "delta"])
 def test_a_freeze_copies_only_what_was_written_since_the_last_pass(
     is_base: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -280,6 +281,7 @@ def test_a_freeze_copies_only_what_was_written_since_the_last_pass(
     assert 50 <= session.frozen_size // 4096 <= 50 + own
 
 
+@pytest.mark.write_protection
 def test_a_small_delta_is_copied_while_the_program_runs(tmp_path: Path) -> None:
     """What was written a while ago does not wait for the freeze, as little as it is."""
     with ended(start([sys.executable, "-S", "-c", OBEDIENT, tmp_path, "1"], tmp_path)) as program, protected(program) as session:
@@ -310,6 +312,7 @@ def test_memory_that_is_written_while_its_base_is_taken_is_of_one_instant(compil
         expect_ok(back)
 
 
+@pytest.mark.write_protection
 def test_writes_that_were_begun_land_before_a_pass_reads(
     compiled: Compiled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -33,7 +33,13 @@ from tests.checkpoint.round_trip import (
 ROUNDS = 3
 ATTEMPTS = 4
 PATIENCE_S = 60.0
-ENVIRONMENT = {"PATH": os.environ["PATH"], "LANG": "C", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "HOME": "/tmp"}
+ENVIRONMENT = {
+    **{name: os.environ[name] for name in ("PATH", "PYTHONPATH") if name in os.environ},  # where numpy lies, on some machines
+    "LANG": "C",
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "HOME": "/tmp",
+}
 
 
 @pytest.fixture
