@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import signal
 import subprocess
@@ -523,8 +524,8 @@ def test_processes_that_have_lost_their_parent_are_told_by_their_session(crowded
         for pid in strays | set(everybody):
             with contextlib.suppress(ChildProcessError):
                 os.waitpid(pid, 0)
-    last = procfs.pid_max() - 1
-    there = [spawn_vessel(Birth(inner_pid=last - n)) for n in range(2 if crowded else 0)]
+    highest = (pid for pid in range(procfs.pid_max() - 1, 0, -1) if pid not in {program.pid, *everybody})
+    there = [spawn_vessel(Birth(inner_pid=pid)) for pid in itertools.islice(highest, 2 if crowded else 0)]
     try:
         again = restored(snapshot, tmp_path)
     finally:
