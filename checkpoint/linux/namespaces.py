@@ -98,6 +98,9 @@ def enter(pids: bool, clocks: bool) -> Entered:
     With PIDs come mounts of their own, so that a /proc that shows these PIDs can be mounted over ours.
     """
     notes: list[str] = []
+    if pids and not _may_keep_mounts():
+        notes.append(f"no namespace of its own for PIDs: {_IN_A_CHROOT}")
+        pids = False
     attempts = [(pids, clocks)] + ([(True, False), (False, True)] if pids and clocks else [])
     for with_pids, with_clocks in attempts:
         if not (with_pids or with_clocks):
@@ -114,6 +117,19 @@ def enter(pids: bool, clocks: bool) -> Entered:
 
 
 _CURE: Final = "give it CAP_SYS_ADMIN, or allow user namespaces (sysctl user.max_user_namespaces; never in a chroot)"
+
+
+_IN_A_CHROOT: Final = (
+    "its mounts would be seen by everybody, for the root directory is that of a chroot and no mount point; bind that directory "
+    "to itself first (mount --bind DIRECTORY DIRECTORY)"
+)
+
+
+def _may_keep_mounts() -> bool:
+    """Whether mounts can be of one namespace alone here: what hands them on is the mount of the root directory, which whoever was
+    put into a directory of it (chroot(2)) cannot name. Source: mount_namespaces(7); do_change_type() in fs/namespace.c."""
+    lines = Path("/proc/self/mountinfo").read_text().splitlines()
+    return any(line.split(" ", 5)[4] == "/" for line in lines)
 
 
 def _unshare_as_permitted(flags: int) -> tuple[bool, str | None]:

@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -111,6 +112,38 @@ def test_an_isolated_program_sees_only_its_own_processes() -> None:
     text, code = output_of(["sh", "-c", "echo $$; cd /proc; ls -d [0-9]* | wc -l; exit 3"], Birth(isolate=True))
     assert (text.split()[0], code) == ("2", 3)
     assert int(text.split()[1]) <= 4  # the first process, the shell, ls and wc
+
+
+IN_A_CHROOT = """
+set -e
+mount -t tmpfs none "$1"
+mkdir "$1/root"
+for place in /*; do
+    if [ -L "$place" ]; then
+        cp -d "$place" "$1/root$place"
+    elif [ -d "$place" ]; then
+        mkdir "$1/root$place"
+        mount --rbind "$place" "$1/root$place"
+    fi
+done
+exec chroot "$1/root" "$2" -c "$3"
+"""
+ENTERS = """
+import sys
+sys.path[:] = {path!r}
+from checkpoint.linux import namespaces
+entered = namespaces.enter(pids=True, clocks=False)
+print(entered.pids, *entered.notes)
+"""
+
+
+@pytest.mark.root
+@pytest.mark.command("unshare")
+def test_in_a_chroot_that_hands_its_mounts_on_a_program_shares_the_pids(tmp_path: Path) -> None:
+    words = ["unshare", "-m", "sh", "-c", IN_A_CHROOT, "sh", str(tmp_path), sys.executable, ENTERS.format(path=sys.path)]
+    seen = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert seen.returncode == 0, seen.stderr
+    assert seen.stdout.startswith("False no namespace of its own for PIDs") and "mount --bind DIRECTORY DIRECTORY" in seen.stdout
 
 
 @pytest.mark.user_namespaces
