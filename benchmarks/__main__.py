@@ -19,7 +19,21 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from benchmarks import beside, costs, crowd, cuts, encoding, engine, interference, machine, outage, overload, results, task
+from benchmarks import (
+    beside,
+    costs,
+    crowd,
+    cuts,
+    encoding,
+    engine,
+    increments,
+    interference,
+    machine,
+    outage,
+    overload,
+    results,
+    task,
+)
 from benchmarks.figures import Absent, Findings
 from benchmarks.running import BenchmarkError
 from checkpoint.errors import CheckpointError
@@ -71,6 +85,7 @@ def _outage(quick: bool, directory: Path) -> Findings:
 
 BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "freeze": _freeze,
+    "increments": increments.increments,
     "crowd": _crowd,
     "beside": beside.beside,
     "restore": _restore,

@@ -99,7 +99,7 @@ def _ours(program: Running, count: int, case: str) -> list[Figure]:
         for sequence in range(1, count + 2):
             seen = further if sequence > 1 else first
             time.sleep(engine.PERIOD_S)
-            captured = _watched(program, seen, lambda: engine.capture(keeper, base=sequence == 1, sequence=sequence)[0])  # noqa: B023
+            captured = _watched(program, seen, lambda: engine.capture(keeper, base=sequence == 1, sequence=sequence).told)  # noqa: B023
             seen.sizes_mb.append(captured.size / 1e6)
         keeper.ask(channel.Release(), channel.Released)
     return further.figures(case, OURS) + first.figures(case, FIRST_BASE)

@@ -48,7 +48,7 @@ def _freezes_us(kind: int, count: int, directory: Path, terms: Terms = NO_TERMS)
         capture(keeper, base=True, sequence=1)
         for sequence in range(2, DELTAS + 2):
             time.sleep(PERIOD_S)
-            captured, _ = capture(keeper, base=False, sequence=sequence)
+            captured = capture(keeper, base=False, sequence=sequence).told
             found.append(float(captured.freeze_us))
         keeper.ask(channel.Release(), channel.Released)
     return found

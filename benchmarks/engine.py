@@ -7,6 +7,7 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.figures import Figure
@@ -46,13 +47,13 @@ def _freeze_of(megabytes: int, dirty_kb: int, count: int, directory: Path) -> li
     dirty: list[float] = []
     with resident(megabytes, dirty_kb, directory) as pid, Keeper.spawn() as keeper:
         keeper.ask(channel.Protect(pid, "/benchmark"), channel.Protected)
-        base, _ = capture(keeper, base=True, sequence=1)
+        base = capture(keeper, base=True, sequence=1).told
         for sequence in range(2, count + 2):
             time.sleep(PERIOD_S)
-            captured, wall_ms = capture(keeper, base=False, sequence=sequence)
-            freezes.append(captured.freeze_us / 1000)
-            walls.append(wall_ms)
-            dirty.append(captured.dirty_bytes / 1e6)
+            taken = capture(keeper, base=False, sequence=sequence)
+            freezes.append(taken.told.freeze_us / 1000)
+            walls.append(taken.wall_ms)
+            dirty.append(taken.told.dirty_bytes / 1e6)
         keeper.ask(channel.Release(), channel.Released)
     return [
         Figure("freeze of the first base", case, "ms", (base.freeze_us / 1000,)),
@@ -63,20 +64,40 @@ def _freeze_of(megabytes: int, dirty_kb: int, count: int, directory: Path) -> li
 
 
 @contextmanager
-def resident(megabytes: int, dirty_kb: int, directory: Path) -> Iterator[int]:
-    """The measured program; yields its PID once it has all its memory."""
-    with running("resident", megabytes, dirty_kb, directory=directory) as program:
+def resident(megabytes: int, dirty_kb: int, directory: Path, *, by_chance: bool = False) -> Iterator[int]:
+    """The measured program; yields its PID once it has all its memory.
+
+    Args:
+        by_chance: what it writes does not compress.
+    """
+    with running("resident", megabytes, dirty_kb, int(by_chance), directory=directory) as program:
         yield program.pid
 
 
-def capture(keeper: Keeper, base: bool, sequence: int) -> tuple[channel.Captured, float]:
-    """One snapshot, acknowledged at once: what the keeper told, and milliseconds from asking to having it encoded."""
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """One snapshot.
+
+    Attributes:
+        told: by the keeper.
+        wall_ms: milliseconds from asking to having it encoded.
+        size: encoded, in bytes.
+    """
+
+    told: channel.Captured
+    wall_ms: float
+    size: int
+
+
+def capture(keeper: Keeper, base: bool, sequence: int) -> Taken:
+    """One snapshot, acknowledged at once."""
     began = time.perf_counter()
     captured, (content,) = keeper.ask(channel.Capture(base=base, generation=1, sequence=sequence), channel.Captured)
     wall_ms = (time.perf_counter() - began) * 1000
+    size = os.fstat(content).st_size
     os.close(content)
     keeper.tell(channel.Acknowledge(captured.position))
-    return captured, wall_ms
+    return Taken(captured, wall_ms, size)
 
 
 def restore(quick: bool, directory: Path) -> list[Figure]:

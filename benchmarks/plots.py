@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from benchmarks import increments
 from benchmarks.figures import OURS, Figure, percentile
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ COLOURS: Final = {
     "CRIU": "#c8553d",
     "gcore": "#8d8d8d",
     f"{OURS}, first base": "#7fb2d6",
+    "full copy": "#8d8d8d",
     "nobody": "#bdbdbd",
     "unprotected": "#bdbdbd",
 }
@@ -121,6 +123,27 @@ def _stands_still(axes: Axes, figures: Sequence[Figure]) -> bool:
     return _over_size(axes, figures, {"the program stands still (its own clock)": ""})
 
 
+def _increments(axes: Axes, figures: Sequence[Figure]) -> bool:
+    return _over_size(axes, figures, {increments.STILL: ""})
+
+
+def _sent(axes: Axes, figures: Sequence[Figure]) -> bool:
+    """What a snapshot sends over what was written, beside a full copy of as much memory."""
+    found = sorted((figure for figure in figures if figure.benchmark == increments.SENT_OF_ONE), key=_megabytes)
+    if found:
+        ours = [figure for figure in found if figure.who == OURS]
+        axes.plot([_megabytes(one) for one in ours], [one.median for one in ours], marker="o", label=OURS, color=COLOURS[OURS])
+        for figure in found:
+            if figure.who != OURS:
+                axes.axhline(figure.median, linestyle="--", label=figure.who, color=COLOURS.get(figure.who))
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axes.set_xlabel("written since the last snapshot, MB")
+        axes.set_ylabel("sent, KB: median")
+        axes.legend(frameon=False)
+    return bool(found)
+
+
 def _resumes(axes: Axes, figures: Sequence[Figure]) -> bool:
     return _over_size(axes, figures, {"restore": "", "takeover from a ready copy": "from a ready copy"})
 
@@ -183,6 +206,8 @@ def _work(axes: Axes, figures: Sequence[Figure]) -> bool:
 
 PICTURES: Final[dict[str, tuple[str, Callable[[Axes, Sequence[Figure]], bool]]]] = {
     "stands-still": ("How long one more snapshot stops a program", _stands_still),
+    "increments": ("How long one more snapshot stops a program, beside a full copy", _increments),
+    "sent": ("What one more snapshot sends, of 100 MB", _sent),
     "freezes": ("Freezes of the deltas, all of them", _freezes),
     "per-thing": ("What one more thread, descriptor or carried name adds to the freeze", _per_thing),
     "resumes": ("From the snapshot to the running program", _resumes),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import plots, results
+from benchmarks import increments, plots, results
 from benchmarks.figures import Figure, Findings
 
 STILL = "the program stands still (its own clock)"
@@ -16,6 +16,10 @@ FIGURES = (
     Figure(STILL, "10 MB", "ms", (1.0, 2.0, 3.0)),
     Figure(STILL, "100 MB", "ms", (2.0, 2.5)),
     Figure(STILL, "10 MB", "ms", (15.0,), "CRIU"),
+    Figure(increments.STILL, "10 MB, 400 KB written since the last", "ms", (1.0, 2.0)),
+    Figure(increments.STILL, "10 MB, 400 KB written since the last", "ms", (5.0, 6.0), increments.FULL),
+    Figure(increments.SENT_OF_ONE, "0.4 MB written since the last", "KB", (40.0, 50.0)),
+    Figure(increments.SENT_OF_ONE, "0.4 MB written since the last", "KB", (9000.0,), increments.FULL),
     Figure("freeze of a delta", "100 MB, 400 KB written each 50 ms", "ms", (0.7, 0.8, 0.9)),
     Figure("restore", "10 MB", "ms", (60.0, 66.0)),
     Figure("takeover from a ready copy", "10 MB", "ms", (6.0, 7.0)),
@@ -61,7 +65,7 @@ def test_another_figure_is_another_picture_and_leaves_the_rest_as_they_are(tmp_p
 
 
 def test_what_was_not_measured_is_not_drawn(tmp_path: Path) -> None:
-    assert drawn(tmp_path, FIGURES[3]).keys() == {"freezes"}
+    assert drawn(tmp_path, FIGURES[7]).keys() == {"freezes"}
     assert drawn(tmp_path / "unprotected-alone", FIGURES[-1]).keys() == set()
 
 
