@@ -46,6 +46,7 @@ class Kind:
         emulator: its command, as far as it says what machine it is; ``console``: the kernel's name of the serial line.
         compiler: of a static program for it.
         commands, packages: what else it takes.
+        given: packages that hold another kernel, as files; with them ``suite`` is only its name.
     """
 
     processor: str
@@ -58,6 +59,7 @@ class Kind:
     compiler: str
     commands: tuple[str, ...]
     packages: str
+    given: tuple[Path, ...] = ()
 
     @property
     def name(self) -> str:
@@ -100,7 +102,7 @@ _ARM: Final = Kind(
     commands=("qemu-aarch64-static", "update-binfmts"),
     packages="qemu-user-static binfmt-support arch-test qemu-system-arm gcc-aarch64-linux-gnu libc6-dev-arm64-cross",
 )
-KINDS: Final = (
+_OF_DEBIAN: Final = (
     _ARM,  # follows written pages by write protection
     replace(_ARM, suite="bookworm"),  # 6.1: by digests
     replace(_ARM, system="trixie", suite="trixie", kernel="linux-image-arm64-16k"),
@@ -117,6 +119,23 @@ KINDS: Final = (
         packages="qemu-system-x86 gcc libc6-dev",
     ),
 )
+
+
+def _with_given_kernel(files: str) -> Iterator[Kind]:
+    """A machine with a kernel of somebody else's, a vendor's for one: "" is none.
+
+    Args:
+        files: Debian packages that hold it and its modules, with commas between them; the first one has its name.
+    """
+    given = tuple(Path(file).absolute() for file in files.split(",") if file)
+    for first in given[:1]:
+        told = subprocess.run(["dpkg-deb", "-f", first, "Package", "Architecture"], capture_output=True, text=True, check=True)
+        about = dict(line.split(": ") for line in told.stdout.splitlines())
+        alike = next(kind for kind in _OF_DEBIAN if kind.architecture == about["Architecture"])
+        yield replace(alike, system="bookworm", suite=about["Package"].removeprefix("linux-image-"), kernel="", given=given)
+
+
+KINDS: Final = (*_OF_DEBIAN, *_with_given_kernel(os.environ.get("FAILOVER_TEST_KERNEL", "")))
 
 
 @dataclass
@@ -170,19 +189,22 @@ class Machine:
         """Debian 12, and in /kernel the one that is wanted, unpacked: its scripts would take ten minutes under emulation."""
         sources = Path("/etc/apt/sources.list.d/debian.sources").read_text().replace("bookworm", self.kind.system)
         listed, suite = self.directory / "debian.sources", self.kind.suite
-        if suite != self.kind.system:
+        if suite != self.kind.system and not self.kind.given:
             sources = sources.replace(f"{self.kind.system}-updates", f"{self.kind.system}-updates {suite}")
         listed.write_text(sources)
         newest = f"apt-cache depends -t {suite} {self.kind.kernel} | awk '/Depends:/ {{ print $2; exit }}'"
         fetch = f"cd /tmp && apt-get update -qq && apt-get download -qq -t {suite} $({newest})"
         unpack = 'for one in "$1"/tmp/linux-image-*.deb; do dpkg-deb -x "$one" "$1/kernel"; rm "$one"; done'
+        hooks = (f"--customize-hook=chroot \"$1\" sh -c '{_quoted(fetch)}'", f"--customize-hook={unpack}")
         self._system.mkdir()
         _run(
             *("mmdebstrap", "--quiet", f"--architectures={self.kind.architecture}", "--variant=minbase", f"--include={INCLUDED}"),
-            *(f"--customize-hook=chroot \"$1\" sh -c '{_quoted(fetch)}'", f"--customize-hook={unpack}"),
+            *(() if self.kind.given else hooks),
             *(self.kind.system, self.directory / "system.tar", listed),
         )
         _run("tar", "-C", self._system, "-xpf", self.directory / "system.tar")
+        for package in self.kind.given:
+            _run("dpkg-deb", "-x", package, self._system / "kernel")
         (self.directory / "system.tar").unlink()
 
     def _take_kernel(self) -> None:
