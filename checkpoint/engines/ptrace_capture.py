@@ -289,6 +289,8 @@ class PtraceSession:
             if procfs.status(self.pid).has_ended:
                 return error
             if not self._first.onlooker.is_entered():
+                if procfs.stat(self.pid).flags & procfs.PF_EXITING:  # its memory goes before it says that it has ended
+                    return ProcessGoneError(f"{self.component} (pid {self.pid}) has ended")
                 self._first.memory.start_over()
                 return ProcessGoneError(f"{self.component} (pid {self.pid}) has become another program (exec): protect it anew")
             if isinstance(error, ProcessGoneError):

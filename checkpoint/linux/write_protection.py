@@ -45,6 +45,15 @@ def is_small(line: MapsLine) -> bool:
     return line.size <= (WHOLE_FILE if line.has_file else WHOLE_WINDOW)
 
 
+def is_closed(line: MapsLine) -> bool:
+    """Whether nobody may look into a file's mapping, as into what lies between two parts of a library: nothing comes there.
+
+    To protect its holes would mark them, and who looks at a marked hole cannot tell it from a page that is swapped out; most of
+    these lie behind the end of their file, where they cannot be read either. A library has 16 to 31 of them on aarch64.
+    """
+    return line.has_file and not line.protection
+
+
 def windows_of(line: MapsLine, existing: Words) -> Words:
     """The parts of a mapping that are worth protecting: all of a small one, the surroundings of what exists in a large one."""
     if is_small(line):
@@ -61,7 +70,8 @@ def windows_of(line: MapsLine, existing: Words) -> Words:
 class PagemapTracker:
     """Asynchronous write protection, and one scan that finds and protects again.
 
-    Invariants: every page that exists in a followed mapping lies in ``_armed`` or is found by looking at the rest; a mapping
+    Invariants: every page that exists in a followed mapping lies in ``_armed`` or is found by looking at the rest, but for what
+    `is_closed` and nothing existed in; a mapping
     without registration is fresh, whatever maps says, and is copied whole; one that cannot be registered is fresh each time.
 
     Private copies of a file's pages that the program has dropped (MADV_DONTNEED) are looked for by name, for the file shows
@@ -221,7 +231,8 @@ class PagemapTracker:
         followed = [line for line in lines if (line.start, line.end) not in self._stubborn]
         self._tracked = extents_of(followed)
         self._armed = pages.intersection(self._armed, self._tracked)
-        self._open = pages.difference(self._tracked, self._armed)
+        closed = extents_of([line for line in followed if is_closed(line)])
+        self._open = pages.difference(pages.difference(self._tracked, self._armed), closed)
         self._doubtful = pages.intersection(self._doubtful, self._tracked)
         self._files = extents_of([line for line in followed if line.has_file])
         self._owned = pages.intersection(self._owned, self._files)
@@ -251,7 +262,8 @@ class PagemapTracker:
 
         Where a mapping has gone meanwhile nothing is protected, and the next scan finds out.
         """
-        parts = [windows_of(line, _inside(existing, line)) for line in lines if is_small(line) or len(_inside(existing, line))]
+        worth = (line for line in lines if len(_inside(existing, line)) or (is_small(line) and not is_closed(line)))
+        parts = [windows_of(line, _inside(existing, line)) for line in worth]
         if parts:
             windows = pages.difference(pages_joined(np.concatenate(parts)), self._armed)
             self._scanner.written_where_protected(windows)

@@ -74,13 +74,15 @@ for order in sys.stdin:
         away = libc.mmap(None, 4096, 3, 0x22, -1, 0)
         for old, new in ((place + first * 4096, away), (place + size * 4096, place + first * 4096), (away, place + size * 4096)):
             assert libc.mremap(old, 4096, 4096, 3, new) == new
-    elif verb == "file":
+    elif verb in ("file", "closed"):
         large = next(line.split()[-1] for line in open("/proc/self/maps") if "libc" in line)
         file = os.open(large, os.O_RDONLY)
         assert os.fstat(file).st_size > count * 4096
-        assert libc.mmap(place, count * 4096, 3, 0x12, file, 0) == place
+        assert libc.mmap(place, count * 4096, 3 if verb == "file" else 0, 0x12, file, 0) == place
     elif verb == "seal":
         libc.mprotect(place, count * 4096, 1)
+    elif verb == "shut":
+        libc.mprotect(place, count * 4096, 0)
     elif verb == "open":
         libc.mprotect(place, count * 4096, 3)
     print("done", flush=True)
@@ -252,6 +254,20 @@ def test_a_page_that_is_sealed_after_the_write_is_reported(child: Child) -> None
 
 def test_existing_pages_are_those_with_content(child: Child) -> None:
     assert child.numbers(child.tracker.existing(child.lines())) == set(range(10))
+
+
+def test_a_files_mapping_that_nobody_may_look_into_has_no_pages_until_it_is_opened(child: Child) -> None:
+    child.order("closed")
+    found = child.scan()
+    assert child.numbers(found.written) == set()
+    assert set(range(10)) <= child.numbers(found.cleared)
+    assert child.numbers(child.scan().written) == set()
+    child.order("open")
+    child.order("write 4 2")
+    assert {4, 5} <= child.numbers(child.scan().written)
+    child.order("write 7")
+    child.order("shut")
+    assert 7 in child.numbers(child.scan().written)
 
 
 # Scans of a process that runs
