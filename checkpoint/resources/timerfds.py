@@ -53,6 +53,9 @@ _TICKS: Final = re.compile(rb"ticks: (\d+)\n")
 _TOLD: Final = re.compile(rb"clockid: (\d+)\nticks: (\d+)\nsettime flags: (\d+)\n")
 _TIMES: Final = struct.Struct("<4q")
 _NS_PER_S: Final = 1_000_000_000
+DUE_MS: Final = 2
+"""How long a periodic timer of which nothing is left is given to go off: its processor may be late to notice, a virtual one above
+all. One that was disarmed and has an interval still looks the same, and costs as much."""
 SOONEST_WITH_TICKS_NS: Final = 200_000
 """A timer with unread expirations is not armed for less: the next one would come before they have been set."""
 
@@ -76,10 +79,8 @@ def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
             ticks = int(told[2])
             if not interval_ns:
                 ticks = ticks or (_ticks(held) if _went_off(timer) else 0)
-            before_ns = -1
-            while interval_ns and value_ns > before_ns:  # until it was not wound up between two questions
-                ticks, before_ns = _ticks(held) if _went_off(timer) else 0, value_ns
-                _, value_ns, asked_ns = _times(timer)
+            else:
+                value_ns, ticks, asked_ns = _periodic(held, timer, value_ns)
     except OSError as error:
         raise CaptureError(f"cannot ask the timerfd {held.name} of pid {held.pid}: {error.strerror}; try again") from error
     return {
@@ -92,6 +93,18 @@ def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
     }
 
 
+def _periodic(held: OpenFile, timer: int, value_ns: int) -> tuple[int, int, int]:
+    """Of a periodic timer: what is left, how many expirations were not read, and when that was so."""
+    while True:
+        went_off, before_ns = _went_off(timer, 0 if value_ns else DUE_MS), value_ns
+        ticks = _ticks(held) if went_off else 0
+        _, value_ns, asked_ns = _times(timer)
+        if not value_ns and not before_ns and not went_off:  # disarmed
+            return 0, 0, asked_ns
+        if 0 < value_ns <= before_ns:  # not wound up between two questions
+            return value_ns, ticks, asked_ns
+
+
 def _times(timer: int) -> tuple[int, int, int]:
     """The interval, what is left, and when that was so, by the calendar; ns."""
     times = ctypes.create_string_buffer(_TIMES.size)
@@ -102,11 +115,11 @@ def _times(timer: int) -> tuple[int, int, int]:
     return interval_s * _NS_PER_S + interval_ns, value_s * _NS_PER_S + value_ns, asked_ns
 
 
-def _went_off(timer: int) -> bool:
+def _went_off(timer: int, patience_ms: int = 0) -> bool:
     """Whether it has expirations that were not read."""
     asking = select.poll()
     asking.register(timer, select.POLLIN)
-    return bool(asking.poll(0))
+    return bool(asking.poll(patience_ms))
 
 
 def _ticks(held: OpenFile) -> int:

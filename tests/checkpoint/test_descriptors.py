@@ -147,6 +147,31 @@ def test_a_timer_that_has_not_gone_off_has_all_that_is_left(interval_ms: int) ->
         os.close(timer)
 
 
+def test_a_periodic_timer_that_is_due_and_has_not_gone_off_yet_is_not_taken_for_a_disarmed_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The kernel says of both that nothing is left: it notes that one goes off a moment after it should, on a busy machine."""
+    genuine = timerfds._times
+
+    def of_a_late_one(timer: int) -> tuple[int, int, int]:
+        interval_ns, value_ns, asked_ns = genuine(timer)
+        return interval_ns, 0 if value_ns < 1_000_000 else value_ns, asked_ns
+
+    monkeypatch.setattr(timerfds, "_times", of_a_late_one)
+    timer = timerfd(1_000_000, 60_000)
+    try:
+        seen = procfs_descriptor(os.getpid(), timer)
+        assert seen is not None
+        arm(timer, 1, 60_000)
+        found = timerfds.observe(OpenFile(os.getpid(), (seen,)), ())
+        assert found["ticks"] == 1 and 59_000_000_000 < number_of(found["value_ns"]) <= 60_000_000_000
+        arm(timer, 0, 60_000)
+        found = timerfds.observe(OpenFile(os.getpid(), (seen,)), ())
+        assert (found["ticks"], found["value_ns"]) == (0, 0)
+    finally:
+        os.close(timer)
+
+
 def timerfd(first_ms: int, interval_ms: int) -> int:
     """A timer of ours that runs."""
     timer = int(ctypes.CDLL(None).timerfd_create(time.CLOCK_MONOTONIC, os.O_CLOEXEC))
