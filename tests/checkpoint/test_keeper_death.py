@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 import pytest
 
-from checkpoint import channel
+from checkpoint import arch, channel
 from checkpoint.arch import cpu
 from checkpoint.channel import Channel, ChannelError, Reply
 from checkpoint.engine import CaptureOrder, ProtectOrder
@@ -323,9 +323,9 @@ def test_a_keeper_killed_at_any_instant_leaves_no_thread_stopped(compiled: Calla
         expect_ok(tracee)
 
 
-HOLDER = """
+HOLDER = f"""
 import ctypes, os, sys, time
-number = ctypes.CDLL(None).syscall(323, os.O_CLOEXEC | os.O_NONBLOCK | 1)  # userfaultfd(2), UFFD_USER_MODE_ONLY
+number = ctypes.CDLL(None).syscall({arch.number_of("userfaultfd")}, os.O_CLOEXEC | os.O_NONBLOCK | 1)
 print(number, flush=True)
 print("ready", flush=True)
 while True:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from checkpoint import pages
+from checkpoint import arch, pages
 from checkpoint.linux import abi, dirty, pagetables, write_protection
 from checkpoint.linux.digests import DigestTracker
 from checkpoint.linux.dirty import SoftDirtyTracker
@@ -42,14 +42,14 @@ for name in ("madvise", "mprotect"):
 libc.mremap.restype = ctypes.c_void_p
 libc.mremap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_size_t, ctypes.c_int, ctypes.c_void_p]
 libc.munmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t]
-count = int(sys.argv[1])
+count, userfaultfd = map(int, sys.argv[1:])
 hole = libc.mmap(None, (count + 2) * 4096, 0, 0x22, -1, 0)
 place = hole + 4096
 def make():
     assert libc.mmap(place, count * 4096, 3, 0x32, -1, 0) == place
     libc.madvise(place, count * 4096, 15)  # MADV_NOHUGEPAGE
 make()
-faults = libc.syscall(323, os.O_CLOEXEC | os.O_NONBLOCK | 1)
+faults = libc.syscall(userfaultfd, os.O_CLOEXEC | os.O_NONBLOCK | 1)
 print(place, faults, flush=True)
 for order in sys.stdin:
     verb, *numbers = order.split()
@@ -134,9 +134,8 @@ def child(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> It
     """A child with pages 0 to 9 written, followed from then on."""
     if request.param.endswith("user"):
         monkeypatch.setattr(pagetables, "zero_frame", lambda: 0)
-    process = subprocess.Popen(
-        [sys.executable, "-c", CHILD, str(COUNT)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
+    words = [sys.executable, "-c", CHILD, str(COUNT), str(arch.number_of("userfaultfd"))]
+    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     tracker: Tracker | None = None
     try:
         assert process.stdout
