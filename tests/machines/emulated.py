@@ -25,7 +25,7 @@ from typing import Final
 ROOT: Final = Path(__file__).parents[2]
 COMMANDS: Final = ("mmdebstrap", "mke2fs", "ssh", "ssh-keygen", "dpkg-deb", "cpio", "depmod")
 PACKAGES: Final = "mmdebstrap e2fsprogs openssh-client cpio kmod"
-INCLUDED: Final = "systemd,systemd-sysv,dbus,udev,python3,procps,iproute2,kmod,openssh-server,gcc,libc6-dev,bc"
+INCLUDED: Final = "systemd,systemd-sysv,dbus,udev,python3,procps,iproute2,kmod,openssh-server,gcc,libc6-dev,bc,sqlite3,xz-utils"
 MODULES: Final = ("virtio_pci", "virtio_blk", "crc32c_generic", "ext4", "virtio_net")
 """Of the kernel, what it takes to reach disk and network, and what these need; some are part of it."""
 FOR_TESTS: Final = ("pytest", "pytest-timeout", "hypothesis")
