@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from checkpoint.arch import stubs
 from checkpoint.engine import CaptureOrder
 from checkpoint.engines.capture_memory import RunningCopy
 from checkpoint.engines.ptrace_capture import PtraceSession
@@ -196,7 +197,7 @@ def _kernel_allows(program: bytes, number: int) -> bool:
     child = os.fork()
     if child == 0:
         libc.prctl(4, 0, 0, 0, 0)  # PR_SET_DUMPABLE: no core
-        if libc.syscall(317, 1, 0, about) == 0:
+        if libc.syscall(stubs.SYSTEM_CALLS["seccomp"], 1, 0, about) == 0:
             libc.syscall(number, -1, 0, 0, 0, 0, 0)
         os._exit(0)
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
