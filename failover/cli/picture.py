@@ -74,15 +74,26 @@ def rows(status: Mapping[str, Any]) -> tuple[Row, ...]:
 
 
 def sight(component: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The component as the robot sees it that runs or ran it, where that one was asked; otherwise as the asked robot does."""
-    primary = component.get("primary")
-    seen: Mapping[str, Any] = (component.get("elsewhere") or {}).get(primary, {})
-    return seen if seen.get("primary") == primary else component
+    """The component as the robot sees it that runs or ran it, where that one was asked; otherwise as the asked robot does.
+
+    With what its standby lacks, as that one says.
+    """
+    primary, elsewhere = component.get("primary"), component.get("elsewhere") or {}
+    seen: Mapping[str, Any] = elsewhere.get(primary, {})
+    seen = seen if seen.get("primary") == primary else component
+    standing_by = elsewhere.get(seen.get("standby"), component)
+    return {**seen, "lacks": standing_by.get("lacks"), "prepared_first": standing_by.get("prepared_first")}
 
 
 def is_unprotected(component: Mapping[str, Any]) -> bool:
     """It runs, and nobody could go on with what it does now."""
-    return component.get("role") == "primary" and component.get("protection") in ("none", "stopped")
+    checkpointed = component.get("protection") not in ("none", "stopped")
+    return component.get("role") == "primary" and (not checkpointed or _is_lacking(component))
+
+
+def _is_lacking(component: Mapping[str, Any]) -> bool:
+    """Its standby would refuse it, and no hook brings what is lacking."""
+    return bool(component.get("lacks")) and not component.get("prepared_first")
 
 
 def _robot_row(status: Mapping[str, Any], name: str, peer: Mapping[str, Any] | None) -> Row:
@@ -227,7 +238,8 @@ def _remarks_on(component: Mapping[str, Any]) -> list[str]:
         lines += [f"{robot}: {line}" if robot else line for line in notes if line not in lines]
         lines += [line for line in reasons[:REASONS_SHOWN] if not any(line in other for other in said)]
     seen = sight(component)
-    if seen.get("promise") and not seen.get("promise_differs") and (seen.get("state") == "degraded" or is_unprotected(seen)):
+    wanting = seen.get("state") == "degraded" or is_unprotected(seen)
+    if seen.get("promise") and not seen.get("promise_differs") and wanting and not _is_lacking(seen):
         lines.append(str(seen["promise"]))
     return [f"{component['name']}: {line}" for line in lines]
 
@@ -245,7 +257,7 @@ def is_healthy(status: Mapping[str, Any]) -> bool:
     living = [sight(component) for component in status["components"] if component.get("state") not in OVER_STATES]
     unwell = any(one.get("state") in BAD_STATES or not one.get("standby") or is_unprotected(one) for one in living)
     unwell |= any(
-        seen.get("cold") or seen.get("unstored") or (seen.get("lacks") and not seen.get("prepared_first"))
+        seen.get("cold") or seen.get("unstored") or _is_lacking(seen)
         for one in status["components"]
         for seen in (one, *(one.get("elsewhere") or {}).values())
     )

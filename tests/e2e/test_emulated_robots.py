@@ -118,8 +118,8 @@ def test_a_program_that_nobody_prepared_is_refused_there_by_name_and_goes_on(mix
     robots.run(first, "count", PYTHON, "-c", COUNTING)
     reason = f"it was taken on {platform.machine()}, this machine is {kind.processor}"
     robots.until(lambda: reason in robots.failover(first, "status").stdout, "the refusal", PATIENCE_S)
-    told = robots.failover(first, "status").stdout
-    assert "docs/decorator.md" in told and robots.component(first, "count")["protection"] != "protected"
+    told = robots.failover(first, "status")
+    assert "docs/decorator.md" in told.stdout and "running, unprotected" in told.stdout and told.returncode == 1, told
     refused = robots.failover(first, "handover", "count")
     assert refused.returncode == 1 and robots.component(first, "count")["role"] == "primary", refused
     until_it_goes_on(first, "count", len(counted(first, "count")))
