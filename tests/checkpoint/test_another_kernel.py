@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint.arch import cpu
+from checkpoint.arch import cpu, stubs
 from checkpoint.engines.restore_memory import content_at
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import procfs, vdso
@@ -38,8 +38,10 @@ Compiled = Callable[..., Path]
 
 FOREIGN = os.environ.get("FAILOVER_TEST_VDSO")
 """A file with the image of another kernel: its vdso64.so, or cut out of it."""
-BREAKPOINT = b"\xcc"
+BREAKPOINT = {"x86_64": b"\xcc", "aarch64": b"\x00\x00\x20\xd4"}[cpu.NAME]
 """An instruction that ends whoever comes to it."""
+READ_CLOCK = next(name for name in stubs.VDSO_CALLS if name.endswith("_clock_gettime"))
+"""What the C library's clock_gettime(2) calls."""
 ATTEMPTS = 400
 """Captures after which a program that reads clocks all the time has been met while it does."""
 
@@ -74,9 +76,9 @@ def written_over(snapshot: Snapshot, address: int, content: bytes) -> Snapshot:
 def with_deadly_functions(snapshot: Snapshot) -> Snapshot:
     """The same with an old vdso of which every instruction ends the program: nobody may come to it any more."""
     for function in functions_of(snapshot):
-        if function.name != "__vdso_getrandom":
+        if function.name in stubs.VDSO_CALLS:
             place = image_of(snapshot).start + function.offset
-            snapshot = written_over(snapshot, place, BREAKPOINT * function.size)
+            snapshot = written_over(snapshot, place, BREAKPOINT * (function.size // len(BREAKPOINT)))
     return snapshot
 
 
@@ -98,7 +100,7 @@ def captured_where(program: Program, *, inside: bool) -> Snapshot:
         for _ in range(ATTEMPTS):
             snapshot = captured_at_last(session, CaptureOrder())
             image = image_of(snapshot)
-            place = cpu.decode_registers(snapshot.threads[0].registers["prstatus"])["rip"]
+            place = cpu.decode_registers(snapshot.threads[0].registers["prstatus"])[cpu.INSTRUCTION_POINTER]
             if (image.start <= place < image.end) is inside:
                 return snapshot
     raise AssertionError(f"not met {'inside' if inside else 'outside'} the vdso in {ATTEMPTS} captures")
@@ -110,7 +112,7 @@ def test_a_program_of_another_kernel_reads_the_clocks_of_this_one(
 ) -> None:
     with ended(start_tracee(compiled("clock_reader", "-O2"), tmp_path)) as tracee:
         snapshot = outside_the_image(tracee)
-        assert {function.name for function in functions_of(snapshot)} >= {"__vdso_clock_gettime", "__vdso_time"}
+        assert {function.name for function in functions_of(snapshot)} >= {READ_CLOCK}
     with ended(restored(with_deadly_functions(change(snapshot)), tmp_path)) as tracee:
         tracee.tell()
         expect_ok(tracee)
@@ -140,12 +142,14 @@ def test_a_thread_that_was_just_reading_a_clock_reads_it_to_the_end(compiled: Co
 
 def test_a_thread_that_would_take_zeros_for_the_time_is_said_so(compiled: Compiled, tmp_path: Path) -> None:
     """It stands before the first instruction of time(2), which reads the kernel's data without looking whether they are good."""
+    if "__vdso_time" not in stubs.VDSO_CALLS:
+        pytest.skip("every function of this processor's image looks")
     with ended(start_tracee(compiled("clock_reader", "-O2"), tmp_path)) as tracee:
         snapshot = captured(tracee)
     (offset,) = (function.offset for function in functions_of(snapshot) if function.name == "__vdso_time")
     (thread,) = snapshot.threads
     registers = cpu.decode_registers(thread.registers["prstatus"])
-    registers |= {"rip": image_of(snapshot).start + offset, "rdi": 0, "orig_rax": cpu.NO_CALL}
+    registers |= {cpu.INSTRUCTION_POINTER: image_of(snapshot).start + offset, cpu.ARGUMENTS[0]: 0, cpu.CALL_NUMBER: cpu.NO_CALL}
     inside = replace(thread, registers={**thread.registers, "prstatus": cpu.encode_registers(registers)}, interrupted="")
     before = children()
     with pytest.raises(CheckpointError, match="reading a clock"):
@@ -168,7 +172,7 @@ def test_a_snapshot_without_the_old_image_is_said_so(compiled: Compiled, tmp_pat
 
 @pytest.fixture(params=["ours", "foreign"])
 def image(request: pytest.FixtureRequest) -> bytes:
-    """The image of a vdso: our own, and the one that FAILOVER_TEST_VDSO names, of any other kernel for x86-64."""
+    """The image of a vdso: our own, and the one that FAILOVER_TEST_VDSO names, of any other kernel for this processor."""
     if request.param == "ours":
         (line,) = (line for line in procfs.parse_maps(procfs.read_text(os.getpid(), "maps")) if line.name == "[vdso]")
         return Memory(os.getpid()).read(line.start, line.size)
@@ -199,12 +203,15 @@ def test_a_thread_comes_out_of_an_old_image_by_a_system_call(image: bytes, compi
     with ended(start_tracee(compiled("vdso_user", "-O2"), tmp_path)) as tracee:
         landed, reading = (int(word, 16) for word in tracee.output.split()[:2])
         snapshot = with_image(outside_the_image(tracee), image)
-    (offset,) = (function.offset for function in functions_of(snapshot) if function.name == "__vdso_clock_gettime")
+    (offset,) = (function.offset for function in functions_of(snapshot) if function.name == READ_CLOCK)
     (thread,) = snapshot.threads
     registers = cpu.decode_registers(thread.registers["prstatus"])
-    stack = registers["rsp"] - 1024 & ~15
-    registers |= {"rip": image_of(snapshot).start + offset, "rsp": stack, "rdi": time.CLOCK_MONOTONIC, "rsi": reading}
-    state = {**thread.registers, "prstatus": cpu.encode_registers(registers | {"orig_rax": cpu.NO_CALL})}
+    stack = registers[cpu.STACK_POINTER] - 1024 & ~15
+    registers |= {cpu.INSTRUCTION_POINTER: image_of(snapshot).start + offset, cpu.STACK_POINTER: stack}
+    registers |= {cpu.ARGUMENTS[0]: time.CLOCK_MONOTONIC, cpu.ARGUMENTS[1]: reading, cpu.CALL_NUMBER: cpu.NO_CALL}
+    if "x30" in registers:
+        registers["x30"] = landed
+    state = {**thread.registers, "prstatus": cpu.encode_registers(registers)}
     snapshot = written_over(snapshot, stack, landed.to_bytes(8, "little"))
     snapshot = replace(snapshot, threads=(replace(thread, registers=state, interrupted=""),))
     with ended(restored(snapshot, tmp_path)) as tracee:

@@ -1,5 +1,7 @@
 """A machine with another processor or kernel, under software emulation: made once, booted for tests, spoken to over loopback.
 
+python -m tests.machines.emulated KIND     says which packages it takes to make and emulate that one
+
 Debian for that processor with a kernel of its own choice, as files in one directory; nothing outside of it is changed. It takes
 root, and the packages of its kind. An emulated machine is some twenty times slower than a real one: what must be in time on
 a robot is not measured here.
@@ -14,6 +16,7 @@ import lzma
 import os
 import shutil
 import subprocess
+import sys
 import tarfile
 import time
 import tomllib
@@ -343,3 +346,7 @@ def _in_order(modules: Path) -> list[Path]:
 def _quoted(command: str) -> str:
     """Inside of single quotes."""
     return command.replace("'", "'\\''")
+
+
+if __name__ == "__main__":
+    print(PACKAGES, next(kind.packages for kind in KINDS if kind.name == sys.argv[1]))

@@ -6,7 +6,6 @@
 
 #include <linux/bpf.h>
 #include <linux/filter.h>
-#include <asm/ldt.h>
 #include <linux/io_uring.h>
 #include <linux/perf_event.h>
 #include <linux/userfaultfd.h>
@@ -15,7 +14,6 @@
 #include <pthread.h>
 #include <sys/fanotify.h>
 #include <sys/file.h>
-#include <sys/io.h>
 #include <sys/ioctl.h>
 #include <sys/pidfd.h>
 #include <sys/prctl.h>
@@ -23,6 +21,10 @@
 #include <sys/shm.h>
 #include <sys/socket.h>
 #include <sys/un.h>
+#ifdef __x86_64__
+#include <asm/ldt.h>
+#include <sys/io.h>
+#endif
 
 static const char *go;
 static int opened; /* what a kind that is a descriptor leaves here is looked at again at the end */
@@ -209,6 +211,7 @@ static void take_userfaultfd_registered(void) {
     if (ioctl(opened, UFFDIO_REGISTER, &range)) cannot("register memory");
 }
 
+#ifdef __x86_64__
 static void take_segments(void) {
     struct user_desc segment = {.entry_number = 1, .limit = 0xfffff, .seg_32bit = 1, .limit_in_pages = 1, .useable = 1};
     if (syscall(SYS_modify_ldt, 1, &segment, sizeof segment)) cannot("make a segment");
@@ -217,6 +220,10 @@ static void take_segments(void) {
 static void take_ports(void) {
     if (ioperm(0x80, 1, 1)) cannot("use an I/O port");
 }
+#else
+static void take_segments(void) { cannot("make a segment: this processor has none"); }
+static void take_ports(void) { cannot("use an I/O port: this processor has none"); }
+#endif
 
 static void take_flusher(void) {
     if (prctl(PR_SET_IO_FLUSHER, 1, 0, 0, 0)) cannot("write back for a file system");

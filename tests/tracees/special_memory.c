@@ -23,12 +23,20 @@ static void leap(int signal_number) {
 
 /* A signal handler runs with the rights that every thread begins with, and we leap out of it. */
 static unsigned rights(void) {
-    unsigned low, high;
-    __asm__ volatile("rdpkru" : "=a"(low), "=d"(high) : "c"(0));
+    unsigned low = 0;
+#ifdef __x86_64__
+    __asm__ volatile("rdpkru" : "=a"(low) : "c"(0) : "edx");
+#endif
     return low;
 }
 
-static void set_rights(unsigned low) { __asm__ volatile("wrpkru" : : "a"(low), "c"(0), "d"(0)); }
+static void set_rights(unsigned low) {
+#ifdef __x86_64__
+    __asm__ volatile("wrpkru" : : "a"(low), "c"(0), "d"(0));
+#else
+    (void)low;
+#endif
+}
 
 static int has_keys;
 
