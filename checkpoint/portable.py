@@ -28,8 +28,9 @@ def environment(given: Mapping[str, str], level: str) -> dict[str, str]:
     tunables = [one for one in given.get(TUNABLES, "").split(":") if one]
     others = [one for one in tunables if not one.startswith(f"{HWCAPS}=")]
     chosen = [one.partition("=")[2] for one in tunables if one.startswith(f"{HWCAPS}=")]
-    hwcaps = ",".join((*filter(None, chosen), arch.glibc_hwcaps(level)))
-    ours = {TUNABLES: ":".join((*others, f"{HWCAPS}={hwcaps}")), VARIABLE: level}
+    hwcaps = ",".join(filter(None, (*chosen, arch.glibc_hwcaps(level))))
+    tuned = (*others, *([f"{HWCAPS}={hwcaps}"] if hwcaps else []))
+    ours = {**({TUNABLES: ":".join(tuned)} if tuned else {}), VARIABLE: level}
     return {**arch.variables(level), **given, **ours}
 
 

@@ -1,9 +1,10 @@
 """Levels of aarch64 that a fleet of different processors can agree on, and how libraries are told to choose nothing beyond.
 
-Data only. A library that asks the processor by itself (getauxval) and has no variable for it is not told: the C library among
-them, whose choice changes nothing that a program keeps.
+Data only. A library that asks the processor by itself (getauxval) and has no variable for it is not told. What the C library
+and the run-time of the compiler choose so is a program's for good (`_CHOSEN_BY_ALL`), and a level cannot do without.
 
-Source: Arm Architecture Reference Manual; numpy's "CPU dispatcher"; OpenBLAS, driver/others/dynamic_arm64.c; OPENSSL_armcap.
+Source: Arm Architecture Reference Manual; numpy's "CPU dispatcher"; OpenBLAS, driver/others/dynamic_arm64.c; OPENSSL_armcap;
+libgcc, config/aarch64/lse-init.c; glibc, sysdeps/aarch64/multiarch/memcpy.c.
 """
 
 from __future__ import annotations
@@ -15,14 +16,16 @@ LEVELS: Final = (V8,)
 DEFAULT: Final = V8
 """What every 64-bit ARM processor has."""
 
-_FLAGS: Final = {V8: frozenset(["asimd", "fp"])}
+_CHOSEN_BY_ALL: Final = frozenset(["atomics", "mops"])
+"""By the atomic operations of whatever gcc has compiled, and by memcpy(3)."""
+_FLAGS: Final = {V8: frozenset(["asimd", "fp"]) | _CHOSEN_BY_ALL}
 """Names in /proc/cpuinfo."""
 _NUMPY_BEYOND: Final = {V8: "ASIMDHP ASIMDDP ASIMDFHM SVE"}
 _OPENBLAS: Final = {V8: "ARMV8"}
 
 
 def flags_of(level: str) -> frozenset[str]:
-    """Names in /proc/cpuinfo that a program of a level may rely on."""
+    """Names in /proc/cpuinfo that a program of a level may rely on where it was started."""
     return _FLAGS[level]
 
 

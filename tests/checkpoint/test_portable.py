@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from checkpoint import portable
+from checkpoint.arch import aarch64_levels, aarch64_stub, cpu
 from checkpoint.arch.x86_64_levels import flags_of
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import processor
@@ -24,6 +25,11 @@ Compiled = Callable[..., Path]
 LOOKED_AT = 0x300
 """Bytes of a function in which it would show what it is made of."""
 WIDE = re.compile(r"%[yz]mm")
+LEVEL, BEYOND = {
+    "x86_64": ("x86-64-v2", ("avx512f", "amx_tile", "sha512")),
+    "aarch64": ("armv8-a", ("asimddp", "bf16", "sha512")),
+}[cpu.NAME]
+"""A level, and instruction sets of processors that have more."""
 CHOICES = """
 import ctypes, glob, os
 import numpy
@@ -36,6 +42,10 @@ print(core().decode())
 """
 
 
+of_x86 = pytest.mark.skipif(cpu.NAME != "x86_64", reason="levels of x86-64")
+
+
+@of_x86
 def test_what_is_set_already_stays() -> None:
     mine = {"OPENBLAS_CORETYPE": "Core2", "GLIBC_TUNABLES": "glibc.malloc.check=3:glibc.cpu.hwcaps=-ERMS", "HOME": "/root"}
     found = portable.environment(mine, "x86-64-v3")
@@ -54,16 +64,34 @@ def test_the_level_is_found_again() -> None:
     assert portable.level_in(b"XFAILOVER_PORTABLE=x86-64-v2\0") == ""
 
 
+def test_of_a_processor_whose_c_library_takes_no_advice_what_is_set_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(portable, "arch", aarch64_levels)
+    found = portable.environment({"OPENBLAS_CORETYPE": "CORTEXA57"}, aarch64_levels.V8)
+    assert found["OPENBLAS_CORETYPE"] == "CORTEXA57" and portable.TUNABLES not in found
+    mine = {portable.TUNABLES: "glibc.malloc.check=3"}
+    assert portable.environment(mine, aarch64_levels.V8)[portable.TUNABLES] == "glibc.malloc.check=3"
+
+
 def test_each_level_has_what_the_one_below_has_and_more() -> None:
     for low, high in zip(portable.LEVELS, portable.LEVELS[1:], strict=False):
         assert flags_of(low) < flags_of(high)
 
 
+@of_x86
 def test_features_beyond_the_level_do_not_count() -> None:
     wide = ("avx", "avx2", "avx512f", "erms", "fpu", "sse4_2")
     assert portable.features_used(wide, "") == wide
     assert portable.lacking(portable.features_used(wide, "x86-64-v3"), ("avx", "sse4_2")) == ("avx2",)
     assert portable.lacking(portable.features_used(wide, "x86-64-v2"), ("sse4_2",)) == ()
+
+
+def test_what_every_library_chooses_by_itself_counts_at_every_level(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of aarch64: the atomic operations of its compilers."""
+    monkeypatch.setattr(portable, "arch", aarch64_levels)
+    monkeypatch.setattr(portable, "stubs", aarch64_stub)
+    used = portable.features_used(("asimd", "asimddp", "atomics", "fp", "sha512"), aarch64_levels.V8)
+    assert used == ("asimd", "atomics", "fp")
+    assert portable.lacking(used, ("asimd", "fp")) == ("atomics",)
 
 
 # --- With programs -----------------------------------------------------------------------------------------------------
@@ -125,8 +153,8 @@ def test_numpy_and_openblas_choose_no_code_beyond_the_level() -> None:
 @pytest.mark.root
 def test_a_portable_program_goes_on_where_a_processor_has_less(compiled: Compiled, tmp_path: Path) -> None:
     """Its snapshot asks for nothing beyond its level, so the widest processor's is good enough here; another program's is not."""
-    wide = tuple(sorted({*processor.features(), "avx512f", "amx_tile", "sha512"}))
-    for level, is_refused in (("x86-64-v2", False), ("", True)):
+    wide = tuple(sorted({*processor.features(), *BEYOND}))
+    for level, is_refused in ((LEVEL, False), ("", True)):
         directory = tmp_path / (level or "plain")
         directory.mkdir()
         environment = portable.environment({}, level) if level else {}

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from checkpoint.arch import stubs
 from checkpoint.linux.descriptors import NOT_YET, Copier, lending
 from checkpoint.linux.socket_questions import SO_ATTACH_FILTER, WORTH_SHARING, Asking, Subject, Told
 from checkpoint.model import Fact
@@ -119,6 +120,7 @@ def test_sockets_that_are_as_they_were_are_known(sockets: Sockets) -> None:
     assert facts == anew()
 
 
+@pytest.mark.skipif(not stubs.SECOND_LOOP, reason="this processor has no loop for a second thread")
 def test_of_many_sockets_a_second_thread_asks_half_and_of_few_none(sockets: Sockets, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1})
     onlooker = Onlooker()

@@ -22,6 +22,8 @@ from checkpoint.linux.second_thread import SecondThread
 from checkpoint.linux.socket_questions import WORTH_SHARING, Asking, Subject
 from checkpoint.resources import sockets
 
+pytestmark = pytest.mark.skipif(not stubs.SECOND_LOOP, reason="this processor has no loop for a second thread")
+
 COUNTS = (WORTH_SHARING - 1, WORTH_SHARING, WORTH_SHARING + 1, 3 * WORTH_SHARING)
 LIMIT_S = 60
 

@@ -108,7 +108,13 @@ _ARM: Final = Kind(
 _OF_DEBIAN: Final = (
     _ARM,  # follows written pages by write protection
     replace(_ARM, suite="bookworm"),  # 6.1: by digests
-    replace(_ARM, system="trixie", suite="trixie", kernel="linux-image-arm64-16k"),
+    replace(  # pages of 16 KiB, and a processor that has them, a Raspberry Pi 5's
+        _ARM,
+        system="trixie",
+        suite="trixie",
+        kernel="linux-image-arm64-16k",
+        emulator=("qemu-system-aarch64", "-M", "virt", "-cpu", "cortex-a76"),
+    ),
     Kind(  # 6.1: by the soft-dirty bit
         processor="x86_64",
         architecture="amd64",

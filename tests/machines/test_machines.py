@@ -17,7 +17,7 @@ from tests.machines.emulated import KINDS, Kind, Machine
 
 pytestmark = pytest.mark.timeout(7200)
 
-ENVIRONMENT = "PYTHONPATH=/opt/site:/root/failover PYTHONDONTWRITEBYTECODE=1"
+ENVIRONMENT = "PYTHONPATH=/opt/site:/root/failover"
 TESTS = (
     ("tests/checkpoint/test_processors.py", ""),
     ("tests/checkpoint/test_tracees.py", "heap or registers or mappings or advice or rseq or sigwait or sigsuspend"),
