@@ -75,12 +75,19 @@ class Interruption:
         """
         decoded = arch.decode_registers(registers)
         number = decoded[arch.NUMBER]
+        if tracee.is_as_found:
+            tracee.left_alone = b""
         if not tracee.is_as_found or (number != _RESTART and (self.begins_anew or not arch.may_go_on(decoded))):
             return registers
         if not entered_calls.is_before_a_call(tracee, decoded):
             return registers
         self._interrupted(decoded, number)
-        return registers if number == _RESTART or tracee.stopped_by else restart_blocks.shown(tracee, decoded)
+        if number != _RESTART and not tracee.stopped_by:
+            registers = restart_blocks.shown(tracee, decoded)
+            decoded = arch.decode_registers(registers)
+        if decoded[arch.NUMBER] == _RESTART:  # who gives itself everything back has the kernel forget what it would go on with
+            tracee.left_alone = arch.encode_registers(self._of_forgotten(decoded))
+        return registers
 
     def remembers(self, registers: bytes) -> bool:
         """Whether `settled` needs to ask the program nothing, for these registers as `Tracee.registers` gives them."""

@@ -85,7 +85,7 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
     """
     place, room = vdso_tail(tracee.memory, maps)
     hole = largest_hole(maps)
-    goes_on, vectors = resumed(arch.decode_registers(registers)), tracee.xstate()
+    goes_on, vectors = resumed(arch.decode_registers(tracee.left_alone or registers)), tracee.xstate()
     stub = arch.entry_code(place, _entry_calls(hole), goes_on, mask, patience_ns(tracee), vectors)
     if len(stub) > room:
         raise CaptureError(

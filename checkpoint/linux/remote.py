@@ -249,7 +249,7 @@ class Desk:
         self.is_known_idle = False
         tracee, registers, mask = guest
         patience = divmod(patience_ns(tracee), 10**9)
-        return _HEAD.pack(MAGIC, ARMED, 0, self._serial, mask, *patience, 0, *_going_on(registers))
+        return _HEAD.pack(MAGIC, ARMED, 0, self._serial, mask, *patience, 0, *_going_on(tracee.left_alone or registers))
 
     def is_done(self, table: bytes) -> bool:
         """Whether the calls have been made, by the table's bytes."""

@@ -103,6 +103,7 @@ class Tracee:
 
     Attributes:
         is_as_found: it stands where the program has come to by itself: nobody has set its registers since.
+        left_alone: the registers that it gives itself back if we die while it makes calls of ours; empty: those it stood with.
         stopped_by: the signal that had stopped its process when it stopped for us last (SIGSTOP, job control); 0: it ran.
 
     Args:
@@ -114,6 +115,7 @@ class Tracee:
         self.pid = pid
         self.memory = memory or Memory(pid)
         self.is_as_found = True
+        self.left_alone = b""
         self.stopped_by = 0
         self._registers = ctypes.create_string_buffer(REGISTERS_SIZE)
         self._xstate = ctypes.create_string_buffer(SET_SIZE)

@@ -222,6 +222,47 @@ def test_a_keeper_that_is_late_with_its_first_entry_does_no_harm_either(worker: 
     expect_undisturbed(worker)
 
 
+@pytest.mark.parametrize("late", ["the first entry", "a batch"])
+def test_a_sleep_is_not_cut_short_where_a_keeper_is_late(late: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor where it dies: the thread gives itself everything back, and the kernel remembers no sleep any more by then."""
+    with ended(start([sys.executable, "-c", SLEEPER], tmp_path)) as program:
+        program.wait_for_line("ready")
+        program.wait_until(lambda: procfs.stat(program.pid).state == "S", "it to sleep")
+        if late == "a batch":
+            with protected(program) as session:
+                monkeypatch.setattr(remote, "_tables_when_done", too_late(remote._tables_when_done))
+                with pytest.raises(CaptureError, match="has run on while it was looked at"):
+                    session.capture(CaptureOrder(base=True, generation=1, sequence=1))
+        else:
+            monkeypatch.setattr(entry, "_wait_in_call", too_late(entry._wait_in_call))
+            with pytest.raises(CaptureError, match="has run on while it was looked at"):
+                ENGINE.protect(program.pid, ProtectOrder("/test/sleeper")).close()
+        assert program.finish() == 0, program.output
+        assert program.output.splitlines() == ["ready", "0 True"]
+
+
+SLEEPER = """
+import ctypes, time
+libc, seconds = ctypes.CDLL(None), 5
+asked, remaining = (ctypes.c_long * 2)(seconds, 0), (ctypes.c_long * 2)()
+print("ready", flush=True)
+began = time.monotonic()
+result = libc.nanosleep(asked, remaining)
+print(result, time.monotonic() - began >= seconds, flush=True)
+"""
+
+
+def too_late(genuine: Callable[..., Any]) -> Callable[..., Any]:
+    """The same, until whoever makes calls of ours has gone on by itself."""
+
+    def act(*arguments: Any) -> Any:
+        answer = genuine(*arguments)
+        time.sleep(3 * cpu.ENTRY_TIMEOUT_NS / 1e9)
+        return answer
+
+    return act
+
+
 def test_a_program_that_is_stopped_does_not_run_because_a_keeper_is_late(
     worker: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
