@@ -11,6 +11,12 @@
 #include <stddef.h>
 #include <sys/prctl.h>
 
+#ifdef __aarch64__
+#define NATIVE_CALLS AUDIT_ARCH_AARCH64
+#else
+#define NATIVE_CALLS AUDIT_ARCH_X86_64
+#endif
+
 #define CALL(number, verdict) \
     BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, number, 0, 1), BPF_STMT(BPF_RET | BPF_K, verdict)
 #define LOAD(field) BPF_STMT(BPF_LD | BPF_W | BPF_ABS, offsetof(struct seccomp_data, field))
@@ -26,7 +32,7 @@ static int install(struct sock_filter *code, unsigned short length, unsigned fla
 
 /* getppid answers EXDEV; what only a tracer has us do kills. */
 static int install_deadly(unsigned flags) {
-    return INSTALL(flags, LOAD(arch), BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, AUDIT_ARCH_X86_64, 1, 0),
+    return INSTALL(flags, LOAD(arch), BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, NATIVE_CALLS, 1, 0),
                    BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_KILL_PROCESS), LOAD(nr),
                    CALL(SYS_getppid, SECCOMP_RET_ERRNO | EXDEV), CALL(SYS_prctl, SECCOMP_RET_KILL_PROCESS),
                    CALL(SYS_rt_sigaction, SECCOMP_RET_KILL_PROCESS), CALL(SYS_rt_sigtimedwait, SECCOMP_RET_KILL_PROCESS),
