@@ -113,7 +113,7 @@ class RestoredProgram:
         try:
             for threads in everybody:
                 for tracee in (*threads.others, threads.leader):
-                    tracee.request("let go of", abi.PTRACE_SETOPTIONS, 0, 0)
+                    tracee.may_outlive_us()
         finally:
             for threads in everybody:
                 threads.thaw()

@@ -77,7 +77,7 @@ class Interruption:
         number = decoded[arch.NUMBER]
         if tracee.is_as_found:
             tracee.left_alone = b""
-        if not tracee.is_as_found or (number != _RESTART and (self.begins_anew or not arch.may_go_on(decoded))):
+        if not tracee.is_as_found or (number != _RESTART and not arch.may_go_on(decoded)):
             return registers
         if not entered_calls.is_before_a_call(tracee, decoded):
             return registers
@@ -85,8 +85,13 @@ class Interruption:
         if number != _RESTART and not tracee.stopped_by:
             registers = restart_blocks.shown(tracee, decoded)
             decoded = arch.decode_registers(registers)
-        if decoded[arch.NUMBER] == _RESTART:  # who gives itself everything back has the kernel forget what it would go on with
-            tracee.left_alone = arch.encode_registers(self._of_forgotten(decoded))
+        if decoded[arch.NUMBER] != _RESTART:
+            return registers
+        anew = arch.encode_registers(self._of_forgotten(decoded))
+        if self.begins_anew and not tracee.is_as_found:
+            tracee.set_registers(anew)
+            return anew
+        tracee.left_alone = anew  # who gives itself everything back has the kernel forget what it would go on with
         return registers
 
     def remembers(self, registers: bytes) -> bool:
@@ -175,10 +180,14 @@ class Interruptions:
 
     def mend(self, tracee: Tracee) -> None:
         """Let a thread that stands still, and has not been given registers, go on as if it had not been stopped."""
+        interruption = self.of(tracee)
+        if arch.FORGETS_CALLS and interruption.begins_anew:
+            tracee.suspend_filters()
+            interruption.going_on(tracee, tracee.registers())
         found = arch.decode_registers(tracee.registers())
         if arch.FORGETS_CALLS:
             found = ended_calls.told(tracee, found)
-        mended = self.of(tracee).undisturbed(found)
+        mended = interruption.undisturbed(found)
         if mended != found:
             tracee.set_registers(arch.encode_registers(mended))
 

@@ -54,7 +54,7 @@ def spawn(leader: Tracee, registers: bytes, base: int, tid: int) -> Tracee:
     Raises:
         RestoreError: that id cannot be had.
     """
-    thread = Tracee(_birth(leader, registers, base, (FLAGS, 0, tid), f"thread {tid}"), leader.memory)
+    thread = leader.child(_birth(leader, registers, base, (FLAGS, 0, tid), f"thread {tid}"), leader.memory)
     thread.wait(call_table.RUN_TIMEOUT_S)
     return thread
 
@@ -69,14 +69,14 @@ def spawn_process(parent: Tracee, registers: bytes, base: int, pid: int, exit_si
     Raises:
         IdInUseError: somebody has that id.
     """
-    process = Tracee(_birth(parent, registers, base, (flags, exit_signal, pid), f"process {pid}"))
+    process = parent.child(_birth(parent, registers, base, (flags, exit_signal, pid), f"process {pid}"))
     process.wait(call_table.RUN_TIMEOUT_S)
     return process
 
 
 def spawn_any(parent: Tracee, registers: bytes, base: int) -> Tracee:
     """Have a process give birth to one with whatever id, of whose end it is told by no signal. As `spawn`."""
-    process = Tracee(_birth(parent, registers, base, (0, 0, ANY_ID), "stand-in for a process that has ended"))
+    process = parent.child(_birth(parent, registers, base, (0, 0, ANY_ID), "stand-in for a process that has ended"))
     process.wait(call_table.RUN_TIMEOUT_S)
     return process
 

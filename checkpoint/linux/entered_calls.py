@@ -10,8 +10,9 @@ A signal that comes on the way shows itself by a stop of its own. It is put back
 blocked by then. *Killed between that and the call:* the thread goes on with every signal blocked; some ten µs, and only then.
 
 Whoever is let go where a call begins starts it as if a signal had come. The kernel makes most calls again by itself then; those
-of `ENDED_BY_A_STOP` would end with EINTR. Such a one is not begun: the thread is brought to its end, with what says that it
-is to be made again unless a handler runs. Nothing but the kernel looks at that.
+of `ENDED_BY_A_STOP` would end with EINTR, and it goes on with a sleep by restart_syscall(2), which a filter may forbid. Such a
+one is not begun: the thread is brought to its end, with what says that it is to be made again unless a handler runs. Nothing
+but the kernel looks at that.
 
 Source: ptrace(2), "Syscall-stops"; kernel/ptrace.c, __ptrace_unlink(); kernel/signal.c, ptrace_signal();
 arch/arm64/kernel/signal.c, do_signal(), and syscall.c, el0_svc_common(): no call is made where its number is -1 by then.
@@ -44,7 +45,7 @@ def enter(tracee: Tracee) -> None:
     registers = arch.decode_registers(tracee.registers())
     if tracee.stopped_by or not is_before_a_call(tracee, registers):
         return
-    tracee.request("set options of", abi.PTRACE_SETOPTIONS, 0, abi.PTRACE_O_TRACESYSGOOD)
+    tracee.mark_calls()
     stop = _step(tracee)
     while stop.event and stop.signal == signal.SIGTRAP:  # it had been asked to stop twice
         stop = _step(tracee)
@@ -54,15 +55,16 @@ def enter(tracee: Tracee) -> None:
         while stop.is_delivery:
             stop = _step(tracee, stop.signal)
         tracee.set_signal_mask(mask)
-    if _is_ended_by_a_stop(registers):
+    if _suffers_from_a_stop(registers, is_confined=tracee.is_confined):
         _leave_as_stopped(tracee, registers)
 
 
-def _is_ended_by_a_stop(registers: Registers) -> bool:
+def _suffers_from_a_stop(registers: Registers, *, is_confined: bool) -> bool:
     """Whether the next call is such a one: a socket's, if it bears a mark, for only those with a timeout are marked."""
     name = arch.SYSCALL_NAMES.get(registers[arch.NUMBER] & 0xFFFFFFFF, "")
     is_marked = bool(registers[arch.ARGUMENTS[0]] >> 32)
-    return name in arch.ENDED_BY_A_STOP or (name in arch.SOCKET_TIMEOUT and is_marked)
+    may_be_forbidden = is_confined and name in arch.RESTART_BLOCK_USERS
+    return name in arch.ENDED_BY_A_STOP or (name in arch.SOCKET_TIMEOUT and is_marked) or may_be_forbidden
 
 
 def _leave_as_stopped(tracee: Tracee, registers: Registers) -> None:

@@ -116,6 +116,7 @@ class Tracee:
         self.memory = memory or Memory(pid)
         self.is_as_found = True
         self.left_alone = b""
+        self._options = 0
         self.stopped_by = 0
         self._registers = ctypes.create_string_buffer(REGISTERS_SIZE)
         self._xstate = ctypes.create_string_buffer(SET_SIZE)
@@ -166,6 +167,17 @@ class Tracee:
                 raise
             raise CaptureError(f"{error}: it is ours since an earlier look, until it stops; capture it again") from error
         self.is_as_found = True
+        self._options = options & abi.PTRACE_O_SUSPEND_SECCOMP
+
+    def child(self, pid: int, memory: Memory | None = None) -> Tracee:
+        """One that it has given birth to, which is ours with the same options."""
+        child = Tracee(pid, memory)
+        child._options = self._options
+        return child
+
+    def may_outlive_us(self) -> None:
+        """Have it not be killed when we die, nor stop for us in ways that were asked for; filters that are suspended stay so."""
+        self.request("let go of", abi.PTRACE_SETOPTIONS, 0, self._options)
 
     def interrupt(self) -> None:
         """Ask it to stop; `wait` tells when it has."""
@@ -382,6 +394,16 @@ class Tracee:
     def suspend_filters(self) -> None:
         """Have no seccomp filter, nor strict mode, judge its calls until it is let go: that ends by itself then."""
         self.request("suspend the seccomp filters of", abi.PTRACE_SETOPTIONS, 0, abi.PTRACE_O_SUSPEND_SECCOMP)
+        self._options = abi.PTRACE_O_SUSPEND_SECCOMP
+
+    @property
+    def is_confined(self) -> bool:
+        """Whether its filters judge its calls again when it is let go."""
+        return bool(self._options)
+
+    def mark_calls(self) -> None:
+        """Have its stops at the beginning and the end of calls be marked (`CALL_STOP`); filters that are suspended stay so."""
+        self.request("set options of", abi.PTRACE_SETOPTIONS, 0, abi.PTRACE_O_TRACESYSGOOD | self._options)
 
     def filter_at(self, number: int) -> tuple[bytes, int] | None:
         """One of its seccomp filters: instructions (struct sock_filter), and flags as far as the kernel tells them.
