@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint.arch.x86_64_stub import SYSTEM_CALLS
+from checkpoint.arch import stubs
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
@@ -65,7 +65,7 @@ def test_a_deleted_file_gets_no_attribute_that_takes_more_than_its_user_may() ->
     attributes: dict[str, Fact] = {"user.colour": b"red", "security.capability": b"all", "trusted.overlay.opaque": b"y"}
     facts: dict[str, Fact] = {"path": "/gone", "flags": 0, "size": 0, "content": [], "mode": 0o100755, "attributes": attributes}
     rebuild._finish(table, 3, Resource("files", "fd 3", facts), 0o100755)
-    given = [call for call in table.calls if call.number == SYSTEM_CALLS["setxattr"]]
+    given = [call for call in table.calls if call.number == stubs.SYSTEM_CALLS["setxattr"]]
     assert len(given) == 1
     assert b"user.colour" in table.content and b"security." not in table.content
 
@@ -84,7 +84,7 @@ def test_nothing_is_made_as_root_for_somebody_else(facts: dict[str, Fact]) -> No
         table = CallTable(0x10000)
         with as_whom(table, Resource("unix_sockets", "fd 3", facts)):
             before = [(call.number, call.arguments[:2]) for call in table.calls]
-        assert (SYSTEM_CALLS["setresuid"], (1000, 1000)) in before
+        assert (stubs.SYSTEM_CALLS["setresuid"], (1000, 1000)) in before
 
 
 def by_node(table: CallTable, path: str) -> None:
@@ -103,7 +103,7 @@ def by_named_pipe(table: CallTable, path: str) -> None:
 def test_the_mode_is_given_to_what_was_made_and_not_to_its_name(make: Callable[[CallTable, str], None], tmp_path: Path) -> None:
     table = CallTable(0x10000)
     make(table, str(tmp_path / "made"))
-    (given,) = (call for call in table.calls if call.number == SYSTEM_CALLS["fchmodat"])
+    (given,) = (call for call in table.calls if call.number == stubs.SYSTEM_CALLS["fchmodat"])
     offset = given.arguments[1] - (table.place(b"") - len(table.content))
     assert bytes(table.content)[offset:].startswith(b"/proc/self/fd/")
 
@@ -115,5 +115,5 @@ def test_a_netlink_socket_is_opened_by_whom_it_belongs_to(owner: int, expected: 
     facts |= {"port": 0, "groups": [], "peer": [], "flags": 2}
     table = CallTable(0x10000)
     netlink_sockets.prepare(table, [Resource("netlink_sockets", "fd 3", facts)], 10, Disguise(vessel, process(), True, 1))
-    names = {number: name for name, number in SYSTEM_CALLS.items()}
+    names = {number: name for name, number in stubs.SYSTEM_CALLS.items()}
     assert [names[call.number] for call in table.calls][: len(expected)] == expected

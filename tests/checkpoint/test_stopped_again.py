@@ -22,12 +22,10 @@ from tests.checkpoint.test_trees import three_lives
 
 pytestmark = pytest.mark.root
 
-TGKILL = 234
 PATIENCE_S = 60.0
 
 STOPS = """
 import ctypes, threading
-TGKILL = 234
 libc = ctypes.CDLL(None, use_errno=True)
 
 def run_several():
@@ -48,7 +46,7 @@ def stop_again_and_again(pid):
     os.kill(pid, signal.SIGSTOP)
     wait_until(lambda: states_of(pid) == {"T"})
     for tid in threads_of(pid):
-        expect("the second stop", libc.syscall(TGKILL, pid, tid, signal.SIGSTOP), 0)
+        expect("the second stop", libc.tgkill(pid, tid, signal.SIGSTOP), 0)
     os.kill(pid, signal.SIGSTOP)
 """
 
@@ -136,7 +134,7 @@ def test_no_call_made_inside_a_stopped_program_meets_a_stop_that_waits() -> None
         os.kill(child.pid, signal.SIGSTOP)
         wait_until(lambda: procfs.stat(child.pid).state == "T")
         for tid in os.listdir(f"/proc/{child.pid}/task"):
-            assert ctypes.CDLL(None).syscall(TGKILL, child.pid, int(tid), signal.SIGSTOP) == 0
+            assert ctypes.CDLL(None).tgkill(child.pid, int(tid), signal.SIGSTOP) == 0
         os.kill(child.pid, signal.SIGSTOP)
         assert waiting_stops(child.pid) == 3
         threads = Threads(Tracee(child.pid))
