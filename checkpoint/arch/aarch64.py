@@ -283,6 +283,8 @@ _NO_STACK: Final = 7
 """Flags of an alternate stack that are none: rt_sigreturn(2) leaves the one that there is."""
 _PLACES: Final = {name: _GENERAL_OF_FRAME + 8 * index for index, name in enumerate((*_GENERAL, "sp", "pc", "pstate"))}
 _SCRATCH: Final = 9
+_STORES_BEFORE: Final = 0xD5033ABF
+"""``dmb ishst``: whoever sees a later store sees every earlier one."""
 
 
 class _Code:
@@ -353,6 +355,10 @@ class _Code:
         return address - (self._address + len(self.content))
 
 
+SHOWS_STORES_IN_ORDER: Final = False
+"""Whether who reads what a thread has stored last sees what that one stored before, without asking a second time."""
+
+
 def batch_code(address: int, calls: Sequence[Call], places: TablePlaces) -> bytes:
     """The batch: every call once, then wait for the tracer, then (nobody came) give everything back and go on.
 
@@ -366,6 +372,7 @@ def batch_code(address: int, calls: Sequence[Call], places: TablePlaces) -> byte
         code.store(0)
     code.load(0, places.serial)
     code.place(_SCRATCH, places.done)
+    code.emit(_STORES_BEFORE)
     code.store(0)
     code.call(SYSCALLS["rt_sigtimedwait"], (places.empty_set, 0, places.timeout, 8))
     _fill_frame(code, places)

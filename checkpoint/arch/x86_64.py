@@ -295,6 +295,10 @@ class _Code:
         self.content += bytes((0x48 | (number >> 3) << 2, opcode, (number & 7) << 3 | 5)) + struct.pack("<i", displacement)
 
 
+SHOWS_STORES_IN_ORDER: Final = True
+"""Whether who reads what a thread has stored last sees what that one stored before, without asking a second time."""
+
+
 def batch_code(address: int, calls: Sequence[Call], places: TablePlaces) -> bytes:
     """The batch: every call once, then wait for the tracer, then (nobody came) give everything back and go on.
 

@@ -432,8 +432,8 @@ class ProcessRestore:
         *places, image = self._foreign
         instruction = self._syscall_instruction(self._vdso, self._vdso_size)
 
-        def protect(protection: int) -> None:
-            for place in places:
+        def protect(protection: int, mappings: Sequence[Vma] = places) -> None:
+            for place in mappings:
                 self._single(instruction, "mprotect", place.start, place.size, protection)
 
         def led_out(thread: ThreadState) -> ThreadState:
@@ -443,8 +443,10 @@ class ProcessRestore:
             protect(abi.PROT_NONE)
             return replace(thread, registers={**thread.registers, "prstatus": outside}, interrupted="")
 
+        protect(abi.PROT_READ | abi.PROT_EXEC, [image])
         self._state = replace(self._state, threads=tuple(map(led_out, self._state.threads)))
         self._thread = self._state.threads[0]
+        protect(abi.PROT_READ | abi.PROT_WRITE, [image])
         protect(abi.PROT_READ)
 
     def _mappings_table(self, table: CallTable, vessel: Vessel, mappings: tuple[procfs.MapsLine, ...], refuge: int) -> CallTable:

@@ -287,7 +287,12 @@ def _map(table: CallTable, vma: Vma, protection: int, descriptor: int) -> None:
 
 
 def first_protection(vma: Vma, carried: Carried) -> int:
-    return vma.protection | (abi.PROT_READ | abi.PROT_WRITE if carried.within(vma) else 0)
+    """That of a mapping while its pages are written: `settle` gives it its own.
+
+    No instruction runs there by then: a processor whose caches do not see what is written among instructions (aarch64) is told
+    by the kernel when a page becomes one of instructions, and not when it is written to afterwards.
+    """
+    return (vma.protection | abi.PROT_READ | abi.PROT_WRITE) & ~abi.PROT_EXEC if carried.within(vma) else vma.protection
 
 
 class Carried:

@@ -448,12 +448,11 @@ def _tables_when_done(memory: Memory, desks: Sequence[Desk], end: int) -> list[b
         CaptureError: they were not, in time.
     """
     began = time.perf_counter()
-    size = desks[0].size
     while True:
-        raw = memory.read(desks[0].table, (len(desks) - 1) * size + end)
-        tables = [raw[place * size : (place + 1) * size] for place in range(len(desks))]
+        tables = _tables(memory, desks, end)
         if all(desk.is_done(table) for desk, table in zip(desks, tables, strict=True)):
-            return tables
+            # that they are done may have been read before what they stored
+            return tables if arch.SHOWS_STORES_IN_ORDER else _tables(memory, desks, end)
         waited = time.perf_counter() - began
         if waited > BATCH_TIMEOUT_S:
             raise CaptureError(
@@ -461,6 +460,12 @@ def _tables_when_done(memory: Memory, desks: Sequence[Desk], end: int) -> list[b
                 "cgroup, or higher priorities leave it no processor; capture it again when it runs"
             )
         rest(waited)
+
+
+def _tables(memory: Memory, desks: Sequence[Desk], end: int) -> list[bytes]:
+    size = desks[0].size
+    raw = memory.read(desks[0].table, (len(desks) - 1) * size + end)
+    return [raw[place * size : (place + 1) * size] for place in range(len(desks))]
 
 
 def give_back(tracee: Tracee, registers: bytes, mask: int, is_ours: Callable[[int], bool]) -> Registers:
