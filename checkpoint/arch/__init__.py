@@ -22,8 +22,10 @@ __all__ = ["SUPPORTED", "cpu", "extended", "levels", "number_of", "stubs", "why_
 
 KNOWN: Final = ("x86_64", "aarch64")
 """Those that there are files for, as uname(2) calls them."""
-UNPROVED: Final = ("aarch64",)
+UNPROVED: Final[tuple[str, ...]] = ()
 """Those of them on which not everything has been seen to work yet."""
+EMULATED: Final = ("aarch64",)
+"""Those of them that were seen to work under software emulation only, no machine being at hand."""
 TRY_UNPROVED: Final = "FAILOVER_TRY_UNPROVED_PROCESSOR"
 """Variable of the environment by which those who complete one run it; never for a program that matters."""
 SUPPORTED: Final = tuple(name for name in KNOWN if name not in UNPROVED or os.environ.get(TRY_UNPROVED))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from checkpoint.arch import cpu
+from checkpoint.arch import EMULATED, cpu
 from checkpoint.channel import Capture, Captured, Protect, Protected, Release, Released
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import vessel
@@ -82,7 +82,8 @@ def _architecture() -> Offer:
     machine, kernel = platform.machine(), platform.release()
     if reason := why_unsupported():
         return Offer("missing", "processor", reason)
-    return Offer("good", "processor", f"{machine}, Linux {kernel}")
+    seen = "; so far its kind was seen to work on emulated machines only (docs/machines.md)" if machine in EMULATED else ""
+    return Offer("good", "processor", f"{machine}, Linux {kernel}{seen}")
 
 
 def _looking_into() -> list[Offer]:
