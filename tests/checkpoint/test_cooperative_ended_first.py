@@ -84,7 +84,7 @@ def program(tmp_path: Path) -> Iterator[Program]:
     file = tmp_path / "program.py"
     file.write_text(PROGRAM)
     command = [sys.executable, "-u", str(file)]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(ROOT), os.environ.get("PYTHONPATH", "")))}
     with subprocess.Popen(command, stdin=-1, stdout=-1, text=True, env=environment) as process:
         try:
             yield Program(process, file)

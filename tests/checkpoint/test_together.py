@@ -41,7 +41,6 @@ print("ready", flush=True)
 while os.read(here, 1):
     print("heard", flush=True)
 """
-TGKILL = 234
 
 
 @pytest.fixture
@@ -106,7 +105,7 @@ def test_a_signal_that_comes_before_the_stop_is_delivered(
     ask = Together.ask_to_stop
 
     def ask_after_a_signal(self: Together, tids: list[int]) -> list[bool]:
-        assert ctypes.CDLL(None).syscall(TGKILL, program.pid, tids[-1], signal.SIGUSR1) == 0
+        assert ctypes.CDLL(None).tgkill(program.pid, tids[-1], signal.SIGUSR1) == 0
         program.wait_until(lambda: "t" in states(program.pid), "a thread that stands for a signal")
         return ask(self, tids) if is_seen else [Tracee(tid).interrupt() is None for tid in tids]
 
