@@ -89,6 +89,10 @@ def test_a_layout_survives_its_way_through_bytes() -> None:
     assert xstate.decode_layout(b"torn") == ()
 
 
+of_x86 = pytest.mark.skipif(os.uname().machine != "x86_64", reason="registers of x86-64")
+
+
+@of_x86
 def test_this_processor_tells_its_layout() -> None:
     layout = processor.xstate_layout()
     assert layout[0] == Component(2, 576, 256)  # AVX, the same everywhere
@@ -117,6 +121,7 @@ def snapshot(compiled: Compiled, tmp_path: Path) -> Snapshot:
         return captured_and_killed(tracee)
 
 
+@of_x86
 @pytest.mark.compiler
 @pytest.mark.root
 def test_a_program_comes_to_a_narrower_processor_with_its_registers(snapshot: Snapshot, tmp_path: Path) -> None:
@@ -126,6 +131,7 @@ def test_a_program_comes_to_a_narrower_processor_with_its_registers(snapshot: Sn
         expect_ok(tracee)
 
 
+@of_x86
 @pytest.mark.compiler
 @pytest.mark.root
 def test_a_program_that_is_using_what_this_processor_lacks_is_said_so(snapshot: Snapshot, tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def stub_in_a_vessel() -> Iterator[Stub]:
         mappings = procfs.parse_maps(procfs.read_text(born.pid, "maps"))
         stub = Stub(tracee, call_table.find_hole([(line.start, line.end) for line in mappings], AREA_SIZE))
         vdso = kernel_pages(mappings)[-1]
-        stub.install(vdso.start + tracee.memory.read(vdso.start, vdso.size).find(b"\x0f\x05"), MIB)
+        stub.install(vdso.start + cpu.call_in(tracee.memory.read(vdso.start, vdso.size)), MIB)
         yield stub
     finally:
         vessel.discard(born)
@@ -72,8 +72,8 @@ def test_single_calls_work_while_every_signal_is_blocked_and_ignored() -> None:
         tracee.set_signal_mask(abi.ALL_SIGNALS)
         mappings = procfs.parse_maps(procfs.read_text(tracee.pid, "maps"))
         vdso = kernel_pages(mappings)[-1]
-        place = vdso.start + tracee.memory.read(vdso.start, vdso.size).find(b"\x0f\x05")
-        umask = 95
+        place = vdso.start + cpu.call_in(tracee.memory.read(vdso.start, vdso.size))
+        umask = {"x86_64": 95, "aarch64": 166}[cpu.NAME]
         call_table.single_call(tracee, registers, place, umask, 0o77)
         assert call_table.single_call(tracee, registers, place, umask, 0o22) == 0o77
         assert procfs.status(tracee.pid).caught >> (signal.SIGTRAP - 1) & 1 == 0
