@@ -1,6 +1,7 @@
 """A machine with another processor or kernel, under software emulation: made once, booted for tests, spoken to over loopback.
 
-python -m tests.machines.emulated KIND     says which packages it takes to make and emulate that one
+python -m tests.machines.emulated KIND                says which packages it takes to make and emulate that one
+python -m tests.machines.emulated KIND DIRECTORY      makes it there, for FAILOVER_TEST_MACHINES_DIRECTORY
 
 Debian for that processor with a kernel of its own choice, as files in one directory; nothing outside of it is changed. It takes
 root, and the packages of its kind. An emulated machine is some twenty times slower than a real one: what must be in time on
@@ -354,5 +355,15 @@ def _quoted(command: str) -> str:
     return command.replace("'", "'\\''")
 
 
+def _main(name: str, *directory: str) -> None:
+    kind = next(kind for kind in KINDS if kind.name == name)
+    if not directory:
+        print(PACKAGES, kind.packages)
+        return
+    if reason := kind.lacking():
+        sys.exit(f"cannot make {name}: it {reason}")
+    Machine(kind, Path(*directory) / name, 0).make()
+
+
 if __name__ == "__main__":
-    print(PACKAGES, next(kind.packages for kind in KINDS if kind.name == sys.argv[1]))
+    _main(*sys.argv[1:])
