@@ -4,6 +4,9 @@ There the result has taken the place of the first argument, and the kernel tells
 the argument: it tells that of whatever call it is told the thread stands in. So for a moment it is told the number that the
 program has called by, which is in a register still.
 
+Newer kernels (6.12.117, not 6.12.95) tell the result there instead. So each thread is looked at just before it is stopped, too:
+who waits in a call then, and has come out of the very same one, stack and all other arguments alike, was in that.
+
 What looks alike and is not: a thread that has just come back from the handler of a signal which had ended the call. It is known
 by the argument, which is that of the return from a handler, and hardly ever fits the call.
 
@@ -24,8 +27,18 @@ from checkpoint.linux import procfs
 from checkpoint.linux.tracee import Tracee
 
 _NUMBER: Final = struct.Struct("<i")
+_WORDS: Final = 9
+"""Of /proc/PID/syscall for one that waits in a call: number, six arguments, stack and instruction pointer."""
 EPOLL: Final = "anon_inode:[eventpoll]"
 """What a descriptor of epoll_create(2) is called in /proc/PID/fd."""
+
+
+def look(tracee: Tracee) -> None:
+    """Note in what a thread waits that is about to be stopped; one that runs, has ended or may not be looked at is in nothing."""
+    try:
+        tracee.waited_in = procfs.read_text(tracee.pid, "syscall")
+    except CheckpointError:
+        tracee.waited_in = ""
 
 
 def told(tracee: Tracee, registers: Registers) -> Registers:
@@ -47,6 +60,8 @@ def told(tracee: Tracee, registers: Registers) -> Registers:
     if not _holds(tracee, before, arch.SYSCALL):
         return registers
     first = _first_argument(tracee, number)
+    if first == registers[arch.RESULT]:
+        first = _first_before(tracee, number, registers)
     if first is None:
         return registers
     found = arch.recalled(registers, number, first)
@@ -63,6 +78,16 @@ def _first_argument(tracee: Tracee, number: int) -> int | None:
     finally:
         tracee.set_register_set(arch.CALL_SET, known)
     return int(words[1], 16) if len(words) > 2 and words[0] == str(number) else None
+
+
+def _first_before(tracee: Tracee, number: int, registers: Registers) -> int | None:
+    """The first argument of the call that it waited in before the stop; None if that was another one."""
+    words = tracee.waited_in.split()
+    if len(words) != _WORDS or words[0] != str(number):
+        return None
+    first, *others = (int(word, 16) for word in words[1:])
+    same = (*arch.ARGUMENTS[1:], arch.STACK_POINTER, arch.INSTRUCTION_POINTER)
+    return first if others == [registers[name] for name in same] else None
 
 
 def _fits(tracee: Tracee, name: str, first: int) -> bool:

@@ -32,7 +32,7 @@ from typing import Any, Final
 
 from checkpoint.arch import cpu as arch
 from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError
-from checkpoint.linux import entered_calls, procfs, second_stops
+from checkpoint.linux import ended_calls, entered_calls, procfs, second_stops
 from checkpoint.linux.burial import Burial, bury
 from checkpoint.linux.tasks import thread_count, thread_ids
 from checkpoint.linux.together import Together
@@ -207,6 +207,9 @@ class Threads:
     def _stop(self, tids: list[int], deadline: float) -> set[int]:
         """Stop these; those that have ended instead."""
         ended: set[int] = set()
+        if arch.FORGETS_CALLS:
+            for tid in tids:
+                ended_calls.look(self._tracee(tid))
         with self._watched(tids):
             seized = self._seize_together(tids) if len(tids) >= FEW else set[int]()
             asked = [tid for tid in tids if tid in seized or self._unless_ended(self._seize, tid, ended)]

@@ -104,6 +104,7 @@ class Tracee:
     Attributes:
         is_as_found: it stands where the program has come to by itself: nobody has set its registers since.
         left_alone: the registers that it gives itself back if we die while it makes calls of ours; empty: those it stood with.
+        waited_in: its /proc/TID/syscall just before it was stopped, where it is looked at (`ended_calls`); "" otherwise.
         stopped_by: the signal that had stopped its process when it stopped for us last (SIGSTOP, job control); 0: it ran.
 
     Args:
@@ -116,6 +117,7 @@ class Tracee:
         self.memory = memory or Memory(pid)
         self.is_as_found = True
         self.left_alone = b""
+        self.waited_in = ""
         self._options = 0
         self.stopped_by = 0
         self._registers = ctypes.create_string_buffer(REGISTERS_SIZE)
