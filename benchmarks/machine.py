@@ -13,6 +13,8 @@ from typing import Final
 WATCHED_S: Final = 1.0
 """How long the machine is looked at before anything is measured."""
 
+UNKNOWN: Final = "unknown"
+
 BUSY_SHARE: Final = 0.05
 """Of all cores' time, used by others while we look: more than this moves the figures."""
 
@@ -24,7 +26,7 @@ IMAGES_SIZE: Final = 4 << 30
 def facts(share: float) -> dict[str, str]:
     """What a reader needs to know before comparing; ``share`` is what `busy_share` found."""
     return {
-        "processor": _field("/proc/cpuinfo", "model name"),
+        "processor": _processor(),
         "cores": str(os.cpu_count()),
         "memory": _field("/proc/meminfo", "MemTotal"),
         "kernel": platform.release(),
@@ -72,16 +74,29 @@ def _field(path: str, name: str) -> str:
         key, _, value = line.partition(":")
         if key.strip() == name:
             return value.strip()
-    return "unknown"
+    return UNKNOWN
 
 
 def _file_system(path: Path) -> str:
     """The kind of file system that a path lies on: the deepest mount point above it."""
     mounts = [line.split()[1:3] for line in Path("/proc/self/mounts").read_text().splitlines()]
     above = [(len(point), kind) for point, kind in mounts if path.is_relative_to(point)]
-    return max(above)[1] if above else "unknown"
+    return max(above)[1] if above else UNKNOWN
+
+
+def _processor() -> str:
+    """By its name where the kernel tells it; an ARM's maker and part otherwise."""
+    told = _field("/proc/cpuinfo", "model name")
+    if told != UNKNOWN:
+        return told
+    maker, part = (_field("/proc/cpuinfo", field) for field in ("CPU implementer", "CPU part"))
+    return f"{platform.machine()}, implementer {maker}, part {part}"
 
 
 def _commit() -> str:
-    ran = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False)
-    return ran.stdout.strip() or "unknown"
+    """What is measured; nobody knows where there is no checkout, or no git."""
+    try:
+        ran = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False)
+    except FileNotFoundError:
+        return UNKNOWN
+    return ran.stdout.strip() or UNKNOWN

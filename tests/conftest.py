@@ -155,7 +155,8 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
             if path is None:
                 pytest.skip("needs a C compiler and its headers: apt-get install gcc libc6-dev")
             program = tmp_path_factory.mktemp("tracees") / name
-            subprocess.run([path, "-O1", "-g", "-o", program, TRACEES / f"{name}.c", *flags], check=True)
+            page = f"-DPAGE={os.sysconf('SC_PAGESIZE')}UL"
+            subprocess.run([path, "-O1", "-g", page, "-o", program, TRACEES / f"{name}.c", *flags], check=True)
             made[key] = program
         return made[key]
 

@@ -7,6 +7,7 @@ int main(int count, char **arguments) {
     (void)count;
     unsigned char *area = mmap(NULL, SPAN, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
     if (area == MAP_FAILED) cannot("map 64 GiB");
+    madvise(area, SPAN, MADV_NOHUGEPAGE); /* one of them is 32 MiB where pages are 16 KiB */
     for (uint64_t index = 0; index < 40; index++) fill(area + (mix(index) % (SPAN / PAGE)) * PAGE, PAGE, index);
     ready();
     wait_for_go(arguments[1]);
