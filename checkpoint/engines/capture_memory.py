@@ -190,7 +190,8 @@ class MemoryCapture:
             self._catch_up(copied)
             missing = self._missing(copied, base=base)
             self._read_into(copied, missing)
-            self.refresh()
+            self._refresh_if_moved()
+            self._maps.prepare()
             last, before = pages.total_size(missing), last
             if turn >= PASS_LIMIT and last >= CATCHING_UP * before:
                 break
@@ -251,8 +252,7 @@ class MemoryCapture:
 
     def take(self, copied: RunningCopy, *, base: bool) -> Taken:
         """Copy what is not copied yet, or not any more. The program stands still."""
-        if self._maps.refresh_if_moved():
-            self._sort()
+        self._refresh_if_moved()
         scan = self._scan(everywhere=base)
         self._guards.named(scan)
         self._unacknowledged.append(Unacknowledged(None, scan.written, scan.cleared))
@@ -319,6 +319,11 @@ class MemoryCapture:
         if self._maps.refresh():
             self._sort()
         self._maps.prepare()
+
+    def _refresh_if_moved(self) -> None:
+        """As `refresh`, where only names may have changed since."""
+        if self._maps.refresh_if_moved():
+            self._sort()
 
     def _sort(self) -> None:
         self._has_moved = True

@@ -30,6 +30,7 @@ from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.tracking import NONE, NOT_CARRIED
 from checkpoint.linux.vm_flags import WATCHED, FlagsReader
+from checkpoint.memo import Memo
 from checkpoint.model import Position, ProcessState, Resource, ThreadState, Vma
 from checkpoint.resources import (
     Opened,
@@ -122,6 +123,7 @@ class CapturedProcess:
             raise
         self.identities = Identities(self.pid, order.names or {})
         self._flags = FlagsReader(self.pid)
+        self._of_mappings = Memo[tuple[str, ...]]()
 
     @classmethod
     def entered(cls, met: Met, order: ProtectOrder, slot: int = 0) -> CapturedProcess:
@@ -246,16 +248,22 @@ class CapturedProcess:
         """Why what it has turned into cannot be captured."""
         try:
             self._flags.refresh(self.memory.lines)
-            of_mappings = (unsupported.refuse_mapping(line, self._foreign_flags(line)) for line in look.taken.lines)
-            of_process = unsupported.refuse_process(self.pid, look.standing.status, kin, files_kept=self.files_kept)
+            lines = look.taken.lines
+            of_mappings = self._of_mappings.of(lines, self._flags.flags, make=lambda: self._refused(lines))
+            of_process = unsupported.refuse_process(self.pid, look.standing.status, kin, files_kept=self.files_kept, lines=lines)
             of_rings = aio_rings.refuse(look.standing.opened) if self.memory.has_rings else ()
             return (
                 *of_process,
-                *(reason for reason in of_mappings if reason),
+                *of_mappings,
                 *of_rings,
             )
         except ProcessGoneError:
             return ()  # the picture was taken before it ended
+
+    def _refused(self, lines: tuple[MapsLine, ...]) -> tuple[str, ...]:
+        """Why mappings cannot be captured."""
+        reasons = (unsupported.refuse_mapping(line, self._foreign_flags(line)) for line in lines)
+        return tuple(reason for reason in reasons if reason)
 
     def known(self, resources: Iterable[Resource]) -> tuple[Resource, ...]:
         """What it has open, by the names that it knows."""

@@ -15,6 +15,7 @@ from checkpoint.errors import CaptureError
 from checkpoint.linux import procfs, vm_flags
 from checkpoint.linux.procfs import DELETED, MapsLine
 from checkpoint.linux.tracking import NOT_CARRIED, is_shared_object
+from checkpoint.memo import Memo
 from checkpoint.model import FileIdentity, Resource, Vma, VmaKind
 from checkpoint.pages import Words
 from checkpoint.resources import files
@@ -53,6 +54,9 @@ class Identities:
         self.is_kin = False
         self._mapped_twice: frozenset[int] = frozenset()
         self._known: dict[tuple[int, int, str], FileIdentity] = {}
+        self._found = Memo[tuple[Vma, ...]]()
+        self._sees_sizes = False
+        """Of a shared object that is mapped nothing tells the size but itself."""
 
     def vmas(self, lines: Sequence[MapsLine], flags: Mapping[int, tuple[str, ...]], guards: Words) -> tuple[Vma, ...]:
         """The mappings as the model has them.
@@ -61,13 +65,19 @@ class Identities:
             flags: VmFlags by start, possibly older than ``lines``.
             guards: guard pages of all of them.
         """
+        found = self._found.of(lines, flags, self.is_kin, make=lambda: self._every(lines, flags))
+        if self._sees_sizes:
+            self._found.forget()
+        if not len(guards):
+            return found
+        return tuple(replace(vma, guards=pages.page_runs(pages.intersection(guards, pages.extents((vma,))))) for vma in found)
+
+    def _every(self, lines: Sequence[MapsLine], flags: Mapping[int, tuple[str, ...]]) -> tuple[Vma, ...]:
         mapped = {_key(line) for line in lines}
         self._known = {key: identity for key, identity in self._known.items() if key in mapped}
         self._mapped_twice = _mapped_twice(lines)
-        found = (self._vma(line, flags.get(line.start, ())) for line in lines if line.name != VSYSCALL)
-        if not len(guards):
-            return tuple(found)
-        return tuple(replace(vma, guards=pages.page_runs(pages.intersection(guards, pages.extents((vma,))))) for vma in found)
+        self._sees_sizes = any(map(is_shared_object, lines))
+        return tuple(self._vma(line, flags.get(line.start, ())) for line in lines if line.name != VSYSCALL)
 
     def _vma(self, line: MapsLine, flags: tuple[str, ...]) -> Vma:
         is_told = self._is_told(line)

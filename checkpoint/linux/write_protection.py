@@ -18,6 +18,7 @@ from checkpoint.linux.memory import Memory
 from checkpoint.linux.pagetables import PageScanner, pages_joined
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.tracking import NONE, Scan, extents_of
+from checkpoint.memo import Memo
 from checkpoint.pages import Words
 
 WHOLE_WINDOW: Final = 4 << 20
@@ -101,6 +102,7 @@ class PagemapTracker:
         self._files: Words = NONE
         self._owned: Words = NONE
         self._around: tuple[Words, Words] = (NONE, NONE)
+        self._parts = Memo[Words]()
         self._stubborn: set[tuple[int, int]] = set()
         self._restless: Words = NONE
         self._looked_for: Words | None = None
@@ -202,8 +204,8 @@ class PagemapTracker:
         """Written pages of what is protected; while the process runs, mapping by mapping, so that only a lost one is in doubt."""
         if not is_running:
             return self._scanner.written(ranges)
-        parts = [_within(ranges, line) for line in lines]
-        found, refused = self._scanner.written_where_protected(np.concatenate(parts)) if parts else (NONE, NONE)
+        parts = self._parts.of(ranges, lines, make=lambda: _by_mapping(ranges, lines))
+        found, refused = self._scanner.written_where_protected(parts) if len(parts) else (NONE, NONE)
         self._doubtful = pages.union(self._doubtful, refused)
         return found
 
@@ -353,6 +355,11 @@ def _inside(existing: Words, line: MapsLine) -> Words:
     first = np.searchsorted(existing[:, 1], np.uint64(line.start), side="right")
     last = np.searchsorted(existing[:, 0], np.uint64(line.end), side="left")
     return existing[first:last]
+
+
+def _by_mapping(ranges: Words, lines: Sequence[MapsLine]) -> Words:
+    """A set, cut where a mapping ends."""
+    return np.concatenate([_within(ranges, line) for line in lines]) if lines else NONE
 
 
 def _within(ranges: Words, line: MapsLine) -> Words:

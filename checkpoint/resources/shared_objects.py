@@ -11,13 +11,15 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from functools import lru_cache
 from typing import Final
 
 from checkpoint.capability import Area, refused
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import procfs
+from checkpoint.linux.procfs import DELETED, MapsLine
+from checkpoint.linux.tracking import ANONYMOUS, MEMORY_PLACE
 
 CAPABILITIES: Final = (
     refused(
@@ -32,22 +34,22 @@ _MAPPED: Final = re.compile(rb"^\S+ ...s \S+ (\S+ [1-9]\d*) +(/dev/shm/.*|.* \(d
 """Device and inode number, and the name."""
 FOREBEARS: Final = 8
 """Of a process that are looked at: who is born while a component is looked at has few."""
-_ANONYMOUS: Final = b"/dev/zero (deleted)"
 
 
-def refuse(pid: int, kin: Collection[int] = ()) -> Iterator[str]:
+def refuse(pid: int, lines: Iterable[MapsLine], kin: Collection[int] = ()) -> Iterator[str]:
     """Why shared memory of a process cannot be kept: one sentence for each object that another one has mapped as well.
 
     Args:
+        lines: its mappings.
         kin: all processes of its component.
     """
     asker = min(kin, default=pid)
-    for key, name in dict(_objects(pid)).items():
+    for key, name in dict(_objects_of(lines)).items():
         mappers = _mappers(asker, time.monotonic_ns() // 1_000_000_000).get(key, ())
         others = [other for other in mappers if other != pid and other not in kin and not _belongs(other, {pid, *kin})]
         if others:
             yield (
-                f"the shared memory {os.fsdecode(name)} is mapped by pid {others[0]} too, which stays behind: protect the "
+                f"the shared memory {name} is mapped by pid {others[0]} too, which stays behind: protect the "
                 "program when that has ended"
             )
 
@@ -65,9 +67,17 @@ def _belongs(other: int, kin: Collection[int]) -> bool:
     return False
 
 
+def _objects_of(lines: Iterable[MapsLine]) -> Iterator[tuple[bytes, str]]:
+    """As `_objects`, of mappings that have been read."""
+    for line in lines:
+        is_object = line.name.startswith(MEMORY_PLACE) or (line.name.endswith(DELETED) and line.name != ANONYMOUS)
+        if line.shared and line.inode and is_object:
+            yield b"%02x:%02x %d" % (os.major(line.device), os.minor(line.device), line.inode), line.name
+
+
 def _objects(pid: int) -> Iterator[tuple[bytes, bytes]]:
     for key, name in _MAPPED.findall(procfs.read_bytes(pid, "maps")):
-        if name != _ANONYMOUS:
+        if os.fsdecode(name) != ANONYMOUS:
             yield key, name
 
 

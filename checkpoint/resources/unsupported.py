@@ -10,7 +10,7 @@ import contextlib
 import os
 import re
 import stat
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
@@ -271,6 +271,9 @@ def is_shared_anonymous(line: MapsLine) -> bool:
 # --- The process as a whole --------------------------------------------------------------------------------------------
 
 
+_VDSO: Final = "[vdso]"
+
+
 def require_traceable(pid: int, status: Status) -> None:
     """Raise `ProbeError` where no tracer can or should go."""
     if status.tgid != pid:
@@ -287,28 +290,39 @@ def require_traceable(pid: int, status: Status) -> None:
         )
 
 
-def refuse_process(pid: int, status: Status, kin: Collection[int] = (), *, files_kept: bool = False) -> Iterator[str]:
+def refuse_process(
+    pid: int,
+    status: Status,
+    kin: Collection[int] = (),
+    *,
+    files_kept: bool = False,
+    lines: Sequence[MapsLine] | None = None,
+) -> Iterator[str]:
     """Why a process as a whole cannot be captured.
 
     Args:
         kin: all processes of its component, if there are several.
         files_kept: somebody keeps its program file by content, so that it need not be there any more.
+        lines: its mappings, where they are known.
     """
+    lines = procfs.parse_maps(procfs.read_text(pid, "maps")) if lines is None else lines
     yield from refused_threads.refuse(pid, status, kin)
-    yield from shared_objects.refuse(pid, kin)
-    yield from refuse_entering(pid, status, files_kept=files_kept)
+    yield from shared_objects.refuse(pid, lines, kin)
+    yield from refuse_entering(pid, status, files_kept=files_kept, lines=lines)
     yield from _refuse_places(pid)
     yield from _refuse_namespaces(pid)
 
 
-def refuse_entering(pid: int, status: Status, *, files_kept: bool = False) -> Iterator[str]:
-    """Why a process cannot even be asked."""
+def refuse_entering(
+    pid: int, status: Status, *, files_kept: bool = False, lines: Sequence[MapsLine] | None = None
+) -> Iterator[str]:
+    """Why a process cannot even be asked; arguments as of `refuse_process`."""
     if status.tracer not in (0, os.getpid()):
         yield f"it is traced by pid {status.tracer}: end that debugger"
     if status.seccomp and (why := confinement.why_not()):
         yield seccomp.not_ours(why)
     yield from _refuse_image(pid, files_kept)
-    yield from _refuse_memory(pid)
+    yield from _refuse_memory(procfs.parse_maps(procfs.read_text(pid, "maps")) if lines is None else lines)
 
 
 def _refuse_image(pid: int, files_kept: bool) -> Iterator[str]:
@@ -320,9 +334,9 @@ def _refuse_image(pid: int, files_kept: bool) -> Iterator[str]:
         yield f"it is a program of 32 bits ({executable}), which is not supported: use a 64-bit build"
 
 
-def _refuse_memory(pid: int) -> Iterator[str]:
+def _refuse_memory(lines: Sequence[MapsLine]) -> Iterator[str]:
     """What our own calls inside it need."""
-    if "[vdso]" not in procfs.read_text(pid, "maps"):
+    if all(line.name != _VDSO for line in lines):
         yield "it has no vdso (it unmapped it, or the kernel was started with vdso=0), by which a capture enters it"
 
 

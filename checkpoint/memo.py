@@ -1,0 +1,30 @@
+"""What was worked out last, for as long as it is asked of the very same objects.
+
+What is looked at again and again has mostly not changed, and whoever reads it hands out the same objects then. To find that out
+takes nothing; to work out anew what hundreds of mappings mean takes longer than a freeze.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+_Result = TypeVar("_Result")
+
+
+class Memo(Generic[_Result]):
+    """One result, and what it is of. Those things are never changed in place."""
+
+    def __init__(self) -> None:
+        self._last: tuple[tuple[object, ...], _Result] | None = None
+
+    def of(self, *things: object, make: Callable[[], _Result]) -> _Result:
+        """The result for these things: the last one where they are the same objects, otherwise what ``make`` answers."""
+        if self._last is None or len(self._last[0]) != len(things) or not all(map(operator.is_, self._last[0], things)):
+            self._last = things, make()
+        return self._last[1]
+
+    def forget(self) -> None:
+        """Work it out anew the next time."""
+        self._last = None
