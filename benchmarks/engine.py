@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks import machine
 from benchmarks.figures import Figure
 from benchmarks.running import running
 from checkpoint import channel
@@ -26,6 +27,8 @@ CASES: tuple[tuple[int, int, int], ...] = (
     (1000, 4000, 100),
 )
 """MB resident, KB written each `PERIOD_S`, snapshots. So many in one case that its 99th percentile says something."""
+ROOM = 3
+"""Times its size that a program's image may take in memory, read, encoded and written."""
 QUICK_CASES = ((10, 400, 20), (100, 400, 20))
 
 PERIOD_S = 0.05
@@ -113,7 +116,7 @@ def _restores_of(megabytes: int, count: int, directory: Path) -> list[Figure]:
         keeper.ask(channel.Protect(pid, "/benchmark"), channel.Protected)
         _, (content,) = keeper.ask(channel.Capture(base=True, generation=1, sequence=1, hold=True), channel.Captured)
         os.kill(pid, signal.SIGKILL)
-    whole = tuple(_restored_once(content, pid) for _ in range(count))
+    whole = tuple(_restored_once(content, pid, megabytes) for _ in range(count))
     ready, again = zip(*(_taken_over_once(content, pid) for _ in range(count)), strict=True)
     os.close(content)
     case = f"{megabytes} MB"
@@ -138,9 +141,10 @@ def _taken_over_once(content: int, pid: int) -> tuple[float, float]:
             vessel.discard(born)
 
 
-def _restored_once(content: int, pid: int) -> float:
+def _restored_once(content: int, pid: int, megabytes: int) -> float:
     with Keeper.spawn() as keeper:
         _wait_until_ready(keeper)
+        machine.touch_memory(ROOM * megabytes)
         began_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         born = vessel.spawn_vessel(Birth(pid))
         try:
