@@ -33,7 +33,7 @@ COUNT = 256
 """Pages of the child's mapping: more than what may be a page on the move (`pagetables.MARKER_RUN`)."""
 
 CHILD = r"""
-import ctypes, os, sys
+import ctypes, mmap, os, sys
 libc = ctypes.CDLL(None, use_errno=True)
 libc.mmap.restype = ctypes.c_void_p
 libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, ctypes.c_long]
@@ -43,11 +43,12 @@ libc.mremap.restype = ctypes.c_void_p
 libc.mremap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_size_t, ctypes.c_int, ctypes.c_void_p]
 libc.munmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t]
 count, userfaultfd = map(int, sys.argv[1:])
-hole = libc.mmap(None, (count + 2) * 4096, 0, 0x22, -1, 0)
-place = hole + 4096
+PAGE = mmap.PAGESIZE
+hole = libc.mmap(None, (count + 2) * PAGE, 0, 0x22, -1, 0)
+place = hole + PAGE
 def make():
-    assert libc.mmap(place, count * 4096, 3, 0x32, -1, 0) == place
-    libc.madvise(place, count * 4096, 15)  # MADV_NOHUGEPAGE
+    assert libc.mmap(place, count * PAGE, 3, 0x32, -1, 0) == place
+    libc.madvise(place, count * PAGE, 15)  # MADV_NOHUGEPAGE
 make()
 faults = libc.syscall(userfaultfd, os.O_CLOEXEC | os.O_NONBLOCK | 1)
 print(place, faults, flush=True)
@@ -56,35 +57,36 @@ for order in sys.stdin:
     first, size = [int(number) for number in numbers] + [1] * (2 - len(numbers))
     if verb == "write":
         for page in range(first, first + size):
-            ctypes.memset(place + page * 4096, 1 + (page + ctypes.string_at(place + page * 4096)[0:1].__len__()) % 200, 64)
-            value = int.from_bytes(ctypes.string_at(place + page * 4096 + 8, 8), "little") + 1
-            ctypes.memmove(place + page * 4096 + 8, value.to_bytes(8, "little"), 8)
+            ctypes.memset(place + page * PAGE, 1 + (page + ctypes.string_at(place + page * PAGE)[0:1].__len__()) % 200, 64)
+            value = int.from_bytes(ctypes.string_at(place + page * PAGE + 8, 8), "little") + 1
+            ctypes.memmove(place + page * PAGE + 8, value.to_bytes(8, "little"), 8)
     elif verb == "forget":
-        libc.madvise(place + first * 4096, size * 4096, 4)
+        libc.madvise(place + first * PAGE, size * PAGE, 4)
     elif verb == "look":
-        assert not any(ctypes.string_at(place + first * 4096, size * 4096))
-    elif verb == "guard" and libc.madvise(place + first * 4096, size * 4096, 102):  # MADV_GUARD_INSTALL
+        assert not any(ctypes.string_at(place + first * PAGE, size * PAGE))
+    elif verb == "guard" and libc.madvise(place + first * PAGE, size * PAGE, 102):  # MADV_GUARD_INSTALL
         print("unknown", flush=True)
         continue
     elif verb == "again":
-        libc.munmap(place, count * 4096); make()
+        libc.munmap(place, count * PAGE); make()
     elif verb == "replace":
-        assert libc.mmap(place + first * 4096, size * 4096, 3, 0x32, -1, 0) == place + first * 4096
+        assert libc.mmap(place + first * PAGE, size * PAGE, 3, 0x32, -1, 0) == place + first * PAGE
     elif verb == "swap":
-        away = libc.mmap(None, 4096, 3, 0x22, -1, 0)
-        for old, new in ((place + first * 4096, away), (place + size * 4096, place + first * 4096), (away, place + size * 4096)):
-            assert libc.mremap(old, 4096, 4096, 3, new) == new
+        away = libc.mmap(None, PAGE, 3, 0x22, -1, 0)
+        for old, new in ((place + first * PAGE, away), (place + size * PAGE, place + first * PAGE), (away, place + size * PAGE)):
+            assert libc.mremap(old, PAGE, PAGE, 3, new) == new
     elif verb in ("file", "closed"):
-        large = next(line.split()[-1] for line in open("/proc/self/maps") if "libc" in line)
+        mapped = {line.split()[-1] for line in open("/proc/self/maps") if " /" in line}
+        large = max(filter(os.path.exists, mapped), key=os.path.getsize)
         file = os.open(large, os.O_RDONLY)
-        assert os.fstat(file).st_size > count * 4096
-        assert libc.mmap(place, count * 4096, 3 if verb == "file" else 0, 0x12, file, 0) == place
+        assert os.fstat(file).st_size > count * PAGE
+        assert libc.mmap(place, count * PAGE, 3 if verb == "file" else 0, 0x12, file, 0) == place
     elif verb == "seal":
-        libc.mprotect(place, count * 4096, 1)
+        libc.mprotect(place, count * PAGE, 1)
     elif verb == "shut":
-        libc.mprotect(place, count * 4096, 0)
+        libc.mprotect(place, count * PAGE, 0)
     elif verb == "open":
-        libc.mprotect(place, count * 4096, 3)
+        libc.mprotect(place, count * PAGE, 3)
     print("done", flush=True)
 """
 

@@ -96,7 +96,7 @@ static void packets(void) {
     int lo = if_nametoindex("lo"), sees = socket(AF_PACKET, SOCK_RAW, 0), ring = socket(AF_PACKET, SOCK_DGRAM, 0);
     struct sockaddr_ll address = {.sll_family = AF_PACKET, .sll_protocol = htons(0x88b5), .sll_ifindex = lo}, found = {0};
     struct packet_mreq request = {.mr_ifindex = lo, .mr_type = PACKET_MR_MULTICAST, .mr_alen = 6, .mr_address = {1, 0, 94, 1, 2, 3}};
-    struct tpacket_req pages = {.tp_block_size = 4096, .tp_block_nr = 2, .tp_frame_size = 2048, .tp_frame_nr = 4};
+    struct tpacket_req pages = {.tp_block_size = PAGE, .tp_block_nr = 2, .tp_frame_size = 2048, .tp_frame_nr = 2 * PAGE / 2048};
     socklen_t size = sizeof address;
     if (sees < 0 || setsockopt(ring, SOL_SOCKET, SO_ATTACH_FILTER, &program, sizeof program)) cannot("make packet sockets");
     if (bind(sees, (struct sockaddr *)&address, sizeof address)) cannot("bind");
@@ -115,7 +115,7 @@ static void packets(void) {
         int result = setsockopt(sees, SOL_PACKET, PACKET_DROP_MEMBERSHIP, &request, sizeof request);
         EXPECT(result == (index < 2 ? 0 : -1) || index == 2, "it was a member %d times", index);
     }
-    EXPECT(mmap(NULL, 8192, PROT_READ | PROT_WRITE, MAP_SHARED, ring, 0) != MAP_FAILED, "it has no ring: %s", strerror(errno));
+    EXPECT(mmap(NULL, 2 * PAGE, PROT_READ | PROT_WRITE, MAP_SHARED, ring, 0) != MAP_FAILED, "it has no ring: %s", strerror(errno));
     EXPECT_EQUAL("filter", option(ring, SOL_SOCKET, SO_LOCK_FILTER), 0);
     char frame[64] = {[12] = (char)0x88, [13] = (char)0xb5};
     EXPECT(sendto(sees, frame, sizeof frame, 0, (struct sockaddr *)&address, sizeof address) == sizeof frame, "cannot send");
