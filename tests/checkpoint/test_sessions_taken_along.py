@@ -68,8 +68,8 @@ def follow(parent, session):
 def adopt():
     os.setsid()
     own = os.getpid()
-    between = [born(lambda: born(lambda: lead(own)) and signal.pause()) for _ in range(2)]
     ask_for_orphans(1)
+    between = [born(lambda: born(lambda: lead(own)) and signal.pause()) for _ in range(2)]
     for _ in between:
         os.read(read_end, 1)
     ask_for_orphans(0)
