@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -109,9 +110,10 @@ def main() -> int:
     facts = machine.facts(share) | {"measured": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"}
     if warning:
         print(f"WARNING: {warning}", file=sys.stderr)
-    began = time.monotonic()
+    began, before = time.monotonic(), machine.ticks()
     findings = [_measure(name, arguments.quick) for name in arguments.names or BENCHMARKS]
     facts["it took"] = f"{time.monotonic() - began:.0f} s"
+    facts["given to others by the host meanwhile"] = f"{(machine.ticks() - before).stolen_share:.1%} of its cores' time"
     command = " ".join(["python -m benchmarks", *(["--quick"] if arguments.quick else []), *arguments.names])
     print(results.page(command, facts, warning, findings))
     whole = not arguments.names and not arguments.quick
@@ -123,12 +125,12 @@ def main() -> int:
 def _measure(name: str, quick: bool) -> Findings:
     """One benchmark; one that comes to nothing says why and leaves the others their turn."""
     print(f"measuring {name} …", file=sys.stderr, flush=True)
-    began = time.monotonic()
+    began, before = time.monotonic(), machine.ticks()
     try:
         with tempfile.TemporaryDirectory(prefix="failover-benchmark-") as directory:
             found = BENCHMARKS[name](quick, Path(directory))
         print(f"  in {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
-        return found
+        return replace(found, stolen=(machine.ticks() - before).stolen_share)
     except (BenchmarkError, CheckpointError, FailoverError, OSError) as error:
         print(f"{name} came to nothing: {error}", file=sys.stderr)
         return Findings(name, "This came to nothing.", (), (Absent(name, str(error)),))

@@ -46,12 +46,14 @@ class Findings:
     Attributes:
         title: heading of its table.
         story: one paragraph: what was measured, and how.
+        stolen: of the cores' time meanwhile, the share that the host of a virtual machine gave to others.
     """
 
     title: str
     story: str
     figures: tuple[Figure, ...]
     absent: tuple[Absent, ...] = ()
+    stolen: float = 0.0
 
 
 def percentile(values: Sequence[float], share: float) -> float:

@@ -8,6 +8,7 @@ import platform
 import shutil
 import subprocess
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -21,9 +22,42 @@ UNKNOWN: Final = "unknown"
 BUSY_SHARE: Final = 0.05
 """Of all cores' time, used by others while we look: more than this moves the figures."""
 
+STOLEN_SHARE: Final = 0.01
+"""Of all cores' time, given to others by the host of a virtual machine: more than this is said beside the figures."""
+
 SHARED_MEMORY: Final = Path("/dev/shm")
 IMAGES_SIZE: Final = 4 << 30
 """Bytes of room that images of the largest program want, several at a time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ticks:
+    """Time of all cores, in clock ticks: ``stolen`` was the host's, of a virtual machine, for others."""
+
+    used: int
+    stolen: int
+    idle: int
+
+    def __sub__(self, earlier: Ticks) -> Ticks:
+        return Ticks(self.used - earlier.used, self.stolen - earlier.stolen, self.idle - earlier.idle)
+
+    @property
+    def whole(self) -> int:
+        """All of it."""
+        return self.used + self.stolen + self.idle
+
+    @property
+    def stolen_share(self) -> float:
+        """Of all of it."""
+        return self.stolen / max(self.whole, 1)
+
+
+def ticks() -> Ticks:
+    """Since boot. Source: proc_stat(5)."""
+    user, nice, system, idle, waiting, interrupts, soft, stolen = map(
+        int, Path("/proc/stat").read_text().splitlines()[0].split()[1:9]
+    )
+    return Ticks(user + nice + system + interrupts + soft, stolen, idle + waiting)
 
 
 def facts(share: float) -> dict[str, str]:
@@ -44,10 +78,10 @@ def facts(share: float) -> dict[str, str]:
 
 def busy_share() -> float:
     """The part of all cores' time that somebody used during the last `WATCHED_S`; we only wait."""
-    before = _ticks()
+    before = ticks()
     time.sleep(WATCHED_S)
-    used, idle = (after - earlier for after, earlier in zip(_ticks(), before, strict=True))
-    return used / max(used + idle, 1)
+    passed = ticks() - before
+    return (passed.used + passed.stolen) / max(passed.whole, 1)
 
 
 def warning(share: float) -> str:
@@ -74,12 +108,6 @@ def images_place() -> Path:
     except OSError:
         roomy = False
     return SHARED_MEMORY if roomy else Path(os.environ.get("TMPDIR", "/tmp"))
-
-
-def _ticks() -> tuple[int, int]:
-    """Clock ticks that all cores were used and idle since boot. Source: proc_stat(5)."""
-    user, nice, system, idle, waiting, *others = map(int, Path("/proc/stat").read_text().splitlines()[0].split()[1:9])
-    return user + nice + system + sum(others), idle + waiting
 
 
 def _field(path: str, name: str) -> str:

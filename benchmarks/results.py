@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.figures import OURS, Findings, table
+from benchmarks.machine import STOLEN_SHARE
 
 PAGE: Final = "RESULTS.md"
 RECORD: Final = "results.json"
@@ -31,6 +32,8 @@ def section(found: Findings) -> str:
     """One benchmark: what was measured, the table, who is missing and why."""
     parts = [f"## {found.title}", found.story]
     parts += [table(found.figures)] if found.figures else []
+    if found.stolen >= STOLEN_SHARE:
+        parts += [f"**The host gave {found.stolen:.0%} of this machine's time to others meanwhile.**"]
     parts += [f"Not measured: {one.who}: {one.reason}." for one in found.absent]
     return "\n\n".join(parts)
 

@@ -71,6 +71,22 @@ def test_a_busy_machine_is_said_on_the_page() -> None:
     assert f"**{said}.**" in results.page("python -m benchmarks", FACTS, said, [])
 
 
+def test_what_the_host_gave_to_others_is_said_beside_the_figures() -> None:
+    earlier, later = machine.Ticks(100, 10, 50), machine.Ticks(140, 20, 100)
+    stolen = (later - earlier).stolen_share
+    assert stolen == pytest.approx(0.1)
+    assert "The host gave 10% of this machine's time to others" in results.section(Findings("Stops", "", (OURS,), (), stolen))
+    assert "The host" not in results.section(Findings("Stops", "", (OURS,), (), 0.005))
+
+
+def test_the_clock_ticks_of_this_machine_go_on() -> None:
+    before = machine.ticks()
+    while (passed := machine.ticks() - before).used + passed.idle == 0:
+        pass
+    assert passed.whole == passed.used + passed.stolen + passed.idle
+    assert 0 <= passed.stolen_share <= 1
+
+
 def test_the_record_holds_every_single_value(tmp_path: Path) -> None:
     results.write(tmp_path, "python -m benchmarks", FACTS, "", [Findings("Stops", "How long.", (OURS, THEIRS))])
     record = json.loads((tmp_path / results.RECORD).read_text())
