@@ -1,7 +1,8 @@
 """The first entry into a stopped tracee: where our pages come to lie, and what an earlier tracer has left.
 
-The first entry has no page yet: a stub of constants in the zero tail of the vdso's last page (writing there makes the page
-private to the process) maps the pages and opens a userfaultfd, keeping both results in registers. The tail is zeroed afterwards.
+The first entry has no page yet: a stub of constants at the end of the vdso's last page (writing there makes the page private to
+the process) maps the pages and opens a userfaultfd, keeping both results in registers. What was there is put back afterwards:
+zeros, or, where these are too few, also the names and headers of the image's sections, which no program reads.
 
 Source: vdso(7), userfaultfd(2), pidfd_getfd(2).
 """
@@ -12,7 +13,6 @@ import ctypes
 import errno
 import itertools
 import os
-import struct
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from typing import Final
 from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import Call, EntryCalls
 from checkpoint.errors import CaptureError
-from checkpoint.linux import abi, procfs
+from checkpoint.linux import abi, procfs, vdso
 from checkpoint.linux.descriptors import Descriptor, descriptors_to
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import MapsLine
@@ -83,14 +83,10 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
         ProcessGoneError: it was killed meanwhile.
         CaptureError: no place for the stub, or its memory limit leaves no room.
     """
-    place, room = vdso_tail(tracee.memory, maps)
     hole = largest_hole(maps)
-    goes_on, vectors = resumed(arch.decode_registers(tracee.left_alone or registers)), tracee.xstate()
-    stub = arch.entry_code(place, _entry_calls(hole), goes_on, mask, patience_ns(tracee), vectors)
-    if len(stub) > room:
-        raise CaptureError(
-            f"cannot enter pid {tracee.pid}: its vdso has only {room} spare bytes of {len(stub)}; upgrade the kernel"
-        )
+    rooms = vdso_rooms(tracee.memory, maps)
+    place, stub = _stub(tracee, rooms, hole, registers, mask)
+    had = tracee.memory.read(place, max(0, rooms[0].start - place)).ljust(len(stub), b"\0")
     tracee.memory.poke(place, stub)
     there = arch.decode_registers(registers)
     there[arch.INSTRUCTION_POINTER] = place + arch.ENTRY_CODE_OFFSET
@@ -105,7 +101,7 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
     finally:
         found = give_back(tracee, registers, mask, range(place, place + len(stub)).__contains__)
     code, table, inside = (ctypes.c_int64(found[name]).value for name in arch.ENTRY_REGISTERS)
-    tracee.memory.poke(place, bytes(len(stub)))
+    tracee.memory.poke(place, had)
     if code != hole or table != hole + CODE_SIZE:
         raise CaptureError(
             f"cannot borrow pages in pid {tracee.pid}: {os.strerror(-min(code, table, 0))}; raise its limit of address space"
@@ -114,6 +110,23 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
     tracee.memory.poke(pages.table - len(MAGIC), MAGIC)
     faults, why_not = _taken(tracee.pid, inside) if inside >= 0 else (None, -inside)
     return Entered(pages, faults, inside, why_not)
+
+
+def _stub(tracee: Tracee, rooms: Sequence[range], hole: int, registers: bytes, mask: int) -> tuple[int, bytes]:
+    """Where there is room for what the thread will run, and that.
+
+    Raises:
+        CaptureError: there is none.
+    """
+    calls, patience = _entry_calls(hole), patience_ns(tracee)
+    goes_on, vectors = resumed(arch.decode_registers(tracee.left_alone or registers)), tracee.xstate()
+    for room in rooms:
+        stub = arch.entry_code(room.start, calls, goes_on, mask, patience, vectors)
+        if len(stub) <= len(room):
+            return room.start, stub
+    raise CaptureError(
+        f"cannot enter pid {tracee.pid}: its vdso has only {len(rooms[-1])} spare bytes of {len(stub)}; upgrade the kernel"
+    )
 
 
 def _entry_calls(hole: int) -> EntryCalls:
@@ -175,33 +188,30 @@ def largest_hole(maps: Sequence[MapsLine]) -> int:
     return (begin + size // 2) & -abi.PAGE_SIZE
 
 
-_ELF64_HEADER: Final = struct.Struct("<16sHHIQQQIHHHHHH")
 _SPARE_ALIGNMENT: Final = 64
 
 
-def vdso_tail(memory: Memory, maps: Sequence[MapsLine]) -> tuple[int, int]:
-    """The unused end of the vdso's last page: its address and size.
+def vdso_rooms(memory: Memory, maps: Sequence[MapsLine]) -> tuple[range, range]:
+    """Addresses at the end of the vdso where code of ours may lie: zeros behind the image; and with what of it no program reads.
 
     Raises:
         CaptureError: the process has no vdso.
     """
-    begin = vdso_image_end(memory, maps)
-    return begin, max(0, next(line.end for line in maps if line.name == "[vdso]") - begin)
+    line, used, whole = _vdso_ends(memory, maps)
+    return range(whole, line.end), range(used, line.end)
 
 
-def vdso_image_end(memory: Memory, maps: Sequence[MapsLine]) -> int:
-    """Where the vdso's own content ends.
+def _vdso_ends(memory: Memory, maps: Sequence[MapsLine]) -> tuple[MapsLine, int, int]:
+    """The mapping, and the addresses of `vdso.ends`, rounded up.
 
     Raises:
         CaptureError: the process has no vdso.
-
-    Source: elf(5): the section headers are the last thing in the image.
     """
     for line in maps:
         if line.name == "[vdso]":
-            header = _ELF64_HEADER.unpack(memory.read(line.start, _ELF64_HEADER.size))
-            sections_end = int(header[6] + header[11] * header[12])
-            return line.start + -(-sections_end // _SPARE_ALIGNMENT) * _SPARE_ALIGNMENT
+            ends = vdso.ends(memory.read(line.start, min(line.size, abi.PAGE_SIZE)))
+            used, whole = (line.start + -(-end // _SPARE_ALIGNMENT) * _SPARE_ALIGNMENT for end in ends)
+            return line, used, whole
     raise CaptureError(f"cannot enter pid {memory.pid}: it has no vdso (the kernel was started with vdso=0, or it unmapped it)")
 
 
@@ -240,5 +250,5 @@ def is_left_open(found: Descriptor) -> bool:
 def is_in_stub(instruction_pointer: int, memory: Memory, maps: Sequence[MapsLine]) -> bool:
     """Whether a thread stands in the stub of an earlier tracer's first entry: it leaves it by itself."""
     return any(line.name == "[vdso]" and line.start <= instruction_pointer < line.end for line in maps) and (
-        instruction_pointer >= vdso_image_end(memory, maps)
+        instruction_pointer >= _vdso_ends(memory, maps)[1]
     )

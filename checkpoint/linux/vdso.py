@@ -15,6 +15,7 @@ _SEGMENT: Final = struct.Struct("<IIQQQQQQ")
 _ENTRY: Final = struct.Struct("<QQ")
 _SYMBOL: Final = struct.Struct("<IBBHQQ")
 _MAGIC: Final = b"\x7fELF\x02\x01"
+PT_LOAD: Final = 1
 PT_DYNAMIC: Final = 2
 DT_STRTAB: Final = 5
 DT_SYMTAB: Final = 6
@@ -63,13 +64,33 @@ def _functions(image: bytes) -> Iterator[Function]:
 
 def _dynamic(image: bytes) -> dict[int, int]:
     """What its dynamic section says: tag → value; addresses are offsets, for an image is linked at 0."""
+    for address, size in _segments(image, PT_DYNAMIC):
+        return dict(_ENTRY.iter_unpack(image[address : address + size]))
+    raise ValueError("no dynamic section")
+
+
+def _segments(image: bytes, wanted: int) -> Iterator[tuple[int, int]]:
+    """Address and size in memory of those of one kind."""
     header = _HEADER.unpack_from(image)
     table, entry_size, count = header[5], header[9], header[10]
     for index in range(count):
         kind, _, _, address, _, _, size, _ = _SEGMENT.unpack_from(image, table + index * entry_size)
-        if kind == PT_DYNAMIC:
-            return dict(_ENTRY.iter_unpack(image[address : address + size]))
-    raise ValueError("no dynamic section")
+        if kind == wanted:
+            yield address, size
+
+
+def ends(image: bytes) -> tuple[int, int]:
+    """Where that of an image ends which programs use, and where all of it does; offsets from its beginning.
+
+    In between lie names of its sections and their headers, which only debuggers read; the headers are the last thing in an image.
+
+    Raises:
+        struct.error: it is not an image.
+    """
+    header = _HEADER.unpack_from(image)
+    used = max((address + size for address, size in _segments(image, PT_LOAD)), default=0)
+    whole = header[6] + header[11] * header[12]
+    return used, max(used, whole)
 
 
 def address_in(auxv: bytes) -> int:
