@@ -7,6 +7,7 @@ Sources: namespaces(7), user_namespaces(7), pid_namespaces(7), time_namespaces(7
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import os
@@ -243,9 +244,17 @@ def prctl(option: int, *arguments: int) -> int:
 
 
 def close_others_on_exec(first: int) -> None:
-    """Have every descriptor from ``first`` on closed by the next execve."""
+    """Have every descriptor from ``first`` on closed by the next execve.
+
+    One by one where close_range(2) cannot do that: before Linux 5.11.
+    """
     everything = ctypes.c_uint(0xFFFFFFFF)
-    _checked(_libc.syscall(_SYS_CLOSE_RANGE, ctypes.c_uint(first), everything, _CLOSE_RANGE_CLOEXEC), "close_range")
+    if _libc.syscall(_SYS_CLOSE_RANGE, ctypes.c_uint(first), everything, _CLOSE_RANGE_CLOEXEC) == 0:
+        return
+    for number in map(int, os.listdir("/proc/self/fd")):
+        if number >= first:
+            with contextlib.suppress(OSError):  # it was that of the listing
+                os.set_inheritable(number, False)
 
 
 def _checked(result: int, what: str) -> int:
