@@ -267,15 +267,42 @@ def call_number_before(code: bytes) -> int | None:
 CLOBBERED: Final = ("x0", "x1", "x2", "x3", "x4", "x5", "x8", "x9", "sp", "pstate")
 """What the calls change, or the code between them: ours to give back, in this order in the table."""
 LARGE_DESK_SIZE: Final = 32768
-SMALL_DESK_SIZE: Final = 2048
-"""Bytes of a desk's code, and of its table: for 200 of the longest calls, and for four."""
-FRAME_SIZE: Final = 1024
-"""Bytes at the end of a desk's table that its code needs: for a frame of rt_sigreturn(2), from struct ucontext on."""
+SMALL_DESK_SIZE: Final = 1024
+"""Bytes of a desk's code, and of its table without the frame: for 200 of the longest calls, and for four."""
+
+
+def frame_size(lost: int) -> int:
+    """Bytes at the end of a desk's table that its code needs: for a frame of rt_sigreturn(2), from struct ucontext on.
+
+    Args:
+        lost: bytes of the register set of `extended.LOST_IN_CALLS`; 0: there is none.
+    """
+    further = _FURTHER.size + 2 * len(_TERMINATOR) + -(-lost // 16) * 16 if lost else 0
+    return _END_OF_FRAME + further + len(_TERMINATOR)
+
+
+def frame_of_lost(frame: int, lost: bytes) -> tuple[int, bytes]:
+    """Where in a frame it stands what a thread has lost in our calls, and that as it stands there.
+
+    Args:
+        frame: address of its struct ucontext.
+        lost: the register set of `extended.LOST_IN_CALLS` as the thread stood; empty: nothing is lost.
+    """
+    place = frame + _END_OF_FRAME
+    return place, _lost(place, lost) if lost else _TERMINATOR
+
 
 _STACK_FLAGS, _MASK_OF_FRAME, _GENERAL_OF_FRAME = 24, 40, 184
 _SP_OF_FRAME, _PC_OF_FRAME, _PSTATE_OF_FRAME, _VECTORS = 432, 440, 448, 464
 _END_OF_FRAME: Final = _VECTORS + 528
-"""Offsets in struct ucontext (asm/ucontext.h, asm/sigcontext.h): `_VECTORS` begins struct fpsimd_context, the last there is."""
+"""Offsets in struct ucontext (asm/ucontext.h, asm/sigcontext.h): `_VECTORS` begins struct fpsimd_context, the last that every
+thread has."""
+_TERMINATOR: Final = bytes(16)
+_FURTHER: Final = struct.Struct("<IIQI12x")
+"""struct extra_context: what it leads to comes right after it and a terminator."""
+_SCALABLE: Final = struct.Struct("<IIHH4x")
+"""struct sve_context, before the registers: Z, P, FFR."""
+_FURTHER_MAGIC, _SCALABLE_MAGIC = 0x45585401, 0x53564501
 _BEFORE_UCONTEXT: Final = 128
 """Bytes of siginfo, which lie before struct ucontext in a frame; nobody reads them."""
 _VECTORS_HEAD: Final = 0x46508001 | 528 << 32
@@ -285,6 +312,23 @@ _PLACES: Final = {name: _GENERAL_OF_FRAME + 8 * index for index, name in enumera
 _SCRATCH: Final = 9
 _STORES_BEFORE: Final = 0xD5033ABF
 """``dmb ishst``: whoever sees a later store sees every earlier one."""
+
+
+def _lost(place: int, content: bytes) -> bytes:
+    """The end of a frame with scalable vectors in it: these lie where the frame's own room would not do for the longest.
+
+    Args:
+        place: its address.
+        content: NT_ARM_SVE.
+
+    Source: parse_user_sigframe() in arch/arm64/kernel/signal.c; asm/sigcontext.h.
+    """
+    vector_size = int.from_bytes(content[8:10], "little")
+    registers = content[16 : 16 + 34 * vector_size + vector_size // 8]  # 32 of these, 16 + 1 of an eighth
+    size = -(-(_SCALABLE.size + len(registers)) // 16) * 16
+    told = (_SCALABLE.pack(_SCALABLE_MAGIC, size, vector_size, 0) + registers).ljust(size, b"\0") + _TERMINATOR
+    begin = place + _FURTHER.size + len(_TERMINATOR)
+    return _FURTHER.pack(_FURTHER_MAGIC, _FURTHER.size, begin, len(told)) + _TERMINATOR + told
 
 
 class _Code:
@@ -392,7 +436,7 @@ def _fill_frame(code: _Code, places: TablePlaces) -> None:
     for offset, address in (*told, (_PC_OF_FRAME, places.resume), (_MASK_OF_FRAME, places.mask)):
         code.load(0, address)
         code.store(0, offset)
-    for offset, value in ((_STACK_FLAGS, _NO_STACK), (_VECTORS, _VECTORS_HEAD), (_END_OF_FRAME, 0)):
+    for offset, value in ((_STACK_FLAGS, _NO_STACK), (_VECTORS, _VECTORS_HEAD)):
         code.set(0, value)
         code.store(0, offset)
     for offset, instruction in ((_VECTORS + 8, 0xD53B4420), (_VECTORS + 12, 0xD53B4400)):  # mrs x0, fpsr; mrs x0, fpcr
@@ -406,7 +450,15 @@ ENTRY_REGISTERS: Final = ("x19", "x20", "x21")
 """Where the entry keeps its results, and gives them back: the code pages, the table pages, the userfaultfd."""
 
 
-def entry_code(address: int, calls: EntryCalls, registers: Registers, mask: int, patience_ns: int, vectors: bytes = b"") -> bytes:
+def entry_code(
+    address: int,
+    calls: EntryCalls,
+    registers: Registers,
+    mask: int,
+    patience_ns: int,
+    vectors: bytes = b"",
+    lost: bytes = b"",
+) -> bytes:
     """The first entry, for a place where nothing of ours is mapped yet: constants only, nothing stored.
 
     It waits with three results in `ENTRY_REGISTERS`, where a tracer sees them. If none comes it closes the descriptor, gives
@@ -417,9 +469,17 @@ def entry_code(address: int, calls: EntryCalls, registers: Registers, mask: int,
         registers: what the program goes on with; ``pc`` is where.
         mask: the program's signal mask.
         patience_ns: how long it waits for the tracer.
-        vectors: NT_PRFPREG, as the thread stands.
+        vectors: the extended state, of which NT_PRFPREG comes first, as the thread stands.
+        lost: the register set of `extended.LOST_IN_CALLS`, likewise.
     """
-    frame = address + 32
+    size = len(_entry_instructions(address, calls, address))
+    frame = -(-(address + ENTRY_CODE_OFFSET + size) // 16) * 16
+    instructions = _entry_instructions(address, calls, frame).ljust(frame - address - ENTRY_CODE_OFFSET, b"\0")
+    return struct.pack("<QQQQ", *divmod(patience_ns, 10**9), 0, 0) + instructions + _frame(frame, registers, mask, vectors, lost)
+
+
+def _entry_instructions(address: int, calls: EntryCalls, frame: int) -> bytes:
+    """Those of `entry_code`, as many whatever the address of the frame."""
     code = _Code(address + ENTRY_CODE_OFFSET)
     code.call(SYSCALLS[calls.code_pages.name], calls.code_pages.arguments)
     code.move(19, 0)
@@ -432,20 +492,20 @@ def entry_code(address: int, calls: EntryCalls, registers: Registers, mask: int,
     code.move(0, 21)
     code.call(SYSCALLS["close"], ())
     code.give_back(frame)
-    return struct.pack("<QQQQ", *divmod(patience_ns, 10**9), 0, 0) + _frame(registers, mask, vectors) + bytes(code.content)
+    return bytes(code.content)
 
 
-def _frame(registers: Registers, mask: int, vectors: bytes) -> bytes:
+def _frame(address: int, registers: Registers, mask: int, vectors: bytes, lost: bytes) -> bytes:
     """A struct ucontext of constants. ``vectors``: 32 registers, then fpsr and fpcr, 32 bits each."""
-    frame = bytearray(_END_OF_FRAME + 16)
+    frame = bytearray(_END_OF_FRAME)
     struct.pack_into("<Q", frame, _STACK_FLAGS, _NO_STACK)
     struct.pack_into("<Q", frame, _MASK_OF_FRAME, mask)
     frame[_GENERAL_OF_FRAME : _GENERAL_OF_FRAME + REGISTERS_SIZE] = encode_registers(registers)
     struct.pack_into("<Q8s512s", frame, _VECTORS, _VECTORS_HEAD, vectors[512:520], vectors[:512])
-    return bytes(frame)
+    return bytes(frame) + frame_of_lost(address, lost)[1]
 
 
-ENTRY_CODE_OFFSET: Final = 32 + _END_OF_FRAME + 16
+ENTRY_CODE_OFFSET: Final = 32
 """Where the instructions of `entry_code` begin, after its constants."""
 ENTRY_TIMEOUT_NS: Final = 100_000_000
 """How long a program whose tracer died waits before it goes on by itself."""

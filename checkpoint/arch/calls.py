@@ -57,7 +57,7 @@ class TablePlaces:
     """Addresses inside the borrowed table that the code reads and writes.
 
     Attributes:
-        frame: of `FRAME_SIZE` bytes, as many as the processor's code needs for itself.
+        frame: of `frame_size` bytes, as many as the processor's code needs for itself.
     """
 
     state: int

@@ -238,9 +238,21 @@ CLOBBERED: Final = ("rax", "rdi", "rsi", "rdx", "r10", "r8", "r9", "rcx", "r11")
 """What the calls change: ours to give back, in this order in the table."""
 LARGE_DESK_SIZE: Final = 16384
 SMALL_DESK_SIZE: Final = 512
-"""Bytes of a desk's code, and of its table: for 200 of the longest calls, and for four."""
-FRAME_SIZE: Final = 0
-"""Bytes at the end of a desk's table that its code needs for itself."""
+"""Bytes of a desk's code, and of its table without the frame: for 200 of the longest calls, and for four."""
+
+
+def frame_size(lost: int) -> int:
+    """Bytes at the end of a desk's table that its code needs for itself: none.
+
+    Args:
+        lost: bytes of the register set of `extended.LOST_IN_CALLS`; 0: there is none.
+    """
+    return 0
+
+
+def frame_of_lost(frame: int, lost: bytes) -> tuple[int, bytes]:
+    """Where in a frame it stands what a thread has lost in our calls, and that as it stands there: nowhere, and nothing."""
+    return frame, b""
 
 
 class _Code:
@@ -324,7 +336,15 @@ ENTRY_REGISTERS: Final = ("r12", "r13", "r14")
 """Where the entry keeps its results, and gives them back: the code pages, the table pages, the userfaultfd."""
 
 
-def entry_code(address: int, calls: EntryCalls, registers: Registers, mask: int, patience_ns: int, vectors: bytes = b"") -> bytes:
+def entry_code(
+    address: int,
+    calls: EntryCalls,
+    registers: Registers,
+    mask: int,
+    patience_ns: int,
+    vectors: bytes = b"",
+    lost: bytes = b"",
+) -> bytes:
     """The first entry, for a place where nothing of ours is mapped yet: constants only, nothing stored.
 
     It waits with three results in `ENTRY_REGISTERS`, where a tracer sees them. If none comes it closes the descriptor, gives
@@ -334,7 +354,7 @@ def entry_code(address: int, calls: EntryCalls, registers: Registers, mask: int,
         registers: what the program goes on with; ``rip`` is where.
         mask: the program's signal mask.
         patience_ns: how long it waits for the tracer.
-        vectors: unused: nothing here changes them.
+        vectors, lost: unused: nothing here changes them.
     """
     code = _Code(address + ENTRY_CODE_OFFSET)
     code.call(SYSCALLS[calls.code_pages.name], calls.code_pages.arguments)

@@ -49,6 +49,8 @@ PKRU_OF_LINUX: Final = 0x55555554
 HIGHEST: Final = 62
 AMX: Final = (17, 18)
 """Only for a process that has asked for it, and 8 KiB a thread: kept while its tiles are released, as between computations."""
+LOST_IN_CALLS: Final[int | None] = None
+"""The register set of which every system call may take a part: none."""
 UNKEPT: Final[dict[str, str]] = {}
 """Features of which a thread has registers that are not kept: none, whatever XSAVE knows is."""
 PERMISSIONS: Final = (("amx_tile", "arch_prctl", (0x1023, 18)),)
@@ -58,13 +60,19 @@ Source: Documentation/arch/x86/xstate.rst.
 """
 
 
-def sets(features: Callable[[], Collection[str]]) -> tuple[tuple[int, int], ...]:
-    """The register sets that make up the state, in order: number, and the bytes to offer for it.
+def sets(features: Callable[[], Collection[str]], vector_size: Callable[[], int]) -> tuple[tuple[int, int], ...]:
+    """The register sets that make up the state, in order: number, and the bytes to offer for it. The last one may come short.
 
     Args:
         features: of this machine's processor.
+        vector_size: unused: bytes of its longest scalable vectors.
     """
     return ((XSTATE, XSTATE_SIZE),)
+
+
+def is_lost_in_calls(content: bytes) -> bool:
+    """Whether a system call would take a part of what `LOST_IN_CALLS` holds: never."""
+    return False
 
 
 def parts(state: bytes, layout: Layout) -> Iterator[tuple[int, bytes]]:
@@ -171,10 +179,11 @@ ASK_ENABLED: Final = bytes.fromhex(
 LEAF_XSTATE: Final = 0xD
 
 
-def layout_here(features: Callable[[], Collection[str]], run: Callable[[bytes], int]) -> Layout:
+def layout_here(features: Callable[[], Collection[str]], vector_size: Callable[[], int], run: Callable[[bytes], int]) -> Layout:
     """The components of this machine's processor; () where there are none.
 
     Args:
+        vector_size: unused, see `sets`.
         run: the address of instructions, in memory that nobody can write.
 
     Raises:

@@ -76,7 +76,7 @@ CAPABILITIES: Final = (
     ),
     preserved(
         Area.PROCESS,
-        "registers, floating point, SSE, AVX and AVX-512, thread-local storage",
+        "registers, floating point, SSE, AVX and AVX-512, scalable vectors (SVE), thread-local storage",
         "as they were",
     ),
     preserved(

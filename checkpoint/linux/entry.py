@@ -34,6 +34,7 @@ from checkpoint.linux.remote import (
     TABLE_SIZE,
     Batch,
     BorrowedPages,
+    Guest,
     give_back,
     patience_ns,
     resumed,
@@ -85,7 +86,8 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
     """
     hole = largest_hole(maps)
     rooms = vdso_rooms(tracee.memory, maps)
-    place, stub = _stub(tracee, rooms, hole, registers, mask)
+    guest = Guest(tracee, registers, mask, tracee.lost_in_calls())
+    place, stub = _stub(guest, rooms, hole)
     had = tracee.memory.read(place, max(0, rooms[0].start - place)).ljust(len(stub), b"\0")
     tracee.memory.poke(place, stub)
     there = arch.decode_registers(registers)
@@ -99,7 +101,7 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
     try:
         _wait_in_call(tracee.pid, "rt_sigtimedwait")
     finally:
-        found = give_back(tracee, registers, mask, range(place, place + len(stub)).__contains__)
+        found = give_back(guest, range(place, place + len(stub)).__contains__)
     code, table, inside = (ctypes.c_int64(found[name]).value for name in arch.ENTRY_REGISTERS)
     tracee.memory.poke(place, had)
     if code != hole or table != hole + CODE_SIZE:
@@ -112,16 +114,20 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
     return Entered(pages, faults, inside, why_not)
 
 
-def _stub(tracee: Tracee, rooms: Sequence[range], hole: int, registers: bytes, mask: int) -> tuple[int, bytes]:
+def _stub(guest: Guest, rooms: Sequence[range], hole: int) -> tuple[int, bytes]:
     """Where there is room for what the thread will run, and that.
+
+    Scalable vectors may be too long to lie there. Only a keeper that dies in this very entry would owe them to the program: it
+    loses what calls take from them then.
 
     Raises:
         CaptureError: there is none.
     """
+    tracee, registers, mask, lost = guest
     calls, patience = _entry_calls(hole), patience_ns(tracee)
     goes_on, vectors = resumed(arch.decode_registers(tracee.left_alone or registers)), tracee.xstate()
-    for room in rooms:
-        stub = arch.entry_code(room.start, calls, goes_on, mask, patience, vectors)
+    for with_lost, room in itertools.product((lost, b"") if lost else (b"",), rooms):
+        stub = arch.entry_code(room.start, calls, goes_on, mask, patience, vectors, with_lost)
         if len(stub) <= len(room):
             return room.start, stub
     raise CaptureError(

@@ -17,6 +17,11 @@ import numpy as np
 from checkpoint import arch
 from checkpoint.arch import cpu, extended
 from checkpoint.errors import ProbeError
+from checkpoint.linux.namespaces import prctl
+
+_PR_SVE_SET_VL, _PR_SVE_GET_VL, _PR_SVE_VL_LEN_MASK = 50, 51, 0xFFFF
+_ANY_VECTOR_SIZE = 8192
+"""More than any processor has: the kernel takes the longest there is. Source: linux/prctl.h, asm/sigcontext.h (SVE_VL_MAX)."""
 
 
 @functools.cache
@@ -24,7 +29,7 @@ def xstate_layout() -> extended.Layout:
     """Where the components of a thread's extended state lie; () where there are none, or the system forbids code of our own."""
     with contextlib.ExitStack() as pages:
         try:
-            return extended.layout_here(features, lambda code: pages.enter_context(_instructions(code)))
+            return extended.layout_here(features, vector_size, lambda code: pages.enter_context(_instructions(code)))
         except OSError:
             return ()
 
@@ -58,7 +63,22 @@ def require_supported(what: str) -> None:
 @functools.cache
 def state_sets() -> tuple[tuple[int, int], ...]:
     """The register sets that make up a thread's extended state, in order: number, and the bytes to offer for it."""
-    return extended.sets(features)
+    return extended.sets(features, vector_size)
+
+
+@functools.cache
+def vector_size() -> int:
+    """Bytes of the longest scalable vectors that this processor has; 0: it has none.
+
+    Found by having our own thread use the longest for an instant, for nothing else tells it. Source: PR_SVE_SET_VL(2const).
+    """
+    try:
+        ours = prctl(_PR_SVE_GET_VL)
+        longest = prctl(_PR_SVE_SET_VL, _ANY_VECTOR_SIZE)
+        prctl(_PR_SVE_SET_VL, ours)
+    except OSError:
+        return 0
+    return longest & _PR_SVE_VL_LEN_MASK
 
 
 @contextlib.contextmanager

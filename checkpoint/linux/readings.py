@@ -37,8 +37,8 @@ _WORD: Final = 8
 _RSEQ: Final = struct.Struct("<QIIII")
 _INT: Final = struct.Struct("<i")
 _PAIR: Final = struct.Struct("<QQ")
-(_STATE_SET, _STATE_SIZE), *FURTHER = STATE_SETS
-"""The first register set of the extended state, which may come short, and those that come whole: number and size of each."""
+*FURTHER, (_STATE_SET, _STATE_SIZE) = STATE_SETS
+"""The register sets of the extended state that come whole, and the last one, which may come short: number and size of each."""
 _IOV_SIZE: Final = 16
 
 
@@ -252,8 +252,8 @@ class _Answers:
 
     def _xstate(self, index: int) -> bytes:
         begin = index * _Layout.size + _Layout.xstate
-        first, at = bytes(self._area.view[begin : begin + self._word(index, _XSTATE_LENGTH)]), index * _Layout.size
-        return b"".join([first, *(self._area.view[at + place :][:size] for _, place, size in _FURTHER_PLACES)])
+        last, at = self._area.view[begin : begin + self._word(index, _XSTATE_LENGTH)], index * _Layout.size
+        return b"".join([*(self._area.view[at + place :][:size] for _, place, size in _FURTHER_PLACES), last])
 
     def _rseq(self, at: int) -> Rseq | None:
         address, size, signature, flags, _ = _RSEQ.unpack_from(self._area.view, at + _Layout.rseq)

@@ -44,13 +44,16 @@ from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import abi
 from checkpoint.linux.memory import Memory, Ranges, ranges_of
 from checkpoint.linux.rounds import Round
-from checkpoint.linux.tracee import Tracee, rest
+from checkpoint.linux.tracee import LOST_SIZE, Tracee, rest
 
 LARGE_DESK: Final = max(arch.LARGE_DESK_SIZE, 4 * abi.PAGE_SIZE)
 """Bytes of the large desk's code, and of its table."""
 DESK_COUNT: Final = 32
-SMALL_DESK: Final = arch.SMALL_DESK_SIZE
-"""Bytes of a small desk's code, and of its table: room for four short calls."""
+FRAME_SIZE: Final = arch.frame_size(LOST_SIZE)
+"""Bytes at the end of a desk's table that are the code's own."""
+_SHARE_OF_A_PAGE: Final = abi.PAGE_SIZE // DESK_COUNT
+SMALL_DESK: Final = -(-(arch.SMALL_DESK_SIZE + FRAME_SIZE) // _SHARE_OF_A_PAGE) * _SHARE_OF_A_PAGE
+"""Bytes of a small desk's code, and of its table: room for four short calls. All of them are whole pages."""
 CODE_SIZE: Final = LARGE_DESK + DESK_COUNT * SMALL_DESK
 TABLE_SIZE: Final = CODE_SIZE
 SIZE: Final = CODE_SIZE + TABLE_SIZE
@@ -100,7 +103,7 @@ class Plan:
     @functools.cached_property
     def room(self) -> int:
         """Offset of where the outputs end at the latest: the code's own room, and the note, come after."""
-        return (self.size - _NOTE.size) // _OUTPUT_ALIGNMENT * _OUTPUT_ALIGNMENT - arch.FRAME_SIZE
+        return (self.size - _NOTE.size) // _OUTPUT_ALIGNMENT * _OUTPUT_ALIGNMENT - FRAME_SIZE
 
     @functools.cached_property
     def outputs(self) -> int:
@@ -196,11 +199,13 @@ class Guest(NamedTuple):
     Attributes:
         registers: as it was stopped with; given back untouched.
         mask: the program's own signal mask.
+        lost: `Tracee.lost_in_calls`, likewise.
     """
 
     tracee: Tracee
     registers: bytes
     mask: int
+    lost: bytes = b""
 
 
 def patience_ns(tracee: Tracee) -> int:
@@ -227,6 +232,7 @@ class Desk:
         self._places = _places(table, plan)
         self._code_key: tuple[Call, ...] | None = None
         self._serial = 0
+        self._lost: bytes | None = None
         self.is_known_idle = False
 
     def state(self) -> int:
@@ -245,11 +251,20 @@ class Desk:
             assert len(code) + len(MAGIC) <= self._plan.size, "the limit of calls keeps the code within its desk"
             self._memory.poke(self.code, code)
             self._code_key = key
+        self._lay_lost(guest.lost)
         self._serial += 1
         self.is_known_idle = False
-        tracee, registers, mask = guest
+        tracee, registers, mask, _ = guest
         patience = divmod(patience_ns(tracee), 10**9)
         return _HEAD.pack(MAGIC, ARMED, 0, self._serial, mask, *patience, 0, *_going_on(tracee.left_alone or registers))
+
+    def _lay_lost(self, lost: bytes) -> None:
+        """What the kernel is to give back by the code's own frame besides, unless it stands there."""
+        if lost != self._lost:
+            place, content = arch.frame_of_lost(self._places.frame, lost)
+            if content:
+                self._memory.write(place, content)
+            self._lost = lost
 
     def is_done(self, table: bytes) -> bool:
         """Whether the calls have been made, by the table's bytes."""
@@ -354,6 +369,7 @@ class BorrowedPages:
         return found
 
     def _run_at(self, desks: Sequence[Desk], batches: Sequence[Batch], guests: Sequence[Guest]) -> list[Answers]:
+        guests = [guest._replace(lost=guest.tracee.lost_in_calls()) for guest in guests] if LOST_SIZE else guests
         places = list(zip(desks, batches, guests, strict=False))
         self._require_free([desk for desk, _, _ in places])
         heads = b"".join([desk.armed(batch, guest) for desk, batch, guest in places])
@@ -397,6 +413,8 @@ class BorrowedPages:
             given = self._take_back_singly(places, failures)
         elif all(stand := sent.await_stops(tracees, asked)) and sent.give_back(self.holds):
             given = [desk for desk, _ in places]
+            for _, guest in places:
+                guest.tracee.give_back_lost(guest.lost)
         else:
             moving = [was and not stands for was, stands in zip(asked, stand, strict=True)]
             given = self._set_back_singly(places, moving, failures)
@@ -425,7 +443,7 @@ class BorrowedPages:
             with _collected(failures):
                 if moves:
                     guest.tracee.await_stop()
-                set_back(guest.tracee, guest.registers, guest.mask, self.holds)
+                set_back(guest, self.holds)
                 given.append(desk)
         return given
 
@@ -468,13 +486,13 @@ def _tables(memory: Memory, desks: Sequence[Desk], end: int) -> list[bytes]:
     return [raw[place * size : (place + 1) * size] for place in range(len(desks))]
 
 
-def give_back(tracee: Tracee, registers: bytes, mask: int, is_ours: Callable[[int], bool]) -> Registers:
+def give_back(guest: Guest, is_ours: Callable[[int], bool]) -> Registers:
     """Stop the thread in our code, and set it where the program stood. Answers with what it had there; raises as `set_back`."""
-    tracee.freeze()
-    return set_back(tracee, registers, mask, is_ours)
+    guest.tracee.freeze()
+    return set_back(guest, is_ours)
 
 
-def set_back(tracee: Tracee, registers: bytes, mask: int, is_ours: Callable[[int], bool]) -> Registers:
+def set_back(guest: Guest, is_ours: Callable[[int], bool]) -> Registers:
     """Set a thread that stands in our code where the program stood. Mask first: see step 5. Answers with what it had there.
 
     Args:
@@ -483,6 +501,7 @@ def set_back(tracee: Tracee, registers: bytes, mask: int, is_ours: Callable[[int
     Raises:
         CaptureError: it has left our code by itself, and goes on from where it is now.
     """
+    tracee, registers, mask, lost = guest
     found = arch.decode_registers(tracee.registers())
     if not is_ours(found[arch.INSTRUCTION_POINTER]):
         tracee.is_as_found = True  # whatever it stands in now it has come to by itself
@@ -492,6 +511,7 @@ def set_back(tracee: Tracee, registers: bytes, mask: int, is_ours: Callable[[int
         )
     tracee.set_signal_mask(mask)
     tracee.set_registers(registers)
+    tracee.give_back_lost(lost)
     return found
 
 

@@ -34,7 +34,9 @@ CALL_STOP: Final = 0x80
 REGISTERS_SIZE: Final = 4096
 """Bytes offered for the general registers: more than any processor has."""
 STATE_SETS: Final = processor.state_sets()
-"""The register sets of the extended state."""
+"""The register sets of the extended state. The last one may come short."""
+LOST_SIZE: Final = dict(STATE_SETS).get(extended.LOST_IN_CALLS or 0, 0)
+"""Bytes offered for the one of which system calls take a part; 0: there is none."""
 SET_SIZE: Final = max(size for _, size in STATE_SETS)
 """Bytes offered for one at most."""
 STOP_TIMEOUT_S: Final = 2.0
@@ -326,6 +328,18 @@ class Tracee:
     def xstate(self) -> bytes:
         """Read what it has besides the general registers: all of `STATE_SETS`, one after the other."""
         return b"".join(self._getregset("read vector registers of", kind, self._xstate, size) for kind, size in STATE_SETS)
+
+    def lost_in_calls(self) -> bytes:
+        """What calls of ours would take from its registers, for `give_back_lost`; empty: nothing."""
+        if not LOST_SIZE or extended.LOST_IN_CALLS is None:
+            return b""
+        content = self._getregset("read vector registers of", extended.LOST_IN_CALLS, self._xstate, LOST_SIZE)
+        return content if extended.is_lost_in_calls(content) else b""
+
+    def give_back_lost(self, content: bytes) -> None:
+        """Write what `lost_in_calls` has read."""
+        if content and extended.LOST_IN_CALLS is not None:
+            self._setregset("write vector registers of", extended.LOST_IN_CALLS, content, self._xstate)
 
     def register_set(self, kind: int) -> bytes:
         """Read another register set.

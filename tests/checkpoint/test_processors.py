@@ -19,7 +19,7 @@ import pytest
 from checkpoint import arch
 from checkpoint.arch import aarch64, aarch64_xstate, x86_64
 from checkpoint.arch.calls import Call, EntryCalls, TablePlaces
-from checkpoint.arch.components import Component
+from checkpoint.arch.components import Component, Layout
 from checkpoint.linux import remote
 from checkpoint.linux.remote import Plan
 
@@ -152,6 +152,64 @@ def test_the_state_goes_to_a_processor_that_has_more_and_not_to_one_that_has_les
     assert b"".join(part for _, part in aarch64_xstate.parts(grown, signing)) == grown
 
 
+PLAIN = (Component(aarch64_xstate.VECTORS, 0, 528), Component(aarch64_xstate.THREAD_POINTER, 528, 8))
+PLAIN_STATE = bytes(range(1, 133)) * 4 + b"\x01" * 8
+
+
+def with_vectors_of(size: int) -> Layout:
+    """What a processor tells whose longest scalable vectors have so many bytes."""
+    return aarch64_xstate.layout_here(lambda: ("fp", "sve"), lambda: size, lambda _: 0)
+
+
+def scalable(vector_size: int, *, whole: bool) -> bytes:
+    """NT_ARM_SVE of a thread."""
+    registers = bytes(34 * vector_size + vector_size // 8) if whole else PLAIN_STATE[:528]
+    return struct.pack("<IIHHHH", 16 + len(registers), 8768, vector_size, 256, whole, 0) + registers
+
+
+@pytest.mark.parametrize(
+    ("vector_size", "whole", "here", "lacks"),
+    [
+        (32, True, 64, False),
+        (64, True, 64, False),
+        (64, True, 32, True),
+        (64, False, 32, True),  # it may have asked for them, and reckons with them between two calls
+        (16, True, 0, True),
+        (16, False, 0, False),
+    ],
+)
+def test_scalable_vectors_go_to_where_as_long_ones_can_be_had(vector_size: int, whole: bool, here: int, lacks: bool) -> None:
+    theirs, ours = with_vectors_of(vector_size), with_vectors_of(here) if here else PLAIN
+    state = PLAIN_STATE + scalable(vector_size, whole=whole)
+    found = list(aarch64_xstate.lacking(state, theirs, ours))
+    assert found == [f"scalable vectors (SVE) of {8 * vector_size} bits"] * lacks
+    if not lacks:
+        fitted = aarch64_xstate.fitted(state, theirs, ours, PLAIN_STATE + scalable(here, whole=False) * bool(here))
+        assert fitted == (state if here else PLAIN_STATE)
+        assert b"".join(part for _, part in aarch64_xstate.parts(fitted, ours)) == fitted
+
+
+def test_who_comes_from_a_processor_without_scalable_vectors_keeps_its_vector_registers() -> None:
+    ours = with_vectors_of(64)
+    fitted = aarch64_xstate.fitted(PLAIN_STATE, PLAIN, ours, bytes(536) + scalable(64, whole=False))
+    assert list(aarch64_xstate.parts(fitted, ours)) == [(2, PLAIN_STATE[:528]), (0x401, PLAIN_STATE[528:])]
+
+
+@pytest.mark.parametrize("vector_size", [16, 64, 256])
+def test_a_frame_has_room_for_scalable_vectors_and_leads_to_them(vector_size: int) -> None:
+    lost = scalable(vector_size, whole=True)
+    place, content = aarch64.frame_of_lost(0x20400, lost)
+    offered = dict(aarch64_xstate.sets(lambda: ("fp", "sve"), lambda: vector_size))[aarch64_xstate.SCALABLE]
+    assert place + len(content) <= 0x20400 + aarch64.frame_size(offered)
+    magic, size, begin, further = struct.unpack_from("<IIQI", content)
+    assert (magic, size, begin) == (0x45585401, 32, place + 48) and begin % 16 == further % 16 == 0
+    assert content[32:48] == content[-16:] == bytes(16), "terminators"
+    magic, size, told = struct.unpack_from("<IIH", content, begin - place)
+    assert (magic, told) == (0x53564501, vector_size)
+    assert size % 16 == 0 and further == size + 16 == len(content) - 48
+    assert aarch64.frame_of_lost(0x20400, b"") == (place, bytes(16))
+
+
 PLACES = TablePlaces(
     state=0x20020, ended=2, done=0x20028, serial=0x20030, mask=0x20038, timeout=0x20040, empty_set=0x20050, resume=0x20058,
     registers=0x20060, results=0x200C0, frame=0x20400,
@@ -171,11 +229,12 @@ def disassembled(code: bytes, tmp_path: Path) -> list[str]:
 
 
 def test_a_batch_of_the_longest_calls_fits_at_its_desk() -> None:
-    for size, limit in ((aarch64.LARGE_DESK_SIZE, remote.CALL_LIMIT), (aarch64.SMALL_DESK_SIZE, 4)):
+    frame = aarch64.frame_size(0)
+    for size, limit in ((aarch64.LARGE_DESK_SIZE, remote.CALL_LIMIT), (aarch64.SMALL_DESK_SIZE + frame, 4)):
         code = aarch64.batch_code(0x10000, [LONGEST] * limit, PLACES)
         assert len(code) + len(remote.MAGIC) <= size
         plan = Plan(size, limit)
-        assert plan.outputs < size - aarch64.FRAME_SIZE
+        assert plan.outputs < size - frame
 
 
 def test_constants_are_set_by_as_few_instructions_as_it_takes(tmp_path: Path) -> None:

@@ -76,7 +76,13 @@ OF_X86 = [
     *cases("segments"),
     *cases("single_steps"),
 ]
-OF_PROCESSOR = {"aarch64": [*cases("registers_aarch64", told=BY_SIGNAL), *cases("rseq_loop", told=BY_SIGNAL)]}
+OF_AARCH64 = [
+    *cases("registers_aarch64", told=BY_SIGNAL),
+    *cases("rseq_loop", told=BY_SIGNAL),
+    *cases("scalable", "0 16", told=BY_SIGNAL),
+    Case("scalable", ("0", "threads"), BY_SIGNAL),
+]
+OF_PROCESSOR = {"aarch64": OF_AARCH64}
 """What is written in instructions of one processor; `OF_X86` for those that have none of their own."""
 REGISTERS = [
     *OF_PROCESSOR.get(os.uname().machine, OF_X86),

@@ -51,6 +51,7 @@ class Kind:
         compiler: of a static program for it.
         commands, packages: what else it takes.
         given: packages that hold another kernel, as files; with them ``suite`` is only its name.
+        variant: of its processor, for the name.
     """
 
     processor: str
@@ -64,11 +65,12 @@ class Kind:
     commands: tuple[str, ...]
     packages: str
     given: tuple[Path, ...] = ()
+    variant: str = ""
 
     @property
     def name(self) -> str:
         """For files and tests."""
-        return f"{self.processor}-{self.suite}{'-16k' * self.kernel.endswith('-16k')}"
+        return f"{self.processor}-{self.suite}{'-16k' * self.kernel.endswith('-16k')}{self.variant and f'-{self.variant}'}"
 
     @property
     def python(self) -> str:
@@ -115,6 +117,11 @@ _OF_DEBIAN: Final = (
         suite="trixie",
         kernel="linux-image-arm64-16k",
         emulator=("qemu-system-aarch64", "-M", "virt", "-cpu", "cortex-a76"),
+    ),
+    replace(  # a processor with scalable vectors, as a Jetson Thor's has; these are longer: up to 512 bits
+        _ARM,
+        emulator=("qemu-system-aarch64", "-M", "virt", "-cpu", "max,sve-max-vq=4,sme=off,pauth-impdef=on"),
+        variant="sve",
     ),
     Kind(  # 6.1: by the soft-dirty bit
         processor="x86_64",
