@@ -1,6 +1,6 @@
 """The few system calls that a guard needs and that Python does not offer.
 
-Sources: prctl(2), mlockall(2), fallocate(2), sigqueue(3), timerfd_create(2).
+Sources: prctl(2), mlock(2), fallocate(2), sigqueue(3), timerfd_create(2).
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ import os
 import resource
 import threading
 import time
+from collections.abc import Iterable
 from typing import Final
 
 PR_SET_CHILD_SUBREAPER: Final = 36
 MCL_CURRENT: Final = 1
 MCL_FUTURE: Final = 2
+MCL_ONFAULT: Final = 4
 FALLOC_FL_KEEP_SIZE: Final = 1
 FALLOC_FL_PUNCH_HOLE: Final = 2
 TFD_TIMER_ABSTIME: Final = 1
@@ -26,6 +28,7 @@ THREAD_STACK: Final = 256 << 10
 """Bytes; the usual 8 MB are for programs that know nothing of their threads."""
 
 _libc = ctypes.CDLL(None, use_errno=True)
+_libc.mlock.argtypes = (ctypes.c_void_p, ctypes.c_size_t)
 _libc.fallocate.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_int64, ctypes.c_int64)
 
 
@@ -74,14 +77,43 @@ def become_realtime(priority: int) -> int:
 
 
 def lock_memory() -> None:
-    """Keep every page of this process in memory, also those that are still to come; children do not inherit it.
+    """Keep every page of this process in memory, also those of mappings that are still to come; children do not inherit it.
+
+    What comes from files, or has been swapped out, is all read now: never will a disk be waited for. Memory that begins as zeros
+    stays when it is first used: until then the unused parts of stacks, and of the tables that allocators spread over address
+    space, take nothing. Such a first use costs a microsecond, and whoever runs in real time gets its page from what the kernel
+    holds back for that.
 
     Who has threads calls `small_stacks` before the first of them.
 
     Raises:
         OSError: RLIMIT_MEMLOCK is too small and CAP_IPC_LOCK is missing.
+
+    Source: mlock(2); gfp_to_alloc_flags in mm/page_alloc.c.
     """
-    _check(_libc.mlockall(MCL_CURRENT | MCL_FUTURE), "mlockall")
+    _check(_libc.mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT), "mlockall")
+    with open("/proc/self/smaps") as smaps:
+        spans = on_disk(smaps)
+    for address, size in spans:
+        _check(_libc.mlock(address, size), "mlock")
+    _check(_libc.mlockall(MCL_FUTURE), "mlockall")  # what will be mapped: whole, as it is mapped
+
+
+def on_disk(smaps: Iterable[str]) -> list[tuple[int, int]]:
+    """(address, size) of readable mappings of which a part may lie on a disk only: those of files, and of what was swapped out.
+
+    Line by line: their whole text would leave a hole in the memory that is about to be locked. Source: proc_pid_smaps(5).
+    """
+    spans: list[tuple[int, int]] = []
+    span, mode, inode = "", "", ""
+    for line in smaps:
+        name, *values = line.split(maxsplit=5)
+        if not name.endswith(":"):
+            span, mode, inode = name, values[0], values[3]
+        elif name == "Swap:" and mode.startswith("r") and (inode != "0" or values[0] != "0"):
+            start, end = (int(part, 16) for part in span.split("-"))
+            spans.append((start, end - start))
+    return spans
 
 
 def punch_hole(descriptor: int, offset: int, size: int) -> None:

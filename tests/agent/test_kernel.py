@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -44,6 +45,62 @@ def test_two_threads_of_a_process_that_is_locked_take_little_memory() -> None:
     if "not allowed" in found:
         pytest.skip("this user may not lock memory")
     assert int(found) < 4096
+
+
+LOCKED_FILES: Final = """
+import mmap, sys, tempfile
+from agent import kernel
+with tempfile.TemporaryFile() as file:
+    file.truncate(1 << 20)
+    unread = mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ, flags=mmap.MAP_PRIVATE)
+    unused = mmap.mmap(-1, 1 << 20, flags=mmap.MAP_PRIVATE)
+    try:
+        kernel.lock_memory()
+    except OSError:
+        print("not allowed")
+        raise SystemExit
+    later = mmap.mmap(-1, 3 << 20, flags=mmap.MAP_PRIVATE)
+    print(open("/proc/self/smaps").read())
+"""
+
+
+def test_of_a_process_that_is_locked_all_files_are_there_and_what_it_maps_later_but_no_memory_that_it_has_not_used() -> None:
+    found = subprocess.run([sys.executable, "-c", LOCKED_FILES], capture_output=True, text=True, check=True, timeout=60).stdout
+    if "not allowed" in found:
+        pytest.skip("this user may not lock memory")
+    mappings = [mapping.split() for mapping in re.split(r"(?m)^(?=[0-9a-f]+-[0-9a-f]+ )", found) if mapping.strip()]
+    assert mappings
+    mapped = [(fields[1], fields[4] != "0", kb_of(fields, "Size:"), kb_of(fields, "Rss:"), "lo" in fields) for fields in mappings]
+    assert [one for one in mapped if one[0].startswith("r") and one[1] and (one[2] != one[3] or not one[4])] == []
+    assert ("rw-p", False, 3072, 3072, True) in mapped
+    resident = sum(rss for _, of_file, _, rss, _ in mapped if not of_file)
+    assert resident <= sum(size for _, of_file, size, _, _ in mapped if not of_file) - 1024
+    assert all(is_locked for mode, _, _, rss, is_locked in mapped if rss and mode.startswith("rw"))  # not the vdso
+
+
+SOME_MAPPINGS: Final = """\
+00400000-0041f000 r--p 00000000 08:01 131                        /usr/bin/python3.11
+Size:                124 kB
+Swap:                  0 kB
+01c6b000-02054000 rw-p 00000000 00:00 0                          [heap]
+Size:               4004 kB
+Swap:                  0 kB
+7f0000000000-7f0000021000 rw-p 00000000 00:00 0
+Size:                132 kB
+Swap:                  8 kB
+7f0000021000-7f0004000000 ---p 00000000 08:01 132                /usr/lib/libz.so.1 (deleted)
+Size:              65404 kB
+Swap:                  0 kB
+"""
+
+
+def test_what_may_lie_on_a_disk_are_files_and_what_was_swapped_out() -> None:
+    assert kernel.on_disk(SOME_MAPPINGS.splitlines()) == [(0x400000, 0x1F000), (0x7F0000000000, 0x21000)]
+
+
+def kb_of(fields: list[str], name: str) -> int:
+    """A size out of one mapping's words in smaps."""
+    return int(fields[fields.index(name) + 1])
 
 
 @pytest.mark.root
