@@ -13,7 +13,7 @@ from typing import Final
 
 from agent.errors import LaneError
 from agent.rtnetlink import ANCILLARY_SIZE, allow_absent, interface_index, tell_interfaces
-from failover.client.team import Robot, split_address
+from failover.client.team import Robot, for_lookup, split_address
 
 FRAME_LIMIT: Final = 1_472
 """Bytes of one datagram: an Ethernet frame's worth, so that no beat is lost with half a fragment."""
@@ -86,8 +86,8 @@ class BeatLane:
 def _bound(address: str) -> socket.socket:
     host, port = split_address(address, "beat address")
     try:
-        given = host.encode() if host.isascii() else host  # a str would go through the codec of names, half a megabyte
-        family, kind, protocol, _, where = socket.getaddrinfo(given, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)[0]
+        found = socket.getaddrinfo(for_lookup(host), port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)
+        family, kind, protocol, _, where = found[0]
         link = socket.socket(family, kind | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC, protocol)
         link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         with contextlib.suppress(OSError):

@@ -16,7 +16,7 @@ from typing import Final
 
 from agent import rtnetlink
 from agent.rtnetlink import KernelLink
-from failover.client.team import Robot, split_address
+from failover.client.team import Robot, for_lookup, split_address
 
 SYSFS: Final = Path("/sys/class/net")
 PROC_WIRELESS: Final = Path("/proc/net/wireless")
@@ -286,7 +286,7 @@ def can_pin(name: str) -> bool:
 def resolved(host: str) -> str:
     """The address that a host's name stands for, as the kernel would write it; the name itself if it has none now."""
     try:
-        return str(socket.getaddrinfo(host, None, type=socket.SOCK_DGRAM)[0][4][0])
+        return str(socket.getaddrinfo(for_lookup(host), None, type=socket.SOCK_DGRAM)[0][4][0])
     except OSError:
         return host
 

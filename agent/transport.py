@@ -28,7 +28,7 @@ from agent.errors import LaneError
 from agent.links import Device
 from agent.mistake import end_lanes_on_mistake
 from agent.rtnetlink import allow_absent
-from failover.client.team import split_address
+from failover.client.team import for_lookup, split_address
 from failover.core.messages import CHUNK_SIZE_MAX, Bulk, Chunk
 from failover.core.wire import decode_bulk, encode_bulk
 
@@ -473,7 +473,8 @@ def _listener(address: str, device: Device | None) -> int:
         OSError: the address is taken, or is none.
     """
     host, port = split_address(address, "bulk address")
-    family, kind, protocol, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    found = socket.getaddrinfo(for_lookup(host), port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    family, kind, protocol, _, where = found[0]
     with socket.socket(family, kind | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC, protocol) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         allow_absent(listener)

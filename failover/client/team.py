@@ -123,6 +123,11 @@ def split_address(address: str, where: str) -> tuple[str, int]:
     return host.strip("[]"), int(port)
 
 
+def for_lookup(host: str) -> str | bytes:
+    """A host as getaddrinfo is asked for it: a str would go through the codec of names, half a megabyte for good."""
+    return host.encode() if host.isascii() else host
+
+
 def write(directory: Path, team: Team) -> None:
     """Write the team file whole: aside, then renamed."""
     directory.mkdir(parents=True, exist_ok=True)
