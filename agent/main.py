@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import logging
 import sys
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from agent import config as configuration
 from agent import kernel, lean
@@ -15,6 +13,9 @@ from agent.errors import AgentError
 from agent.journal import set_up_log
 from agent.systemd import notifier
 from failover.errors import FailoverError
+
+if TYPE_CHECKING:
+    import argparse
 
 DEFAULT_CONFIG: Final = Path("/etc/failover/agent.toml")
 FAILED: Final = 1
@@ -40,19 +41,28 @@ log = logging.getLogger("failover.agent")
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the agent until SIGTERM, or print a key pair, or check a configuration."""
-    wanted = command_line().parse_args(arguments)
+    command, config = _wanted(sys.argv[1:] if arguments is None else arguments)
     try:
-        if wanted.command == "keypair":
+        if command == "keypair":
             return _print_keys()
-        settings = configuration.load(wanted.config)
-        if wanted.command == "check":
+        settings = configuration.load(config)
+        if command == "check":
             peers = ", ".join(settings.peers) or "none"
-            print(f"{wanted.config}: robot {settings.config.robot} of team {settings.team.team}; peers: {peers}")
+            print(f"{config}: robot {settings.config.robot} of team {settings.team.team}; peers: {peers}")
             return 0
         return _run(settings)
     except (AgentError, FailoverError) as error:
         print(f"failover-agent: {error}", file=sys.stderr)
         return FAILED
+
+
+def _wanted(arguments: list[str]) -> tuple[str, Path]:
+    """The command and the configuration file; as services are started without argparse: the heart would keep half a megabyte."""
+    match arguments:
+        case ["--config", path] if not path.startswith("-"):
+            return "run", Path(path)
+    found = command_line().parse_args(arguments)
+    return found.command, found.config
 
 
 def _run(settings: configuration.Settings) -> int:
@@ -67,6 +77,8 @@ def _run(settings: configuration.Settings) -> int:
 
 
 def _print_keys() -> int:
+    import json
+
     from agent.transport import new_keys
 
     public, secret = new_keys()
@@ -76,6 +88,8 @@ def _print_keys() -> int:
 
 def command_line() -> argparse.ArgumentParser:
     """What can be typed."""
+    import argparse
+
     parser = argparse.ArgumentParser(
         prog="failover-agent",
         description=DESCRIPTION.strip(),
