@@ -6,7 +6,6 @@ linux/if_link.h, linux/rtnetlink.h.
 
 from __future__ import annotations
 
-import ipaddress
 import socket
 import struct
 from collections.abc import Iterable, Iterator
@@ -209,7 +208,8 @@ def _address(body: bytes) -> tuple[str, int]:
     *_, index = _ADDRESS.unpack_from(body)
     said = _attributes(body[_ADDRESS.size :])
     packed = said.get(IFA_LOCAL, said.get(IFA_ADDRESS, b""))
-    return (str(ipaddress.ip_address(packed)) if len(packed) in (4, 16) else ""), index
+    family = {4: socket.AF_INET, 16: socket.AF_INET6}.get(len(packed))
+    return (socket.inet_ntop(family, packed) if family is not None else ""), index
 
 
 def _text(content: bytes) -> str:

@@ -70,6 +70,8 @@ Offered = Offer | Content
 
 @dataclass(slots=True)
 class _Outgoing:
+    """One transfer that leaves, as far as it has been taken."""
+
     peer: str
     what: str
     until: int = 0
@@ -211,6 +213,8 @@ class Desk(Protocol[Kind]):
 
 @dataclass(slots=True)
 class _Incoming:
+    """One transfer that comes in, and the task that writes it."""
+
     offer: Offered
     chunks: asyncio.Queue[Chunk]
     task: asyncio.Task[None] | None = None

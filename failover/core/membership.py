@@ -36,6 +36,8 @@ SUSPECT_BEATS = 3
 
 @dataclass(slots=True)
 class _Known:
+    """What is known of one component from one beat."""
+
     entry: Entry
     counter: int
 

@@ -4,30 +4,79 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import Final
 
 import pytest
 
+from agent import lean
+
+LOADED: Final = """
+import sys
+from agent import lean
+lean.begin()
+import {}
+print(*(name for name, module in sys.modules.items() if vars(module or object).get("__spec__")))
+"""
+
 
 def loaded_by(*modules: str) -> set[str]:
-    """The modules in a fresh interpreter that has imported these."""
-    script = (
-        f"from agent import lean; lean.begin(); import {', '.join(modules)}, sys; print(*filter(sys.modules.get, sys.modules))"
-    )
+    """The modules that a fresh interpreter has loaded which has imported these; what stands in for a module has no spec."""
+    script = LOADED.format(", ".join(modules))
     return set(subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split())
 
 
+def seldom_used() -> set[str]:
+    """What neither process needs; dataclasses ask inspect of every class from Python 3.12 on."""
+    return set(lean.SELDOM_USED) - ({"inspect"} if sys.version_info >= (3, 12) else set())
+
+
 def test_the_heart_loads_neither_asyncio_nor_what_reads_pages() -> None:
-    assert not loaded_by("agent.main", "agent.loop") & {
+    loaded = loaded_by("agent.main", "agent.loop")
+    assert "agent.loop" in loaded
+    assert not loaded & {
         "asyncio",
+        "argparse",
+        "json",
         "ssl",
         "numpy",
         "zmq",
         "importlib.metadata",
         "unicodedata",
         "_hashlib",
+        *seldom_used(),
     }
 
 
 @pytest.mark.parametrize("lanes", ["agent.lanes", "agent.witness"])
 def test_the_lanes_load_no_numpy_before_a_snapshot_comes(lanes: str) -> None:
-    assert not loaded_by(lanes) & {"numpy", "importlib.metadata", "_ssl", "_hashlib", "unicodedata"}
+    loaded = loaded_by(lanes)
+    assert lanes in loaded
+    assert not loaded & {"numpy", "importlib.metadata", "ssl", "_ssl", "_hashlib", "unicodedata", *seldom_used()}
+
+
+USED: Final = """
+import sys, threading
+from agent import lean
+lean.begin()
+import inspect
+assert type(sys.modules["inspect"]) is lean._Seldom
+from dataclasses import dataclass
+found = []
+threads = [threading.Thread(target=lambda: found.append(inspect.isclass(int))) for _ in range(8)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+@dataclass
+class Point:
+    x: int
+from inspect import signature
+import textwrap as first, textwrap
+print(found == [True] * 8, sys.modules["inspect"].__file__ == __import__("inspect").__file__, Point.__doc__, signature(Point))
+print(first.dedent("  x"), first is textwrap, hasattr(inspect, "no such thing"), hasattr(first, "__file__"))
+"""
+
+
+def test_what_is_seldom_used_is_there_when_it_is_used_by_several_threads_at_once() -> None:
+    ran = subprocess.run([sys.executable, "-c", USED], capture_output=True, text=True, check=True)
+    assert ran.stdout.splitlines() == ["True True Point(x: int) (x: int) -> None", "x True False True"]

@@ -328,7 +328,7 @@ def ip_inside(robot: RobotMachine, *words: str) -> list[str]:
 
 def agent_command(config: Path) -> list[str]:
     """The command line of an agent."""
-    return [sys.executable, "-m", "agent.main", "--config", str(config)]
+    return [sys.executable, "-m", "agent.lean", "agent.main", "--config", str(config)]
 
 
 def wait_for_network(robot: RobotMachine) -> None:
