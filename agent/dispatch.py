@@ -11,7 +11,6 @@ from agent.bringing import Bringing
 from agent.errors import AgentError, LaneError
 from agent.mistake import end_lanes_on_mistake
 from agent.shipping import Shipper, digest_of
-from checkpoint import format
 from checkpoint.errors import CheckpointError
 from checkpoint.model import Position
 from checkpoint.needs import needs
@@ -92,7 +91,7 @@ class Dispatch:
         descriptor = os.open(entry.path, os.O_RDONLY | os.O_CLOEXEC)
         try:
             if self._bringing is not None:
-                outline = await asyncio.to_thread(format.read_outline, descriptor)
+                outline = await asyncio.to_thread(self._store.outline, act.component, entry, descriptor)
                 await self._bringing.bring(act.to, act.component, needs(outline, opened=self._brings_data(act.component)))
             digest = await asyncio.to_thread(digest_of, descriptor, entry.size)
             offer = Offer(0, act.component, entry.epoch, entry.position, entry.parent, entry.size, digest, act.spec)

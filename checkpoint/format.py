@@ -309,12 +309,21 @@ def verify(source: Source) -> Header:
     Raises:
         FormatError: as ``decode``.
     """
+    return state.header_of(verified_outline(source))
+
+
+def verified_outline(source: Source) -> Snapshot:
+    """The outline of a file of which every byte is as it was written; no page is decompressed.
+
+    Raises:
+        FormatError: as ``decode``.
+    """
     with _opened(source) as reader:
         preamble = _read_preamble(reader)
-        _read_outline(reader, preamble)
+        outline = _read_outline(reader, preamble)
         for frame in _frames(reader, preamble):
             _check_digest(reader.read(frame.body_offset, frame.head.stored_size), frame)
-        return _read_header(reader, preamble)
+    return outline
 
 
 def _read_preamble(reader: _Reader) -> Preamble:

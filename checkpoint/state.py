@@ -296,10 +296,10 @@ def _sorted(value: Any) -> Any:
 
 
 def _is_sorted(value: Any) -> bool:
-    """Whether the keys of every mapping in it are in order."""
-    if isinstance(value, Mapping):
+    """Whether the keys of every mapping in it, as msgpack decodes it, are in order."""
+    if isinstance(value, dict):
         return all(earlier < later for earlier, later in pairwise(value)) and all(map(_is_sorted, value.values()))
-    return not isinstance(value, list | tuple) or all(map(_is_sorted, value))
+    return not isinstance(value, list) or all(map(_is_sorted, value))
 
 
 def _decoded(packed: bytes | memoryview, kind: type[_Value], what: str) -> _Value:

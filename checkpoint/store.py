@@ -96,6 +96,8 @@ class Store:
         self._changing: dict[str, threading.RLock] = {}
         self._shelves: dict[str, Shelf] = {}
         self._proofs = Proofs(cache_size, self._decoded)
+        self._made_last: dict[str, tuple[Path, Snapshot]] = {}
+        """Of each component what was put last without a proof, without its pages and its output, and where."""
         self.notices: list[str] = []
         """What was found damaged or left over: one sentence each."""
 
@@ -146,6 +148,19 @@ class Store:
                 os.close(descriptor)
             raise
         return opened
+
+    def outline(self, component: str, entry: Entry, source: int) -> Snapshot:
+        """A snapshot without its pages; where it was made here last it is known still, but neither runs nor output of it.
+
+        Args:
+            source: descriptor of its file, which may have been removed meanwhile.
+
+        Raises:
+            FormatError: not a whole, unaltered snapshot.
+        """
+        with self._lock:
+            path, outline = self._made_last.get(component, (None, None))
+        return outline if outline is not None and path == entry.path else format.read_outline(source)
 
     def load(self, component: str, position: Position | None = None) -> Snapshot:
         """The state at a position as one base, verified and proved.
@@ -211,13 +226,12 @@ class Store:
             ChainError: it continues no position that the store holds, or does not lead to the state it names; ask for a base.
             StoreError: the disk does not take it; nothing of it is left.
         """
-        snapshot = format.decode(source) if prove else format.read_outline(source)
-        header = format.verify(source) if not prove else header_of(snapshot)
+        snapshot = format.decode(source) if prove else format.verified_outline(source)
         with self._change_of(snapshot.component):
             shelf = self._shelf(snapshot.component)
             self._check_parent(shelf, snapshot)
             proved = self._proofs.prove(shelf, snapshot) if prove else None
-            final = self._root / folder_name(header.component) / file_name(header)
+            final = self._root / folder_name(snapshot.component) / file_name(header_of(snapshot))
             if all(entry.path != final for entry in shelf.entries):
                 size = self._files.write(final, lambda file: file.copy_from(source), source)
                 self._add(snapshot.component, _entry_of(final, snapshot, size))
@@ -225,7 +239,12 @@ class Store:
                 self._proofs.keep(snapshot.component, proved)
             else:  # what comes from here is not proved: what was remembered while it came from elsewhere is of no use
                 self._proofs.forget(snapshot.component)
-        return replace(snapshot, runs=(), cleared=(), copies=(), differences=(), contents=b"")
+            outline = replace(snapshot, runs=(), cleared=(), copies=(), differences=(), contents=b"")
+            with self._lock:
+                self._made_last.pop(snapshot.component, None)
+                if not prove:
+                    self._made_last[snapshot.component] = (final, replace(outline, output=()))
+        return outline
 
     @contextmanager
     def _change_of(self, component: str) -> Iterator[None]:
@@ -344,6 +363,7 @@ class Store:
             self._remove_damaged(component, lambda _: True)
             self._history.forget(folder_name(component))
             self._shelves.pop(component, None)
+            self._made_last.pop(component, None)
             self._proofs.forget(component)
 
     def collect_contents(self) -> int:

@@ -58,6 +58,7 @@ def test_what_was_written_is_what_is_read(made: Snapshot) -> None:
     outline = format.read_outline(content)
     assert replace(outline, contents=made.contents) == made
     assert format.verify(content) == format.read_header(content)
+    assert format.verified_outline(content) == outline
     assert format.read_header(content).position == made.position
 
 

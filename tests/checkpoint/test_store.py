@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ from checkpoint.channel import memfd_holding
 from checkpoint.disk import Disk, DiskFile
 from checkpoint.errors import ChainError, FormatError, StoreError
 from checkpoint.model import Snapshot
+from checkpoint.shelf import Entry
 from checkpoint.store import Store, open_store
 from checkpoint.whole_files import WholeFiles
 from tests.checkpoint.snapshots import COMPONENT, history, page, pages_of, snapshot
@@ -201,6 +203,25 @@ def test_a_former_standby_remembers_no_pages_of_what_it_runs_now(tmp_path: Path)
         assert not store._proofs._proved
         put(store, fourth)  # a standby again
         assert store.newest(COMPONENT) == fourth.position
+
+
+def test_the_outline_of_what_was_made_here_last_is_not_read_again(tmp_path: Path) -> None:
+    first, second, third = history(3)
+    with opened(tmp_path / "store") as store:
+        put(store, first, prove=False)
+        put(store, second, prove=False)
+        older, newer = store.chain_of(COMPONENT)
+        assert outline_of(store, older) == replace(first, contents=b"")
+        newer.path.write_bytes(b"altered")
+        assert outline_of(store, newer).vmas == second.vmas
+        put(store, third, prove=False)
+        with pytest.raises(FormatError):
+            outline_of(store, newer)
+
+
+def outline_of(store: Store, entry: Entry) -> Snapshot:
+    with entry.path.open("rb") as file:
+        return store.outline(COMPONENT, entry, file.fileno())
 
 
 def test_what_is_older_than_wanted_is_forgotten(tmp_path: Path) -> None:
