@@ -74,6 +74,8 @@ class Charge:
     """Whether the core wants it to stand still, whatever is still in the queue."""
     _is_thaw_owed: bool = False
     """A thaw was refused, for its lease was over by then; the next lease brings it."""
+    _to_prune: acts.Prune | None = None
+    _pruning: asyncio.Task[None] | None = None
     _not_let_go: Exception | None = None
     """Why the order to let it go was in vain; None: it was not, or somebody has been told."""
 
@@ -166,11 +168,12 @@ class Charge:
         if self.component is not None:
             self.component.close()
 
-    def _task(self, work: Coroutine[Any, Any, None]) -> None:
+    def _task(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         task.add_done_callback(end_lanes_on_mistake)
+        return task
 
     # --- acts ---
 
@@ -218,10 +221,29 @@ class Charge:
                 await self._let_go()
             case acts.KeepAside():
                 await self._keep_aside(act)
-            case acts.Forget() | acts.Prune() | acts.Drop():
+            case acts.Prune():
+                self._prune(act)
+            case acts.Forget() | acts.Drop():
+                if self._pruning is not None:
+                    await asyncio.wait((self._pruning,))
                 await self._snapshots.tidy(act)
             case acts.ReportExit():
                 await self._report(act)
+
+    def _prune(self, act: acts.Prune) -> None:
+        """Put away beside the queue: a chain is folded then, for a second or more, and a takeover would wait for that."""
+        self._to_prune = act
+        if self._pruning is None or self._pruning.done():
+            self._pruning = self._task(self._prune_all())
+
+    async def _prune_all(self) -> None:
+        """The newest order, and the one that came meanwhile: the others are contained in it."""
+        while (act := self._to_prune) is not None:
+            self._to_prune = None
+            try:
+                await self._snapshots.tidy(act)
+            except TROUBLE as trouble:
+                await self._told_of(act, trouble)
 
     async def _told_of(self, act: Act, trouble: Exception) -> None:
         """Say what went wrong, to the log and to the core where it waits for it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -122,6 +123,52 @@ def test_a_lease_lets_nothing_run_whose_last_snapshot_before_a_handover_was_orde
 
     guard = carried_out(orders, tmp_path)
     assert (guard.runs, guard.lease_ns, guard.refused) == (False, NEWER_NS, 1)
+
+
+class SlowStore:
+    """Stands for a store that folds until it may go on."""
+
+    def __init__(self) -> None:
+        self.may_go_on = threading.Event()
+        self.begun = threading.Semaphore(0)
+        self.calls: list[object] = []
+
+    def prune(self, _: str, oldest: Position) -> None:
+        self.calls.append(oldest.sequence)
+        self.begun.release()
+        self.may_go_on.wait()
+
+    def set_aside(self, _: str, generations: tuple[int, ...]) -> None:
+        self.calls.append(generations)
+
+
+def test_nobody_waits_until_a_chain_is_folded_but_who_forgets_of_it(tmp_path: Path) -> None:
+    store, guard, none = SlowStore(), Told(), cast(Any, None)
+
+    async def run() -> None:
+        around = Surroundings(none, cast(Any, store), Records(tmp_path), lambda _: None, none, none, lambda _: ComponentConfig())
+        charge = Charge(NAME, around, cast(Component, guard), epoch=3)
+        charge.begin()
+        charge.order(acts.Prune(NAME, 3, Position(1, 1, b"")))
+        await asyncio.to_thread(store.begun.acquire)
+        for sequence in (2, 3):
+            charge.order(acts.Prune(NAME, 3, Position(1, sequence, b"")))
+        charge.order(acts.Thaw(NAME, 3, LATE_NS))
+        charge.order(acts.Forget(NAME, 3, (2,)))
+        await settled()
+        assert guard.runs and store.calls == [1]
+        store.may_go_on.set()
+        await forgotten(store)
+        for task in tuple(charge._tasks):
+            task.cancel()
+
+    asyncio.run(run())
+    assert store.calls == [1, 3, (2,)], "the newest order contains those before it"
+
+
+async def forgotten(store: SlowStore) -> None:
+    while not {3, (2,)} <= set(store.calls):
+        await asyncio.sleep(0.001)
 
 
 def test_a_takeover_that_what_waited_cannot_carry_out_starts_the_program_anew(
