@@ -317,18 +317,14 @@ class PtraceSession:
             if hold and self._surroundings.connections:
                 self._departing = carried_connections.depart(self._opened(first, others))
         except BaseException:
-            self._thaw()
-            self._stood_since(began)
+            self._note_freeze(began, self._thaw())
             raise
-        if hold:
-            self._hold()
-        else:
-            self._thaw()
-        return Frozen(first, others, self._stood_since(began), seen, self._departing, segments)
+        ended = self._hold() if hold else self._thaw()
+        return Frozen(first, others, self._note_freeze(began, ended), seen, self._departing, segments)
 
-    def _stood_since(self, began: int) -> int:
+    def _note_freeze(self, began: int, ended: int) -> int:
         """Note how long it stood still; the longest time of this capture, in µs."""
-        self._longest_us = max(self._longest_us, (time.perf_counter_ns() - began) // NS_PER_US)
+        self._longest_us = max(self._longest_us, (ended - began) // NS_PER_US)
         return self._longest_us
 
     def _require_whole(self, first: Look, others: SeenOthers | None) -> None:
@@ -361,28 +357,29 @@ class PtraceSession:
         return {line.inode for line in _lines_of_all(first, others) if line.shared}
 
     def _freeze(self) -> int:
-        """Stop it, nothing of ours half done inside; answers when that began."""
+        """Stop it, nothing of ours half done inside; answers when it was first asked to, in ns: until then it runs."""
         if self._held:
             return time.perf_counter_ns()
         self._collects = gc.isenabled()
         gc.disable()
         self._precedence.take()
-        began = time.perf_counter_ns()
         try:
             self._first.threads.freeze()
         except BaseException:
             self._be_ordinary()
             raise
-        return began
+        return self._first.threads.asked_ns
 
-    def _hold(self) -> None:
-        """Leave it standing."""
+    def _hold(self) -> int:
+        """Leave it standing; answers when that was."""
         self._precedence.give_back()
         self._held = True
         self._first.threads.hold()
         self._tree.hold()
+        return time.perf_counter_ns()
 
-    def _thaw(self) -> None:
+    def _thaw(self) -> int:
+        """Let it go; answers when the last of it was, in ns."""
         self._departing.stay(self._first.pid)
         self._departing = carried_connections.NOBODY
         self._held = False
@@ -391,8 +388,10 @@ class PtraceSession:
         finally:
             try:
                 self._tree.thaw()
+                ended = time.perf_counter_ns()
             finally:
                 self._be_ordinary()
+        return ended
 
     def _be_ordinary(self) -> None:
         """As before the freeze: what this thread makes may be collected, and it has no precedence."""

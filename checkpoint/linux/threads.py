@@ -102,6 +102,7 @@ class Threads:
     Attributes:
         leader: the first thread, whose id is the process's; or, where that has ended, its spokesman.
         process: the process's id.
+        asked_ns: when the first of them was asked to stop for the last `freeze`, by time.perf_counter_ns.
         is_one_of_many: other processes stand still meanwhile: one that waits inside the kernel (for a child of vfork, for one) is
             not waited for.
 
@@ -118,6 +119,7 @@ class Threads:
         self._held: dict[int, Tracee] = {}
         self._moving: set[int] = set()
         self._loose: dict[int, Tracee] = {}
+        self.asked_ns = 0
         self.is_one_of_many = False
         self._burial: Burial | None = None
         self._seized: set[int] = set()
@@ -168,6 +170,7 @@ class Threads:
         ended: set[int] = set()
         self._moving.clear()
         self._have_ended = False
+        self.asked_ns = 0
         if self.process != self.pid:
             self._await_end_of_first(deadline)
         fresh = [self.pid] if self._count() == 1 else thread_ids(self.pid)
@@ -213,6 +216,7 @@ class Threads:
         with self._watched(tids):
             seized = self._seize_together(tids) if len(tids) >= FEW else set[int]()
             asked = [tid for tid in tids if tid in seized or self._unless_ended(self._seize, tid, ended)]
+        self.asked_ns = self.asked_ns or time.perf_counter_ns()
         told = self._ask_together(asked) if len(asked) >= FEW else set[int]()
         for tid in asked:
             if tid not in told:
