@@ -40,6 +40,7 @@ from checkpoint.linux import abi, kinship, procfs
 from checkpoint.linux.kinship import Kinship
 from checkpoint.linux.precedence import Precedence
 from checkpoint.linux.procfs import MapsLine
+from checkpoint.linux.reports import Reports
 from checkpoint.linux.spokesman import SPOKESMEN_MAX, told_by_spokesman
 from checkpoint.linux.system_v import Segment
 from checkpoint.model import Position, Snapshot
@@ -122,6 +123,7 @@ class PtraceSession:
         self._longest_us = 0
         self._collects = False
         self._precedence = Precedence()
+        self._reports = Reports()
         self._budget = FreezeBudget(order.terms.freeze_budget_ns)
         self._closed = False
 
@@ -362,6 +364,7 @@ class PtraceSession:
             return time.perf_counter_ns()
         self._collects = gc.isenabled()
         gc.disable()
+        self._reports.keep()
         self._precedence.take()
         try:
             self._first.threads.freeze()
@@ -373,6 +376,7 @@ class PtraceSession:
     def _hold(self) -> int:
         """Leave it standing; answers when that was."""
         self._precedence.give_back()
+        self._reports.give_back()
         self._held = True
         self._first.threads.hold()
         self._tree.hold()
@@ -396,6 +400,7 @@ class PtraceSession:
     def _be_ordinary(self) -> None:
         """As before the freeze: what this thread makes may be collected, and it has no precedence."""
         self._precedence.give_back()
+        self._reports.give_back()
         if self._collects:
             gc.enable()
 

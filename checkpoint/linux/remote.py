@@ -233,6 +233,7 @@ class Desk:
         self._code_key: tuple[Call, ...] | None = None
         self._serial = 0
         self._lost: bytes | None = None
+        self._guest: Tracee | None = None
         self.is_known_idle = False
 
     def state(self) -> int:
@@ -255,8 +256,13 @@ class Desk:
         self._serial += 1
         self.is_known_idle = False
         tracee, registers, mask, _ = guest
+        self._guest = tracee
         patience = divmod(patience_ns(tracee), 10**9)
         return _HEAD.pack(MAGIC, ARMED, 0, self._serial, mask, *patience, 0, *_going_on(tracee.left_alone or registers))
+
+    def is_guest_here(self) -> bool:
+        """Whether the thread that was sent here last is to run where we do."""
+        return self._guest is not None and self._guest.is_here()
 
     def _lay_lost(self, lost: bytes) -> None:
         """What the kernel is to give back by the code's own frame besides, unless it stands there."""
@@ -465,6 +471,7 @@ def _tables_when_done(memory: Memory, desks: Sequence[Desk], end: int) -> list[b
     Raises:
         CaptureError: they were not, in time.
     """
+    is_here: bool | None = None
     began = time.perf_counter()
     while True:
         tables = _tables(memory, desks, end)
@@ -477,7 +484,9 @@ def _tables_when_done(memory: Memory, desks: Sequence[Desk], end: int) -> list[b
                 f"pid {memory.pid} did not run for {BATCH_TIMEOUT_S:g} s while it was looked at: it is frozen by its "
                 "cgroup, or higher priorities leave it no processor; capture it again when it runs"
             )
-        rest(waited)
+        if is_here is None:
+            is_here = desks[0].is_guest_here()
+        rest(waited, is_here=is_here)
 
 
 def _tables(memory: Memory, desks: Sequence[Desk], end: int) -> list[bytes]:

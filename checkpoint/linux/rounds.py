@@ -102,6 +102,7 @@ class Round:
         stand = [False] * len(tracees)
         began = now = time.perf_counter()
         waiting = [index for index, was_asked in enumerate(asked) if was_asked]
+        is_here = False
         while waiting and now - began < SPIN_S:
             results = self._run(STAND)[::2]
             for index in [index for index in waiting if results[index] == tracees[index].pid]:
@@ -117,7 +118,8 @@ class Round:
                     stand[index] = True
                     waiting.remove(index)
             if waiting:
-                rest(now - began)
+                is_here = is_here or (now == began and len(waiting) == 1 and tracees[waiting[0]].is_here())
+                rest(now - began, is_here=is_here)
                 now = time.perf_counter()
         return stand
 

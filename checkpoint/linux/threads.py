@@ -37,6 +37,7 @@ from checkpoint.linux.burial import Burial, bury
 from checkpoint.linux.tasks import thread_count, thread_ids
 from checkpoint.linux.together import Together
 from checkpoint.linux.tracee import PLAIN_STOP, STOP_TIMEOUT_S, Tracee, no_stop, rest
+from checkpoint.linux.whereabouts import Whereabouts
 
 GLANCE_S: Final = 0.02
 """How long a thread may take before we look whether it waits inside the kernel."""
@@ -115,6 +116,7 @@ class Threads:
         self.leader = leader
         self.process = process or leader.pid
         self._mend = mend
+        self._whereabouts = leader.whereabouts = Whereabouts(leader.pid)
         self._known: dict[int, Tracee] = {leader.pid: leader}
         self._held: dict[int, Tracee] = {}
         self._moving: set[int] = set()
@@ -155,6 +157,7 @@ class Threads:
             CaptureError: one did not stop in time. Nobody stands still for us after any of these.
         """
         self._require_none_loose()
+        self._whereabouts.prepare()
         try:
             self._freeze()
             if any(tracee.stopped_by for tracee in self._held.values()):
@@ -292,12 +295,14 @@ class Threads:
         """
         began = now = time.perf_counter()
         glance = began + GLANCE_S
+        is_here = False
         while self._moving:
             count = len(self._moving)
             for tid in self._hear_reports(ended) if count >= FEW else tuple(self._moving):
                 self._unless_ended(self._look_whether_it_stands, tid, ended)
             if len(self._moving) == count:
-                rest(now - began)
+                is_here = is_here or (now == began and self._moving == {self.pid} and self.leader.is_here())
+                rest(now - began, is_here=is_here)
             now = time.perf_counter()
             if now > deadline:
                 raise no_stop(min(self._moving), now - began)
@@ -380,6 +385,7 @@ class Threads:
 
     def close(self) -> None:
         """Nothing more will be asked of it; nobody may be held."""
+        self._whereabouts.close()
         if self._burial is not None:
             self._burial.close()
             self._burial = None

@@ -24,6 +24,8 @@ from checkpoint.arch import extended
 from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError
 from checkpoint.linux import abi, processor, procfs
 from checkpoint.linux.memory import Memory
+from checkpoint.linux.reports import sleep_until_report
+from checkpoint.linux.whereabouts import Whereabouts
 from checkpoint.model import Rseq
 
 PTRACE_EVENT_STOP: Final = 128
@@ -44,8 +46,8 @@ STOP_TIMEOUT_S: Final = 2.0
 SPIN_S: Final = 0.001
 """How long we look for the stops of many before we look at each singly."""
 YIELDING_S: Final = 0.0001
-"""How long we look without sleeping: a thread stops within 0.1 ms when nothing holds it. One that is to run where we do waits for
-our sleep, if we have precedence (`checkpoint.linux.precedence`)."""
+"""How long we look without sleeping: a thread stops within 0.1 ms when nothing holds it. For one that is to run where we do we
+sleep at once: if we have precedence it waits for that (`checkpoint.linux.precedence`)."""
 REST_S: Final = 0.00005
 PEEK_COUNT: Final = 64
 """Pending signals asked for in one call."""
@@ -92,12 +94,16 @@ def no_stop(tid: int, waited_s: float) -> CaptureError:
     )
 
 
-def rest(waited_s: float) -> None:
-    """Leave the processor to others before a thread is looked at again that we have waited for so long already."""
-    if waited_s < YIELDING_S:
+def rest(waited_s: float, *, is_here: bool = False) -> None:
+    """Leave the processor to others before a thread is looked at again that we have waited for so long already.
+
+    Args:
+        is_here: it is to run where we do.
+    """
+    if waited_s < YIELDING_S and not is_here:
         os.sched_yield()
     else:
-        time.sleep(REST_S if waited_s < SPIN_S else 2 * REST_S)
+        sleep_until_report(REST_S if waited_s < SPIN_S else 2 * REST_S)
 
 
 class Tracee:
@@ -107,6 +113,7 @@ class Tracee:
         is_as_found: it stands where the program has come to by itself: nobody has set its registers since.
         left_alone: the registers that it gives itself back if we die while it makes calls of ours; empty: those it stood with.
         waited_in: its /proc/TID/syscall just before it was stopped, where it is looked at (`ended_calls`); "" otherwise.
+        whereabouts: tells where it runs, of one that is stopped again and again.
         stopped_by: the signal that had stopped its process when it stopped for us last (SIGSTOP, job control); 0: it ran.
 
     Args:
@@ -125,6 +132,7 @@ class Tracee:
         self._registers = ctypes.create_string_buffer(REGISTERS_SIZE)
         self._xstate = ctypes.create_string_buffer(SET_SIZE)
         self._iov = abi.IoVec()
+        self.whereabouts: Whereabouts | None = None
         self._mask = ctypes.c_uint64()
         self._signals: ctypes.Array[ctypes.c_char] | None = None
 
@@ -154,6 +162,10 @@ class Tracee:
                 "give the keeper CAP_SYS_PTRACE, see systemd/failover-agent.service"
             )
         return CaptureError(f"{on}: {os.strerror(number)}; capture it again")
+
+    def is_here(self) -> bool:
+        """Whether it is known that it is to run on the processor that we run on."""
+        return self.whereabouts is not None and self.whereabouts.are_ours()
 
     # Stopping and letting go
 
