@@ -33,6 +33,8 @@ from checkpoint.resources.thread_tables import ThreadTables
 from checkpoint.stream_counts import Totals
 
 NOTHING_WRITTEN: Final[Totals] = (0, 0)
+FEW: Final = 64
+"""Descriptors that are read, in less than a millisecond, while the process makes its calls: it does not wait for us for ever."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +196,11 @@ class Onlooker:
         tracee = self._tracee
         self.tables.look()
         inquiry = self._questions(place.special)
-        answers = self._borrowed.run(tracee, inquiry.batch, place.registers, place.mask)
+        with self._borrowed.errand(tracee, inquiry.batch, place.registers, place.mask) as errand:
+            if opened is None and 0 < len(self._kept.texts.numbers) <= FEW:
+                opened = self.gather()
+            errand.call_back()
+            contents = self._with_contents(self.gather() if opened is None else opened)  # meanwhile it stops
         others = self._others.ask(place.others)
         waiting = (*tracee.pending(shared=False), *tracee.pending(shared=True))
         if inquiry.has_timers:
@@ -206,9 +212,9 @@ class Onlooker:
             settled=settled,
             interrupted=interrupted,
             inquiry=inquiry,
-            answers=answers,
+            answers=errand.answers[0],
             waiting=waiting,
-            opened=self._with_contents(self.gather() if opened is None else opened),
+            opened=contents,
             totals=outputs.totals() if outputs else NOTHING_WRITTEN,
         )
 

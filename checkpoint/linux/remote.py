@@ -374,7 +374,22 @@ class BorrowedPages:
             found += self._run_at(self.desks, batches, guests[first : first + len(self.desks)])
         return found
 
+    @contextlib.contextmanager
+    def errand(self, tracee: Tracee, batch: Batch, registers: bytes, mask: int) -> Iterator[Errand]:
+        """As `run`, with the body carried out meanwhile; it must be short, for the thread does not wait for ever (6).
+
+        The answers are there after `Errand.call_back`, or after the body.
+        """
+        with self._errand([self._large], [batch], [Guest(tracee, registers, mask)]) as errand:
+            yield errand
+
     def _run_at(self, desks: Sequence[Desk], batches: Sequence[Batch], guests: Sequence[Guest]) -> list[Answers]:
+        with self._errand(desks, batches, guests) as errand:
+            pass
+        return errand.answers
+
+    @contextlib.contextmanager
+    def _errand(self, desks: Sequence[Desk], batches: Sequence[Batch], guests: Sequence[Guest]) -> Iterator[Errand]:
         guests = [guest._replace(lost=guest.tracee.lost_in_calls()) for guest in guests] if LOST_SIZE else guests
         places = list(zip(desks, batches, guests, strict=False))
         self._require_free([desk for desk, _, _ in places])
@@ -383,13 +398,14 @@ class BorrowedPages:
         tracees = [guest.tracee for guest in guests]
         sent = self._of_small if desks is self.desks else self._of_large
         registers, masks = [guest.registers for guest in guests], [guest.mask for guest in guests]
+        errand = Errand(self._memory, sent, places)
         try:
             if not sent.start(tracees, [desk.code for desk, _, _ in places], registers, masks):
                 raise ProcessGoneError(f"pid {self._memory.pid} ended while it was being looked at")
-            tables = _tables_when_done(self._memory, [desk for desk, _, _ in places], batches[0].end)
+            yield errand
+            errand.call_back()
         finally:
-            self._take_back(sent, [(desk, guest) for desk, _, guest in places])
-        return [desk.answers(table, batch) for (desk, batch, _), table in zip(places, tables, strict=True)]
+            self._take_back(errand, [(desk, guest) for desk, _, guest in places])
 
     def _heads_of(self, desks: Sequence[Desk]) -> Ranges:
         """Where the heads of their tables lie."""
@@ -406,7 +422,7 @@ class BorrowedPages:
                     f"pid {self._memory.pid} still has to return to code of an earlier look; capture it again in a moment"
                 )
 
-    def _take_back(self, sent: Round, places: Sequence[tuple[Desk, Guest]]) -> None:
+    def _take_back(self, errand: Errand, places: Sequence[tuple[Desk, Guest]]) -> None:
         """As `give_back`, for many: nobody waits for another one's stop, and one that is gone spoils nothing for the others.
 
         Raises:
@@ -414,7 +430,8 @@ class BorrowedPages:
         """
         failures: list[CaptureError] = []
         tracees = [guest.tracee for _, guest in places]
-        asked = sent.ask_to_stop()
+        errand.ask_to_stop()
+        sent, asked = errand.sent, errand.asked
         if asked is None:
             given = self._take_back_singly(places, failures)
         elif all(stand := sent.await_stops(tracees, asked)) and sent.give_back(self.holds):
@@ -452,6 +469,42 @@ class BorrowedPages:
                 set_back(guest, self.holds)
                 given.append(desk)
         return given
+
+
+class Errand:
+    """Threads at the desks: on their way there, at work, or asked to stop.
+
+    Attributes:
+        answers: what they brought back.
+        asked: who takes it that they were asked to stop; None: nobody was.
+    """
+
+    def __init__(self, memory: Memory, sent: Round, places: Sequence[tuple[Desk, Batch, Guest]]) -> None:
+        self.sent = sent
+        self.answers: list[Answers] = []
+        self.asked: list[bool] | None = None
+        self._memory = memory
+        self._places = places
+        self._is_over = False
+
+    def call_back(self) -> None:
+        """Wait until the calls have been made, read what they have brought, and ask the threads to stop. Once.
+
+        Raises:
+            ProcessGoneError: the process was killed meanwhile.
+            CaptureError: the calls were not made in time.
+        """
+        if self._is_over:
+            return
+        desks = [desk for desk, _, _ in self._places]
+        tables = _tables_when_done(self._memory, desks, self._places[0][1].end)
+        self.answers = [desk.answers(table, batch) for (desk, batch, _), table in zip(self._places, tables, strict=True)]
+        self.ask_to_stop()
+
+    def ask_to_stop(self) -> None:
+        """Ask the threads to stop, wherever they are. Once."""
+        if not self._is_over:
+            self._is_over, self.asked = True, self.sent.ask_to_stop()
 
 
 @contextlib.contextmanager

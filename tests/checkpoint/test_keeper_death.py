@@ -24,6 +24,7 @@ from checkpoint import arch, channel
 from checkpoint.arch import cpu
 from checkpoint.channel import Channel, ChannelError, Reply
 from checkpoint.engine import CaptureOrder, ProtectOrder
+from checkpoint.engines.standing import Onlooker
 from checkpoint.errors import CaptureError
 from checkpoint.linux import entry, procfs, remote
 from checkpoint.linux.memory import Memory
@@ -203,6 +204,28 @@ def test_a_keeper_that_is_late_does_not_send_the_program_back_to_where_it_stood(
         assert goes_on(worker)
         monkeypatch.undo()
         captured_at_last(session, CaptureOrder(base=False, generation=1, sequence=2))
+    expect_undisturbed(worker)
+
+
+@pytest.mark.parametrize("step", ["gather", "_with_contents"])
+def test_what_fails_while_the_program_makes_our_calls_leaves_it_undisturbed(
+    step: str, worker: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its descriptors are read meanwhile, before it is asked to stop, and while it does."""
+
+    def fail(onlooker: Onlooker, *opened: object) -> None:
+        raise CaptureError("cannot look into it")
+
+    with protected(worker) as session:
+        for sequence in range(1, 4):
+            snapshot = captured_at_last(session, CaptureOrder(base=sequence == 1, generation=1, sequence=sequence))
+            session.acknowledge(snapshot.position)
+        monkeypatch.setattr(Onlooker, step, fail)
+        with pytest.raises(CaptureError, match="cannot look into it"):
+            session.capture(CaptureOrder(base=False, generation=1, sequence=4))
+        assert goes_on(worker)
+        monkeypatch.undo()
+        captured_at_last(session, CaptureOrder(base=False, generation=1, sequence=4))
     expect_undisturbed(worker)
 
 
