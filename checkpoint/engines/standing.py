@@ -22,7 +22,7 @@ from checkpoint.linux import confinement, procfs
 from checkpoint.linux.confinement import FREE, Confinement
 from checkpoint.linux.descriptors import lending
 from checkpoint.linux.procfs import KeptFiles, Stat, Status
-from checkpoint.linux.readings import Readings, Unread
+from checkpoint.linux.readings import Readings, Unread, Waiting
 from checkpoint.linux.remote import Answers
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.timers import parse_timers
@@ -110,6 +110,7 @@ class Onlooker:
         self._kept = Kept(threads.pid)
         self._files = KeptFiles(threads.pid)
         self._readings = Readings()
+        self._waiting = Waiting(threads.leader)
         self._confinements = Confinements(threads.pid, entered.interruptions)
         self._others = ThreadOnlooker(threads, entered, self._confinements)
         self._recollection = Recollection()
@@ -202,7 +203,7 @@ class Onlooker:
             errand.call_back()
             contents = self._with_contents(self.gather() if opened is None else opened)  # meanwhile it stops
         others = self._others.ask(place.others)
-        waiting = (*tracee.pending(shared=False), *tracee.pending(shared=True))
+        waiting = self._waiting.read()
         if inquiry.has_timers:
             waiting += self._others.waiting(place.others)
         settled, interrupted = self._interruptions.of(tracee).settled(arch.decode_registers(place.registers))

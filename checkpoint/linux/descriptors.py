@@ -78,7 +78,7 @@ def descriptors(pid: int, kept: KeptTexts | None = None) -> tuple[Descriptor, ..
     Args:
         kept: of a process that is looked at again and again.
     """
-    if kept is not None and kept.are_there(_count(pid)):
+    if kept is not None and kept.are_there():
         if (same := kept.as_before()) is not None:
             return same
         numbers, is_asked = kept.numbers, True
@@ -88,14 +88,6 @@ def descriptors(pid: int, kept: KeptTexts | None = None) -> tuple[Descriptor, ..
         if kept is None:
             return tuple(found for number in numbers if (found := _descriptor(number, links, texts)) is not None)
         return kept.every(numbers, links, texts, is_asked=is_asked)
-
-
-def _count(pid: int) -> int:
-    """How many are open; 0 where the kernel does not count them: before Linux 6.2. Source: proc_pid_fd(5)."""
-    try:
-        return os.stat(f"/proc/{pid}/fd").st_size
-    except OSError:  # whoever lists them says why
-        return 0
 
 
 def descriptors_to(pid: int, target: str) -> tuple[Descriptor, ...]:

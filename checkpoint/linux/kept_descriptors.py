@@ -130,18 +130,22 @@ class KeptTexts:
         self._is_known = False
         self._last: tuple[list[int], tuple[bytes, ...], tuple[Descriptor, ...]] | None = None
 
-    def are_there(self, count: int) -> bool:
+    def are_there(self) -> bool:
         """Ask about all that were there at the last look; whether they are there still, and nobody else.
 
         To list them takes the kernel longer than to count them.
-
-        Args:
-            count: how many there are; 0 if nobody knows.
         """
-        if self._last is None or not 0 < count == len(self._last[0]):
+        if self._last is None or not 0 < self._count() == len(self._last[0]):
             return False
         self._ask()
         return self._texts.has_every_answer()  # of one that is closed there is none
+
+    def _count(self) -> int:
+        """How many are open; 0 where the kernel does not count them: before Linux 6.2. Source: proc_pid_fd(5)."""
+        try:
+            return os.stat(f"/proc/{self.pid}/fd" if self._directory < 0 else self._directory).st_size
+        except OSError:  # whoever lists them says why
+            return 0
 
     @property
     def numbers(self) -> list[int]:

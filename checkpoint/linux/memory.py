@@ -248,3 +248,27 @@ class Memory:
             return ProcessGoneError(f"cannot {verb} memory of pid {self.pid}: it has ended")
         advice = "give the keeper the right to trace it (CAP_SYS_PTRACE)" if number == errno.EPERM else "capture it again"
         return CaptureError(f"cannot {verb} memory of pid {self.pid} at {address:#x}: {os.strerror(number)}; {advice}")
+
+
+class Place:
+    """One range of a process's memory that is read and written again and again: how to ask for it is worked out once."""
+
+    def __init__(self, memory: Memory, address: int, size: int) -> None:
+        self._memory = memory
+        self._address = address
+        self._buffer = bytearray(size)
+        self._remote = abi.IoVec(address, size)
+        self._local = abi.IoVec(address_of(self._buffer), size)
+        self._order = (memory.pid, ctypes.addressof(self._local), 1, ctypes.addressof(self._remote), 1, 0)
+
+    def read(self) -> bytes:
+        """All of it. Raises as `Memory.read`."""
+        if abi.process_vm_readv(*self._order) == len(self._buffer):
+            return bytes(self._buffer)
+        return self._memory.read(self._address, len(self._buffer))
+
+    def write(self, content: bytes) -> None:
+        """Fill it; the content is as long. Raises as `Memory.write`."""
+        self._buffer[:] = content
+        if abi.process_vm_writev(*self._order) != len(content):
+            self._memory.write(self._address, content)

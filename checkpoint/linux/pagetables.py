@@ -192,14 +192,18 @@ class PageScanner:
         found = self._there(ranges, abi.PAGE_IS_FILE | abi.PAGE_IS_PFNZERO | self._guard, abi.PAGE_IS_WRITTEN)
         present, written = (found[:, 2] & np.uint64(one) != 0 for one in (abi.PAGE_IS_PRESENT, abi.PAGE_IS_WRITTEN))
         extents = found[:, :2]
-        return Private(pages_joined(extents[present]), pages_joined(extents[~present]), pages_joined(extents[written]))
+        swapped = NONE if present.all() else pages_joined(extents[~present])
+        return Private(pages_joined(extents[present]), swapped, pages_joined(extents[written]))
 
     def _there(self, ranges: Words, unwanted: int, told: int = 0) -> Words:
         """Regions of pages that are present or swapped out, and what is to be told of them besides."""
         wanted = abi.PAGE_IS_PRESENT | abi.PAGE_IS_SWAPPED
         self._orders.want(0, unwanted, wanted | told, inverted=unwanted, anyof=wanted)
         found = self._collect(ranges)
-        marker = (found[:, 2] & np.uint64(abi.PAGE_IS_PRESENT) == 0) & (found[:, 1] - found[:, 0] >= MARKER_RUN)
+        absent = found[:, 2] & np.uint64(abi.PAGE_IS_PRESENT) == 0
+        if not absent.any():
+            return found
+        marker = absent & (found[:, 1] - found[:, 0] >= MARKER_RUN)
         if marker.any() and not procfs.swapped_size(self._pid):
             found = found[~marker]
         return found

@@ -107,8 +107,12 @@ class KeptFiles:
 
     def read(self, name: str) -> bytes:
         """Read ``/proc/PID/name`` whole. Raises as `read_bytes`."""
-        with _explained(self._pid, name):
-            return _read_whole(self.descriptor(name))
+        file = self.descriptor(name)
+        try:
+            return _read_whole(file)
+        except OSError:
+            with _explained(self._pid, name):
+                raise
 
     def close(self) -> None:
         """Give the descriptors back."""

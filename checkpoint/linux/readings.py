@@ -9,6 +9,7 @@ Source: ptrace(2), seccomp_get_filter() in kernel/seccomp.c, get_robust_list(2),
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import struct
@@ -306,6 +307,30 @@ class Readings:
         answers = _Answers(self._area, results, files)
         self._given = weakref.ref(answers)
         return [Unread(answers, index, tracee, results[index]) for index, tracee in enumerate(tracees)]
+
+
+class Waiting:
+    """Tells, again and again, which signals wait for one thread and its process. Every call from the thread that traces it."""
+
+    def __init__(self, tracee: Tracee) -> None:
+        self._tracee = tracee
+        self._orders = (abi.PeekSiginfo(0, 0, PEEKED), abi.PeekSiginfo(0, abi.PTRACE_PEEKSIGINFO_SHARED, PEEKED))
+        self._found = np.zeros(abi.SIGINFO_SIZE, dtype=np.uint8)
+        self._results = np.zeros(len(self._orders), dtype=np.int64)
+        into, answers = int(self._found.ctypes.data), int(self._results.ctypes.data)
+        self._calls = OwnCalls(
+            [
+                row("ptrace", abi.PTRACE_PEEKSIGINFO, tracee.pid, ctypes.addressof(order), into, to=answers + place * _WORD)
+                for place, order in enumerate(self._orders)
+            ]
+        )
+
+    def read(self) -> tuple[bytes, ...]:
+        """Those of the thread, then those of the process. Raises as `Tracee.pending`: hardly ever there are any."""
+        self._calls.run()
+        if not self._results.any():
+            return ()
+        return (*self._tracee.pending(shared=False), *self._tracee.pending(shared=True))
 
 
 def _calls_about(area: int) -> list[tuple[int, ...]]:

@@ -42,7 +42,7 @@ from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import Call, Registers, TablePlaces
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import abi
-from checkpoint.linux.memory import Memory, Ranges, ranges_of
+from checkpoint.linux.memory import Memory, Place, ranges_of
 from checkpoint.linux.rounds import Round
 from checkpoint.linux.tracee import LOST_SIZE, Tracee, rest
 
@@ -234,15 +234,28 @@ class Desk:
         self._serial = 0
         self._lost: bytes | None = None
         self._guest: Tracee | None = None
+        self._head = Place(memory, table, _HEAD_SIZE)
+        self._state = Place(memory, self._places.state, len(_IDLE_WORD))
+        self._of_interest: tuple[int, Place] = (_HEAD_SIZE, self._head)
         self.is_known_idle = False
 
     def state(self) -> int:
         """`IDLE`, `ARMED`, `ENDED` or `ABANDONED`, as it stands in the table."""
-        return int.from_bytes(self._memory.read(self._places.state, 8), "little")
+        return int.from_bytes(self._state.read(), "little")
 
     def set_state(self, state: int) -> None:
         """Write it."""
-        self._memory.write(self._places.state, struct.pack("<Q", state))
+        self._state.write(struct.pack("<Q", state))
+
+    def lay(self, head: bytes) -> None:
+        """Write the head of the table."""
+        self._head.write(head)
+
+    def table_until(self, end: int) -> bytes:
+        """Read the table, up to an offset."""
+        if self._of_interest[0] != end:
+            self._of_interest = end, Place(self._memory, self.table, end)
+        return self._of_interest[1].read()
 
     def armed(self, batch: Batch, guest: Guest) -> bytes:
         """Step 1: lay the code; the head of the table, to be laid, too: what a thread needs that goes on by itself."""
@@ -299,7 +312,6 @@ class BorrowedPages:
         offsets = range(LARGE_DESK, CODE_SIZE, SMALL_DESK)
         self._of_large = Round(1)
         self.desks = tuple(Desk(memory, address + offset, self.table + offset, SMALL) for offset in offsets)
-        self._large_head = ranges_of([(self.table, _HEAD_SIZE)])
         self._small_heads = ranges_of([(desk.table, _HEAD_SIZE) for desk in self.desks])
 
     @functools.cached_property
@@ -393,8 +405,11 @@ class BorrowedPages:
         guests = [guest._replace(lost=guest.tracee.lost_in_calls()) for guest in guests] if LOST_SIZE else guests
         places = list(zip(desks, batches, guests, strict=False))
         self._require_free([desk for desk, _, _ in places])
-        heads = b"".join([desk.armed(batch, guest) for desk, batch, guest in places])
-        self._memory.write_from(self._heads_of(desks)[: len(places)], bytearray(heads))
+        heads = [desk.armed(batch, guest) for desk, batch, guest in places]
+        if len(heads) == 1:
+            desks[0].lay(heads[0])
+        else:
+            self._memory.write_from(self._small_heads[: len(heads)], bytearray(b"".join(heads)))
         tracees = [guest.tracee for guest in guests]
         sent = self._of_small if desks is self.desks else self._of_large
         registers, masks = [guest.registers for guest in guests], [guest.mask for guest in guests]
@@ -406,10 +421,6 @@ class BorrowedPages:
             errand.call_back()
         finally:
             self._take_back(errand, [(desk, guest) for desk, _, guest in places])
-
-    def _heads_of(self, desks: Sequence[Desk]) -> Ranges:
-        """Where the heads of their tables lie."""
-        return self._small_heads if desks is self.desks else self._large_head
 
     def _require_free(self, desks: Sequence[Desk]) -> None:
         if all(desk.is_known_idle for desk in desks):
@@ -442,7 +453,9 @@ class BorrowedPages:
             moving = [was and not stands for was, stands in zip(asked, stand, strict=True)]
             given = self._set_back_singly(places, moving, failures)
         with _collected(failures):
-            if given:
+            if len(given) == 1:
+                given[0].set_state(IDLE)
+            elif given:
                 states = ranges_of([(desk.table + _STATE_OFFSET, len(_IDLE_WORD)) for desk in given])
                 self._memory.write_from(states, bytearray(_IDLE_WORD * len(given)))
             for desk in given:
@@ -543,6 +556,8 @@ def _tables_when_done(memory: Memory, desks: Sequence[Desk], end: int) -> list[b
 
 
 def _tables(memory: Memory, desks: Sequence[Desk], end: int) -> list[bytes]:
+    if len(desks) == 1:
+        return [desks[0].table_until(end)]
     size = desks[0].size
     raw = memory.read(desks[0].table, (len(desks) - 1) * size + end)
     return [raw[place * size : (place + 1) * size] for place in range(len(desks))]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import weakref
 from typing import Final
 
 from checkpoint.errors import ProcessGoneError
@@ -20,6 +22,34 @@ def thread_count(pid: int) -> int:
         return os.stat(f"/proc/{pid}/task").st_nlink - FIRST_LINKS
     except (FileNotFoundError, ProcessLookupError) as error:
         raise ProcessGoneError(f"there is no process {pid} any more") from error
+
+
+class ThreadCount:
+    """As `thread_count`, of one process again and again: its directory stays open, and is closed with this at the latest."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._directory = -1
+        self._close: weakref.finalize[..., ThreadCount] | None = None
+
+    def read(self) -> int:
+        """How many there are. Raises as `thread_count`."""
+        if self._close is None:
+            count = thread_count(self._pid)
+            with contextlib.suppress(OSError):  # we have no descriptor left
+                self._directory = os.open(f"/proc/{self._pid}/task", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+                self._close = weakref.finalize(self, os.close, self._directory)
+            return count
+        count = os.fstat(self._directory).st_nlink - FIRST_LINKS
+        if count < 1:  # what is open still has its own links when nobody is left
+            raise ProcessGoneError(f"there is no process {self._pid} any more")
+        return count
+
+    def close(self) -> None:
+        """Give the descriptor back."""
+        if self._close is not None:
+            self._close()
+            self._close = None
 
 
 def thread_ids(pid: int) -> list[int]:

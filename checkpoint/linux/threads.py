@@ -34,7 +34,7 @@ from checkpoint.arch import cpu as arch
 from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError
 from checkpoint.linux import ended_calls, entered_calls, procfs, second_stops
 from checkpoint.linux.burial import Burial, bury
-from checkpoint.linux.tasks import thread_count, thread_ids
+from checkpoint.linux.tasks import ThreadCount, thread_ids
 from checkpoint.linux.together import Together
 from checkpoint.linux.tracee import PLAIN_STOP, STOP_TIMEOUT_S, Tracee, no_stop, rest
 from checkpoint.linux.whereabouts import Whereabouts
@@ -117,6 +117,7 @@ class Threads:
         self.process = process or leader.pid
         self._mend = mend
         self._whereabouts = leader.whereabouts = Whereabouts(leader.pid)
+        self._thread_count = ThreadCount(leader.pid)
         self._known: dict[int, Tracee] = {leader.pid: leader}
         self._held: dict[int, Tracee] = {}
         self._moving: set[int] = set()
@@ -134,7 +135,7 @@ class Threads:
 
     def _count(self) -> int:
         """Of threads that can be stopped: a first one that has ended is counted until all have."""
-        return thread_count(self.pid) - (self.process != self.pid)
+        return self._thread_count.read() - (self.process != self.pid)
 
     @functools.cached_property
     def _together(self) -> Together:
@@ -386,6 +387,7 @@ class Threads:
     def close(self) -> None:
         """Nothing more will be asked of it; nobody may be held."""
         self._whereabouts.close()
+        self._thread_count.close()
         if self._burial is not None:
             self._burial.close()
             self._burial = None

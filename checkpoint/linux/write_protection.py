@@ -101,7 +101,7 @@ class PagemapTracker:
         self._doubtful: Words = NONE
         self._files: Words = NONE
         self._owned: Words = NONE
-        self._around: tuple[Words, Words] = (NONE, NONE)
+        self._around: tuple[tuple[bytes, Words], tuple[bytes, Words]] = ((b"", NONE), (b"", NONE))
         self._parts = Memo[Words]()
         self._stubborn: set[tuple[int, int]] = set()
         self._restless: Words = NONE
@@ -326,13 +326,13 @@ class PagemapTracker:
         return real, pages.union(copied, pages.intersection(found.swapped, readable))
 
     def _surroundings_of(self, doubtful: Words) -> Words:
-        """Those of the private copies are the same from scan to scan."""
-        if doubtful is not self._around[0]:
-            around = doubtful, surroundings_of(doubtful)
-            if doubtful is not self._owned and doubtful is not self._restless:
-                return around[1]
-            self._around = around
-        return self._around[1]
+        """Of the same pages from scan to scan, as a rule: one set while the process runs, and one while it stands still."""
+        key = doubtful.tobytes()
+        for known, around in self._around:
+            if known == key:
+                return around
+        self._around = ((key, surroundings_of(doubtful)), self._around[0])
+        return self._around[0][1]
 
 
 def surroundings_of(extents: Words) -> Words:
