@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
@@ -235,6 +236,8 @@ def with_contents(
     """
     from checkpoint.resources import attached_devices, files, kinds, owners, pipes
 
+    if recollection and noted is not None and not rules and recollection.are_plain(opened, _is_plain):
+        return owners.asked(opened)
     found = []
     empty = recollection.empty_pipes(opened) if recollection and not rules else {}
     for held in _with_travelling(opened, noted, recollection):
@@ -253,6 +256,19 @@ def with_contents(
             held = pipes.with_content(held, capacity, pieces)
         found.append(held)
     return owners.asked(found) if noted is not None else tuple(found)
+
+
+def _is_plain(held: OpenFile) -> bool:
+    """Whether nothing is to be looked into: what its descriptors say is all that there is. It follows from them alone."""
+    from checkpoint.resources import kinds, pipes
+
+    first = held.first
+    if held.is_echo or held.lent or held.observed:
+        return False
+    if pipes.is_pipe(first):
+        return not (held.both_ends or _may_be_half(held))
+    is_known = stat.S_ISCHR(first.mode) or (stat.S_ISREG(first.mode) and first.links > 0)
+    return is_known and kinds.observer_of(first, None) is None
 
 
 def _with_travelling(opened: Opened, noted: Noted | None, recollection: Recollection | None = None) -> list[OpenFile]:

@@ -13,7 +13,7 @@ import operator
 import select
 import socket
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -21,6 +21,7 @@ from checkpoint.linux import socket_questions
 from checkpoint.linux.descriptors import Copier, copy_of
 from checkpoint.linux.second_thread import SecondThread
 from checkpoint.linux.socket_questions import WORTH_SHARING, Asking, Subject, Told, events
+from checkpoint.memo import Memo
 from checkpoint.model import Fact
 from checkpoint.resources import (
     Opened,
@@ -146,6 +147,7 @@ class Recollection:
         self._askings: dict[Subject, Asking] = {}
         self._round: _Round | None = None
         self._second: SecondThread | None = None
+        self._are_plain = Memo[bool]()
 
     def close(self) -> None:
         """End what it has running."""
@@ -178,6 +180,16 @@ class Recollection:
             self.close()
         elif self._second is None:
             self._second = SecondThread.where_it_gains()
+
+    def are_plain(self, opened: Opened, is_plain: Callable[[OpenFile], bool]) -> bool:
+        """Whether there is nothing among these to be looked into, nor was; asked once of open files that are the very same.
+
+        Args:
+            is_plain: of one; it follows from what is told of it, which never changes.
+        """
+        if self._known or self._pipes:
+            return False
+        return self._are_plain.of(*opened, make=lambda: all(map(is_plain, opened)))
 
     def recall(self, opened: Opened) -> dict[int, _Answer]:
         """Ask every socket that was there last time; ``opened`` is told what is as it was. The process stands still.
