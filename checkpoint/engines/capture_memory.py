@@ -248,6 +248,12 @@ class MemoryCapture:
         if found:
             copied.add(Copy(pagetables.pages_joined(np.concatenate(found)), buffer[: filled + ROOM_SIZE]))
 
+    def rehearse(self) -> None:
+        """See ``checkpoint.engines.captured_process``."""
+        self._maps.rehearse()
+        self._guards.rehearse()
+        self._tracker.rehearse()
+
     # While it stands still
 
     def take(self, copied: RunningCopy, *, base: bool) -> Taken:

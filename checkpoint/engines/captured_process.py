@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import operator
 from collections.abc import Collection, Iterable, Iterator
@@ -22,7 +23,7 @@ from checkpoint.engines.outputs import Outputs
 from checkpoint.engines.restart import Interruptions
 from checkpoint.engines.standing import Onlooker, Standing
 from checkpoint.engines.taken_memory import Taken
-from checkpoint.errors import CaptureError, ProcessGoneError
+from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.spokesman import SPOKESMEN_MAX, spokesman_of
@@ -201,6 +202,16 @@ class CapturedProcess:
             self.onlooker.rights.prepare()
             self.onlooker.tables.prepare()
         return copied
+
+    def rehearse(self) -> None:
+        """Ask, as far as that changes nothing, what `look` is going to ask, and forget the answers.
+
+        What the processor has at hand, of our code, of the kernel's and of the page tables, it need not fetch while the program
+        stands still; between two captures it has done other things.
+        """
+        with contextlib.suppress(CheckpointError, OSError):  # whoever asks in earnest says why not
+            self.onlooker.rehearse()
+            self.memory.rehearse()
 
     # While it stands still
 

@@ -303,6 +303,9 @@ class PtraceSession:
 
     def _frozen_look(self, copied: RunningCopy, *, base: bool, hold: bool) -> Frozen:
         """Everything that needs the program to stand still."""
+        if not self._held:
+            for process in (self._first, *self._tree.processes()):
+                process.rehearse()
         began = self._freeze()
         try:
             others = None

@@ -166,6 +166,14 @@ class Onlooker:
         self.rights.prepare()
         self.tables.prepare()
 
+    def rehearse(self) -> None:
+        """See `CapturedProcess.rehearse`."""
+        procfs.signal_sets(self._files.read("status"))
+        self._files.read("timers")
+        self._readings.rehearse(self._tracee.pid, self._files.descriptor("stat"))
+        self._borrowed.rehearse(self._tracee)
+        self._kept.texts.rehearse()
+
     def place(self) -> Place:
         """Where it stands, before anything else is asked.
 

@@ -58,6 +58,9 @@ class SoftDirtyTracker:
         self._clear()
         return Scan(pages.union(pages.intersection(dirty, existing), fresh), gone)
 
+    def rehearse(self) -> None:
+        """See `Tracker.rehearse`: it would take as long as the scan."""
+
     def confirm(self) -> bool:
         """See `Tracker.confirm`."""
         return True

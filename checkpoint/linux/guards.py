@@ -36,6 +36,10 @@ class Guards:
         """What is written is not known any more: the next search is one everywhere."""
         self._watched = NONE
 
+    def rehearse(self) -> None:
+        """Look where `found` is going to look, and forget what is there."""
+        self._look(self._unwatched)
+
     def named(self, scan: Scan) -> None:
         """Take in what a scan has named."""
         self._scans.append(scan)

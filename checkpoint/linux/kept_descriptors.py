@@ -147,6 +147,12 @@ class KeptTexts:
         except OSError:  # whoever lists them says why
             return 0
 
+    def rehearse(self) -> None:
+        """Ask as `are_there`, and forget the answers."""
+        self._count()
+        self._ask()
+        self._heard()
+
     @property
     def numbers(self) -> list[int]:
         """Those of the last look; none where something of it was not understood from what was known."""

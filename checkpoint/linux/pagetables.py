@@ -147,6 +147,12 @@ class PageScanner:
         self._ask_for_written(abi.PM_SCAN_CHECK_WPASYNC | abi.PM_SCAN_WP_MATCHING)
         return pages_joined(self._collect(ranges)[:, :2])
 
+    def rehearse(self, ranges: Words, around: Words) -> None:
+        """Go through the page tables as `written`, without protecting anything, and as `private`; forget what was found."""
+        self._ask_for_written(abi.PM_SCAN_CHECK_WPASYNC)
+        self._collect(ranges, [])
+        self.private(around)
+
     def written_where_protected(self, ranges: Words) -> tuple[Words, Words]:
         """As `written`, of a process that runs and may unmap anything under our hands.
 

@@ -13,6 +13,7 @@ import ctypes
 import errno
 import os
 import struct
+import threading
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -180,17 +181,18 @@ class _Area:
     def ask(self, tids: list[int], files: list[int]) -> list[list[int]]:
         """Make the calls about these: the results of each."""
         count = len(tids)
-        if (tids, files) != self._about:
-            self._address(tids, files)
-            self._about = tids, files
+        self.address(tids, files)
         self._words[:count, _REGISTERS_LENGTH] = REGISTERS_SIZE
         self._words[:count, _XSTATE_LENGTH] = _STATE_SIZE
         self._calls.run(0, count * CALLS)
         found: list[list[int]] = self._results[:count].tolist()
         return found
 
-    def _address(self, tids: list[int], files: list[int]) -> None:
+    def address(self, tids: list[int], files: list[int]) -> None:
         """Fill in whom the calls are about."""
+        if (tids, files) == self._about:
+            return
+        self._about = tids, files
         rows, ids = self._rows[: len(tids)], np.array(tids, dtype=np.uint64)
         rows[:, : FILTER + 1, 2] = ids[:, None]
         rows[:, TEXT + 1 :, 2] = ids[:, None]
@@ -300,13 +302,26 @@ class Readings:
         Raises:
             ProcessGoneError: one of them has been killed.
         """
-        is_taken = self._given is not None and self._given() is not None
-        if is_taken or len(tracees) > self._area.capacity:
+        if self._is_taken() or len(tracees) > self._area.capacity:
             self._area = _Area(max(self._area.capacity, 1 if len(tracees) == 1 else -(-len(tracees) // STEP) * STEP))
         results = self._area.ask([tracee.pid for tracee in tracees], list(files))
         answers = _Answers(self._area, results, files)
         self._given = weakref.ref(answers)
         return [Unread(answers, index, tracee, results[index]) for index, tracee in enumerate(tracees)]
+
+    def _is_taken(self) -> bool:
+        """Whether somebody holds what was read last."""
+        return self._given is not None and self._given() is not None
+
+    def rehearse(self, tid: int, file: int) -> None:
+        """Ask about ourselves, who are not traced, and forget the answers.
+
+        Args:
+            tid, file: what the next `read` is about, if there is but one thread.
+        """
+        if not self._is_taken():
+            self._area.ask([threading.get_native_id()], [file])
+            self._area.address([tid], [file])
 
 
 class Waiting:

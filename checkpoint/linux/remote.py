@@ -273,6 +273,10 @@ class Desk:
         patience = divmod(patience_ns(tracee), 10**9)
         return _HEAD.pack(MAGIC, ARMED, 0, self._serial, mask, *patience, 0, *_going_on(tracee.left_alone or registers))
 
+    def rehearse(self) -> None:
+        """Read what is to be read, and forget it."""
+        self.table_until(self._of_interest[0])
+
     def is_guest_here(self) -> bool:
         """Whether the thread that was sent here last is to run where we do."""
         return self._guest is not None and self._guest.is_here()
@@ -361,6 +365,11 @@ class BorrowedPages:
             return None
         self._memory.write(self._note, bytes(_NOTE.size))
         return descriptor - 1, value
+
+    def rehearse(self, tracee: Tracee) -> None:
+        """Do what `run` is going to do with a thread, as far as that changes nothing; it may run."""
+        self._large.rehearse()
+        self._of_large.rehearse(tracee.pid)
 
     def run(self, tracee: Tracee, batch: Batch, registers: bytes, mask: int) -> Answers:
         """Make the calls of a batch; afterwards the thread stands exactly as before.

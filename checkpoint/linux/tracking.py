@@ -69,6 +69,10 @@ class Tracker(Protocol):
         """
         ...
 
+    def rehearse(self) -> None:
+        """Ask, as far as that changes nothing, what `scan` is going to ask, and forget the answers."""
+        ...
+
     def confirm(self) -> bool:
         """Whether the last `scan` has told everything; the process may run again. If not, the next one does."""
         ...

@@ -37,6 +37,8 @@ NOWHERE: Final = 1 << 20
 """An address below all that programs have. A mapping there would be registered, which it is in any case."""
 SETBACK_MAX: Final = 64
 """After a scan that left something out at most so many look everywhere; one that does costs less than another freeze."""
+REHEARSED_SIZE: Final = 1 << 30
+"""Memory whose page tables (a five-hundredth of it) a processor still has at hand when they are looked at again."""
 SMALL_GAP: Final = 64 * abi.PAGE_SIZE
 """Extents that are no farther apart are looked at together."""
 
@@ -130,6 +132,12 @@ class PagemapTracker:
         everywhere = everywhere or self._wary > 0
         self._wary = max(self._wary - 1, 0)
         return self._found(lines, changed=changed, is_running=False, everywhere=everywhere)
+
+    def rehearse(self) -> None:
+        """See `Tracker.rehearse`."""
+        self._scanner.unprotected(self._spans)
+        if pages.total_size(self._armed) <= REHEARSED_SIZE:
+            self._scanner.rehearse(self._armed, surroundings_of(self._restless))
 
     def confirm(self) -> bool:
         """See `Tracker.confirm`.
