@@ -27,6 +27,7 @@ from benchmarks import (
     cuts,
     encoding,
     engine,
+    files,
     increments,
     interference,
     machine,
@@ -46,7 +47,8 @@ HERE: Final = Path(__file__).parent
 def _freeze(quick: bool, directory: Path) -> Findings:
     return Findings(
         "Freeze time",
-        "How long the keeper holds the program still, by its own account, for its first snapshot (a base, copied while the "
+        "How long the keeper holds the program still, by its own account (from asking its first thread to stop until the last "
+        "one is let go), for its first snapshot (a base, copied while the "
         "program runs) and for the deltas after it, twenty a second; the time until a delta is encoded; what it carries.",
         tuple(engine.freeze(quick, directory)),
     )
@@ -90,6 +92,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "crowd": _crowd,
     "beside": beside.beside,
     "restore": _restore,
+    "files": files.files,
     "outage": _outage,
     "cuts": cuts.cuts,
     "overload": overload.overload,
