@@ -45,9 +45,10 @@ def test_what_is_chosen_right_after_the_freeze_is_not_part_of_the_snapshot(
         number = number_of(tracee, "/owned")
         thaw = PtraceSession._thaw
 
-        def thaw_and_choose(session: PtraceSession) -> None:
-            thaw(session)
+        def thaw_and_choose(session: PtraceSession) -> int:
+            ended_ns = thaw(session)
             send(tracee, number, wanted, tracee.pid if to_itself else 0)
+            return ended_ns
 
         monkeypatch.setattr(PtraceSession, "_thaw", thaw_and_choose)
         with protected(tracee) as session:
