@@ -37,10 +37,11 @@ def test_a_report_that_came_before_the_sleep_ends_it(reports: Reports) -> None:
 
 
 STOPS = """
-import sys
+import os, sys
 from checkpoint.linux.reports import Reports, sleep_until_report
 from checkpoint.linux.tracee import Tracee
 tracee, reports = Tracee(int(sys.argv[1])), Reports()
+assert len(os.listdir("/proc/self/task")) == 1
 reports.keep()
 tracee.seize()
 tracee.interrupt()
@@ -52,9 +53,10 @@ tracee.detach()
 
 
 def test_a_stop_for_us_ends_the_sleep(tmp_path: Path) -> None:
-    """In a process of its own: of one with more threads, as ours may be, another may take the report."""
+    """In a process of one thread: of more another may take a report that comes before the sleep, which is a short one then."""
+    alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     with ended(start(["sleep", "600"], tmp_path)) as program:
-        subprocess.run([sys.executable, "-c", STOPS, str(program.pid)], check=True, timeout=PATIENCE_S)
+        subprocess.run([sys.executable, "-c", STOPS, str(program.pid)], check=True, timeout=PATIENCE_S, env=alone)
 
 
 def test_without_one_it_sleeps_for_so_long(reports: Reports) -> None:
