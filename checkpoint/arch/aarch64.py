@@ -19,6 +19,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+from checkpoint.arch.aarch64_xstate import scalable_registers
 from checkpoint.arch.calls import SOCKET, TIMESPEC, Call, EntryCalls, Registers, TablePlaces, Timeout, Unkept
 
 NAME: Final = "aarch64"
@@ -323,8 +324,7 @@ def _lost(place: int, content: bytes) -> bytes:
 
     Source: parse_user_sigframe() in arch/arm64/kernel/signal.c; asm/sigcontext.h.
     """
-    vector_size = int.from_bytes(content[8:10], "little")
-    registers = content[16 : 16 + 34 * vector_size + vector_size // 8]  # 32 of these, 16 + 1 of an eighth
+    vector_size, registers = scalable_registers(content)
     size = -(-(_SCALABLE.size + len(registers)) // 16) * 16
     told = (_SCALABLE.pack(_SCALABLE_MAGIC, size, vector_size, 0) + registers).ljust(size, b"\0") + _TERMINATOR
     begin = place + _FURTHER.size + len(_TERMINATOR)

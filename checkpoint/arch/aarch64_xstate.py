@@ -66,11 +66,21 @@ def sets(features: Callable[[], Collection[str]], vector_size: Callable[[], int]
     return tuple((number, size or _scalable_size(vector_size())) for number, size in found)
 
 
+def _registers_size(vector_size: int) -> int:
+    """Bytes of 32 vectors (Z) and 17 of an eighth (P, FFR), which lie in this order in the set and in a signal's frame."""
+    return 34 * vector_size + vector_size // 8
+
+
 def _scalable_size(vector_size: int) -> int:
-    """Bytes of the set: its head, 32 vectors, 17 of an eighth, two words of status. Source: asm/ptrace.h, SVE_PT_SIZE."""
-    registers = 34 * vector_size + vector_size // 8
-    status = -(-registers // 16) * 16
+    """Bytes of the set: its head, the registers, two words of status. Source: asm/ptrace.h, SVE_PT_SIZE."""
+    status = -(-_registers_size(vector_size) // 16) * 16
     return _HEAD.size + status + 16
+
+
+def scalable_registers(content: bytes) -> tuple[int, bytes]:
+    """Of a set that holds them all: bytes of a vector, and the registers."""
+    vector_size = _HEAD.unpack_from(content)[2]
+    return vector_size, content[_HEAD.size : _HEAD.size + _registers_size(vector_size)]
 
 
 def is_lost_in_calls(content: bytes) -> bool:
