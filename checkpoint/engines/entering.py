@@ -163,9 +163,11 @@ def where_it_stands(tracee: Tracee, registers: bytes, rseq: Callable[[], Rseq | 
     registration = rseq()
     if registration is None:
         return registers
-    decoded = arch.decode_registers(registers)
-    found = outside_critical_section(decoded, tracee.memory, registration.address)
-    return registers if found is decoded else arch.encode_registers(found)
+    pointer, _, _ = arch.stand_of(registers)
+    found = outside_critical_section(pointer, tracee.memory, registration.address)
+    if found == pointer:
+        return registers
+    return arch.encode_registers({**arch.decode_registers(registers), arch.INSTRUCTION_POINTER: found})
 
 
 def _undisturbed(tracee: Tracee, registers: bytes, interruptions: Interruptions) -> bytes:

@@ -202,16 +202,17 @@ def _again(registers: Registers, number: int) -> tuple[Registers, str]:
     return again, arch.SYSCALL_NAMES.get(number, str(number))
 
 
-def outside_critical_section(registers: Registers, memory: Memory, rseq_address: int) -> Registers:
-    """The registers as the kernel itself would set them after a preemption inside a restartable sequence: at its abort point.
+def outside_critical_section(pointer: int, memory: Memory, rseq_address: int) -> int:
+    """Where the kernel itself would have a thread go on after a preemption: within a restartable sequence at its abort point.
+
+    Args:
+        pointer: the instruction that it stands at.
 
     Source: rseq(2); kernel/rseq.c, rseq_ip_fixup(): struct rseq holds the address of struct rseq_cs at offset 8.
     """
     section = int.from_bytes(memory.read(rseq_address + 8, 8), "little")
     if not section:
-        return registers
+        return pointer
     described = memory.read(section, 32)
     start, length, abort = (int.from_bytes(described[offset : offset + 8], "little") for offset in (8, 16, 24))
-    if not start <= registers[arch.INSTRUCTION_POINTER] < start + length:
-        return registers
-    return {**registers, arch.INSTRUCTION_POINTER: abort}
+    return abort if start <= pointer < start + length else pointer

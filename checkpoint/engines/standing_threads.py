@@ -305,7 +305,7 @@ class ThreadOnlooker:
         inner_tid = self._inner_tid(life)
         mode = self._modes.get(life, mode) or (FILTERED if unread.is_filtered else 0)
         found = self._confinements.suspended(tracee, mode, life)
-        registers = where_it_stands(tracee, unread.registers, lambda: unread.reading.rseq, self._interruptions)
+        registers = where_it_stands(tracee, unread.registers, lambda: unread.rseq, self._interruptions)
         pointer, _, _ = arch.stand_of(registers)
         if self._borrowed.holds(pointer):
             raise CaptureError(f"thread {tracee.pid} still stands in code of an earlier look; capture it again in a moment")

@@ -62,7 +62,7 @@ class Memory:
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
-        self._local = abi.IoVec()
+        self._local, self._remote = abi.IoVec(), abi.IoVec()
 
     def read(self, address: int, size: int) -> bytes:
         """Read ``size`` bytes.
@@ -71,8 +71,12 @@ class Memory:
             ProcessGoneError: the process has ended.
             CaptureError: some of it is not mapped or not readable.
         """
+        if not size:
+            return b""
         buffer = bytearray(size)
-        if size:
+        remote, local = self._remote, self._local
+        remote.base, remote.length, local.base, local.length = address, size, address_of(buffer), size
+        if abi.process_vm_readv(self.pid, ctypes.addressof(local), 1, ctypes.addressof(remote), 1, 0) != size:
             self.read_into(ranges_of([(address, size)]), buffer)
         return bytes(buffer)
 

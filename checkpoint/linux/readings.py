@@ -145,6 +145,11 @@ class Unread:
             self.registers, self.mask = self.reading.registers, self.reading.mask
 
     @property
+    def rseq(self) -> Rseq | None:
+        """As in `Reading`, without reading the rest: asked of each thread that was stopped outside of calls."""
+        return self.reading.rseq if self._answers is None else self._answers.rseq(self._index)
+
+    @property
     def reading(self) -> Reading:
         """All of it; the thread need not stand still for that any more."""
         if self._reading is None:
@@ -226,7 +231,7 @@ class _Answers:
         return Reading(
             registers=self.registers(index) if results[REGISTERS] == 0 else tracee.registers(),
             mask=self.mask(index) if results[MASK] == 0 else tracee.signal_mask(),
-            rseq=self._rseq(at) if results[RSEQ] > 0 else tracee.rseq(),
+            rseq=self.rseq(index) if results[RSEQ] > 0 else tracee.rseq(),
             pending=tracee.pending(shared=False) if results[PENDING] else (),
             xstate=self._xstate(index) if not (results[XSTATE] or any(results[TEXT + 1 :])) else tracee.xstate(),
             text=self._text(at, results[TEXT], self._files[index]),
@@ -250,6 +255,11 @@ class _Answers:
         """Of signals."""
         return self._word(index, _Layout.mask // _WORD)
 
+    def rseq(self, index: int) -> Rseq | None:
+        """Its registration for restartable sequences."""
+        address, size, signature, flags, _ = _RSEQ.unpack_from(self._area.view, index * _Layout.size + _Layout.rseq)
+        return Rseq(address, size, signature, flags) if address else None
+
     def _word(self, index: int, place: int) -> int:
         return self._area.cells[index * (_Layout.size // _WORD) + place]
 
@@ -257,10 +267,6 @@ class _Answers:
         begin = index * _Layout.size + _Layout.xstate
         last, at = self._area.view[begin : begin + self._word(index, _XSTATE_LENGTH)], index * _Layout.size
         return b"".join([*(self._area.view[at + place :][:size] for _, place, size in _FURTHER_PLACES), last])
-
-    def _rseq(self, at: int) -> Rseq | None:
-        address, size, signature, flags, _ = _RSEQ.unpack_from(self._area.view, at + _Layout.rseq)
-        return Rseq(address, size, signature, flags) if address else None
 
     def _text(self, at: int, result: int, file: int) -> bytes:
         if 0 <= result < TEXT_SIZE:
