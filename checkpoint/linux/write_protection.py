@@ -80,7 +80,8 @@ class PagemapTracker:
     Private copies of a file's pages that the program has dropped (MADV_DONTNEED) are looked for by name, for the file shows
     again: the kernel leaves such a page protected (zap_install_uffd_wp_if_needed() in mm/memory.c), so that no scan tells. To
     look for all of them (``_owned``) takes a tenth of a freeze, and next to none is ever dropped. So while the process stands
-    still only those are looked for that it writes as soon as it runs (``_restless``), and the others afterwards (`confirm`).
+    still only those are looked for that it writes again and again (``_restless``, with what belongs to the same extents), and the
+    others afterwards (`confirm`).
 
     Args:
         faults: a userfaultfd of the process's memory; the tracker owns it, once it is made.
@@ -107,7 +108,8 @@ class PagemapTracker:
         self._parts = Memo[Words]()
         self._stubborn: set[tuple[int, int]] = set()
         self._restless: Words = NONE
-        self._looked_for: Words | None = None
+        self._looked_for: tuple[Words, Words] | None = None
+        self._unrest: Words = NONE
         self._wary = 0
         self._setback = 1
 
@@ -145,9 +147,11 @@ class PagemapTracker:
         A private copy that is there, and was not written since the scan, was there then. One that has gone may have gone before;
         one that was written may have come back.
         """
+        if len(self._unrest):
+            self._restless, self._unrest = pages.union(self._restless, self._unrest), NONE
         if self._looked_for is None:
             return True
-        owned = pages.difference(pages.intersection(self._owned, self._armed), self._looked_for)
+        owned = pages.difference(pages.intersection(self._owned, self._armed), pages.union(*self._looked_for))
         found = self._scanner.private(surroundings_of(owned))
         written = pages.intersection(found.written, owned)
         if pages.covers(found.present, owned) and not len(written):
@@ -246,7 +250,7 @@ class PagemapTracker:
         self._doubtful = pages.intersection(self._doubtful, self._tracked)
         self._files = extents_of([line for line in followed if line.has_file])
         self._owned = pages.intersection(self._owned, self._files)
-        self._restless = pages.intersection(self._restless, self._owned)
+        self._restless = pages.intersection(self._restless, self._tracked)
         self._spans = extents_of(lines)
 
     def _lost(self, lines: Sequence[MapsLine], start: int, end: int) -> list[MapsLine]:
@@ -299,19 +303,22 @@ class PagemapTracker:
             copied: exist, and are to be read in any case.
             everywhere: look for all private copies that may have been dropped.
         """
-        is_doubtful = (written[:, 1] - written[:, 0]) > LONG_RUN
-        if len(self._files):
-            is_doubtful |= touching(written, self._files)
-        doubtful, suspects = written[is_doubtful], self._owned if everywhere else self._restless
-        doubtful = suspects if pages.covers(suspects, doubtful) else pages.union(doubtful, suspects)
-        self._looked_for = None if everywhere else pages.union(written, doubtful)
+        is_long = (written[:, 1] - written[:, 0]) > LONG_RUN
+        touches = touching(written, self._files) if len(self._files) else np.zeros_like(is_long)
+        doubtful, suspects = written[is_long | touches], self._owned if everywhere else self._restless
+        if pages.covers(suspects, doubtful):
+            doubtful = suspects
+        else:
+            self._unrest = NONE if everywhere else written[touches & ~is_long]
+            doubtful = pages.union(doubtful, suspects)
+        self._looked_for = None if everywhere else (written, doubtful)
         real, copied = self._existing(doubtful, copied)
         if doubtful is suspects and not len(copied) and pages.covers(real, doubtful):
             return written, NONE
         empty = pages.difference(doubtful, pages.union(real, copied))
         kept = NONE if everywhere else pages.difference(self._owned, empty)
         self._owned = pages.union(kept, pages.intersection(pages.union(real, copied), self._files))
-        self._restless = pages.intersection(self._restless, self._owned)
+        self._restless = pages.difference(self._restless, empty)
         return pages.union(pages.difference(written, empty), copied), empty
 
     def _existing(self, doubtful: Words, copied: Words) -> tuple[Words, Words]:
