@@ -35,7 +35,7 @@ from checkpoint.linux.remote import BorrowedPages
 from checkpoint.linux.tracking import NONE, Scan, Tracker
 from checkpoint.model import Position
 from checkpoint.pages import Words
-from checkpoint.resources import aio_rings
+from checkpoint.resources import aio_rings, system_v_memory
 
 BUFFER_SIZE: Final = 8 << 20
 """Bytes that a freeze may copy without asking for memory first."""
@@ -105,6 +105,7 @@ class MemoryCapture:
         acknowledged: the newest acknowledged position; None if only a base can be captured.
         borrowed: our own pages in the process, which belong to no snapshot.
         has_rings: some of them are rings of asynchronous I/O.
+        has_segments: some of them are System V shared memory.
 
     Args:
         tracker: owned from now on.
@@ -136,7 +137,7 @@ class MemoryCapture:
         self._left_out: Words = NONE
         self.acknowledged: Position | None = None
         self.lines: tuple[MapsLine, ...] = ()
-        self.has_rings = False
+        self.has_rings = self.has_segments = False
 
     def close(self) -> None:
         """Stop following; the process is not changed."""
@@ -337,6 +338,7 @@ class MemoryCapture:
         self._private = [line for line in self.lines if tracking.is_private(line)]
         self._sort_shared()
         self.has_rings = any(map(aio_rings.is_ring, self._shared_lines))
+        self.has_segments = any(map(system_v_memory.is_segment, self.lines))
         self._followed = tracking.extents_of(self._private)
         self._orphans = tracking.extents_of([line for line in self.lines if tracking.is_orphan(line)])
         self._mapped = tracking.extents_of([line for line in self.lines if line.name not in tracking.NOT_CARRIED])

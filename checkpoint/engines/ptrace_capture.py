@@ -36,7 +36,7 @@ from checkpoint.engines.captured_tree import CapturedTree, MovedError, SeenOther
 from checkpoint.engines.freeze_budget import FreezeBudget
 from checkpoint.engines.outputs import Outputs
 from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError, UnsupportedError
-from checkpoint.linux import abi, kinship, procfs
+from checkpoint.linux import abi, kinship, procfs, system_v
 from checkpoint.linux.kinship import Kinship
 from checkpoint.linux.precedence import Precedence
 from checkpoint.linux.procfs import MapsLine
@@ -316,7 +316,7 @@ class PtraceSession:
             if others:
                 self._tree.look(others, first, self._surroundings, base=base)
             seen = self._carried.look(self._shared_inodes(first, others)) if self._carried else Seen()
-            segments = system_v_memory.here(_lines_of_all(first, others))  # whoever runs may attach them, and be born
+            segments = self._segments(others)
             if hold:
                 self._require_whole(first, others)
             if hold and self._surroundings.connections:
@@ -326,6 +326,11 @@ class PtraceSession:
             raise
         ended = self._hold() if hold else self._thaw()
         return Frozen(first, others, self._note_freeze(began, ended), seen, self._departing, segments)
+
+    def _segments(self, others: SeenOthers | None) -> dict[int, Segment]:
+        """The System V shared memory of this machine, where any of them has some: whoever runs may attach it, and be born."""
+        looked_at = (self._first, *(process for process, _ in others.looks())) if others else (self._first,)
+        return system_v.segments() if any(process.memory.has_segments for process in looked_at) else {}
 
     def _note_freeze(self, began: int, ended: int) -> int:
         """Note how long it stood still; the longest time of this capture, in µs."""
