@@ -201,6 +201,13 @@ class PageScanner:
         swapped = NONE if present.all() else pages_joined(extents[~present])
         return Private(pages_joined(extents[present]), swapped, pages_joined(extents[written]))
 
+    def are_present(self, ranges: Words) -> bool:
+        """Whether every page of a set is in memory and the process's own; cheaper than to be told which are, as `private`."""
+        others = abi.PAGE_IS_FILE | abi.PAGE_IS_PFNZERO | self._guard
+        told = abi.PAGE_IS_PRESENT
+        self._orders.want(0, 0, told, inverted=told, anyof=told | others, limit=1)
+        return not any(self._asked(ranges[first : first + BATCH]).any() for first in range(0, len(ranges), BATCH))
+
     def _there(self, ranges: Words, unwanted: int, told: int = 0) -> Words:
         """Regions of pages that are present or swapped out, and what is to be told of them besides."""
         wanted = abi.PAGE_IS_PRESENT | abi.PAGE_IS_SWAPPED

@@ -307,14 +307,14 @@ class PagemapTracker:
         touches = touching(written, self._files) if len(self._files) else np.zeros_like(is_long)
         doubtful, suspects = written[is_long | touches], self._owned if everywhere else self._restless
         if pages.covers(suspects, doubtful):
-            doubtful = suspects
+            self._looked_for = None if everywhere else (written, suspects)
+            if not len(copied) and self._scanner.are_present(suspects):
+                return written, NONE
         else:
             self._unrest = NONE if everywhere else written[touches & ~is_long]
-            doubtful = pages.union(doubtful, suspects)
+        doubtful = pages.union(doubtful, suspects)
         self._looked_for = None if everywhere else (written, doubtful)
         real, copied = self._existing(doubtful, copied)
-        if doubtful is suspects and not len(copied) and pages.covers(real, doubtful):
-            return written, NONE
         empty = pages.difference(doubtful, pages.union(real, copied))
         kept = NONE if everywhere else pages.difference(self._owned, empty)
         self._owned = pages.union(kept, pages.intersection(pages.union(real, copied), self._files))
