@@ -10,7 +10,7 @@ import errno
 import functools
 import mmap
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
@@ -36,17 +36,30 @@ class MappingLostError(CaptureError):
     """A mapping is not write-protected any more."""
 
 
+class Question(NamedTuple):
+    """Which pages are wanted, and what is to be told of them: see struct pm_scan_arg."""
+
+    inverted: int
+    mask: int
+    anyof: int
+    told: int
+
+
+UNREGISTERED: Final = Question(abi.PAGE_IS_WPALLOWED, abi.PAGE_IS_WPALLOWED, 0, abi.PAGE_IS_WPALLOWED)
+WRITTEN: Final = Question(0, abi.PAGE_IS_WRITTEN, 0, abi.PAGE_IS_WRITTEN)
+
+
 class _Orders:
-    """PAGEMAP_SCAN on several ranges in one go.
+    """One question about several ranges in one go. What stays the same from one time to the next is not filled in anew.
 
     Attributes:
-        starts, ends: of the ranges; to be filled in.
+        starts, ends: of the ranges.
         reached: how far each scan came.
         counts: of the regions that each found; an error is a negative number.
         regions: start, end and categories of each, by range.
     """
 
-    def __init__(self, pagemap: int, loop: Loop | None) -> None:
+    def __init__(self, pagemap: int, question: Question, loop: Loop | None) -> None:
         self.counts = np.zeros(BATCH, dtype=np.int64)
         self.regions = np.zeros((BATCH, REGION_COUNT, 3), dtype=np.uint64)
         size = ctypes.sizeof(abi.PageScan)
@@ -55,22 +68,38 @@ class _Orders:
         self._words[:, fields.index("size")] = size
         self._words[:, fields.index("vec")] = self.regions.ctypes.data + np.arange(BATCH) * self.regions[0].nbytes
         self._words[:, fields.index("vec_len")] = REGION_COUNT
+        self._words[:, fields.index("category_inverted") :] = question
         self.starts, self.ends, self.reached = (self._words[:, fields.index(name)] for name in ("start", "end", "walk_end"))
-        self._flags = self._words[:, fields.index("flags")]
-        self._wanted = self._words[:, fields.index("max_pages") :]
+        self._flags, self._limits = (self._words[:, fields.index(name)] for name in ("flags", "max_pages"))
+        self._asked: tuple[int, int] = (0, 0)
+        self._ranges: Words | None = None
         place, answer = self._words.ctypes.data, self.counts.ctypes.data
         self._calls = OwnCalls(
             [row("ioctl", pagemap, abi.PAGEMAP_SCAN, place + index * size, to=answer + 8 * index) for index in range(BATCH)]
         )
         self._loop = loop
 
-    def want(self, flags: int, mask: int, told: int, *, inverted: int = 0, anyof: int = 0, limit: int = 0) -> None:
-        """What is asked from now on: see struct pm_scan_arg; no more than ``limit`` pages, 0: all."""
-        self._flags[:] = flags
-        self._wanted[:] = (limit, inverted, mask, anyof, told)
+    def ask(self, ranges: Words, flags: int, limit: int) -> None:
+        """Make the scans of these ranges, `BATCH` at most, which nobody changes afterwards.
 
-    def ask(self, first: int, last: int) -> None:
-        """Make the scans of the ranges [first, last)."""
+        Args:
+            limit: no more than so many pages in each; 0: all.
+        """
+        if self._asked != (flags, limit):
+            self._flags[:], self._limits[:] = flags, limit
+            self._asked = flags, limit
+        if ranges is not self._ranges:
+            self.starts[: len(ranges)], self.ends[: len(ranges)] = ranges[:, 0], ranges[:, 1]
+            self._ranges = ranges
+        self._make(0, len(ranges))
+
+    def ask_further(self, place: int) -> None:
+        """Make the scan of the rest of one range."""
+        self._ranges = None
+        self.starts[place] = self.reached[place]
+        self._make(place, place + 1)
+
+    def _make(self, first: int, last: int) -> None:
         if self._loop is None:
             self._calls.run(first, last)
         else:
@@ -106,7 +135,8 @@ class PageScanner:
     def __init__(self, pid: int, loop: Loop | None = None) -> None:
         self._pid = pid
         self._pagemap = procfs.opened(pid, "pagemap")
-        self._orders = _Orders(self._pagemap, loop)
+        self._loop = loop
+        self._orders: dict[Question, _Orders] = {}
         self._guard = abi.PAGE_IS_GUARD if self._understands(abi.PAGE_IS_GUARD) else 0
 
     def close(self) -> None:
@@ -119,22 +149,22 @@ class PageScanner:
 
     def unprotected(self, ranges: Words) -> list[tuple[int, int]]:
         """Those ranges in which a mapping is not registered for asynchronous write protection."""
-        self._orders.want(abi.PM_SCAN_CHECK_WPASYNC, abi.PAGE_IS_WPALLOWED, abi.PAGE_IS_WPALLOWED, inverted=abi.PAGE_IS_WPALLOWED)
         found = []
-        for first in range(0, len(ranges), BATCH):
-            counts = self._asked(ranges[first : first + BATCH])
-            for place in np.flatnonzero(counts < 0).tolist():
-                self._refused("check", -int(counts[place]))
-                start, end = ranges[first + place].tolist()
-                found.append((start, end))
+        for batch in _batches(ranges):
+            counts = self._asked(UNREGISTERED, batch, abi.PM_SCAN_CHECK_WPASYNC).counts[: len(batch)].tolist()
+            for count, (start, end) in zip(counts, batch.tolist(), strict=True):
+                if count < 0:
+                    self._refused("check", -count)
+                    found.append((start, end))
         return found
 
-    def _asked(self, ranges: Words) -> NDArray[np.int64]:
-        """Ask about one batch of ranges: the counts."""
-        orders, count = self._orders, len(ranges)
-        orders.starts[:count], orders.ends[:count] = ranges[:, 0], ranges[:, 1]
-        orders.ask(0, count)
-        return orders.counts[:count]
+    def _asked(self, question: Question, batch: Words, flags: int = 0, limit: int = 0) -> _Orders:
+        """Ask about one batch of ranges; see `_Orders.ask`."""
+        orders = self._orders.get(question)
+        if orders is None:
+            orders = self._orders[question] = _Orders(self._pagemap, question, self._loop)
+        orders.ask(batch, flags, limit)
+        return orders
 
     def written(self, ranges: Words) -> Words:
         """Pages written since they were last protected, and holes that never were; all are protected again.
@@ -144,14 +174,12 @@ class PageScanner:
         Raises:
             MappingLostError: a mapping is not protected (any more); what was found until then is lost.
         """
-        self._ask_for_written(abi.PM_SCAN_CHECK_WPASYNC | abi.PM_SCAN_WP_MATCHING)
-        return pages_joined(self._collect(ranges)[:, :2])
+        return pages_joined(self._collect(WRITTEN, ranges, abi.PM_SCAN_CHECK_WPASYNC | abi.PM_SCAN_WP_MATCHING)[:, :2])
 
-    def rehearse(self, ranges: Words, around: Words) -> None:
-        """Go through the page tables as `written`, without protecting anything, and as `private`; forget what was found."""
-        self._ask_for_written(abi.PM_SCAN_CHECK_WPASYNC)
-        self._collect(ranges, [])
-        self.private(around)
+    def rehearse(self, ranges: Words, looked_for: Words) -> None:
+        """Go through the page tables as `written`, without protecting anything, and as `are_present`; forget what was found."""
+        self._collect(WRITTEN, ranges, abi.PM_SCAN_CHECK_WPASYNC, [])
+        self.are_present(looked_for)
 
     def written_where_protected(self, ranges: Words) -> tuple[Words, Words]:
         """As `written`, of a process that runs and may unmap anything under our hands.
@@ -160,9 +188,8 @@ class PageScanner:
             What was written, and the ranges in which a mapping was not protected (any more): a part of such a range may have been
             protected again without being told.
         """
-        self._ask_for_written(abi.PM_SCAN_CHECK_WPASYNC | abi.PM_SCAN_WP_MATCHING)
         refused: list[list[int]] = []
-        found = pages_joined(self._collect(ranges, refused)[:, :2])
+        found = pages_joined(self._collect(WRITTEN, ranges, abi.PM_SCAN_CHECK_WPASYNC | abi.PM_SCAN_WP_MATCHING, refused)[:, :2])
         return found, pages_joined(np.array(refused, dtype=np.uint64).reshape(-1, 2))
 
     def written_count(self, ranges: Words, limit: int) -> int:
@@ -175,14 +202,11 @@ class PageScanner:
         return count
 
     def _counted(self, start: int, end: int, limit: int) -> int:
-        self._orders.want(0, abi.PAGE_IS_WRITTEN, abi.PAGE_IS_WRITTEN, limit=limit)
-        regions = int(self._asked(np.array([[start, end]], dtype=np.uint64))[0])
+        orders = self._asked(WRITTEN, np.array([[start, end]], dtype=np.uint64), limit=limit)
+        regions = int(orders.counts[0])
         if regions < 0:
             self._refused("count written", -regions)
-        return pages.total_size(self._orders.regions[0, : max(regions, 0), :2]) // abi.PAGE_SIZE
-
-    def _ask_for_written(self, flags: int) -> None:
-        self._orders.want(flags, abi.PAGE_IS_WRITTEN, abi.PAGE_IS_WRITTEN)
+        return pages.total_size(orders.regions[0, : max(regions, 0), :2]) // abi.PAGE_SIZE
 
     def existing(self, ranges: Words, *, own: bool = True) -> Words:
         """Pages present or swapped out, but guards, which look as if they were swapped out.
@@ -204,15 +228,13 @@ class PageScanner:
     def are_present(self, ranges: Words) -> bool:
         """Whether every page of a set is in memory and the process's own; cheaper than to be told which are, as `private`."""
         others = abi.PAGE_IS_FILE | abi.PAGE_IS_PFNZERO | self._guard
-        told = abi.PAGE_IS_PRESENT
-        self._orders.want(0, 0, told, inverted=told, anyof=told | others, limit=1)
-        return not any(self._asked(ranges[first : first + BATCH]).any() for first in range(0, len(ranges), BATCH))
+        question = Question(abi.PAGE_IS_PRESENT, 0, abi.PAGE_IS_PRESENT | others, abi.PAGE_IS_PRESENT)
+        return not any(self._asked(question, batch, limit=1).counts[: len(batch)].any() for batch in _batches(ranges))
 
     def _there(self, ranges: Words, unwanted: int, told: int = 0) -> Words:
         """Regions of pages that are present or swapped out, and what is to be told of them besides."""
         wanted = abi.PAGE_IS_PRESENT | abi.PAGE_IS_SWAPPED
-        self._orders.want(0, unwanted, wanted | told, inverted=unwanted, anyof=wanted)
-        found = self._collect(ranges)
+        found = self._collect(Question(unwanted, unwanted, wanted, wanted | told), ranges)
         absent = found[:, 2] & np.uint64(abi.PAGE_IS_PRESENT) == 0
         if not absent.any():
             return found
@@ -228,43 +250,35 @@ class PageScanner:
         """
         if not self._guard:
             return NONE
-        self._orders.want(0, self._guard, self._guard)
-        return pages_joined(self._collect(ranges)[:, :2])
+        return pages_joined(self._collect(Question(0, self._guard, 0, self._guard), ranges)[:, :2])
 
     def _understands(self, category: int) -> bool:
-        self._orders.want(0, category, category)
-        return int(self._asked(np.zeros((1, 2), dtype=np.uint64))[0]) >= 0
+        orders = self._asked(Question(0, category, 0, category), np.zeros((1, 2), dtype=np.uint64))
+        return int(orders.counts[0]) >= 0
 
-    def _collect(self, ranges: Words, refused: list[list[int]] | None = None) -> Words:
+    def _collect(self, question: Question, ranges: Words, flags: int = 0, refused: list[list[int]] | None = None) -> Words:
         """Every region that the kernel tells of.
 
         Args:
             refused: takes the ranges that are not protected, instead of an error.
         """
         found: list[Words] = []
-        for first in range(0, len(ranges), BATCH):
-            batch = ranges[first : first + BATCH]
-            counts = self._asked(batch)
-            told = counts != 0
-            told |= self._orders.reached[: len(batch)] < batch[:, 1]
-            places = np.flatnonzero(told).tolist()
-            if not self._is_whole(places):
-                for place in places:
-                    self._collect_one(place, found, refused)
-            elif places:
-                found.append(np.concatenate([self._orders.regions[place, : counts[place]] for place in places]))
+        for batch in _batches(ranges):
+            orders, size = self._asked(question, batch, flags), len(batch)
+            counts = orders.counts[:size]
+            if (orders.reached[:size] >= batch[:, 1]).all() and (counts >= 0).all():
+                told = [orders.regions[place, :count] for place, count in enumerate(counts.tolist()) if count]
+                if told:
+                    found.append(np.concatenate(told))
+            else:
+                for place in range(size):
+                    self._collect_one(orders, place, found, refused)
         if not found:
             return np.empty((0, 3), dtype=np.uint64)
         return found[0] if len(found) == 1 else np.concatenate(found)
 
-    def _is_whole(self, places: list[int]) -> bool:
-        """Whether nothing more is to be asked about these ranges."""
-        orders = self._orders
-        return all(orders.counts[place] > 0 and orders.reached[place] >= orders.ends[place] for place in places)
-
-    def _collect_one(self, place: int, found: list[Words], refused: list[list[int]] | None) -> None:
+    def _collect_one(self, orders: _Orders, place: int, found: list[Words], refused: list[list[int]] | None) -> None:
         """What was found in one range of the batch; the rest of it is asked for."""
-        orders = self._orders
         while True:
             count, end = int(orders.counts[place]), int(orders.ends[place])
             if count < 0:
@@ -277,10 +291,9 @@ class PageScanner:
                 return
             if count:
                 found.append(orders.regions[place, :count].copy())
-            orders.starts[place] = orders.reached[place]
-            if orders.starts[place] >= end:
+            if orders.reached[place] >= end:
                 return
-            orders.ask(place, place + 1)
+            orders.ask_further(place)
 
     def _refused(self, what: str, number: int) -> int:
         if number == errno.ESRCH:
@@ -288,6 +301,13 @@ class PageScanner:
         if number != errno.EPERM:
             raise CaptureError(f"cannot {what} pages of pid {self._pid}: {os.strerror(number)}; capture it again")
         return number
+
+
+def _batches(ranges: Words) -> Iterable[Words]:
+    """As many as are asked about in one go; a few ranges as they are, so that they are known again."""
+    if len(ranges) <= BATCH:
+        return (ranges,) if len(ranges) else ()
+    return (ranges[first : first + BATCH] for first in range(0, len(ranges), BATCH))
 
 
 def pages_joined(found: Words) -> Words:

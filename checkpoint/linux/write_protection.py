@@ -139,7 +139,7 @@ class PagemapTracker:
         """See `Tracker.rehearse`."""
         self._scanner.unprotected(self._spans)
         if pages.total_size(self._armed) <= REHEARSED_SIZE:
-            self._scanner.rehearse(self._armed, surroundings_of(self._restless))
+            self._scanner.rehearse(self._armed, self._restless)
 
     def confirm(self) -> bool:
         """See `Tracker.confirm`.
