@@ -22,6 +22,8 @@ from failover.cli.keeper import Keeper
 
 SIZES_MB: Final = (10, 100, 500)
 DIRTY_KB: Final = 400
+MORE_OF_OURS: Final = 5
+"""So many snapshots of ours for one of the others': a robot takes some each second, all day."""
 NOBODY: Final = "nobody"
 FIRST_BASE: Final = f"{OURS}, first base"
 
@@ -79,7 +81,7 @@ def _of_size(megabytes: int, count: int, present: list[Alternative], directory: 
     case = f"{megabytes} MB"
     with running("watching", megabytes, DIRTY_KB, directory=directory) as program:
         found = _nobody(program, count).figures(case, NOBODY)
-        found += _ours(program, count, megabytes)
+        found += _ours(program, MORE_OF_OURS * count, megabytes)
         for one in present:
             found += _theirs(program, count, one, place, megabytes).figures(case, one.name)
     return found
