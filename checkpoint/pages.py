@@ -110,7 +110,7 @@ def covers(pages: Words, others: Words) -> bool:
 
 def total_size(pages: Words) -> int:
     """Bytes that the set covers."""
-    return int((pages[:, 1] - pages[:, 0]).sum())
+    return int((pages[:, 1] - pages[:, 0]).sum()) if len(pages) else 0
 
 
 def addresses_of(pages: Words, page_size: int) -> Words:

@@ -98,7 +98,7 @@ class _Glance:
     def finds_nobody(self) -> bool:
         """Whether all lists are empty; one that cannot be read is not."""
         self._calls.run()
-        return not self._results.any()
+        return not any(self._results.tolist())
 
 
 def _whole(file: int) -> bytes:

@@ -99,7 +99,7 @@ class Memory:
             ProcessGoneError: the process has ended.
             CaptureError: one of them is not mapped.
         """
-        size = int((extents[:, 1] - extents[:, 0]).sum())
+        size = pages.total_size(extents)
         if buffer is None or len(buffer) < size:
             buffer = bytearray(size)
         self.read_pages_into(extents, buffer)

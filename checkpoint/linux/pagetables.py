@@ -229,7 +229,7 @@ class PageScanner:
         """Whether every page of a set is in memory and the process's own; cheaper than to be told which are, as `private`."""
         others = abi.PAGE_IS_FILE | abi.PAGE_IS_PFNZERO | self._guard
         question = Question(abi.PAGE_IS_PRESENT, 0, abi.PAGE_IS_PRESENT | others, abi.PAGE_IS_PRESENT)
-        return not any(self._asked(question, batch, limit=1).counts[: len(batch)].any() for batch in _batches(ranges))
+        return not any(any(self._asked(question, batch, limit=1).counts[: len(batch)].tolist()) for batch in _batches(ranges))
 
     def _there(self, ranges: Words, unwanted: int, told: int = 0) -> Words:
         """Regions of pages that are present or swapped out, and what is to be told of them besides."""
@@ -265,9 +265,9 @@ class PageScanner:
         found: list[Words] = []
         for batch in _batches(ranges):
             orders, size = self._asked(question, batch, flags), len(batch)
-            counts = orders.counts[:size]
-            if (orders.reached[:size] >= batch[:, 1]).all() and (counts >= 0).all():
-                told = [orders.regions[place, :count] for place, count in enumerate(counts.tolist()) if count]
+            counts = orders.counts[:size].tolist()
+            if min(counts) >= 0 and (orders.reached[:size] >= batch[:, 1]).all():
+                told = [orders.regions[place, :count] for place, count in enumerate(counts) if count]
                 if told:
                     found.append(np.concatenate(told))
             else:
