@@ -55,6 +55,7 @@ class Peer:
         settled: see ``messages.Beat``.
         unsteady_ns: how late its beats come at worst, lately: silence beyond a period.
         at_odds: number of its rule, where that is not ours: it is known to live, and nothing else it says counts.
+        loyal_until_ns: `Membership.loyal_until_ns`, counted when something of it changes: it is asked for several times a step.
     """
 
     robot: str
@@ -72,6 +73,7 @@ class Peer:
     at_odds: int = 0
     total: int = 0
     load: int = 0
+    loyal_until_ns: int = 0
     links: dict[str, int] = field(default_factory=dict)
     entries: dict[str, _Known] = field(default_factory=dict)
 
@@ -142,6 +144,8 @@ class Membership:
         self._rule = RULES.index(config.rule)
         self._asked: deque[tuple[int, int]] = deque(maxlen=ASKED_MAX)
         self.peers = {robot: Peer(robot, now_ns) for robot in config.peers}
+        for peer in self.peers.values():
+            self._count_loyalty(peer)
 
     def hear(self, beat: Beat, link: str, now_ns: int) -> tuple[Entry, ...]:
         """Take in a beat; returns its entries that are news. A stranger's beat is none."""
@@ -151,6 +155,7 @@ class Membership:
         self._time(peer, beat, now_ns)
         before = (peer.echoed, peer.heard_us)
         news = peer.take(beat, self._own, link, now_ns, self._rule)
+        self._count_loyalty(peer)
         if (peer.echoed, peer.heard_us) != before:
             peer.asked_ns, peer.heard_us_ns = self._left_ns(peer.echoed), self._left_ns(peer.heard_us)
         return news
@@ -179,6 +184,7 @@ class Membership:
             peer.told_ns = min(peer.told_ns + late_ns, now_ns)
             peer.heard_us_ns = min(peer.heard_us_ns + late_ns, now_ns)
             peer.since_ns = min(peer.since_ns + late_ns, now_ns)
+            self._count_loyalty(peer)
         self._born_ns += late_ns
 
     def loyal_until_ns(self, robot: str) -> int:
@@ -186,8 +192,10 @@ class Membership:
 
         The lease and a margin: as long as its beats' lateness asks for, at least the configured one, at most another lease.
         """
-        peer = self.peers[robot]
-        return peer.heard_ns + (self._loyalty_ns + self._wider_ns(peer) if peer.boot else self._grace_ns)
+        return self.peers[robot].loyal_until_ns
+
+    def _count_loyalty(self, peer: Peer) -> None:
+        peer.loyal_until_ns = peer.heard_ns + (self._loyalty_ns + self._wider_ns(peer) if peer.boot else self._grace_ns)
 
     def _wider_ns(self, peer: Peer) -> int:
         """By how much the margin is to be wider than the configured one."""
@@ -196,7 +204,7 @@ class Membership:
 
     def next_death_ns(self, now_ns: int) -> int | None:
         """When the next of those who live counts as dead if it stays silent; None if nobody does."""
-        return min((until for robot in self.peers if (until := self.loyal_until_ns(robot)) > now_ns), default=None)
+        return min((peer.loyal_until_ns for peer in self.peers.values() if peer.loyal_until_ns > now_ns), default=None)
 
     def dead(self, robot: str, now_ns: int) -> bool:
         """Silent for longer than any lease that it may still act on. A robot that is no peer at all is dead to us."""

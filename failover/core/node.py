@@ -120,16 +120,19 @@ class Node:
         self._watch.late(late_ns, self._config.loyalty_ns, now_ns)
         turn = self._turn(now_ns)
         self._watch.look(turn, event)
-        if not self._begun:
+        begins = not self._begun
+        if begins:
             self._begin(turn)
         touched = self._take(event, turn)
         if isinstance(event, Tick):
             self._note_promise(turn)
         for component in touched:
             _review(component, turn)
-        send = self._speak(turn)
+        changed = begins or bool(touched)
+        persist = self._persist() if changed else None
+        send = self._speak(turn) if changed or now_ns >= self._next_beat_ns else ()
         self._asked_ns = self._deadline_ns()
-        return Ready(self._persist(), send, tuple(turn.acts), tuple(turn.said))
+        return Ready(persist, send, tuple(turn.acts), tuple(turn.said))
 
     def outlived_by(self, beat: Beat) -> int:
         """A life of this robot that the sender has heard and that is not an earlier one of ours; 0 for none.
@@ -249,6 +252,7 @@ class Node:
     # What leaves
 
     def _speak(self, turn: Turn) -> tuple[Beat, ...]:
+        """The beat that is due, or that a component's change makes due."""
         entries = self._entries()
         pressing = self._speaker.pressing(entries)
         if pressing:

@@ -102,6 +102,8 @@ class Speaker:
         )
 
     def _fitting(self, entries: list[Entry], empty: Beat) -> tuple[Entry, ...]:
+        if not entries:
+            return ()
         room = BODY_SIZE_MAX - beat_size(empty) - BEAT_OVERHEAD
         chosen: list[Entry] = []
         for entry in entries:

@@ -7,6 +7,7 @@ beat, or a ``Refused`` that says why. The bulk lane's messages are plain msgpack
 from __future__ import annotations
 
 import enum
+import functools
 import hmac
 import struct
 from dataclasses import dataclass, field
@@ -100,11 +101,13 @@ def decode_bulk(body: bytes | memoryview) -> Bulk | None:
         return None
 
 
+@functools.lru_cache(2 * PEERS_MAX)
 def key_number(key: bytes) -> int:
     """Which key a frame was sealed with: the receiver finds it without trying all."""
     return int.from_bytes(blake2b(key, digest_size=4, person=b"failover-key-id\x00").digest(), "little")
 
 
+@functools.cache
 def team_tag(team: str) -> bytes:
     """Eight bytes that tell this team's frames from a neighbour's."""
     return blake2b(team.encode(), digest_size=8, person=b"failover-team-1\x00").digest()
