@@ -7,7 +7,9 @@ is exactly what beats are there to show. Authentication is `failover.core.wire`'
 from __future__ import annotations
 
 import contextlib
+import select
 import socket
+import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
@@ -19,13 +21,18 @@ FRAME_LIMIT: Final = 1_472
 """Bytes of one datagram: an Ethernet frame's worth, so that no beat is lost with half a fragment."""
 
 TURN_LIMIT: Final = 128
-"""Datagrams taken from one socket in one turn, so that a flood cannot keep the loop from its own beats."""
+"""Datagrams taken in one turn, so that a flood cannot keep the loop from its own beats."""
 
 RECEIVE_BUFFER: Final = 256 << 10
 """Bytes: two hundred beats may wait while the loop persists nothing and sleeps."""
 
 EXPEDITED: Final = 0xB8
 """IP type of service: DSCP EF, so that switches and the wireless card send beats first. Source: RFC 3246, RFC 8325."""
+
+
+SO_TIMESTAMPNS: Final = 35
+_ARRIVAL: Final = struct.Struct("@ll")
+"""Source: socket(7), SO_TIMESTAMP; asm-generic/socket.h; a struct timespec."""
 
 
 class BeatLane:
@@ -37,15 +44,17 @@ class BeatLane:
         Raises:
             LaneError: an address cannot be had.
         """
-        self._sockets = [_bound(address) for address in me.beats]
-        self._filenos = tuple(link.fileno() for link in self._sockets)
+        self._sockets = {link.fileno(): link for link in map(_bound, me.beats)}
+        self._waiting = select.epoll()
+        for fileno in self._sockets:
+            self._waiting.register(fileno, select.EPOLLIN)
         self._names: dict[int, str] = {}
-        self._ways = {name: _ways(self._sockets, robot) for name, robot in peers.items()}
+        self._ways = {name: _ways(tuple(self._sockets.values()), robot) for name, robot in peers.items()}
         self.unsent = 0
 
-    def filenos(self) -> tuple[int, ...]:
-        """To wait for datagrams."""
-        return self._filenos
+    def fileno(self) -> int:
+        """Readable while datagrams wait."""
+        return self._waiting.fileno()
 
     def send(self, peer: str, frame: bytes) -> None:
         """One datagram to the peer over every link."""
@@ -55,20 +64,24 @@ class BeatLane:
             except OSError:
                 self.unsent += 1  # no route, no buffer, link down: the peer's silence is the message
 
-    def receive(self, fileno: int) -> Iterator[tuple[bytes, str]]:
-        """The datagrams that wait at one socket, at most `TURN_LIMIT`, each with the interface that it came over ("": not told).
+    def receive(self) -> Iterator[tuple[bytes, str, int]]:
+        """The datagrams that wait, at most `TURN_LIMIT`: each with the interface that it came over ("": not told), and when.
 
-        Which one the kernel chose is not known by the address: where one link is gone, its packets may come over another.
+        Which one the kernel chose is not known by the address: where one link is gone, its packets may come over another. The
+        instant is by this machine's calendar, in nanoseconds since 1970; 0: not told.
         """
-        link = next(link for link in self._sockets if link.fileno() == fileno)
-        for _ in range(TURN_LIMIT):
-            try:
-                frame, ancillary, _, _ = link.recvmsg(FRAME_LIMIT + 1, ANCILLARY_SIZE)
-                yield frame, self._interface(ancillary)
-            except BlockingIOError:
+        taken = 0
+        while taken < TURN_LIMIT:  # asked before each: to be told that none waits is cheaper than a call that fails
+            ready = self._waiting.poll(0)
+            if not ready:
                 return
-            except OSError:
-                continue  # an ICMP error of an earlier datagram; the next call has the next datagram
+            for fileno, _ in ready:
+                taken += 1
+                try:
+                    frame, ancillary, _, _ = self._sockets[fileno].recvmsg(FRAME_LIMIT + 1, ANCILLARY_SIZE)
+                except OSError:
+                    continue  # an ICMP error of an earlier datagram; the next call has the next datagram
+                yield frame, self._interface(ancillary), _arrival_ns(ancillary)
 
     def _interface(self, ancillary: Iterable[tuple[int, int, bytes]]) -> str:
         index = interface_index(ancillary)
@@ -79,7 +92,8 @@ class BeatLane:
 
     def close(self) -> None:
         """Close the sockets."""
-        for link in self._sockets:
+        self._waiting.close()
+        for link in self._sockets.values():
             link.close()
 
 
@@ -94,12 +108,21 @@ def _bound(address: str) -> socket.socket:
             link.setsockopt(socket.IPPROTO_IP, socket.IP_TOS, EXPEDITED)
         allow_absent(link)
         tell_interfaces(link)
+        link.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         link.bind(where)
     except OSError as error:
         raise LaneError(
             f"cannot listen for beats at {address}: {error.strerror}; is another agent running, or is it another robot's?"
         ) from error
     return link
+
+
+def _arrival_ns(ancillary: Iterable[tuple[int, int, bytes]]) -> int:
+    for level, kind, content in ancillary:
+        if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS):
+            seconds, ns = _ARRIVAL.unpack_from(content)
+            return int(seconds) * 1_000_000_000 + int(ns)
+    return 0
 
 
 def _ways(links: Sequence[socket.socket], peer: Robot) -> tuple[tuple[socket.socket, tuple[str, int]], ...]:

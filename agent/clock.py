@@ -47,6 +47,11 @@ def wall_ns(instant_ns: int) -> int:
     return time.time_ns() - (now_ns() - instant_ns)
 
 
+def of_wall_ns(wall_ns: int) -> int:
+    """An instant of this machine's calendar by our clock; only for one so young that nobody can have set the calendar since."""
+    return now_ns() - (time.time_ns() - wall_ns)
+
+
 def kernel_boot() -> str:
     """A name for this boot of the kernel: our clock begins anew with it. Source: random(4)."""
     try:

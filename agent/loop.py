@@ -50,6 +50,9 @@ PERSIST_PATIENCE_S: Final = 2.0
 GAP_BEATS: Final = 3
 """Periods of silence that count as a gap: one lost beat is none, and a lease is longer."""
 
+REST_SHARE: Final = 3
+"""While the heart rests it reads beats so often in a lease: its echoes are fresh enough for one to be granted at once."""
+
 LANES_SILENCE_NS: Final = 4 * NANOSECONDS_A_SECOND
 """How long the lanes may say nothing; then another process takes their place. Meanwhile nobody renews the guards' leases."""
 
@@ -95,7 +98,8 @@ class Heart:
         self._wake, self._signalled = socket.socketpair(
             socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
         )
-        self._ending = False
+        self._ending = self._rests = False
+        self._read_ns, self._rest_ns = 0, settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000 // REST_SHARE
         self._lanes_deaths = 0
         self._turned_ns = clock.now_ns()
         self._lanes_silent_ns = 0
@@ -136,7 +140,7 @@ class Heart:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: None)
         signal.set_wakeup_fd(self._signalled.fileno(), warn_on_full_buffer=False)
-        for descriptor in (*self._beats.filenos(), self._persister.fileno(), self._wake.fileno()):
+        for descriptor in (self._beats.fileno(), self._persister.fileno(), self._wake.fileno()):
             self._poll.register(descriptor, select.EPOLLIN)
         gc.collect()
         kernel.give_back()  # before memory is locked: then it would stay
@@ -164,9 +168,13 @@ class Heart:
     def _turn(self) -> None:
         """Sleep, then one round of everything that came, then the core's deadline."""
         self._lanes.flush()
-        for descriptor, _ in self._poll.poll(self._pause_s()):
-            if descriptor in self._beats.filenos():
-                self._hear(descriptor)
+        self._rest()
+        came = self._poll.poll(self._pause_s())
+        if self._rests and clock.now_ns() >= self._read_ns + self._rest_ns:
+            self._hear()
+        for descriptor, _ in came:
+            if descriptor == self._beats.fileno():
+                self._hear()
             elif descriptor == self._lanes.fileno():
                 self._listen_to_lanes()
             elif descriptor == self._persister.fileno():
@@ -179,6 +187,13 @@ class Heart:
             if late_ns >= 0:
                 self._late_us_max = max(self._late_us_max, late_ns // 1_000)
                 self._step(Tick())
+
+    def _rest(self) -> None:
+        """While there is no component anywhere, what peers say is read a few times a lease only: half the turns, less in each."""
+        rests = self._node is not None and self._node.rests(clock.now_ns())
+        if rests != self._rests:
+            self._rests = rests
+            self._poll.modify(self._beats.fileno(), 0 if rests else select.EPOLLIN)
 
     def _watch_lanes(self) -> None:
         """Count how long the lanes say nothing; a turn of our own that took long proves nothing about them."""
@@ -201,18 +216,28 @@ class Heart:
             now_ns = clock.now_ns()
             ready = self._node.step(event, now_ns)
             self._obey(self._outbox.take(ready, now_ns))
-            self._scribe.note(ready.told)
+            if ready.told:
+                self._scribe.note(ready.told)
 
-    def _hear(self, descriptor: int) -> None:
-        for frame, link in self._beats.receive(descriptor):
+    def _hear(self) -> None:
+        self._read_ns = clock.now_ns()
+        for frame, link, wall_ns in self._beats.receive():
             opened = self._hearing.open(frame)
             if isinstance(opened, Beat):
-                self._count(opened)
+                came_ns = self._came_ns(wall_ns)
+                self._count(opened, came_ns or clock.now_ns())
                 self._mind_earlier_lives(opened)
                 self._copies.heard(opened, link)
-                self._step(Received(opened, link, self._copies.take(opened.sender)))
+                self._step(Received(opened, link, self._copies.take(opened.sender), came_ns))
             elif not self._copies.admit(opened, link, clock.now_ns()):
                 self._refused[str(opened.reason)] += 1
+
+    def _came_ns(self, wall_ns: int) -> int:
+        """When a beat came that waited because this heart rests: its sender was not late. 0: now, or a stall of ours."""
+        if not self._rests or not wall_ns:
+            return 0
+        came_ns, now_ns = clock.of_wall_ns(wall_ns), clock.now_ns()
+        return came_ns if 0 <= now_ns - came_ns <= self._rest_ns + self._outbox.beat_ns else 0
 
     def _mind_earlier_lives(self, beat: Beat) -> None:
         """A peer that remembers a later life of ours believes none of our beats: begin one above that."""
@@ -222,9 +247,9 @@ class Heart:
             log.warning(OUTLIVED, *told)
             self._remembered, self._ending = life, True
 
-    def _count(self, beat: Beat) -> None:
+    def _count(self, beat: Beat, now_ns: int) -> None:
         """Note how long the peer was silent before this beat, and how many were lost in between."""
-        now_ns, peer = clock.now_ns(), beat.sender
+        peer = beat.sender
         boot, counter = self._newest_beat.get(peer, (beat.boot, beat.counter - 1))
         missing = beat.counter - counter - 1 if beat.boot == boot else 0
         self._lost[peer] += max(missing, -1)  # one that comes late was counted as lost

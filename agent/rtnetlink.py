@@ -41,8 +41,8 @@ _ATTRIBUTE: Final = struct.Struct("=HH")
 
 IP_PKTINFO: Final = 8
 IPV6_SIZE: Final = 16
-ANCILLARY_SIZE: Final = 64
-"""Bytes: room for one in6_pktinfo and its head."""
+ANCILLARY_SIZE: Final = 128
+"""Bytes: room for one in6_pktinfo, one timespec, and their heads."""
 
 IP_FREEBIND: Final = 15
 IPV6_FREEBIND: Final = 78

@@ -22,11 +22,13 @@ class Received:
         link: name of the link it came over.
         copies: (link, instant) of the latest copy of a beat of this sender that came over each other link. They say nothing but
             that the link carries.
+        came_ns: when it came, if it is taken in later because this robot rested; 0: now.
     """
 
     beat: Beat
     link: str = ""
     copies: tuple[tuple[str, int], ...] = ()
+    came_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)

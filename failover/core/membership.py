@@ -224,6 +224,11 @@ class Membership:
         peer.told_ns = now_ns
         return Echo(peer.robot, peer.boot, peer.counter)
 
+    def steady(self, now_ns: int) -> bool:
+        """Whether everybody who lives was heard in the last two thirds of a loyalty: nobody is about to be taken for dead."""
+        missing_ns = now_ns - 2 * self._loyalty_ns // 3
+        return all(peer.heard_ns > missing_ns or peer.loyal_until_ns <= now_ns or not peer.boot for peer in self.peers.values())
+
     def gone(self, robot: str, now_ns: int) -> bool:
         """Dead, or so deaf to us that nothing we ever told it lets it act any more."""
         if self.dead(robot, now_ns):

@@ -143,6 +143,11 @@ class Node:
         lives = (echo.boot for echo in beat.echoes if echo.robot == self._config.robot and (echo.boot, abs(echo.counter)) > ours)
         return next((life for life in lives if life < LIVES_MAX), 0)
 
+    def rests(self, now_ns: int) -> bool:
+        """Nothing runs or waits anywhere, as far as we know, and nobody is missing: what peers say may wait a little."""
+        idle = self._begun and all(component.state in ENDED for component in self._components.values())
+        return idle and self._team.steady(now_ns)
+
     def next_deadline_ns(self) -> int:
         """The instant at which a Tick is due."""
         return self._asked_ns
@@ -230,7 +235,7 @@ class Node:
 
     def _hear(self, event: Received, turn: Turn) -> list[Component]:
         beat = event.beat
-        news = self._team.hear(beat, event.link, turn.now_ns)
+        news = self._team.hear(beat, event.link, event.came_ns or turn.now_ns)
         if beat.sender in self._team.peers:
             self._team.peers[beat.sender].carried(event.copies)
         rules = contest if self._config.by_majority else election

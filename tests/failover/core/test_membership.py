@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from failover.core.consent import STATES
 from failover.core.events import Received, Tick
 from failover.core.membership import UNSTEADY_BEATS, Membership
-from failover.core.messages import Beat
+from failover.core.messages import Beat, Entry
 from failover.core.node import Node
-from failover.core.types import MS, Ballot, Config
+from failover.core.types import MS, Ballot, Config, State
 
 PAIR = Config("robot1", ("robot2",), beat_ms=10, lease_ms=100)
 LOYALTY_MS = PAIR.loyalty_ns // MS
@@ -72,3 +73,50 @@ def test_a_step_is_due_the_instant_a_peer_counts_as_dead() -> None:
         asked.append(node.next_deadline_ns())
         node.step(Tick(), asked[-1])
     assert dead_ns in asked
+
+
+def rests_at(node: Node, *at_ms: int) -> list[bool]:
+    return [node.rests(at * MS) for at in at_ms]
+
+
+def beating(node: Node, first: int, last: int) -> int:
+    """Its peer's beats of these numbers, each 10 ms; returns the instant of the last one, in ms."""
+    for number in range(first, last + 1):
+        node.step(Received(beat(number), "eth0"), number * 10 * MS)
+        node.step(Tick(), number * 10 * MS)
+    return last * 10
+
+
+def test_a_robot_rests_while_nothing_is_protected_and_its_peer_is_heard() -> None:
+    node = Node(PAIR, 1, Ballot(), 0)
+    assert rests_at(node, 0) == [False]
+    at = beating(node, 1, 5)
+    missing = at + 2 * LOYALTY_MS // 3
+    assert rests_at(node, at, missing - 1, missing + 1) == [True, True, False]
+    node.step(Tick(), (at + LOYALTY_MS) * MS)
+    assert rests_at(node, at + LOYALTY_MS) == [True], "it is dead: to hear it again is not urgent"
+
+
+def test_a_robot_that_hears_of_a_component_rests_no_more_until_it_has_ended() -> None:
+    node = Node(PAIR, 1, Ballot(), 0)
+    runs = Entry("/lab/x", STATES.index(State.PRIMARY), 1, "robot2")
+    node.step(Received(Beat("robot2", 1, 1, 1, 1, 1, (), (runs,)), "eth0"), 10 * MS)
+    assert rests_at(node, 11) == [False]
+    ended = Entry("/lab/x", STATES.index(State.RELEASED), 1, "robot2")
+    node.step(Received(Beat("robot2", 1, 2, 2, 0, 1, (), (ended,)), "eth0"), 20 * MS)
+    node.step(Tick(), 21 * MS)
+    assert rests_at(node, 22) == [True]
+
+
+def test_a_beat_that_waited_while_its_hearer_rested_was_not_late() -> None:
+    def patience_ms_after(*came_ms: int) -> int:
+        node = Node(PAIR, 1, Ballot(), 0)
+        beating(node, 1, 5)
+        for at in range(60, 110, 10):
+            node.step(Tick(), at * MS)
+        for number, came in enumerate(came_ms, start=6):
+            node.step(Received(beat(number), "eth0", came_ns=came * MS), 101 * MS)
+        return patience_ms(node._team)
+
+    assert patience_ms_after(60, 70, 80, 90) == LOYALTY_MS
+    assert patience_ms_after(95) == 100 + 2 * 35
