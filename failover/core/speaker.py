@@ -78,6 +78,8 @@ class Speaker:
     def beat(self, entries: dict[str, Entry], echoes: tuple[Echo, ...]) -> Beat:
         """The next beat. Entries that changed go first, then those that were not said for the longest time."""
         self.counter += 1
+        if not entries and not self._said:
+            return Beat(self._me, self._boot, self.counter, self._settled, echoes=echoes, rule=self._rule)
         changed = {name for name, entry in entries.items() if self._unsettling(entry)}
         if changed or len(entries) != len(self._said):
             self._settled = self.counter
@@ -102,8 +104,6 @@ class Speaker:
         )
 
     def _fitting(self, entries: list[Entry], empty: Beat) -> tuple[Entry, ...]:
-        if not entries:
-            return ()
         room = BODY_SIZE_MAX - beat_size(empty) - BEAT_OVERHEAD
         chosen: list[Entry] = []
         for entry in entries:
