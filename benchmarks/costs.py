@@ -28,7 +28,7 @@ CHANGES: Final = 300
 SNAPSHOTS: Final = 40
 QUICK_SNAPSHOTS: Final = 8
 WHOLE: Final = "failover, without differences"
-IDLE_S: Final = 10.0
+IDLE_S: Final = 60.0
 QUICK_IDLE_S: Final = 3.0
 
 TICKS_A_SECOND: Final = os.sysconf("SC_CLK_TCK")
