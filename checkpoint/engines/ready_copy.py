@@ -12,32 +12,40 @@ Nothing of the program runs before `RestoredProgram.resume`: the vessel stands i
 
 Nothing is folded: each position of a store was proved when it was stored. Pages go from the decoded snapshot into the vessel.
 
-What is not covered (`hindrances`) comes back from its chain, as ever.
+What is not covered (`copy_hindrances`) comes back from its chain, as ever.
 """
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Container, Mapping
+from dataclasses import dataclass, replace
 from typing import Final
 
-from checkpoint import carried, chain, differences, pages, room
+from checkpoint import chain, differences, pages
 from checkpoint.differences import Rows
 from checkpoint.engine import RestoreOptions, pid_taken
-from checkpoint.engines import restore_checks, restore_kinds, restore_memory, restore_process, restore_vdso
+from checkpoint.engines import restore_checks, restore_memory, restore_process, restore_vdso
+from checkpoint.engines.copy_hindrances import require_covered, require_room
 from checkpoint.engines.copy_mappings import Change
-from checkpoint.engines.ptrace_restore import RSEQ_SECTION_OFFSET, ProcessRestore, RestoredProgram, look_at_vessel, options_for
+from checkpoint.engines.ptrace_restore import (
+    RSEQ_SECTION_OFFSET,
+    LaterTables,
+    ProcessRestore,
+    RestoredProgram,
+    look_at_vessel,
+    options_for,
+)
 from checkpoint.engines.restore_checks import Brought
 from checkpoint.errors import ChainError, CheckpointError, MismatchError, RestoreError, UnsupportedError
-from checkpoint.linux import procfs, vm_flags
-from checkpoint.linux.abi import PAGE_SIZE, PROT_WRITE
+from checkpoint.linux import procfs
+from checkpoint.linux.abi import PAGE_SIZE
 from checkpoint.linux.call_table import AREA_SIZE, CallTable
 from checkpoint.linux.tracee import Tracee
-from checkpoint.model import Fact, Position, Snapshot, ThreadState, Vma
+from checkpoint.model import Fact, Position, Snapshot, ThreadState
 from checkpoint.pages import Words
-from checkpoint.resources import aio_rings, carried_connections, departed, seccomp, system_v_memory, untouched
+from checkpoint.resources import carried_connections, seccomp
 from checkpoint.resources.rebuilding import number_of
 
 ROOM: Final = 16 << 20
@@ -46,64 +54,9 @@ ROOM: Final = 16 << 20
 TIME_NAMESPACE: Final = "/proc/self/ns/time"
 """There is none on a kernel without CONFIG_TIME_NS."""
 
-SHARE: Final = 2
-"""What is free must hold a copy so many times."""
-
 AHEAD_NS: Final = 60_000_000_000
 """How far the clocks of a copy may be ahead of where the program's have got to, before it is laid again: nobody knows how long a
 checkpoint was on its way."""
-
-
-def hindrances(state: Snapshot) -> Iterator[str]:
-    """Why a program can have no ready copy, one sentence each: others would see what is made, or it is not covered yet."""
-    if state.is_tree:
-        yield "it has several processes"
-        return
-    if carried.without(state) is not state:
-        yield "files travel with it"
-    for vma in state.vmas:
-        named = vma.file.path if vma.file is not None else vma.name or "memory"
-        if system_v_memory.is_segment(vma):
-            yield "it has System V shared memory"
-        elif aio_rings.is_ring(vma):
-            yield "it has rings of asynchronous I/O"
-        elif vma.shared and vma.file is not None and not _is_only_read(vma):
-            yield f"it maps {named} shared"
-        elif restore_kinds.is_special(vma):
-            yield f"it has huge or droppable pages ({named})"
-    if departed.of(state.resources, state.process.working_directory):
-        yield "it holds what is left of processes that have ended"
-    if len(untouched.of(state.resources)):
-        yield "it has memory that must stay untouched until it is used"
-    if restore_kinds.keys_of(state):
-        yield "it uses protection keys"
-
-
-def _is_only_read(vma: Vma) -> bool:
-    """Whether it is a mapping of a file with a name that nobody can write through: the C library has such ones."""
-    return restore_memory.is_file_mapping(vma) and not vma.protection & PROT_WRITE and vm_flags.MAY_WRITE not in vma.flags
-
-
-def require_covered(state: Snapshot) -> None:
-    """Refuse a program that can have no ready copy.
-
-    Raises:
-        UnsupportedError: with the reasons.
-    """
-    if reasons := tuple(dict.fromkeys(hindrances(state))):
-        raise UnsupportedError(f"{state.component} can have no ready copy: {'; '.join(reasons)}", reasons)
-
-
-def require_room(base: Snapshot) -> None:
-    """Refuse a copy that takes more than its share of what is free: what runs here needs room more than what may have to.
-
-    Raises:
-        UnsupportedError: with the reason.
-    """
-    size, free = pages.total_size(pages.extents(base.runs)), room.free()
-    if SHARE * size > free:
-        reason = f"it holds {size / room.GB:.2f} GB, more than half of the {free / room.GB:.2f} GB that this machine has free"
-        raise UnsupportedError(f"{base.component} can have no ready copy here: {reason}", (reason,))
 
 
 def lay(vessel_pid: int, base: Snapshot, options: RestoreOptions) -> ReadyCopy:
@@ -129,6 +82,21 @@ def lay(vessel_pid: int, base: Snapshot, options: RestoreOptions) -> ReadyCopy:
         copy.end()
         raise
     return copy
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What a delta does to the copy of one process, worked out before any of it is done.
+
+    Attributes:
+        delta: tells its pages whole.
+        rescued: pages that must outlive that they are mapped afresh, and what they hold.
+    """
+
+    delta: Snapshot
+    change: Change
+    table: CallTable
+    rescued: tuple[tuple[Words, bytearray], ...]
 
 
 class ReadyCopy(ProcessRestore):
@@ -169,18 +137,25 @@ class ReadyCopy(ProcessRestore):
             raise pid_taken(self._state.process.pid)
         if not vessel.may_choose_executable:
             self._execute_program()
+        self._map_and_fill(procfs.parse_maps(procfs.read_text(self._tracee.pid, "maps")))
+
+    def _map_and_fill(self, mappings: tuple[procfs.MapsLine, ...]) -> None:
+        """All of it, in a vessel that stands still.
+
+        Args:
+            mappings: that the vessel has of its own.
+        """
         self._own_xstate = self._tracee.xstate()
         self._start_registers = self._tracee.registers()
-        mappings = procfs.parse_maps(procfs.read_text(self._tracee.pid, "maps"))
         if not restore_vdso.fits(self._state, restore_memory.kernel_pages(mappings)):
             reason = "it comes from another kernel, whose vdso differs"
             raise UnsupportedError(f"{self._state.component} can have no ready copy: {reason}", (reason,))
         base = self._choose_place(mappings)
-        first = self._mappings_table(CallTable(base, descriptors=self._inherited()), vessel, mappings, base + AREA_SIZE)
+        first = self._mappings_table(CallTable(base, descriptors=self._inherited()), self._vessel, mappings, base + AREA_SIZE)
         self._check_room(first)
         self._lay_stub(base, mappings, ROOM)
         self._lay_out(first)
-        self._descriptors = set(first.descriptors)
+        self._descriptors = first.descriptors
         self._forget_pages(self._state)
 
     def advance(self, delta: Snapshot) -> None:
@@ -198,8 +173,23 @@ class ReadyCopy(ProcessRestore):
         self._require_whole()
         chain.check_continues(self.position, delta)
         require_covered(delta)
+        plan = self.planned(differences.resolved(delta, self._rows_at))
+        self.torn = True
+        self.change_mappings(plan)
+        self.fill(plan)
+        self.torn = False
+
+    def planned(self, delta: Snapshot) -> Plan:
+        """What a delta does to it, of which nothing is done yet.
+
+        Args:
+            delta: of this process, and tells its pages whole.
+
+        Raises:
+            MismatchError: this machine lacks a file that is mapped now.
+            RestoreError: it must be laid again.
+        """
         self._require_same_birth(delta)
-        delta = differences.resolved(delta, self._rows_at)
         change = Change.between(self._state.vmas, self._extents, delta)
         brought = self._checked(replace(delta, vmas=tuple(change.fresh_files()))) if change.fresh_files() else Brought()
         table = CallTable(self._stub.base, descriptors=set(self._descriptors))
@@ -208,19 +198,23 @@ class ReadyCopy(ProcessRestore):
         for descriptor in run.values():
             table.close(descriptor)
         self._check_room(table)
-        rescued = change.rescued(self._tracee.memory)
-        self.torn = True
-        if table.calls:
-            self.notes += self._stub.run(table)
-        for extents, content in rescued:
+        return Plan(delta, change, table, tuple(change.rescued(self._tracee.memory)))
+
+    def change_mappings(self, plan: Plan) -> None:
+        """The first half of a plan."""
+        if plan.table.calls:
+            self.notes += self._stub.run(plan.table)
+
+    def fill(self, plan: Plan) -> None:
+        """The other half."""
+        for extents, content in plan.rescued:
             ranges = extents.copy()
             ranges[:, 1] -= ranges[:, 0]
             self._tracee.memory.write_from(ranges, content)
-        restore_memory.fill(self._tracee.memory, delta)
-        self._descriptors = set(table.descriptors)
-        self._extents = change.carried
-        self._forget_pages(delta)
-        self.torn = False
+        restore_memory.fill(self._tracee.memory, plan.delta)
+        self._descriptors = plan.table.descriptors
+        self._extents = plan.change.carried
+        self._forget_pages(plan.delta)
 
     def finish(self, options: RestoreOptions) -> RestoredProgram:
         """Make it the program; it stands still until `RestoredProgram.resume`.
@@ -244,20 +238,29 @@ class ReadyCopy(ProcessRestore):
     def _finished(self, options: RestoreOptions) -> RestoredProgram:
         self._require_whole()
         self.require_clocks(options.elapsed_ns)
-        self._options = options
-        known = replace(options, accept_changed=(*options.accept_changed, *self._unchanged_files()))
-        (self._brought,) = restore_checks.require(self._state, known, self._tracee.pid)
-        arriving, self._state = carried_connections.arriving(self._state, wanted=options.stood_still)
-        self._thread = self._state.threads[0]
-        self._remember_sections()
-        later = self._later_tables(self._stub.base, set(self._descriptors), self._vessel)
-        self._check_room(*later.all)
+        known = replace(options, accept_changed=(*options.accept_changed, *self.unchanged_files(paths_open_in(self._state))))
+        (brought,) = restore_checks.require(self._state, known, self._tracee.pid)
+        arriving, state = carried_connections.arriving(self._state, wanted=options.stood_still)
+        later = self._prepared(state, options, brought, set(self._descriptors))
         self.torn = True
         self._complete(later)
         self.become_program()
         arriving.connect([self._tracee.pid])
         notes = (*self.notes, *arriving.notes)
         return RestoredProgram(self.held(), self.position, tuple(notes), arriving=arriving)
+
+    def _prepared(self, state: Snapshot, options: RestoreOptions, brought: Brought, descriptors: set[int]) -> LaterTables:
+        """Everything that comes after the pages, of which nothing is done yet.
+
+        Args:
+            descriptors: that are open by then.
+        """
+        self._options, self._brought, self._state = options, brought, state
+        self._thread = state.threads[0]
+        self._remember_sections()
+        later = self._later_tables(self._stub.base, descriptors, self._vessel)
+        self._check_room(*later.all)
+        return later
 
     # --- What differs from a restore at once ---
 
@@ -343,12 +346,13 @@ class ReadyCopy(ProcessRestore):
                 self._known[path] = key
         return Brought(run)
 
-    def _unchanged_files(self) -> Iterator[str]:
-        """Files that were compared when they were mapped, and look as they did then; none that is open besides."""
-        opened = {held.facts.get("path") for held in self._state.resources}
-        for path, key in self._known.items():
-            if path not in opened and _look_of(path) == key:
-                yield path
+    def unchanged_files(self, opened: Container[str]) -> tuple[str, ...]:
+        """Files that were compared when they were mapped, and look as they did then.
+
+        Args:
+            opened: paths of those that are open besides, which are compared again.
+        """
+        return tuple(path for path, key in self._known.items() if path not in opened and _look_of(path) == key)
 
     def _open_with_our_rights(self, table: CallTable, brought: Brought) -> dict[str, int]:
         """Open what was brought along, in a place of ours, though the vessel may look with its user's eyes already."""
@@ -393,6 +397,11 @@ class ReadyCopy(ProcessRestore):
             if thread.rseq is not None:
                 place = thread.rseq.address + RSEQ_SECTION_OFFSET
                 self._sections[place] = self._tracee.memory.read(place, 8)
+
+
+def paths_open_in(state: Snapshot) -> frozenset[str]:
+    """What any of its processes has open, by name."""
+    return frozenset(str(held.facts.get("path", "")) for one in state.processes for held in one.resources)
 
 
 def _monotonic_offset_ns(pid: int) -> int:

@@ -1,0 +1,72 @@
+"""Which programs can have no ready copy: others would see what is made in advance, or it is not covered yet.
+
+They come back from their chains, as ever.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from checkpoint import carried, pages, room
+from checkpoint.engines import restore_kinds, restore_memory
+from checkpoint.errors import UnsupportedError
+from checkpoint.linux import vm_flags
+from checkpoint.linux.abi import PROT_WRITE
+from checkpoint.model import Snapshot, Vma
+from checkpoint.resources import aio_rings, departed, system_v_memory, untouched
+
+SHARE: Final = 2
+"""What is free must hold a copy so many times."""
+
+
+def hindrances(state: Snapshot) -> Iterator[str]:
+    """Why a program can have no ready copy, one sentence each: others would see what is made, or it is not covered yet."""
+    if state.is_tree:
+        yield "it has several processes"
+        return
+    if carried.without(state) is not state:
+        yield "files travel with it"
+    for vma in state.vmas:
+        named = vma.file.path if vma.file is not None else vma.name or "memory"
+        if system_v_memory.is_segment(vma):
+            yield "it has System V shared memory"
+        elif aio_rings.is_ring(vma):
+            yield "it has rings of asynchronous I/O"
+        elif vma.shared and vma.file is not None and not _is_only_read(vma):
+            yield f"it maps {named} shared"
+        elif restore_kinds.is_special(vma):
+            yield f"it has huge or droppable pages ({named})"
+    if departed.of(state.resources, state.process.working_directory):
+        yield "it holds what is left of processes that have ended"
+    if len(untouched.of(state.resources)):
+        yield "it has memory that must stay untouched until it is used"
+    if restore_kinds.keys_of(state):
+        yield "it uses protection keys"
+
+
+def _is_only_read(vma: Vma) -> bool:
+    """Whether it is a mapping of a file with a name that nobody can write through: the C library has such ones."""
+    return restore_memory.is_file_mapping(vma) and not vma.protection & PROT_WRITE and vm_flags.MAY_WRITE not in vma.flags
+
+
+def require_covered(state: Snapshot) -> None:
+    """Refuse a program that can have no ready copy.
+
+    Raises:
+        UnsupportedError: with the reasons.
+    """
+    if reasons := tuple(dict.fromkeys(hindrances(state))):
+        raise UnsupportedError(f"{state.component} can have no ready copy: {'; '.join(reasons)}", reasons)
+
+
+def require_room(base: Snapshot) -> None:
+    """Refuse a copy that takes more than its share of what is free: what runs here needs room more than what may have to.
+
+    Raises:
+        UnsupportedError: with the reason.
+    """
+    size, free = pages.total_size(pages.extents(base.runs)), room.free()
+    if SHARE * size > free:
+        reason = f"it holds {size / room.GB:.2f} GB, more than half of the {free / room.GB:.2f} GB that this machine has free"
+        raise UnsupportedError(f"{base.component} can have no ready copy here: {reason}", (reason,))
