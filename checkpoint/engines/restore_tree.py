@@ -23,7 +23,7 @@ import resource
 import signal
 import struct
 import termios
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from itertools import groupby
 from typing import Final
@@ -62,6 +62,9 @@ STOPPED_BY: Final = 0x7F
 
 class TreeRestore:
     """One restore, from the seizing of the vessel to everybody's own registers."""
+
+    _born_with = 0
+    """Flags of clone(2) for everybody."""
 
     def __init__(self, vessel_pid: int, state: Snapshot, options: RestoreOptions, brought: tuple[Brought, ...]) -> None:
         self._state = state
@@ -104,27 +107,9 @@ class TreeRestore:
 
     def run(self) -> None:
         """All of it, up to the registers; everybody stands still."""
-        first = self._first
-        first.seize(options_for(self._state) | PTRACE_O_TRACEFORK)
-        first.freeze()
-        first.set_signal_mask(abi.ALL_SIGNALS & ~(1 << (signal.SIGTRAP - 1)))
-        vessel = look_at_vessel(first.pid)
-        self._require_rights(vessel)
-        self._registers = first.registers()
-        estate = self._make_estate(vessel)
-        self._instruction = estate.base + stubs.CALL_LOOP.index(cpu.SYSCALL)
-        self._come_to_session()
-        self._take_terminal(self._state.process.pid)
-        for step in births.steps_of(self._state, kinship.taken_pids(first.pid)):
-            self._take(step, estate.base)
-        self._set_foreground(estate.base)
-        for zombie in self._state.zombies:
-            self._end_as(zombie, estate.base)
-        if stop := stops.stop_of(self._state.resources):
-            restore_stops.stop(self._first, stop[0])
-        for member in self._state.members:
-            if stop := stops.stop_of(member.resources):
-                self._stop(member.process, *stop)
+        vessel = self._begin()
+        estate = self._make_estate(vessel, first_told(self._views))
+        self._bear_all(estate.base)
         self._restoring = [
             ProcessRestore(self._born[view.process.pid], view, self._options, brought, estate, legacy)
             for view, brought, legacy in zip(self._views, self._brought, self._legacies, strict=True)
@@ -133,6 +118,33 @@ class TreeRestore:
             restoring.build()
         for restoring in self._restoring:
             restoring.become_program()
+
+    def _begin(self) -> Vessel:
+        """Seize the first vessel."""
+        first = self._first
+        first.seize(options_for(self._state) | PTRACE_O_TRACEFORK)
+        first.freeze()
+        first.set_signal_mask(abi.ALL_SIGNALS & ~(1 << (signal.SIGTRAP - 1)))
+        vessel = look_at_vessel(first.pid)
+        self._require_rights(vessel)
+        self._registers = first.registers()
+        return vessel
+
+    def _bear_all(self, base: int) -> None:
+        """Have everybody born, and those end, or be stopped, that had."""
+        self._instruction = base + stubs.CALL_LOOP.index(cpu.SYSCALL)
+        self._come_to_session()
+        self._take_terminal(self._state.process.pid)
+        for step in births.steps_of(self._state, kinship.taken_pids(self._first.pid)):
+            self._take(step, base)
+        self._set_foreground(base)
+        for zombie in self._state.zombies:
+            self._end_as(zombie, base)
+        if stop := stops.stop_of(self._state.resources):
+            restore_stops.stop(self._first, stop[0])
+        for member in self._state.members:
+            if stop := stops.stop_of(member.resources):
+                self._stop(member.process, *stop)
 
     def _require_rights(self, vessel: Vessel) -> None:
         """Its processes know each other by their pids, so these must be had.
@@ -156,7 +168,12 @@ class TreeRestore:
 
     # What they share
 
-    def _make_estate(self, vessel: Vessel) -> Estate:
+    def _make_estate(self, vessel: Vessel, resources: dict[int, Resource]) -> Estate:
+        """Make what they share in the first vessel.
+
+        Args:
+            resources: what is told of each open file that is shared, by its number.
+        """
         mappings, views = procfs.parse_maps(procfs.read_text(self._first.pid, "maps")), self._views
         vmas = [vma for view in views for vma in view.vmas]
         sizes = {
@@ -165,11 +182,8 @@ class TreeRestore:
         size = AREA_SIZE + REFUGE_SIZE + sum(sizes.values())
         taken = [(line.start, line.end) for line in mappings] + [(vma.start, vma.end) for vma in vmas]
         base = call_table.find_hole(taken, size)
-        resources = _first_told(views)
         objects = dict(_grouped(vmas, restore_memory.is_object_mapping))
-        wanted = (one.number for view in views for one in rebuild.descriptors_of(view))
-        made_first = len(streams.STANDARD) + 2 * len(resources) + len(objects) + len(self._nameless)  # at the lowest numbers
-        numbers = itertools.count(max(max(wanted, default=2), made_first) + 1)
+        numbers = self._numbers(resources, len(objects))
         estate = Estate(
             base=base,
             size=size,
@@ -188,31 +202,8 @@ class TreeRestore:
         opened, left = restore_threads.open_what_is_left(self._first, self._registers, stub, ended, streams.STANDARD)
         table = CallTable(estate.base, descriptors=opened)
         inheritance.leave(table)
-        self._make_nameless(table, vessel, estate, sizes, objects, resources, left)
-        inheritance.leave_files(table)
-        if table.end - base > AREA_SIZE:
-            raise RestoreError(f"cannot restore: what its processes share takes more than {AREA_SIZE >> 20} MiB")
-        self._notes += stub.run(table)
-        inheritance.put_in(self._first.memory)
-        return estate
-
-    def _make_nameless(
-        self,
-        table: CallTable,
-        vessel: Vessel,
-        estate: Estate,
-        sizes: dict[restore_memory.Object, int],
-        objects: dict[restore_memory.Object, list[Vma]],
-        resources: dict[int, Resource],
-        left: departed.Descriptors,
-    ) -> None:
-        """Add the calls that make all that is shared, at the numbers and addresses that the estate says.
-
-        Args:
-            left: what is open of processes that have ended.
-        """
         restore_process.raise_limits(table, vessel)
-        opened = self._open_brought(table, resources)  # with our rights, from a place of ours
+        made = self._open_brought(table, resources) | left  # with our rights, from a place of ours
         if self._options.own_eyes:
             restore_process.own_eyes(table, self._state.process, vessel)
         for key, size in sizes.items():
@@ -220,8 +211,39 @@ class TreeRestore:
             flags = abi.MAP_SHARED | abi.MAP_ANONYMOUS | abi.MAP_FIXED_NOREPLACE
             arguments = (place, size, abi.PROT_READ | abi.PROT_WRITE, flags, -1, 0)
             table.call(what, "mmap", *arguments, least=place, most=place)
-        made = opened | left | {key: restore_memory.make_object(table, vmas) for key, vmas in objects.items()}
-        made |= {key: files_of_several.make(table, held) for key, held in self._nameless.items()}
+        made |= {key: restore_memory.make_object(table, vmas) for key, vmas in objects.items()}
+        self._make_nameless(table, vessel, estate, made, resources)
+        inheritance.leave_files(table)
+        if table.end - base > AREA_SIZE:
+            raise RestoreError(f"cannot restore: what its processes share takes more than {AREA_SIZE >> 20} MiB")
+        self._notes += stub.run(table)
+        inheritance.put_in(self._first.memory)
+        return estate
+
+    def _numbers(self, resources: Collection[int], count: int) -> Iterator[int]:
+        """Descriptors for what is shared: above all that any process wants, and that are open while it is made.
+
+        Args:
+            count: of objects that are mapped.
+        """
+        wanted = (one.number for view in self._views for one in rebuild.descriptors_of(view))
+        made_first = len(streams.STANDARD) + 2 * len(resources) + count + len(self._nameless)  # at the lowest numbers
+        return itertools.count(max(max(wanted, default=2), made_first) + 1)
+
+    def _make_nameless(
+        self,
+        table: CallTable,
+        vessel: Vessel,
+        estate: Estate,
+        made: dict[restore_memory.Object, int],
+        resources: dict[int, Resource],
+    ) -> None:
+        """Add the calls that make all open files that are shared, at the numbers that the estate says.
+
+        Args:
+            made: the objects that are there, each open at some number, and no more there afterwards.
+        """
+        made = made | {key: files_of_several.make(table, held) for key, held in self._nameless.items()}
         for key, number in estate.objects.items():
             table.duplicate(made[key], number, os.O_CLOEXEC)
         kept = [Resource(streams.KIND, f"fd {n}", {"descriptors": [[n, 0]], "stream": n, "flags": 0}) for n in streams.STANDARD]
@@ -255,7 +277,7 @@ class TreeRestore:
             case Birth(parent, pid) if pid < 0:
                 self._born[pid], self._standins[pid] = self._stand_in(self._born[parent], base)
             case Birth(parent, pid, exit_signal, flags):
-                mother = self._born[parent]
+                mother, flags = self._born[parent], flags | self._born_with
                 self._born[pid] = restore_threads.spawn_process(mother, self._registers, base, pid, exit_signal, flags)
             case NewSession(pid):
                 self._call(pid, f"make session {pid}", "setsid")
@@ -274,7 +296,7 @@ class TreeRestore:
         """Somebody of any pid, and that: whoever is born or restored beside us may have taken some."""
         for pid in self._spare:
             with contextlib.suppress(restore_threads.IdInUseError):
-                return restore_threads.spawn_process(mother, self._registers, base, pid, 0, 0), pid
+                return restore_threads.spawn_process(mother, self._registers, base, pid, 0, self._born_with), pid
         raise RestoreError(f"cannot restore {self._state.component}: no pid is left for a stand-in of one that has ended")
 
     def _take_terminal(self, pid: int) -> None:
@@ -372,7 +394,7 @@ def _places(begin: int, sizes: object) -> Iterator[int]:
         begin += size
 
 
-def _first_told(views: tuple[Snapshot, ...]) -> dict[int, Resource]:
+def first_told(views: tuple[Snapshot, ...]) -> dict[int, Resource]:
     """What is told of each open file that several processes have, or that leads from one to another."""
     found: dict[int, Resource] = {}
     for view in views:
