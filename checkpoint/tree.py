@@ -97,7 +97,12 @@ def _are_alike(rows: NDArray[np.uint8], some: NDArray[np.intp], others: NDArray[
 
 
 def views(snapshot: Snapshot) -> tuple[Snapshot, ...]:
-    """Each process of a base as a snapshot of its own, the first one first. Pages are not copied, but for ``copies``."""
+    """Each process as a snapshot of its own, the first one first. Pages are not copied, but for ``copies``.
+
+    Args:
+        snapshot: a base, a delta that tells its pages whole, or an outline.
+    """
+    assert not (snapshot.differences and len(snapshot.contents)), "a difference is not the page"
     if not snapshot.is_tree:
         return (snapshot,)
     snapshot = expanded(snapshot)
@@ -116,7 +121,18 @@ def views(snapshot: Snapshot) -> tuple[Snapshot, ...]:
         for member in snapshot.members
     ]
     slots = [0, *(member.slot for member in snapshot.members)]
-    return tuple(_with_pages(view, places, contents, slot) for view, slot in zip((first, *others), slots, strict=True))
+    every = zip((first, *others), slots, strict=True)
+    return tuple(
+        replace(_with_pages(view, places, contents, slot), cleared=_of_slot(snapshot.cleared, slot)) for view, slot in every
+    )
+
+
+def _of_slot(runs: Sequence[PageRun], slot: int) -> Runs:
+    """The part of them that is of one process, at its own addresses."""
+    if not runs:
+        return ()
+    mine = pages.intersection(pages.extents(runs), pages.extents([whole(slot)]))
+    return pages.page_runs(mine - np.uint64(base_of(slot)))
 
 
 Runs = tuple[PageRun, ...]

@@ -6,15 +6,17 @@ They come back from their chains, as ever.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Final
 
-from checkpoint import carried, pages, room
+from checkpoint import carried, pages, room, tree
 from checkpoint.engines import restore_kinds, restore_memory
 from checkpoint.errors import UnsupportedError
 from checkpoint.linux import vm_flags
 from checkpoint.linux.abi import PROT_WRITE
+from checkpoint.linux.tracking import MEMORY_PLACE
 from checkpoint.model import Snapshot, Vma
-from checkpoint.resources import aio_rings, departed, system_v_memory, untouched
+from checkpoint.resources import aio_rings, departed, joint, memory_files, stops, system_v_memory, terminals, untouched
 
 SHARE: Final = 2
 """What is free must hold a copy so many times."""
@@ -22,18 +24,25 @@ SHARE: Final = 2
 
 def hindrances(state: Snapshot) -> Iterator[str]:
     """Why a program can have no ready copy, one sentence each: others would see what is made, or it is not covered yet."""
-    if state.is_tree:
-        yield "it has several processes"
-        return
     if carried.without(state) is not state:
         yield "files travel with it"
+    for view in tree.views(replace(state, cleared=(), runs=(), copies=(), differences=(), contents=b"")):
+        yield from _of_process(view, is_kin=state.is_tree)
+
+
+def _of_process(state: Snapshot, *, is_kin: bool) -> Iterator[str]:
+    """The same of one process.
+
+    Args:
+        is_kin: there are others.
+    """
     for vma in state.vmas:
         named = vma.file.path if vma.file is not None else vma.name or "memory"
         if system_v_memory.is_segment(vma):
             yield "it has System V shared memory"
         elif aio_rings.is_ring(vma):
             yield "it has rings of asynchronous I/O"
-        elif vma.shared and vma.file is not None and not _is_only_read(vma):
+        elif vma.shared and vma.file is not None and not (_is_only_read(vma) or (is_kin and _is_in_memory(vma))):
             yield f"it maps {named} shared"
         elif restore_kinds.is_special(vma):
             yield f"it has huge or droppable pages ({named})"
@@ -43,6 +52,26 @@ def hindrances(state: Snapshot) -> Iterator[str]:
         yield "it has memory that must stay untouched until it is used"
     if restore_kinds.keys_of(state):
         yield "it uses protection keys"
+    if is_kin:
+        yield from _of_kin(state)
+
+
+def _of_kin(state: Snapshot) -> Iterator[str]:
+    """What must come before the births of others, and may be another one at the takeover."""
+    if joint.flags_of(state.resources) & joint.CLONE_FILES:
+        yield "processes of it share a table of descriptors"
+    if stops.stop_of(state.resources):
+        yield "a process of it is stopped, or its parent has not been told that it goes on"
+    if any(held.kind == terminals.KIND and held.facts.get("session") for held in state.resources):
+        yield "it has a controlling terminal"
+
+
+def _is_in_memory(vma: Vma) -> bool:
+    """Whether it is shared memory that no name leads to."""
+    if restore_memory.is_anonymous_object(vma):
+        return True
+    assert vma.file is not None
+    return restore_memory.is_object_mapping(vma) and vma.file.path.startswith((memory_files.PREFIX, MEMORY_PLACE))
 
 
 def _is_only_read(vma: Vma) -> bool:

@@ -4,6 +4,9 @@ A page that a state does not hold is as its mapping is made: zeros, or what the 
 dropped (madvise), and what it maps otherwise is mapped afresh. Mappings count as the same where the same thing lies at the
 same place; protection and advice may differ, they are set at the end.
 
+Memory that several processes share is not their mappings': it is there as long as any of them, and its content with it. What of
+that a delta takes away is told by `held_of_objects` of all of them together (`family_copy`).
+
 Sources: madvise(2), mmap(2).
 """
 
@@ -11,14 +14,15 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
 
 from checkpoint import pages
 from checkpoint.engines import restore_memory
-from checkpoint.engines.restore_memory import KERNEL_KINDS, Carried, first_protection, is_file_mapping
+from checkpoint.engines.restore_memory import KERNEL_KINDS, Carried, Object, first_protection, is_file_mapping
 from checkpoint.errors import RestoreError
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.memory import Memory
@@ -28,6 +32,7 @@ from checkpoint.pages import Words
 MADV_DONTNEED: Final = 4
 MADV_REMOVE: Final = 9
 NO_PAGES: Final[Words] = np.empty((0, 2), np.uint64)
+NO_OBJECTS: Final[Mapping[Object, int]] = MappingProxyType({})
 
 Backing = tuple[object, ...]
 """What a mapping is of, and how it lies there."""
@@ -44,6 +49,7 @@ class Change:
         protections: (start, end, protection) that other parts need while pages are written.
         carried: pages that the new state holds.
         rescued_pages: those that must outlive that they are mapped afresh.
+        stiff: what is mapped since birth still, see `between`.
     """
 
     gone: Words
@@ -53,10 +59,15 @@ class Change:
     protections: tuple[tuple[int, int, int], ...]
     carried: Words
     rescued_pages: Words
+    stiff: Words = field(default_factory=lambda: NO_PAGES)
 
     @classmethod
-    def between(cls, before: Sequence[Vma], held: Words, delta: Snapshot) -> Change:
+    def between(cls, before: Sequence[Vma], held: Words, delta: Snapshot, stiff: Words = NO_PAGES) -> Change:
         """What leads from mappings, and the pages held in them, to a delta's.
+
+        Args:
+            stiff: what a process was born with: the kernel joins it with nothing that is mapped beside it later. A mapping of
+                which some is new is mapped afresh as a whole (mremap(2) takes one mapping only).
 
         Raises:
             RestoreError: shared memory has grown in its place.
@@ -65,11 +76,16 @@ class Change:
         runs, cleared = pages.extents(delta.runs), pages.extents(delta.cleared)
         carried = pages.union(pages.difference(pages.intersection(held, pages.extents(delta.vmas)), cleared), runs)
         gone, fresh_set = _moved(old, new)
+        stiff = pages.difference(pages.difference(stiff, gone), fresh_set)
+        torn_apart = [vma for vma in new if _is_partly(vma, stiff) and _is_partly(vma, fresh_set)] if len(stiff) else []
+        fresh_set = pages.union(fresh_set, _extents(torn_apart))
         fresh = tuple(piece for vma in new for piece in _pieces(vma, fresh_set)) if len(fresh_set) else ()
         emptied = pages.intersection(pages.intersection(cleared, held), _extents(new))
         lost = pages.difference(pages.difference(emptied, fresh_set), runs)
-        shared = _extents(vma for vma in new if vma.shared)
+        shared, of_objects = _extents(vma for vma in new if vma.shared), _extents(filter(is_of_object, new))
+        lost = pages.difference(lost, of_objects)
         rescued = pages.difference(pages.difference(pages.intersection(held, fresh_set), cleared), runs)
+        rescued = pages.difference(rescued, of_objects)
         return cls(
             gone,
             fresh,
@@ -78,21 +94,29 @@ class Change:
             tuple(_protections(old, Carried(held), new, Carried(carried), fresh_set)),
             carried,
             rescued,
+            pages.difference(stiff, fresh_set),
         )
 
     def fresh_files(self) -> list[Vma]:
         """Of what is to be mapped, what is mapped from files that have names."""
         return [vma for vma in self.fresh if is_file_mapping(vma)]
 
-    def add_calls(self, table: CallTable, brought: Mapping[str, int]) -> None:
+    def add_calls(
+        self,
+        table: CallTable,
+        brought: Mapping[str, int],
+        objects: Mapping[Object, int] = NO_OBJECTS,
+        anonymous: Mapping[Object, int] = NO_OBJECTS,
+    ) -> None:
         """Add everything but the writing of pages.
 
         Args:
             brought: descriptors of what is mapped in place of this machine's files, by path.
+            objects, anonymous: memory that several processes share, as `restore_memory.map_program` takes it.
         """
         for start, end in self.gone.tolist():
             table.call(f"unmap {start:#x} of the copy", "munmap", start, end - start)
-        restore_memory.map_program(table, self.fresh, self.carried, brought)
+        restore_memory.map_program(table, self.fresh, self.carried, brought, objects, anonymous)
         for advice, extents in ((MADV_DONTNEED, self.dropped), (MADV_REMOVE, self.removed)):
             for start, end in extents.tolist():
                 table.call(f"empty {(end - start) >> 10} KiB at {start:#x}", "madvise", start, end - start, advice)
@@ -102,6 +126,27 @@ class Change:
     def rescued(self, memory: Memory) -> list[tuple[Words, bytearray]]:
         """What the pages hold that must outlive this change."""
         return [(self.rescued_pages, memory.read_pages(self.rescued_pages))] if len(self.rescued_pages) else []
+
+
+def _is_partly(vma: Vma, some: Words) -> bool:
+    """Whether some of a private mapping is in a set, and not all of it."""
+    return not vma.shared and 0 < pages.total_size(pages.intersection(_extents([vma]), some)) < vma.size
+
+
+def is_of_object(vma: Vma) -> bool:
+    """Whether it shows memory that several processes may share, and that stays when it is unmapped here."""
+    return restore_memory.is_anonymous_object(vma) or restore_memory.is_object_mapping(vma)
+
+
+def held_of_objects(vmas: Iterable[Vma], held: Words) -> dict[Object, Words]:
+    """Which parts of shared memory, by offset, the pages are that one process holds."""
+    found: dict[Object, Words] = {}
+    for vma in filter(is_of_object, vmas):
+        part = pages.intersection(held, _extents([vma]))
+        if len(part):
+            key = restore_memory.object_of(vma)
+            found[key] = pages.union(found.get(key, NO_PAGES), part - np.uint64(vma.start) + np.uint64(vma.offset))
+    return found
 
 
 def _ours(vmas: Iterable[Vma]) -> list[Vma]:
@@ -119,7 +164,8 @@ def backing(vma: Vma) -> Backing:
     if is_file_mapping(vma):
         assert vma.file is not None
         return vma.file.path, vma.file.device, vma.file.inode, vma.start - vma.offset, *marks
-    return vma.shared, vma.start - vma.offset if vma.shared else 0, *marks
+    of_object = restore_memory.object_of(vma) if is_of_object(vma) else None
+    return vma.shared, vma.start - vma.offset if vma.shared else 0, of_object, *marks
 
 
 def _moved(old: Sequence[Vma], new: Sequence[Vma]) -> tuple[Words, Words]:
@@ -131,7 +177,8 @@ def _moved(old: Sequence[Vma], new: Sequence[Vma]) -> tuple[Words, Words]:
             kept = pages.union(kept, extents) if key in before else kept
             continue
         same = pages.intersection(before[key], extents)
-        if key[0] is True and len(same) and len(pages.difference(extents, before[key])):
+        is_of_one = key[0] is True and key[2] is None
+        if is_of_one and len(same) and len(pages.difference(extents, before[key])):
             raise RestoreError("the ready copy must be laid again: its shared memory has grown in its place")
         kept = pages.union(kept, same)
     return pages.difference(_extents(old), kept), pages.difference(_extents(new), kept)

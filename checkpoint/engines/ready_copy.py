@@ -19,18 +19,21 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Container, Mapping
+from collections.abc import Container, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from checkpoint import chain, differences, pages
 from checkpoint.differences import Rows
-from checkpoint.engine import RestoreOptions, pid_taken
+from checkpoint.engine import Copy, RestoreOptions, pid_taken
 from checkpoint.engines import restore_checks, restore_memory, restore_process, restore_vdso
 from checkpoint.engines.copy_hindrances import require_covered, require_room
 from checkpoint.engines.copy_mappings import Change
+from checkpoint.engines.forked_memory import Legacy
 from checkpoint.engines.ptrace_restore import (
     RSEQ_SECTION_OFFSET,
+    Estate,
     LaterTables,
     ProcessRestore,
     RestoredProgram,
@@ -38,15 +41,19 @@ from checkpoint.engines.ptrace_restore import (
     options_for,
 )
 from checkpoint.engines.restore_checks import Brought
+from checkpoint.engines.restore_process import Vessel
 from checkpoint.errors import ChainError, CheckpointError, MismatchError, RestoreError, UnsupportedError
 from checkpoint.linux import procfs
 from checkpoint.linux.abi import PAGE_SIZE
-from checkpoint.linux.call_table import AREA_SIZE, CallTable
+from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.tracee import Tracee
 from checkpoint.model import Fact, Position, Snapshot, ThreadState
 from checkpoint.pages import Words
 from checkpoint.resources import carried_connections, seccomp
 from checkpoint.resources.rebuilding import number_of
+
+if TYPE_CHECKING:
+    from checkpoint.engines.family_copy import FamilyCopy
 
 ROOM: Final = 16 << 20
 """Bytes of address space for all tables to come: some 100,000 calls. Only what is used takes memory."""
@@ -59,7 +66,7 @@ AHEAD_NS: Final = 60_000_000_000
 checkpoint was on its way."""
 
 
-def lay(vessel_pid: int, base: Snapshot, options: RestoreOptions) -> ReadyCopy:
+def lay(vessel_pid: int, base: Snapshot, options: RestoreOptions) -> Copy:
     """Map and fill everything of a base in a vessel, and leave it standing there.
 
     Raises:
@@ -69,19 +76,36 @@ def lay(vessel_pid: int, base: Snapshot, options: RestoreOptions) -> ReadyCopy:
     """
     require_covered(base)
     require_room(base)
-    copy = ReadyCopy(Tracee(vessel_pid), base, options)
-    try:
+    copy = _copy_of(vessel_pid, base, options)
+    with ended_on_error(copy, f"lay a ready copy of {base.component} in pid {vessel_pid}"):
         copy.lay()
-    except RestoreError:
+    return copy
+
+
+def _copy_of(vessel_pid: int, base: Snapshot, options: RestoreOptions) -> ReadyCopy | FamilyCopy:
+    from checkpoint.engines.family_copy import FamilyCopy
+
+    return FamilyCopy(vessel_pid, base, options) if base.is_tree else ReadyCopy(Tracee(vessel_pid), base, options)
+
+
+@contextmanager
+def ended_on_error(copy: ReadyCopy | FamilyCopy, what: str) -> Iterator[None]:
+    """End a copy with which something goes wrong.
+
+    Raises:
+        RestoreError, MismatchError, UnsupportedError: as they come; all else that can go wrong as a RestoreError.
+    """
+    try:
+        yield
+    except (RestoreError, UnsupportedError):
         copy.end()
         raise
     except CheckpointError as error:
         copy.end()
-        raise RestoreError(f"cannot lay a ready copy of {base.component} in pid {vessel_pid}: {error}") from error
+        raise RestoreError(f"cannot {what}: {error}") from error
     except BaseException:
         copy.end()
         raise
-    return copy
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,11 +131,20 @@ class ReadyCopy(ProcessRestore):
         torn: a delta was begun and not finished; nothing can be made of it any more.
     """
 
-    def __init__(self, tracee: Tracee, base: Snapshot, options: RestoreOptions) -> None:
-        super().__init__(tracee, base, options, Brought())
+    _room = ROOM
+
+    def __init__(
+        self,
+        tracee: Tracee,
+        base: Snapshot,
+        options: RestoreOptions,
+        estate: Estate | None = None,
+        legacy: Legacy = restore_memory.NOTHING,
+    ) -> None:
+        super().__init__(tracee, base, options, Brought(), estate, legacy)
         self.position: Position = base.position
         self.torn = False
-        self._extents = pages.extents(base.runs)
+        self._extents, self._stiff = pages.extents(base.runs), legacy.kept
         self._sections: dict[int, bytes] = {}
         self._known: dict[str, tuple[int, ...]] = {}
 
@@ -119,6 +152,16 @@ class ReadyCopy(ProcessRestore):
     def state(self) -> Snapshot:
         """What it stands at, without its pages."""
         return self._state
+
+    @property
+    def stub(self) -> Stub:
+        """From which its calls are made."""
+        return self._stub
+
+    @property
+    def vessel(self) -> Vessel:
+        """What it was when it was laid."""
+        return self._vessel
 
     @property
     def size(self) -> int:
@@ -153,7 +196,7 @@ class ReadyCopy(ProcessRestore):
         base = self._choose_place(mappings)
         first = self._mappings_table(CallTable(base, descriptors=self._inherited()), self._vessel, mappings, base + AREA_SIZE)
         self._check_room(first)
-        self._lay_stub(base, mappings, ROOM)
+        self._lay_stub(base, mappings, self._room)
         self._lay_out(first)
         self._descriptors = first.descriptors
         self._forget_pages(self._state)
@@ -172,8 +215,10 @@ class ReadyCopy(ProcessRestore):
         """
         self._require_whole()
         chain.check_continues(self.position, delta)
+        if delta.is_tree:
+            raise RestoreError(f"the ready copy of {delta.component} must be laid again: it has several processes by now")
         require_covered(delta)
-        plan = self.planned(differences.resolved(delta, self._rows_at))
+        plan = self.planned(differences.resolved(delta, self.rows_at))
         self.torn = True
         self.change_mappings(plan)
         self.fill(plan)
@@ -190,11 +235,12 @@ class ReadyCopy(ProcessRestore):
             RestoreError: it must be laid again.
         """
         self._require_same_birth(delta)
-        change = Change.between(self._state.vmas, self._extents, delta)
+        change = Change.between(self._state.vmas, self._extents, delta, self._stiff)
         brought = self._checked(replace(delta, vmas=tuple(change.fresh_files()))) if change.fresh_files() else Brought()
         table = CallTable(self._stub.base, descriptors=set(self._descriptors))
         run = self._open_with_our_rights(table, brought)
-        change.add_calls(table, run)
+        shared = (self._estate.objects, self._estate.anonymous) if self._estate else ()
+        change.add_calls(table, run, *shared)
         for descriptor in run.values():
             table.close(descriptor)
         self._check_room(table)
@@ -213,7 +259,7 @@ class ReadyCopy(ProcessRestore):
             self._tracee.memory.write_from(ranges, content)
         restore_memory.fill(self._tracee.memory, plan.delta)
         self._descriptors = plan.table.descriptors
-        self._extents = plan.change.carried
+        self._extents, self._stiff = plan.change.carried, plan.change.stiff
         self._forget_pages(plan.delta)
 
     def finish(self, options: RestoreOptions) -> RestoredProgram:
@@ -223,17 +269,8 @@ class ReadyCopy(ProcessRestore):
             MismatchError: this machine lacks something.
             RestoreError: it did not work; the caller kills the vessel, and restores from the chain.
         """
-        try:
+        with ended_on_error(self, f"make {self._state.component} of its ready copy"):
             return self._finished(options)
-        except RestoreError:
-            self.end()
-            raise
-        except CheckpointError as error:
-            self.end()
-            raise RestoreError(f"cannot make {self._state.component} of its ready copy: {error}") from error
-        except BaseException:
-            self.end()
-            raise
 
     def _finished(self, options: RestoreOptions) -> RestoredProgram:
         self._require_whole()
@@ -301,7 +338,7 @@ class ReadyCopy(ProcessRestore):
             raise RestoreError(f"the ready copy of {ours.component} must be laid again: changed are {changed}")
 
     def _overlaps_stub(self, state: Snapshot) -> bool:
-        start, end = self._stub.base, self._stub.base + ROOM
+        start, end = self._stub.base, self._stub.base + self._area_size
         return any(vma.start < end and start < vma.end for vma in state.vmas)
 
     def require_clocks(self, elapsed_ns: int) -> None:
@@ -327,8 +364,8 @@ class ReadyCopy(ProcessRestore):
         return ahead_of_ours_ns + time.clock_gettime_ns(time.CLOCK_MONOTONIC) - self._state.clocks.monotonic_ns - elapsed_ns
 
     def _check_room(self, *tables: CallTable) -> None:
-        if any(table.end - table.base > ROOM for table in tables):
-            raise RestoreError(f"a ready copy has room for {ROOM >> 20} MiB of calls, and {self._state.component} needs more")
+        if any(table.end - table.base > self._room for table in tables):
+            raise RestoreError(f"a ready copy has room for {self._room >> 20} MiB of calls, {self._state.component} needs more")
 
     # --- Files ---
 
@@ -358,21 +395,16 @@ class ReadyCopy(ProcessRestore):
         """Open what was brought along, in a place of ours, though the vessel may look with its user's eyes already."""
         if not brought.run and not brought.opened:
             return {}
-        self._brought, ours = brought, self._vessel.credentials
-        if self._options.own_eyes:
-            table.attempt("", "setfsuid", ours.uids[3])
-            table.attempt("", "setfsgid", ours.gids[3])
-        run = self._open_brought(table)
-        if self._options.own_eyes:
-            restore_process.own_eyes(table, self._state.process, self._vessel)
-        return run
+        self._brought = brought
+        with restore_process.our_eyes(table, self._state.process, self._vessel, self._options):
+            return self._open_brought(table)
 
     def _is_open(self, path: str) -> bool:
         return any(held.facts.get("path") == path and _object_of(held.facts) in self._objects for held in self._state.resources)
 
     # --- What is kept of the program ---
 
-    def _rows_at(self, addresses: Words) -> Rows:
+    def rows_at(self, addresses: Words) -> Rows:
         """What it holds at these addresses.
 
         Raises:

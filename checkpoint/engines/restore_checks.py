@@ -112,20 +112,21 @@ class Brought:
     opened: Mapping[str, str] = field(default_factory=dict)
 
 
-def require(state: Snapshot, options: RestoreOptions, vessel_pid: int) -> tuple[Brought, ...]:
+def require(state: Snapshot, options: RestoreOptions, *vessel_pids: int) -> tuple[Brought, ...]:
     """Refuse a snapshot that cannot come back here; answers with what must come from elsewhere than its own path, by process.
 
     Args:
-        vessel_pid: what is to become the program; it, we and our forebears may hold files that the program writes to.
+        vessel_pids: what is to become the program; they, we and our forebears may hold files that the program writes to.
 
     Raises:
         MismatchError: with one reason for each difference.
     """
     reasons: list[str] = []
     brought = []
+    ours = frozenset[int]().union(*(writers.family(pid) for pid in (os.getpid(), *vessel_pids)))
     for view in tree.views(state):
         differing, one = _compare(view, options)
-        reasons += (*differing, *_of_writers(view, options, vessel_pid))
+        reasons += (*differing, *_of_writers(view, options, ours))
         brought.append(one)
     if reasons:
         each = tuple(dict.fromkeys(reasons))
@@ -376,7 +377,7 @@ def _of_open_file(held: Resource, path: str, same_boot: bool, digest_of: DigestO
         yield f"{named} has another content here; {_FAR}, or {shared}"
 
 
-def _of_writers(state: Snapshot, options: RestoreOptions, vessel_pid: int) -> Iterator[str]:
+def _of_writers(state: Snapshot, options: RestoreOptions, ours: frozenset[int]) -> Iterator[str]:
     """Files that the program writes to and somebody else does, too: their words would mix, and the cut would lose some."""
     for held in state.resources:
         path = str(held.facts.get("path", ""))
@@ -384,7 +385,7 @@ def _of_writers(state: Snapshot, options: RestoreOptions, vessel_pid: int) -> It
             continue
         if not (os.path.isfile(path) and rebuild.is_written(held) and writers.may_be_written(path)):
             continue
-        if pid := writers.writer_of(path, writers.family(os.getpid()) | writers.family(vessel_pid)):
+        if pid := writers.writer_of(path, ours):
             who = f"pid {pid} ({_name_of(pid)})"
             yield f"{path}, open as {held.name}, is held open for writing by {who}: end that first, or accept it as shared"
 
