@@ -183,8 +183,10 @@ class Keeper:
                 raise RestoreError(f"cannot lay a ready copy in pid {request.pid}: this keeper follows a process already")
             options = RestoreOptions(own_eyes=request.own_eyes, contents=request.contents, terms=request.terms)
             with foreign.facts(f"lay a ready copy of {request.component}"):
-                self._copy = self._tracer.lay(request.pid, format.decode(descriptors[0]), options)
-            return self._brought_on(self._copy, descriptors[1:], request.elapsed_ns)
+                is_whole = _has_several_processes(descriptors)  # who came or went within the chain is not followed
+                base = folded(descriptors) if is_whole else format.decode(descriptors[0])
+                self._copy = self._tracer.lay(request.pid, base, options)
+            return self._brought_on(self._copy, () if is_whole else descriptors[1:], request.elapsed_ns)
         finally:
             channel.close_all(descriptors)
 
@@ -369,6 +371,10 @@ def encoded_in(descriptor: int, snapshot: Snapshot, threads: int) -> int:
             return format.encode(snapshot, file, threads=threads)
     except OSError as error:
         raise StoreError(f"cannot write a snapshot of {snapshot.component}: {error.strerror}") from error
+
+
+def _has_several_processes(files: Descriptors) -> bool:
+    return any(format.read_outline(file).is_tree for file in files)
 
 
 def folded(files: Descriptors) -> Snapshot:
