@@ -9,6 +9,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
+import time
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Any, Final
@@ -28,6 +30,9 @@ from failover.core.types import ComponentSpec
 
 PAUSES_S: Final = (0.1, 1.0, 5.0, 30.0)
 """Before a copy that failed is laid again: the last one for ever."""
+
+STEADY_S: Final = 10.0
+"""How long a copy must have stood for its failure to count as the first: one whose processes come and go is laid in vain."""
 
 UNSUPPORTED_S: Final = 60.0
 """Before it is looked again whether a program that could have none can."""
@@ -118,18 +123,23 @@ class ReadyCopy:
     # --- Following the checkpoints ---
 
     async def _follow(self, spec: ComponentSpec, tell: Callable[[bool, str], None]) -> None:
-        failures, told = 0, False
+        failures, told, laid_s = 0, False, math.inf
         while True:
             self._news.clear()
             try:
                 async with self._turn:
-                    await (self._bring_on() if self._ready is not None else self._lay(spec))
-                failures, pause_s = 0, None
+                    if self._ready is not None:
+                        await self._bring_on()
+                    else:
+                        await self._lay(spec)
+                        laid_s = time.monotonic()
+                pause_s = None
             except UnsupportedError as refusal:
                 pause_s = UNSUPPORTED_S
                 await self._end("; ".join(refusal.reasons) or str(refusal))
             except TROUBLE as trouble:
-                pause_s, failures = PAUSES_S[min(failures, len(PAUSES_S) - 1)], failures + 1
+                failures = 0 if time.monotonic() - laid_s >= STEADY_S else failures
+                pause_s, failures, laid_s = PAUSES_S[min(failures, len(PAUSES_S) - 1)], failures + 1, math.inf
                 log.info("%s: its ready copy is laid again: %s", self._name, trouble)
                 await self._end(str(trouble))
             if told != (self._ready is not None):

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import pytest
+
+from agent import ready_copy
 from agent.figures import Figures
 from agent.nursery import Nursery
 from agent.ready_copy import Ready, ReadyCopy
+from checkpoint.errors import RestoreError
 
 
 class Slow:
@@ -37,3 +42,42 @@ def test_a_copy_that_is_being_ended_is_ended_whole_when_none_is_wanted_any_more(
         assert component.is_undone
 
     asyncio.run(story())
+
+
+class Fickle(ReadyCopy):
+    """A copy that can be laid, and not be brought on."""
+
+    async def _lay(self, spec: Any) -> None:
+        component = Slow()
+        component.allowed.set()
+        self._ready = Ready(cast(Any, component), cast(Any, None))
+        self.stored()
+
+    async def _bring_on(self, position: Any = None) -> None:
+        raise RestoreError("its processes are others by now")
+
+    async def _until_news(self) -> None:
+        await self._news.wait()
+
+
+@pytest.mark.parametrize(("steady_s", "pauses"), [(math.inf, [0.1, 1.0, 5.0, 30.0, 30.0]), (0.0, [0.1] * 5)])
+def test_a_copy_that_is_laid_in_vain_is_laid_more_and_more_seldom_unless_it_has_stood_for_long(
+    steady_s: float, pauses: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slept: list[float] = []
+
+    async def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        if len(slept) == len(pauses):
+            raise asyncio.CancelledError
+
+    async def story() -> None:
+        around = SimpleNamespace(places=SimpleNamespace(nursery=Nursery(tmp_path, "")))
+        copy = Fickle("/test/one", cast(Any, around), Figures())
+        with pytest.raises(asyncio.CancelledError):
+            await copy._follow(cast(Any, None), lambda ready, why: None)
+
+    monkeypatch.setattr(ready_copy, "STEADY_S", steady_s)
+    monkeypatch.setattr(ready_copy, "asyncio", SimpleNamespace(**{**vars(asyncio), "sleep": sleep}))
+    asyncio.run(story())
+    assert slept == pauses

@@ -12,6 +12,7 @@ import pytest
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_takeover import numbers, start_counting
+from tests.e2e.test_trees import HANDING_ON
 from tests.e2e.test_verbs_protect import COUNT
 
 CHAIN_ALONE = '[components."/demo/robot1/count"]\nready_copy = false\n'
@@ -46,6 +47,28 @@ def test_a_takeover_lets_the_ready_copy_go(tmp_path: Path) -> None:
         first.cut_power()
         count_goes_on(second)
         robots.until(lambda: "taking the ready copy" in robots.failover(second, "why", "count").stdout, "the story to tell of it")
+
+
+@pytest.mark.root
+def test_a_program_of_several_processes_goes_on_from_its_ready_copy(tmp_path: Path) -> None:
+    with robots.two_robots(tmp_path) as (first, second):
+        robots.run(first, "count", "/usr/bin/python3", "-S", "-c", HANDING_ON)
+        robots.until_protected(first)
+        shown = until_ready(second)
+        assert shown["size"] > 1_000_000, "two interpreters have some megabytes"
+        robots.until(lambda: copy_at(second)["position"] != shown["position"], "the copy to be brought on")
+        robots.until(lambda: "robot2, ready" in robots.failover(first, "status").stdout, "the primary to know")
+        assert "ready copy at robot2" in robots.failover(second, "status").stdout
+        robots.until(lambda: len(robots.numbers(first)) > 30, "some numbers")
+        first.cut_power()
+        robots.until_taken_over(second)
+        before = len(robots.numbers(second))
+        robots.until(lambda: len(robots.numbers(second)) > before + 30, "it to go on")
+        counted = robots.numbers(second)
+        assert counted == list(range(len(counted))), "each number once, in order"
+        told = robots.failover(second, "why", "count").stdout
+        assert "taking the ready copy" in told
+        assert "its descriptors, timers and registers" in told, "and it was not restored from its chain instead"
 
 
 def test_where_it_is_not_wanted_the_checkpoints_alone_are_kept_and_a_takeover_uses_them(tmp_path: Path) -> None:
