@@ -28,6 +28,7 @@ from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.vessel import Born, discard
 from checkpoint.model import Member, PageRun, Snapshot
+from tests.checkpoint import test_tree_states as states
 from tests.checkpoint.round_trip import (
     ENGINE,
     PATIENCE_S,
@@ -242,6 +243,37 @@ def test_memory_that_a_family_has_in_common_since_a_fork_is_there_once_in_its_co
         with laid(base, tmp_path) as standby:
             assert common < standby.copy.size < 2 * common
             assert standby.copy.size >= shared_out(standby.copy.pids()) * 0.9
+
+
+OF_EACH_OTHER = (
+    *("SHARED", "MAPPED_ALONE", "NAMELESS", "NAMED_PIPES", "OWNERS", "RIGHTS", "KILLED", "LEFT_BEHIND", "SERVERS"),
+    "CONNECTED_AS_NOBODY",
+)
+
+
+@pytest.mark.parametrize("program", OF_EACH_OTHER)
+def test_what_processes_are_to_each_other_comes_back_from_their_copy_over_two_lives(program: str, tmp_path: Path) -> None:
+    """Each of these programs says what differs."""
+    tmp_path.chmod(0o755)
+    arguments = ["asks"] if program == "LEFT_BEHIND" else []
+    life = start([sys.executable, "-c", PREAMBLE + getattr(states, program), *arguments], tmp_path, isolate=True)
+    goes_through_copies(life, tmp_path, 2)
+
+
+def goes_through_copies(life: Program, directory: Path, lives: int) -> None:
+    with ended(life):
+        if not lives:
+            life.tell()
+            expect_ok(life)
+            return
+        life.wait_for_line("ready")
+        with protected(life) as session:
+            base = base_of(session)
+            with laid(base, directory) as standby:
+                for delta in deltas_of(session, random.Random(lives), 3):
+                    standby.copy.advance(delta)
+                life.kill()
+                goes_through_copies(standby.becomes_the_program(), directory, lives - 1)
 
 
 # --- Torn, half arrived, killed ---

@@ -1,0 +1,63 @@
+"""A program of several processes, back from its snapshot and from its ready copy: until all of its processes run."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from benchmarks import engine, machine
+from benchmarks.figures import Figure, Findings
+from benchmarks.running import running
+from checkpoint import channel
+from checkpoint.linux import vessel
+from checkpoint.linux.vessel import Birth
+from failover.cli.keeper import Keeper
+
+
+def families(quick: bool, directory: Path) -> Findings:
+    """The same sizes as for one process."""
+    found = []
+    for megabytes in engine.SIZES_MB[: 2 if quick else None]:
+        found += _of(megabytes, 3 if quick else 8, directory)
+    return Findings(
+        "Several processes",
+        "Four processes that have so much memory between them, and share one megabyte: from the snapshot in memory, and from the "
+        "order to a standby that has a ready copy of them, to the last one's being let go.",
+        tuple(found),
+    )
+
+
+def _of(megabytes: int, count: int, directory: Path) -> list[Figure]:
+    with running("family", megabytes, 40, directory=directory) as program, Keeper.spawn() as keeper:
+        keeper.ask(channel.Protect(program.pid, "/benchmark"), channel.Protected)
+        _, (content,) = keeper.ask(channel.Capture(base=True, generation=1, sequence=1, hold=True), channel.Captured)
+        os.kill(program.pid, signal.SIGKILL)
+    whole = tuple(_back_once(content, program.pid, megabytes, from_copy=False) for _ in range(count))
+    ready = tuple(_back_once(content, program.pid, megabytes, from_copy=True) for _ in range(count))
+    os.close(content)
+    case = f"{megabytes} MB"
+    return [Figure("restore of four", case, "ms", whole), Figure("takeover of four from a ready copy", case, "ms", ready)]
+
+
+def _back_once(content: int, pid: int, megabytes: int, *, from_copy: bool) -> float:
+    """Milliseconds from the order to the last one's being let go."""
+    with Keeper.spawn() as keeper:
+        keeper.ask(channel.Probe(os.getpid()), channel.Probed)  # a standby's keeper runs already
+        machine.touch_memory(engine.ROOM * megabytes)
+        began_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        born = vessel.spawn_vessel(Birth(pid, isolate=True))
+        order = channel.Restore(born.pid, "/benchmark")
+        try:
+            if from_copy:
+                laid, _ = keeper.ask(channel.Lay(born.pid, "/benchmark"), channel.Laid, (content,))
+                began_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+                keeper.ask(channel.Finish(order, laid.position), channel.Restored)
+            else:
+                keeper.ask(order, channel.Restored, (content,))
+            resumed, _ = keeper.ask(channel.Resume(), channel.Resumed)
+            return (resumed.let_go_ns - began_ns) / 1e6
+        finally:
+            keeper.ask(channel.Release(), channel.Released)
+            vessel.discard(born)
