@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from agent import lean
-from checkpoint import quiet
+from checkpoint import lean, quiet
 
 
 def main() -> int:

@@ -1,9 +1,4 @@
-"""What an interpreter loads that the agent's processes do without: four megabytes each, in the heart locked ones.
-
-Python may be built without each of the optional parts, and what imports them says so by falling back. OpenSSL, which asyncio and
-hashlib load, is of no use here: beats are sealed by BLAKE2, which is Python's own, and the lanes' encryption is ZeroMQ's.
-
-Others are imported by what we import, for something that we never ask of it: they are loaded when they are used.
+"""The entry of the agent's other processes, which are as lean as the heart (`checkpoint.lean`).
 
 `python -m agent.lean MODULE ARGUMENT…` is how the heart starts its lanes.
 """
@@ -12,55 +7,13 @@ from __future__ import annotations
 
 import sys
 from importlib import import_module
-from importlib.util import find_spec
-from threading import Lock
-from types import ModuleType
-from typing import Any, Final
 
-OPTIONAL: Final = ("ssl", "bz2", "lzma", "typing_extensions")
-
-SELDOM_USED: Final = ("inspect", "ipaddress", "locale", "msgspec.inspect", "textwrap")
-"""Wanted by dataclasses of classes without a docstring, by URLs, by children that are read as text, by schemas, by groups of
-exceptions. None of them by the loop that beats, which would wait for the disk: `tests/agent/test_what_is_loaded.py`."""
-
-OPENSSL_DIGESTS: Final = "_hashlib"
-OWN_DIGESTS: Final = ("_md5", "_sha1", "_sha3", "_blake2")
-"""Without one of them (some distributions leave them out) hashlib would miss OpenSSL's."""
-
-
-def begin() -> None:
-    """Leave them out of this process, where nothing has loaded them yet."""
-    own = all(find_spec(name) is not None for name in OWN_DIGESTS)
-    for name in (*OPTIONAL, *((OPENSSL_DIGESTS,) if own else ())):
-        sys.modules.setdefault(name, None)  # type: ignore[arg-type]  # the import system's sign for: not to be had
-    for name in SELDOM_USED:
-        sys.modules.setdefault(name, _Seldom(name))
-
-
-class _Seldom(ModuleType):
-    """A module until something in it is wanted: then it is loaded, and this one shows what is in it.
-
-    importlib's LazyLoader does not do: before Python 3.12.3 a second thread finds the module half loaded.
-    """
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)  # the import system's questions want nothing of the module
-        with _standing_in:
-            if sys.modules.get(self.__name__) is self:
-                del sys.modules[self.__name__]
-        real = import_module(self.__name__)  # whoever comes meanwhile waits for it here
-        vars(self).update(vars(real))
-        return getattr(real, name)
-
-
-_standing_in: Final = Lock()
-"""Held for a moment, not while a module is loaded: the import system has its own locks for that."""
+from checkpoint import lean
 
 
 def main() -> int:
     """Be one of the agent's other processes."""
-    begin()
+    lean.begin()
     module = import_module(sys.argv.pop(1))
     return int(module.main())
 

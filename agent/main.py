@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from agent import config as configuration
-from agent import kernel, lean
+from agent import kernel
 from agent.errors import AgentError
 from agent.journal import set_up_log
 from agent.systemd import notifier
+from checkpoint import lean
 from failover.errors import FailoverError
 
 if TYPE_CHECKING:

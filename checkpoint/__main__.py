@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sys
 
-from checkpoint import quiet
+from checkpoint import lean, quiet
 
 
 def main() -> int:
     """Load and run the keeper."""
     quiet.begin()
+    lean.begin()
+    lean.load_numpy()
     from checkpoint import keeper
 
     return keeper.main(sys.argv[1:])

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sys
 
-from checkpoint import quiet
+from checkpoint import lean, quiet
 
 
 def main() -> int:
     """Load and run the command line."""
     quiet.begin()
+    lean.begin()
     from failover.cli.main import main as run
 
     return run()

@@ -18,9 +18,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from checkpoint import pages
+from checkpoint.arrays import NDArray
 from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.memory import Memory

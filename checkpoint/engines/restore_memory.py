@@ -17,9 +17,9 @@ from types import MappingProxyType
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from checkpoint import pages
+from checkpoint.arrays import NDArray
 from checkpoint.engines import restore_kinds
 from checkpoint.engines.forked_memory import Legacy
 from checkpoint.linux import abi, vm_flags

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from checkpoint import pages
 from checkpoint.arch import number_of
+from checkpoint.arrays import NDArray
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import abi, own_calls
 from checkpoint.linux.pagetables import PageScanner

@@ -6,16 +6,16 @@ import ctypes
 import errno
 import os
 from collections.abc import Iterator
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from checkpoint import pages, side_by_side
+from checkpoint.arrays import NDArray
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import abi
 
-Ranges = NDArray[np.uint64]
+Ranges: TypeAlias = "NDArray[np.uint64]"
 """Shape (n, 2): address and length in bytes, one row a range; exactly an array of struct iovec."""
 
 MAX_TRANSFER: Final = 1 << 30

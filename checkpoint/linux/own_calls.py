@@ -15,9 +15,9 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from checkpoint.arch import stubs
+from checkpoint.arrays import NDArray
 from checkpoint.linux import abi
 
 NUMBER, FIRST_ARGUMENT, RESULT_TO = 0, 1, 7

@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from checkpoint import pages
+from checkpoint.arrays import NDArray
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.own_calls import ROW_SIZE, Loop, OwnCalls, row

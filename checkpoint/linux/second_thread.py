@@ -21,9 +21,9 @@ import weakref
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from checkpoint.arch import stubs
+from checkpoint.arrays import NDArray
 from checkpoint.linux.own_calls import ROW_SIZE, OwnCalls, instructions, row
 
 ORDER, DONE_WITH, FIRST, END, MADE = range(5)

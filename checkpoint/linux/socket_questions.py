@@ -18,8 +18,8 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from checkpoint.arrays import NDArray
 from checkpoint.linux.own_calls import FIRST_ARGUMENT, ROW, OwnCalls, row
 from checkpoint.linux.second_thread import SecondThread
 

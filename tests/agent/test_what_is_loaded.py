@@ -8,11 +8,11 @@ from typing import Final
 
 import pytest
 
-from agent import lean
+from checkpoint import lean
 
 LOADED: Final = """
 import sys
-from agent import lean
+from checkpoint import lean
 lean.begin()
 import {}
 print(*(name for name, module in sys.modules.items() if vars(module or object).get("__spec__")))
@@ -56,7 +56,7 @@ def test_the_lanes_load_no_numpy_before_a_snapshot_comes(lanes: str) -> None:
 
 USED: Final = """
 import sys, threading
-from agent import lean
+from checkpoint import lean
 lean.begin()
 import inspect
 assert type(sys.modules["inspect"]) is lean._Seldom
