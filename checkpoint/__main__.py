@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 
 from checkpoint import lean, quiet
@@ -10,11 +11,12 @@ from checkpoint import lean, quiet
 def main() -> int:
     """Load and run the keeper."""
     quiet.begin()
+    gc.disable()  # of what is loaded nothing is rubbish, and what captures make is freed by counting
     lean.begin()
     lean.load_numpy()
     from checkpoint import keeper
 
-    return keeper.main(sys.argv[1:])
+    return quiet.left(keeper.main(sys.argv[1:]))
 
 
 if __name__ == "__main__":

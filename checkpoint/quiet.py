@@ -5,8 +5,12 @@ Every entry (`__main__`) begins with this, before the imports that take time; no
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import os
 import signal
+import sys
+import threading
 from types import FrameType
 from typing import Final
 
@@ -23,6 +27,22 @@ def loaded() -> None:
     """From here on Ctrl-C is a KeyboardInterrupt: the command is ready to take it."""
     if signal.getsignal(signal.SIGINT) is _end:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def left(status: int) -> int:
+    """End this process with a status, as the interpreter would, but without taking apart what it has loaded: that takes 10 ms.
+
+    Where something stands against it (other threads, output that nobody takes) it answers the status, for the long way.
+    """
+    if threading.active_count() > 1:
+        return status
+    atexit._run_exitfuncs()
+    with contextlib.suppress(OSError, ValueError):
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:
+                stream.flush()
+        os._exit(status)
+    return status
 
 
 def _end(_number: int, _frame: FrameType | None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 
 from checkpoint import lean, quiet
@@ -10,10 +11,11 @@ from checkpoint import lean, quiet
 def main() -> int:
     """Load and run the command line."""
     quiet.begin()
+    gc.disable()  # until the verb is loaded: nothing of that is rubbish
     lean.begin()
     from failover.cli.main import main as run
 
-    return run()
+    return quiet.left(run())
 
 
 if __name__ == "__main__":

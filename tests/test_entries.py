@@ -49,3 +49,29 @@ def test_an_interruption_that_was_to_be_ignored_stays_ignored() -> None:
         check=True,
     )
     assert ran.stdout == "True\n"
+
+
+LEFT = """
+import atexit, sys, threading
+from checkpoint import quiet
+atexit.register(lambda: print("said goodbye"))
+print("printed", end=" ")
+if {threads}:
+    threading.Thread(target=lambda: print("finished", end=" ")).start()
+    threading.Thread(target=threading.Event().wait, args=(0.2,)).start()
+sys.exit(quiet.left(7))
+"""
+
+
+@pytest.mark.parametrize("threads", [False, True])
+def test_a_process_that_leaves_at_once_has_said_all_and_ended_all(threads: bool) -> None:
+    ran = subprocess.run([sys.executable, "-E", "-c", LEFT.format(threads=threads)], capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stdout.split()) == (7, ["printed", *["finished"] * threads, "said", "goodbye"])
+
+
+def test_what_cannot_be_written_at_the_end_is_an_error_as_ever() -> None:
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-E", "-c", LEFT.format(threads=False)]
+        ran = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, check=False)
+    assert ran.returncode == 120
+    assert b"No space left on device" in ran.stderr

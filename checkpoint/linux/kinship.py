@@ -15,8 +15,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from typing import Final
 
-import numpy as np
-
+from checkpoint.arrays import np
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.own_calls import OwnCalls, row

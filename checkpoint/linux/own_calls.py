@@ -14,10 +14,8 @@ import os
 from collections.abc import Callable, Sequence
 from typing import Final
 
-import numpy as np
-
 from checkpoint.arch import stubs
-from checkpoint.arrays import NDArray
+from checkpoint.arrays import NDArray, np
 from checkpoint.linux import abi
 
 NUMBER, FIRST_ARGUMENT, RESULT_TO = 0, 1, 7

@@ -6,6 +6,8 @@ The one-shot verbs go through the same program that the agent uses, so that pyth
 from __future__ import annotations
 
 import contextlib
+import os
+import select
 import subprocess
 from typing import IO, TypeVar
 
@@ -77,11 +79,14 @@ class Keeper:
         """Hang up, and wait until it has let go."""
         self._complaints.close()
         self._link.close()
-        try:
-            self._process.wait(LEAVE_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        with contextlib.suppress(ProcessLookupError):  # nobody else reaps it
+            end = os.pidfd_open(self._process.pid)
+            try:
+                if not select.select([end], [], [], LEAVE_S)[0]:
+                    self._process.kill()
+            finally:
+                os.close(end)
+        self._process.wait()
 
     def __enter__(self) -> Keeper:
         return self

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
+import gc
 import importlib
 import io
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from checkpoint import quiet
 from checkpoint.errors import CheckpointError
-from failover.cli import parser
 from failover.errors import AgentRefusedError, FailoverError, NoAgentError
+
+if TYPE_CHECKING:
+    import argparse
 
 HEALTHY: Final = 0
 FAILED: Final = 1
@@ -22,8 +24,9 @@ USAGE: Final = 2
 NO_AGENT: Final = 3
 
 REASONS_SHOWN: Final = 8
-WITH_A_KEEPER: Final = "failover.cli.oneshot:"
-"""The functions of all verbs that ask a keeper of their own."""
+WITH_A_KEEPER: Final = ("capture", "restore", "check")
+"""Verbs that ask a keeper of their own."""
+HELP: Final = frozenset({"-h", "--help"})
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -38,13 +41,20 @@ def _main(argv: Sequence[str] | None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a name in other letters than the terminal's must not end in an error
-    room = parser.build()
-    arguments = room.parse_args(argv)
+    words = sys.argv[1:] if argv is None else list(argv)
+    with _keeper_ahead(words):
+        from failover.cli import parser
+
+        return _obeyed(parser.build(words[0] if words else "").parse_args(words))
+
+
+def _obeyed(arguments: argparse.Namespace) -> int:
     try:
-        with _keeper_ahead(arguments.function):
-            verb = verb_function(arguments.function)
-            quiet.loaded()
-            status = verb(arguments)
+        verb = verb_function(arguments.function)
+        gc.freeze()
+        gc.enable()
+        quiet.loaded()
+        status = verb(arguments)
         sys.stdout.flush()
         return status
     except NoAgentError as error:
@@ -60,14 +70,15 @@ def _main(argv: Sequence[str] | None) -> int:
 
 
 @contextlib.contextmanager
-def _keeper_ahead(function: str) -> Iterator[None]:
-    """Start the keeper of a verb that will ask one; other verbs load nothing for it."""
-    if not function.startswith(WITH_A_KEEPER):
+def _keeper_ahead(words: list[str]) -> Iterator[None]:
+    """Start the keeper of a verb that will ask one, before anything else: it loads longer than we do. Other verbs start none."""
+    if not words or words[0] not in WITH_A_KEEPER or HELP.intersection(words):
         yield
         return
     from failover.cli import ahead
 
-    ahead.start()
+    with contextlib.suppress(OSError):  # the verb tries it again, and tells
+        ahead.start()
     try:
         yield
     finally:

