@@ -15,13 +15,14 @@ What is still to be copied is known before (`RunningCopy.owed`), and what a snap
 
 from __future__ import annotations
 
+import itertools
 import time
 from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
-from checkpoint import pages
+from checkpoint import pages, side_by_side
 from checkpoint.engines.taken_memory import Taken, Unacknowledged, joined, since, with_one_tail
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.gathering import Copy
@@ -106,6 +107,7 @@ class MemoryCapture:
         borrowed: our own pages in the process, which belong to no snapshot.
         has_rings: some of them are rings of asynchronous I/O.
         has_segments: some of them are System V shared memory.
+        readers: threads that copy while the program runs; more than one takes processors from it.
 
     Args:
         tracker: owned from now on.
@@ -138,6 +140,7 @@ class MemoryCapture:
         self.acknowledged: Position | None = None
         self.lines: tuple[MapsLine, ...] = ()
         self.has_rings = self.has_segments = False
+        self.readers = 1
 
     def close(self) -> None:
         """Stop following; the process is not changed."""
@@ -242,10 +245,21 @@ class MemoryCapture:
         """Read a set as far as it is there."""
         buffer = np.empty(pages.total_size(wanted) + ROOM_SIZE, dtype=np.uint8).data
         found, filled = [], 0
-        for chunk in digests.chunks_of(wanted):
-            readable = self._memory.readable_pages_into(chunk, buffer[filled:])
+        chunks = digests.chunks_of(wanted)
+        ends = list(itertools.accumulate(map(pages.total_size, chunks)))
+
+        def read(place: tuple[Words, int]) -> Words:
+            chunk, end = place
+            return Memory(self._memory.pid).readable_pages_into(chunk, buffer[end - pages.total_size(chunk) : end])
+
+        threads = self.readers if len(chunks) > 1 else 1
+        answers = side_by_side.in_order(read, zip(chunks, ends, strict=True), threads)
+        for chunk, end, readable in zip(chunks, ends, answers, strict=True):
+            size, begin = pages.total_size(readable), end - pages.total_size(chunk)
+            if begin != filled:  # of one before it there was less than was wanted
+                buffer[filled : filled + size] = buffer[begin : begin + size]
             found.append(readable)
-            filled += pages.total_size(readable)
+            filled += size
         if found:
             copied.add(Copy(pagetables.pages_joined(np.concatenate(found)), buffer[: filled + ROOM_SIZE]))
 

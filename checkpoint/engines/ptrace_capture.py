@@ -24,7 +24,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from checkpoint import portable, room, tree
+from checkpoint import portable, room, side_by_side, tree
 from checkpoint.chain import position_of
 from checkpoint.engine import PTRACE, CaptureOrder, ProtectOrder
 from checkpoint.engines import description
@@ -257,6 +257,7 @@ class PtraceSession:
                 if base and (others := self._tree.processes()):
                     self._refuse(room.refuse_capture((self.pid, *(process.pid for process in others))))
                 enough = self._enough()
+                self._first.memory.readers = side_by_side.thread_count() if order.hold else 1  # it is not to run on by itself
                 copied = self._first.copy_running(base=base, enough=enough)
                 self._tree.copy_running(base=base, enough=enough)
                 frozen = self._frozen_look(copied, base=base, hold=order.hold)

@@ -5,13 +5,17 @@ from __future__ import annotations
 import os
 import random
 import subprocess
+import sys
 from typing import Any
 
 import numpy as np
 import pytest
 
+from checkpoint import pages
+from checkpoint.engines.capture_memory import MemoryCapture, RunningCopy
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import abi
+from checkpoint.linux.digests import READ_CHUNK
 from checkpoint.linux.memory import PIECE, Memory, address_of, in_pieces, ranges_of
 
 
@@ -60,3 +64,36 @@ def test_memory_that_is_not_there_is_refused_by_several_threads_as_by_one() -> N
     ranges = ranges_of([(address_of(content), PIECE), (abi.PAGE_SIZE, PIECE)])
     with pytest.raises(CaptureError, match=f"at {abi.PAGE_SIZE:#x}: Bad address"):
         Memory(os.getpid()).write_side_by_side(ranges, content, 2)
+
+
+HOLLOW = """
+import ctypes, mmap, random, sys
+size, *hollow = map(int, sys.argv[1:])
+place = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
+place.write(random.Random(6).randbytes(size))
+begin = ctypes.addressof(ctypes.c_char.from_buffer(place))
+for page in hollow:
+    assert ctypes.CDLL(None).munmap(ctypes.c_void_p(begin + page * mmap.PAGESIZE), mmap.PAGESIZE) == 0
+print(begin, flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("readers", [1, 3])
+def test_what_several_threads_read_of_memory_with_holes_is_what_is_there(readers: int) -> None:
+    size = 5 * READ_CHUNK
+    whole, count = np.frombuffer(random.Random(6).randbytes(size), np.uint8), size // abi.PAGE_SIZE
+    hollow = {0, count - 1, READ_CHUNK // abi.PAGE_SIZE, *random.Random(7).sample(range(count), 20)}
+    there = [page for page in range(count) if page not in hollow]
+    command = [sys.executable, "-c", HOLLOW, str(size), *map(str, hollow)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as program:
+        assert program.stdout is not None
+        begin = int(program.stdout.readline())
+        capture, copied = MemoryCapture.__new__(MemoryCapture), RunningCopy()
+        capture._memory, capture.readers = Memory(program.pid), readers
+        capture._read_into(copied, np.array([[begin, begin + size]], dtype=np.uint64))
+        program.communicate()
+    (copy,) = copied.copies
+    assert pages.addresses_of(copy.pages, abi.PAGE_SIZE).tolist() == [begin + page * abi.PAGE_SIZE for page in there]
+    found = np.frombuffer(copy.content, np.uint8)[: len(there) * abi.PAGE_SIZE]
+    assert (found.reshape(-1, abi.PAGE_SIZE) == whole.reshape(-1, abi.PAGE_SIZE)[there]).all()
