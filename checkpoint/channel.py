@@ -250,6 +250,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
         streams: the last five descriptors are the streams, as with `Protect`.
         own_eyes, epoch, contents, stood_still: see `checkpoint.engine.RestoreOptions`.
         terms: those under which it is restored, and followed from then on.
+        follow: protect it again as soon as it runs.
     """
 
     pid: int
@@ -263,6 +264,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
     contents: str = ""
     terms: Terms = NO_TERMS
     stood_still: bool = False
+    follow: bool = True
 
 
 class Lay(msgspec.Struct, frozen=True, tag=True):

@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -30,6 +30,9 @@ from checkpoint.linux.address import address_of
 from checkpoint.linux.waking import waking
 from checkpoint.model import Position, Snapshot
 from checkpoint.needs import names_of_contents, needs
+
+if TYPE_CHECKING:
+    from checkpoint.engines.guarded_task import GuardedTask
 
 USAGE: Final = "usage: python -m checkpoint keeper FD|PATH\n"
 CALL_S: Final = 30.0
@@ -270,7 +273,8 @@ class Keeper:
         let_go_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         order, streams = revived
         self._robot = order.robot
-        return channel.Resumed(self._follow(restored.pid, order, streams or late), let_go_ns), ()
+        notes = self._follow(restored.pid, order, streams or late) if order.follow else ()
+        return channel.Resumed(notes, let_go_ns), ()
 
     def _follow(self, pid: int, request: channel.Restore, streams: Streams | None) -> tuple[str, ...]:
         """Protect what has just been let go; that it cannot be protected again must not end it."""
@@ -320,19 +324,21 @@ def _options(order: channel.Restore) -> RestoreOptions:
 
 def _commit_at(session: Session, position: Position) -> tuple[int, int]:
     """The number of the commit that a cooperative capture holds, and its age, in nanoseconds."""
-    from checkpoint.engines.guarded_task import GuardedTask
-
-    return (session.commit_at(position), session.age_ns(position)) if isinstance(session, GuardedTask) else (0, 0)
+    task = _as_task(session)
+    return (task.commit_at(position), task.age_ns(position)) if task else (0, 0)
 
 
 def _unchanged(session: Session, request: channel.Capture) -> channel.Unchanged | None:
     """What is said in place of a delta with nothing in it; a base, and the last delta of a handover, are always made."""
-    from checkpoint.engines.guarded_task import GuardedTask
-
-    if request.base or request.hold or not isinstance(session, GuardedTask):
-        return None
-    position = session.unchanged()
+    task = None if request.base or request.hold else _as_task(session)
+    position = task.unchanged() if task else None
     return channel.Unchanged(position, *_commit_at(session, position)) if position else None
+
+
+def _as_task(session: Session) -> GuardedTask | None:
+    """The session, if it is of the cooperative engine; nothing is loaded to find out that it is not."""
+    module = sys.modules.get("checkpoint.engines.guarded_task")
+    return session if module is not None and isinstance(session, module.GuardedTask) else None
 
 
 def streams_of(descriptors: Descriptors) -> Streams:

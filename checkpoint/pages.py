@@ -54,6 +54,13 @@ def extents(runs: Iterable[PageRun | PageCopy | Vma]) -> Words:
     return np.stack((ordered[first, 0], reach[last]), axis=1)
 
 
+def distinct(values: Words) -> Words:
+    """Each value once, in order (numpy's own loads its masked arrays to say so, which takes 8 ms)."""
+    ordered = np.sort(values)
+    found: Words = ordered[np.concatenate((np.ones(min(len(ordered), 1), dtype=np.bool_), ordered[1:] != ordered[:-1]))]
+    return found
+
+
 def page_runs(pages: Words) -> tuple[PageRun, ...]:
     """The same set as the model's values."""
     return tuple(PageRun(start, end) for start, end in pages.tolist())

@@ -45,7 +45,7 @@ def in_pieces(ranges: Ranges, size: int) -> Iterator[tuple[Ranges, int]]:
     heads = np.array(range(0, total, size), np.uint64)
     if not len(heads):
         return
-    cuts = np.unique(np.concatenate([begins, heads]))
+    cuts = pages.distinct(np.concatenate([begins, heads]))
     within = np.searchsorted(ends, cuts, side="right")
     lengths = np.append(cuts[1:], np.uint64(total)) - cuts
     rows = np.column_stack([ranges[within, 0] + (cuts - begins[within]), lengths])

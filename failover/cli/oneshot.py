@@ -204,7 +204,7 @@ def restore(arguments: argparse.Namespace) -> int:
     elapsed_ns, terms = vessel.elapsed_since(outline.clocks), terms_of(arguments)
     birth = birth_of(outline, elapsed_ns, own_session=not arguments.wait)
     with Keeper.spawn() as keeper, _born(birth) as born:
-        order = Restore(born.pid, outline.component, elapsed_ns, terms=terms, stood_still=terms.connections)
+        order = Restore(born.pid, outline.component, elapsed_ns, terms=terms, stood_still=terms.connections, follow=False)
         restored, _ = keeper.ask(order, Restored, (file,))
         resumed, _ = keeper.ask(Resume(), Resumed)
         keeper.ask(Release(), Released)

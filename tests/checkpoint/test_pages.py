@@ -45,6 +45,11 @@ def test_overlapping_and_unordered_runs_become_one_set() -> None:
     assert pages.page_runs(pages.extents(runs)) == (PageRun(PAGE, 6 * PAGE), PageRun(8 * PAGE, 9 * PAGE))
 
 
+@given(st.lists(st.integers(min_value=0, max_value=9)))
+def test_values_are_told_once_and_in_order(values: list[int]) -> None:
+    assert pages.distinct(np.array(values, dtype=np.uint64)).tolist() == sorted(set(values))
+
+
 def test_only_pages_without_a_single_bit_are_zero() -> None:
     content = bytearray(64 * PAGE)
     dice = random.Random(7)

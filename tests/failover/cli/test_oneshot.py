@@ -18,11 +18,11 @@ from pathlib import Path
 import pytest
 
 from checkpoint import capabilities
-from checkpoint.channel import Restore, Restored
+from checkpoint.channel import Capture, Captured, Restore, Restored, Resume, Resumed, close_all
 from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import kinship, procfs
 from checkpoint.linux.tasks import thread_ids
-from checkpoint.linux.vessel import Birth, spawn_vessel
+from checkpoint.linux.vessel import Birth, discard, spawn_vessel
 from failover.cli import oneshot
 from failover.cli.keeper import Keeper
 from tests.failover.cli.test_verbs import failover
@@ -263,6 +263,23 @@ def snapshot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     process.wait()
     assert ran.returncode == 0, ran.stderr
     return directory / "snapshot"
+
+
+@pytest.mark.parametrize("follow", [True, False])
+def test_a_restored_program_is_protected_again_only_where_that_is_wanted(snapshot: Path, follow: bool) -> None:
+    file = os.open(snapshot, os.O_RDONLY | os.O_CLOEXEC)
+    born = spawn_vessel(Birth())
+    try:
+        with Keeper.spawn() as keeper:
+            keeper.ask(Restore(born.pid, "/test/followed", follow=follow), Restored, (file,))
+            keeper.ask(Resume(), Resumed)
+            allowed = contextlib.nullcontext() if follow else pytest.raises(CaptureError, match="follows no process")
+            with allowed:
+                _, found = keeper.ask(Capture(base=True, generation=1, sequence=1), Captured)
+                close_all(found)
+    finally:
+        os.close(file)
+        discard(born)
 
 
 def test_inspect_shows_what_a_snapshot_holds(snapshot: Path) -> None:
