@@ -5,13 +5,15 @@ from __future__ import annotations
 import gc
 import sys
 
-from checkpoint import lean, quiet
+from checkpoint import quiet
 
 
 def main() -> int:
     """Load and run the keeper."""
     quiet.begin()
     gc.disable()  # of what is loaded nothing is rubbish, and what captures make is freed by counting
+    from checkpoint import lean
+
     lean.begin()
     lean.load_numpy()
     from checkpoint import keeper

@@ -1,15 +1,23 @@
-"""The keeper of a command that will need one, started before the command loads what it needs itself.
+"""The keeper of a command that will need one, started before the command loads anything else.
 
-Each of the two loads for longer than a small program's checkpoint takes; so they do at the same time. Little is imported here.
+Each of the two loads for longer than a small program's checkpoint takes; so they do at the same time. Little is imported
+here, and nothing before there is something to start.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
-import socket
-import subprocess
 import sys
-from typing import IO, Final, NamedTuple
+from typing import IO, TYPE_CHECKING, Final, NamedTuple
+
+if TYPE_CHECKING:
+    import socket
+    import subprocess
+
+WITH_A_KEEPER: Final = ("capture", "restore", "check")
+"""Verbs that ask a keeper of their own."""
+HELP: Final = frozenset({"-h", "--help"})
 
 
 class Started(NamedTuple):
@@ -28,9 +36,11 @@ class Started(NamedTuple):
 _ahead: Final[list[Started]] = []
 
 
-def start() -> None:
-    """Start one for whoever asks next."""
-    _ahead.append(_started())
+def start_for(words: list[str]) -> None:
+    """Start the one that the verb of a command's words will ask; other verbs ask none."""
+    if words and words[0] in WITH_A_KEEPER and not HELP.intersection(words):
+        with contextlib.suppress(OSError):  # the verb tries it again, and tells
+            _ahead.append(_started())
 
 
 def taken() -> Started:
@@ -49,6 +59,9 @@ def forsake() -> None:
 
 
 def _started() -> Started:
+    import socket
+    import subprocess
+
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
     complaints = open(os.memfd_create("complaints"), "w+b")  # noqa: SIM115  # whoever takes it closes it
     with theirs:

@@ -14,7 +14,7 @@ from typing import IO, TypeVar
 import msgspec
 
 from checkpoint import channel, errors
-from checkpoint.channel import Channel, ChannelClosedError, Failed, Reply
+from checkpoint.channel import Channel, ChannelClosedError, Failed, Release, Released, Reply
 from checkpoint.errors import CheckpointError, MismatchError, UnsupportedError
 from failover.cli import ahead
 
@@ -31,6 +31,7 @@ class Keeper:
         self._process = process
         self._link = link
         self._complaints = complaints
+        self._is_released = False
 
     @classmethod
     def spawn(cls) -> Keeper:
@@ -75,8 +76,21 @@ class Keeper:
         lines = self._complaints.read().decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else "nothing"
 
+    def release(self) -> None:
+        """Have it let go of what it follows, and leave it to its end: the more memory it has held, the longer that takes.
+
+        For a command, which ends soon itself: nobody reaps it.
+        """
+        with contextlib.suppress(CheckpointError):  # what it followed has been killed: nothing is left to let go of
+            self.ask(Release(), Released)
+        self._complaints.close()
+        self._link.close()
+        self._is_released = True
+
     def close(self) -> None:
         """Hang up, and wait until it has let go."""
+        if self._is_released:
+            return
         self._complaints.close()
         self._link.close()
         with contextlib.suppress(ProcessLookupError):  # nobody else reaps it

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import importlib
 import io
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final
 
 from checkpoint import quiet
 from checkpoint.errors import CheckpointError
+from failover.cli import ahead
 from failover.errors import AgentRefusedError, FailoverError, NoAgentError
 
 if TYPE_CHECKING:
@@ -24,9 +24,6 @@ USAGE: Final = 2
 NO_AGENT: Final = 3
 
 REASONS_SHOWN: Final = 8
-WITH_A_KEEPER: Final = ("capture", "restore", "check")
-"""Verbs that ask a keeper of their own."""
-HELP: Final = frozenset({"-h", "--help"})
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,10 +39,12 @@ def _main(argv: Sequence[str] | None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a name in other letters than the terminal's must not end in an error
     words = sys.argv[1:] if argv is None else list(argv)
-    with _keeper_ahead(words):
+    try:
         from failover.cli import parser
 
         return _obeyed(parser.build(words[0] if words else "").parse_args(words))
+    finally:
+        ahead.forsake()
 
 
 def _obeyed(arguments: argparse.Namespace) -> int:
@@ -67,22 +66,6 @@ def _obeyed(arguments: argparse.Namespace) -> int:
         return FAILED
     except OSError as error:
         return tell(error, arguments, FAILED)
-
-
-@contextlib.contextmanager
-def _keeper_ahead(words: list[str]) -> Iterator[None]:
-    """Start the keeper of a verb that will ask one, before anything else: it loads longer than we do. Other verbs start none."""
-    if not words or words[0] not in WITH_A_KEEPER or HELP.intersection(words):
-        yield
-        return
-    from failover.cli import ahead
-
-    with contextlib.suppress(OSError):  # the verb tries it again, and tells
-        ahead.start()
-    try:
-        yield
-    finally:
-        ahead.forsake()
 
 
 def verb_function(name: str) -> Callable[[argparse.Namespace], int]:

@@ -15,12 +15,11 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from checkpoint import channel, format
-from checkpoint.channel import Capture, Captured, Protect, Protected, Release, Released, Restore, Restored, Resume, Resumed
+from checkpoint.channel import Capture, Captured, Protect, Protected, Restore, Restored, Resume, Resumed
 from checkpoint.device_rules import DeviceRule, rule_from
 from checkpoint.engine import Terms
 from checkpoint.errors import (
     CaptureError,
-    CheckpointError,
     NothingCommittedError,
     ProbeError,
     ProcessGoneError,
@@ -65,10 +64,8 @@ def capture(arguments: argparse.Namespace) -> int:
         whole = Capture(base=True, generation=1, sequence=1, hold=held)
         with _written_whole(target) as file:
             captured = _captured(keeper, whole, file, target)
-        if held:
-            _end(arguments.pid)
-        with contextlib.suppress(CheckpointError):  # it was killed a moment ago: nothing is left to let go of
-            keeper.ask(Release(), Released)
+        with _ended(arguments.pid) if held else contextlib.nullcontext():
+            keeper.release()
     return _tell_capture(arguments, captured, tuple(dict.fromkeys(protected.notes + captured.notes)))
 
 
@@ -108,8 +105,9 @@ def _at_last(ask: Callable[[], A]) -> A:
     raise AssertionError("the last try answers or raises")
 
 
-def _end(pid: int) -> None:
-    """Kill a program that stands still, its children first, so that none runs on without it; wait until all are dead."""
+@contextmanager
+def _ended(pid: int) -> Iterator[None]:
+    """Kill a program that stands still, its children first, so that none runs on without it; after the body all are dead."""
     with contextlib.ExitStack() as held:
         dying = select.poll()
         count = 0
@@ -120,6 +118,7 @@ def _end(pid: int) -> None:
                 signal.pidfd_send_signal(end, signal.SIGKILL)
                 dying.register(end, select.POLLIN)
                 count += 1
+        yield
         _wait_for_ends(dying, count)
 
 
@@ -207,7 +206,8 @@ def restore(arguments: argparse.Namespace) -> int:
         order = Restore(born.pid, outline.component, elapsed_ns, terms=terms, stood_still=terms.connections, follow=False)
         restored, _ = keeper.ask(order, Restored, (file,))
         resumed, _ = keeper.ask(Resume(), Resumed)
-        keeper.ask(Release(), Released)
+        if not arguments.wait:
+            keeper.release()
     moved = (OWN_PIDS,) if born.isolated and not outline.process.isolated else ()
     _tell_restore(arguments, restored.pid, born.notes + moved + restored.notes + resumed.notes)
     return _wait_for(born) if arguments.wait else 0
