@@ -12,9 +12,10 @@ import os
 import stat
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
+
+from msgspec import Struct
 
 from agent.shipping import Refusal
 from checkpoint.contents import DIGEST_SIZE, digest_of_file
@@ -39,8 +40,7 @@ MB: Final = 10**6
 log = logging.getLogger("failover.belongings")
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
+class Limits(Struct, frozen=True):
     """What this robot's operator allows.
 
     Attributes:

@@ -10,9 +10,11 @@ import asyncio
 import contextlib
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from agent import guard_messages
 from agent.bounds import check_rights
@@ -36,8 +38,7 @@ from checkpoint.needs import names_of_contents, needs
 from checkpoint.task_channel import Origin
 
 
-@dataclass(frozen=True, slots=True)
-class Program:
+class Program(Struct, frozen=True):
     """What to start, as execve(2) wants it.
 
     Attributes:

@@ -13,8 +13,9 @@ import os
 import stat
 import time
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 from agent.belongings import is_in_place, is_plausible, named, size_told
 from agent.errors import LaneError
@@ -40,16 +41,14 @@ Reader = Callable[[str, Need], Awaitable[int]]
 """Opens a file of a component as the program has it; raises CheckpointError or AgentError."""
 
 
-@dataclass(slots=True)
-class _Sure:
+class _Sure(Struct):
     """What a peer was found to have of a component."""
 
     needs: tuple[Need, ...]
     until_s: float
 
 
-@dataclass(slots=True)
-class _Peer:
+class _Peer(Struct):
     """One at a time is sent to a peer.
 
     Attributes:

@@ -12,8 +12,9 @@ import pwd
 import select
 import socket
 import struct
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from agent.errors import RefusedError
 from checkpoint.errors import CheckpointError
@@ -34,8 +35,7 @@ NOBODY: Final = -1
 _CREDENTIALS: Final = struct.Struct("3i")
 
 
-@dataclass(frozen=True, slots=True)
-class Caller:
+class Caller(Struct, frozen=True):
     """One client.
 
     Attributes:

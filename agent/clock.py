@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct, field
 
 from agent import kernel
 
@@ -20,8 +21,7 @@ HEART_PRIORITY: Final = 60
 """SCHED_FIFO priority of the heart: just above the interrupt threads of a PREEMPT_RT kernel (50), below its watchdogs (99)."""
 
 
-@dataclass(slots=True)
-class Laps:
+class Laps(Struct):
     """How long each stage of something took: for the log, and for whoever wants to shorten it."""
 
     last_ns: int = field(default_factory=time.monotonic_ns)

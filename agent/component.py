@@ -23,8 +23,9 @@ import contextlib
 import os
 import signal
 from collections.abc import AsyncIterator, Callable, Iterator
-from dataclasses import dataclass
 from typing import Any, Final
+
+from msgspec import Struct
 
 from agent import guard_messages
 from agent.errors import GuardError, GuardLostError, KeeperLostError
@@ -48,8 +49,7 @@ TOTALS_LIMIT: Final = 64
 """Captures whose acknowledgement may still come; the core has one under way."""
 
 
-@dataclass(frozen=True, slots=True)
-class Captured:
+class Captured(Struct, frozen=True):
     """One snapshot, fresh from the keeper.
 
     Attributes:
@@ -74,8 +74,7 @@ class Captured:
     frozen_bytes: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Prepared:
+class Prepared(Struct, frozen=True):
     """A program that keeps its state, before it goes on: it is started again, or waits already.
 
     Attributes:
@@ -88,8 +87,7 @@ class Prepared:
     age_ns: int
 
 
-@dataclass(frozen=True, slots=True)
-class Standing:
+class Standing(Struct, frozen=True):
     """How a component stands, for ``status``. ``notes`` are whole sentences: what is missing or degraded, and why."""
 
     state: str

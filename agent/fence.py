@@ -9,9 +9,10 @@ Source: the kernel's Documentation/watchdog/watchdog-api.rst and Documentation/A
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct
 
 WATCHDOGS: Final = Path("/sys/class/watchdog")
 ACTIVE: Final = "active"
@@ -19,8 +20,7 @@ ACTIVE: Final = "active"
 GUARDED: Final = "a program whose lease is over is frozen by its guard, whatever becomes of the agent"
 
 
-@dataclass(frozen=True, slots=True)
-class Watchdog:
+class Watchdog(Struct, frozen=True):
     """A hardware watchdog that somebody feeds, as far as the kernel tells.
 
     Attributes:

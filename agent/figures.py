@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 from agent.component import Captured
 from checkpoint.device_rules import DeviceRule, rules_of
@@ -27,8 +28,7 @@ SILENT_NS_AT_FIRST: Final = 10 * 10**9
 """nor sooner than this, where it has made one commit only."""
 
 
-@dataclass(slots=True)
-class Commits:
+class Commits(Struct):
     """When a program that keeps its state commits, as far as captures show it.
 
     Attributes:
@@ -69,8 +69,7 @@ NOT_WANTED: Final = "agent.toml says ready_copy = false"
 """Why there is no ready copy, where that is as it should be."""
 
 
-@dataclass(frozen=True, slots=True)
-class CopyFigures:
+class CopyFigures(Struct, frozen=True):
     """Of the ready copy at a standby.
 
     Attributes:
@@ -86,8 +85,7 @@ class CopyFigures:
     wanted: bool = True
 
 
-@dataclass(slots=True)
-class Budget:
+class Budget(Struct):
     """How snapshots of one component kept to its `freeze_budget_ms`.
 
     Attributes:
@@ -118,8 +116,7 @@ class Budget:
         )
 
 
-@dataclass(slots=True)
-class Figures:
+class Figures(Struct):
     """What ``failover status`` shows of one component on this robot; None where it is not known."""
 
     snapshots: int = 0

@@ -29,8 +29,9 @@ import os
 import secrets
 import signal
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Final
+
+from msgspec import Struct
 
 from agent.hook_kinds import Kind
 from agent.units import in_a_unit
@@ -64,8 +65,7 @@ PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 log = logging.getLogger("failover.component")
 
 
-@dataclass(frozen=True, slots=True)
-class Hook:
+class Hook(Struct, frozen=True):
     """One command, and whose rights it has.
 
     Attributes:
@@ -79,8 +79,7 @@ class Hook:
     user: Inheritance | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Occasion:
+class Occasion(Struct, frozen=True):
     """Why a hook is run. ``source`` is "", ``age_ns`` 0 where it does not go on from a checkpoint; ``pid`` 0 before it runs."""
 
     component: str
@@ -109,8 +108,7 @@ class Occasion:
         return {"PATH": PATH, **told}
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
+class Outcome(Struct, frozen=True):
     """How a hook ended.
 
     Attributes:
@@ -122,8 +120,7 @@ class Outcome:
     last_line: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Hooks:
+class Hooks(Struct, frozen=True):
     """Runs them. Lives in one loop.
 
     Attributes:
@@ -193,8 +190,7 @@ class Hooks:
         return Outcome(sentence, last_line)
 
 
-@dataclass(slots=True)
-class _Running:
+class _Running(Struct):
     """A hook that was begun.
 
     Attributes:

@@ -10,9 +10,10 @@ from __future__ import annotations
 import enum
 import socket
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct
 
 from agent import rtnetlink
 from agent.rtnetlink import KernelLink
@@ -49,8 +50,7 @@ class Medium(enum.StrEnum):
     LOOPBACK = "loopback"
 
 
-@dataclass(frozen=True, slots=True)
-class Link:
+class Link(Struct, frozen=True):
     """One interface that this robot uses.
 
     Attributes:
@@ -65,16 +65,14 @@ class Link:
     index: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Device:
+class Device(Struct, frozen=True):
     """An interface that a socket can be held to; one that went and came back under its name has another index."""
 
     name: str
     index: int
 
 
-@dataclass(frozen=True, slots=True)
-class Scene:
+class Scene(Struct, frozen=True):
     """What the kernel said at one instant: interfaces by index, and the index of each address's."""
 
     links: Mapping[int, KernelLink]

@@ -16,9 +16,10 @@ import struct
 import subprocess
 import sys
 from collections import deque
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct
 
 from agent import guard_messages
 from agent.dialogue import Dialogue
@@ -42,16 +43,14 @@ REFILL_S: Final = 1.0
 log = logging.getLogger("failover.component")
 
 
-@dataclass(slots=True)
-class GuardLink:
+class GuardLink(Struct):
     """A guard that listens, and our conversation with it."""
 
     dialogue: Dialogue
     socket_path: Path
 
 
-@dataclass(slots=True)
-class KeeperLink:
+class KeeperLink(Struct):
     """A keeper, and our conversation with it."""
 
     dialogue: Dialogue

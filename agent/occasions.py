@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from dataclasses import dataclass, field, replace
 from typing import Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from agent import clock, hooks
 from agent.errors import AgentError
@@ -25,8 +27,7 @@ CAPTURE_LIMIT_S: Final = 5.0
 stops of the component wait behind it."""
 
 
-@dataclass(slots=True)
-class Occasions:
+class Occasions(Struct):
     """Of one component. What a hook had to complain of stands in its figures, how it went in ``failover why``."""
 
     name: str

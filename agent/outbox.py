@@ -10,17 +10,16 @@ that lease running out.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
 
 import msgspec
+from msgspec import Struct, field
 
 from failover.core.acts import Act, Ready, SetLease
 from failover.core.messages import Beat
 from failover.core.types import Ballot
 
 
-@dataclass(frozen=True, slots=True)
-class Due:
+class Due(Struct, frozen=True):
     """What may leave now, in this order: ``persist`` to the disk, ``beats`` to the peers, ``acts`` to the lanes.
 
     Attributes:
@@ -32,8 +31,7 @@ class Due:
     acts: tuple[Act, ...] = ()
 
 
-@dataclass(slots=True)
-class Outbox:
+class Outbox(Struct):
     """The obligations of one node.
 
     Attributes:

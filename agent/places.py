@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+
+from msgspec import Struct
 
 from agent.nursery import Nursery
 from agent.streams import OutputLogs, total_of
@@ -12,8 +13,7 @@ from checkpoint import format
 from checkpoint.shelf import folder_name
 
 
-@dataclass(frozen=True, slots=True)
-class Places:
+class Places(Struct, frozen=True):
     """Where the components of this robot keep their things.
 
     Attributes:

@@ -12,8 +12,9 @@ import logging
 import math
 import time
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass
 from typing import Any, Final
+
+from msgspec import Struct
 
 from agent import births, clock
 from agent.component import Component
@@ -40,8 +41,7 @@ UNSUPPORTED_S: Final = 60.0
 log = logging.getLogger("failover.component")
 
 
-@dataclass(frozen=True, slots=True)
-class Ready:
+class Ready(Struct, frozen=True):
     """A copy and what it stands at."""
 
     component: Component

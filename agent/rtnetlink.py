@@ -9,8 +9,9 @@ from __future__ import annotations
 import socket
 import struct
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 NLMSG_ERROR: Final = 2
 NLMSG_DONE: Final = 3
@@ -59,8 +60,7 @@ ATTRIBUTE_KIND: Final = 0x3FFF
 """The rest of an attribute's type are flags."""
 
 
-@dataclass(frozen=True, slots=True)
-class KernelLink:
+class KernelLink(Struct, frozen=True):
     """One interface.
 
     Attributes:

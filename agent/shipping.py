@@ -12,12 +12,12 @@ import logging
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol, TypeVar
 
 import msgspec
 from blake3 import blake3
+from msgspec import Struct, field
 
 from agent.errors import LaneError
 from agent.mistake import end_lanes_on_mistake
@@ -68,8 +68,7 @@ log = logging.getLogger("failover.lane")
 Offered = Offer | Content
 
 
-@dataclass(slots=True)
-class _Outgoing:
+class _Outgoing(Struct):
     """One transfer that leaves, as far as it has been taken."""
 
     peer: str
@@ -211,8 +210,7 @@ class Desk(Protocol[Kind]):
         """They could not be written."""
 
 
-@dataclass(slots=True)
-class _Incoming:
+class _Incoming(Struct):
     """One transfer that comes in, and the task that writes it."""
 
     offer: Offered

@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-from dataclasses import dataclass
 from pathlib import Path
+
+from msgspec import Struct
 
 from agent import clock, lost
 from agent.component import Captured, Component
@@ -22,8 +23,7 @@ from failover.core import acts, events
 log = logging.getLogger("failover.component")
 
 
-@dataclass(frozen=True, slots=True)
-class Snapshots:
+class Snapshots(Struct, frozen=True):
     """Of one component. What the last one was like stands in its figures."""
 
     name: str

@@ -19,9 +19,10 @@ import errno
 import os
 import struct
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct
 
 from agent import kernel
 from checkpoint.model import OutputPiece
@@ -51,8 +52,7 @@ FAR_AWAY: Final = 1 << 40
 """An offset, a multiple of `TRIM_STEP`, to try out whether holes can be made."""
 
 
-@dataclass(frozen=True, slots=True)
-class Bounds:
+class Bounds(Struct, frozen=True):
     """Where one stream begins, what of it is committed, and where it ends; all in bytes from the component's first."""
 
     start: int

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
+from msgspec import Struct, field
 
 from agent.births import Program
 from agent.config import ComponentConfig
@@ -20,8 +20,7 @@ from failover.core.events import Event
 from failover.core.types import COMMITTED, Launch
 
 
-@dataclass(slots=True)
-class Surroundings:
+class Surroundings(Struct):
     """What every charge works with.
 
     Attributes:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
+
+from msgspec import Struct, field
 
 from agent import clock, story
 from agent.arguments import PageArguments, arguments_of
@@ -42,8 +43,7 @@ class Lanes(Protocol):
     async def ask(self, what: Any) -> Told: ...
 
 
-@dataclass(frozen=True, slots=True)
-class Reading:
+class Reading(Struct, frozen=True):
     """Both clocks of one robot at one instant."""
 
     kernel: str
@@ -51,8 +51,7 @@ class Reading:
     wall_ns: int
 
 
-@dataclass(slots=True)
-class Heard:
+class Heard(Struct):
     """One robot's story as it came.
 
     Attributes:

@@ -16,11 +16,11 @@ import logging
 import socket
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
 import zmq
 import zmq.asyncio
+from msgspec import Struct
 from zmq.utils import z85
 from zmq.utils.monitor import parse_monitor_message
 
@@ -71,8 +71,7 @@ class LinkState(enum.StrEnum):
     DOWN = "down"
 
 
-@dataclass(frozen=True, slots=True)
-class Keys:
+class Keys(Struct, frozen=True):
     """This robot's pair and everybody's public keys by name; Z85. Empty strings: no encryption."""
 
     public: str

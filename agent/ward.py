@@ -19,11 +19,12 @@ import os
 import secrets
 import signal
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Literal
 
 import msgspec
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from agent import freezer as freezing
 from agent.clock import now_ns
@@ -53,8 +54,7 @@ class WardError(Exception):
     """What was asked does not fit the state; says why and what to do."""
 
 
-@dataclass(slots=True)
-class Ward:
+class Ward(Struct):
     """One program, alive or ended. Made by `start`, `make_vessel` or `watch`."""
 
     component: str

@@ -6,8 +6,9 @@ rows (``./run table``), and tests hold it and every refusal in the code against 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
+
+from msgspec import Struct
 
 
 class Verdict(StrEnum):
@@ -33,8 +34,7 @@ class Area(StrEnum):
     THERE = "at the other robot"
 
 
-@dataclass(frozen=True, slots=True)
-class Capability:
+class Capability(Struct, frozen=True):
     """One row.
 
     Attributes:

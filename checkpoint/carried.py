@@ -20,8 +20,10 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from checkpoint.engine import is_carriable
 from checkpoint.errors import RestoreError
@@ -46,8 +48,7 @@ OWN_PREFIX: Final = b".failover-"
 """How names of our own begin, beside a carried path or in it: they are never carried."""
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
+class Entry(Struct, frozen=True):
     """One name. The fields stand at the top of this file."""
 
     name: bytes
@@ -79,8 +80,7 @@ class Entry:
         return [self.name, *numbers, self.target, attributes]
 
 
-@dataclass(frozen=True, slots=True)
-class Tree:
+class Tree(Struct, frozen=True):
     """A carried path and what stood there: a file, a directory with all below it, or nothing."""
 
     path: str

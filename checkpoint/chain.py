@@ -10,8 +10,10 @@ position's digest covers the result (``state_digest``), so a fold proves itself.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from itertools import pairwise
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from checkpoint import differences, pages
 from checkpoint.arrays import NDArray, np
@@ -137,8 +139,7 @@ def fold(chain: Sequence[Snapshot]) -> Snapshot:
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Layer:
+class _Layer(Struct, frozen=True, eq=False):
     """The pages that one snapshot tells as differences.
 
     Attributes:

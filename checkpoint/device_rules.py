@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Final, Literal
+
+from msgspec import Struct
 
 from checkpoint.model import Resource
 
@@ -16,8 +17,7 @@ KIND: Final = "attached_devices"
 """Of resources that are kept by these rules."""
 
 
-@dataclass(frozen=True, slots=True)
-class DeviceRule:
+class DeviceRule(Struct, frozen=True):
     """One device.
 
     Attributes:

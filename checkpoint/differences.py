@@ -8,8 +8,9 @@ chain (`checkpoint.chain.fold`) explains itself.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from typing import Final, TypeAlias
+
+from msgspec.structs import replace
 
 from checkpoint import pages
 from checkpoint.arrays import NDArray, np

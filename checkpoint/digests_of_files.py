@@ -10,8 +10,9 @@ import os
 import stat
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 REMEMBERED_MAX: Final = 10_000
 """Files; a program maps some hundred, and reads some more."""
@@ -23,8 +24,7 @@ DigestOf = Callable[[str], bytes]
 """The digest of the file at a path. Raises OSError."""
 
 
-@dataclass(frozen=True, slots=True)
-class FileVersion:
+class FileVersion(Struct, frozen=True):
     """What changes when a file does."""
 
     device: int
@@ -34,8 +34,7 @@ class FileVersion:
     ctime_ns: int
 
 
-@dataclass(frozen=True, slots=True)
-class KnownDigest:
+class KnownDigest(Struct, frozen=True):
     """The digest of a file as it was found."""
 
     path: str

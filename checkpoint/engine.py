@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import os.path
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Final, Protocol
+
+from msgspec import Struct
 
 from checkpoint.device_rules import DeviceRule
 from checkpoint.digests_of_files import DigestOf
@@ -27,8 +28,7 @@ REFUSED: Final = "refused"
 NOTED: Final = "noted"
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
+class Finding(Struct, frozen=True):
     """One thing that a process holds.
 
     Attributes:
@@ -44,8 +44,7 @@ class Finding:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
+class Report(Struct, frozen=True):
     """What a capture of one process would preserve, found without touching it.
 
     Attributes:
@@ -76,8 +75,7 @@ class Report:
         return tuple(finding.text for finding in self.findings if finding.verdict == NOTED)
 
 
-@dataclass(frozen=True, slots=True)
-class Streams:
+class Streams(Struct, frozen=True):
     """The guard's end of a component's standard streams: descriptors of *this* process.
 
     Attributes:
@@ -95,8 +93,7 @@ CARRIED_SIZE_MAX: Final = 256 << 20
 """Bytes that the carried files of one component may hold, unless its operator says otherwise: the keeper holds a copy."""
 
 
-@dataclass(frozen=True, slots=True)
-class Carry:
+class Carry(Struct, frozen=True):
     """Which files travel with a component (rule ``carry``).
 
     Attributes:
@@ -113,8 +110,7 @@ class Carry:
 NOTHING_CARRIED: Final = Carry()
 
 
-@dataclass(frozen=True, slots=True)
-class Terms:
+class Terms(Struct, frozen=True):
     """What an operator has ruled of what one component holds, for one robot.
 
     Attributes:
@@ -134,8 +130,7 @@ class Terms:
 NO_TERMS: Final = Terms()
 
 
-@dataclass(frozen=True, slots=True)
-class ProtectOrder:
+class ProtectOrder(Struct, frozen=True):
     """How a process is to be followed.
 
     Attributes:
@@ -163,8 +158,7 @@ def is_carriable(path: str) -> bool:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class CaptureOrder:
+class CaptureOrder(Struct, frozen=True):
     """What the next snapshot is to be.
 
     Attributes:
@@ -182,8 +176,7 @@ class CaptureOrder:
     hold: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class RestoreOptions:
+class RestoreOptions(Struct, frozen=True):
     """How a program is to come back.
 
     Attributes:

@@ -15,12 +15,13 @@ import stat
 import struct
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
 from queue import SimpleQueue
 from typing import BinaryIO, Protocol
 
 import zstandard
 from blake3 import blake3
+from msgspec import Struct
+from msgspec.structs import replace
 
 from checkpoint import layout, pages, side_by_side, state
 from checkpoint.arrays import NDArray, np
@@ -140,8 +141,7 @@ def _stored(raw: bytes | memoryview, compressor: zstandard.ZstdCompressor) -> tu
     return Codec.RAW, raw
 
 
-@dataclass(frozen=True, slots=True)
-class _Body:
+class _Body(Struct, frozen=True):
     """A frame that is ready to be written, wherever it will lie."""
 
     codec: Codec
@@ -402,8 +402,7 @@ def _decompressed(stored: bytes | memoryview, raw_size: int, where: str, decompr
     return raw
 
 
-@dataclass(frozen=True, slots=True)
-class _RunTable:
+class _RunTable(Struct, frozen=True):
     """The fields of ``Snapshot`` with the same names."""
 
     cleared: tuple[PageRun, ...]
@@ -448,8 +447,7 @@ def _runs(packed: bytes | memoryview) -> tuple[PageRun, ...]:
     return tuple(map(PageRun, pairs[:, 0].tolist(), pairs[:, 1].tolist()))
 
 
-@dataclass(frozen=True, slots=True)
-class _Frame:
+class _Frame(Struct, frozen=True):
     """A frame's head and where its body lies."""
 
     where: str

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint import pages
 from checkpoint.arrays import NDArray, np
@@ -14,8 +15,7 @@ LONG_COPY: Final = 1 << 18
 """Bytes that are copied by numpy, which lets other threads run meanwhile: this is also done inside programs."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Copy:
+class Copy(Struct, frozen=True, eq=False):
     """A set of pages and their bytes, as they were at one moment.
 
     Attributes:

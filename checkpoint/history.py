@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import os
 import threading
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.whole_files import WholeFiles, disk_trouble
 
 HISTORY_FOLDER: Final = "history"
 
 
-@dataclass(frozen=True, slots=True)
-class Retention:
+class Retention(Struct, frozen=True):
     """How much is kept for people.
 
     Attributes:
@@ -37,8 +37,7 @@ class Retention:
         return self.span_s / self.count if self.count else 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Old:
+class Old(Struct, frozen=True):
     """One file. ``stored_s``: when it came, in seconds since 1970; ``size``: bytes."""
 
     path: Path

@@ -7,8 +7,9 @@ correctness: a sender tells a page whole, a store reads it from its files.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint import differences, pages
 from checkpoint.arrays import np
@@ -24,8 +25,7 @@ WHOLE_MAX: Final = 256
 """Deltas that are told whole, at most, before differences are tried again with a robot that does not take them."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Step:
+class Step(Struct, frozen=True, eq=False):
     """What one snapshot does to the pages of its parent.
 
     Attributes:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import enum
 import struct
-from dataclasses import dataclass
 
 from blake3 import blake3
+from msgspec import Struct
 
 from checkpoint.errors import FormatError
 
@@ -97,8 +97,7 @@ def digest_of(content: bytes | bytearray | memoryview) -> bytes:
     return blake3(content).digest()
 
 
-@dataclass(frozen=True, slots=True)
-class Section:
+class Section(Struct, frozen=True):
     """Where one section lies. ``stored_size`` is what it takes in the file, ``raw_size`` what it holds."""
 
     kind: SectionKind
@@ -113,8 +112,7 @@ class Section:
         return _SECTION.pack(self.kind, self.codec, self.offset, self.stored_size, self.raw_size, self.digest)
 
 
-@dataclass(frozen=True, slots=True)
-class Preamble:
+class Preamble(Struct, frozen=True):
     """The first bytes of a file: what follows, where, and how large.
 
     Attributes:
@@ -202,8 +200,7 @@ def _parse_sections(packed: bytes) -> tuple[Section, ...]:
     return tuple(sections)
 
 
-@dataclass(frozen=True, slots=True)
-class FrameHead:
+class FrameHead(Struct, frozen=True):
     """What precedes a frame's body.
 
     Attributes:

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+
+from msgspec import Struct, field
 
 Fact = int | str | bytes | bool | float | None | list["Fact"] | dict[str, "Fact"]
 """One thing that a resource says about itself: whatever msgpack can carry."""
@@ -31,8 +32,7 @@ class VmaKind(enum.StrEnum):
     """None of the process's: the content of a file that travels with it, see `checkpoint.carried`."""
 
 
-@dataclass(frozen=True, slots=True)
-class FileIdentity:
+class FileIdentity(Struct, frozen=True):
     """How to tell that a file here is the file that the program had there.
 
     Attributes:
@@ -55,8 +55,7 @@ class FileIdentity:
     deleted: bool = False
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class PageRun:
+class PageRun(Struct, frozen=True, order=True):
     """Consecutive pages: ``[start, end)``, both multiples of the page size."""
 
     start: int
@@ -68,8 +67,7 @@ class PageRun:
         return self.end - self.start
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class PageCopy:
+class PageCopy(Struct, frozen=True, order=True):
     """Consecutive pages ``[start, end)`` that hold what as many pages from ``source`` on hold."""
 
     start: int
@@ -82,8 +80,7 @@ class PageCopy:
         return self.end - self.start
 
 
-@dataclass(frozen=True, slots=True)
-class Vma:
+class Vma(Struct, frozen=True):
     """One mapping of the address space.
 
     Attributes:
@@ -117,8 +114,7 @@ class Vma:
         return self.end - self.start
 
 
-@dataclass(frozen=True, slots=True)
-class SignalAction:
+class SignalAction(Struct, frozen=True):
     """What one signal does (rt_sigaction(2)): the kernel's own four words."""
 
     signal: int
@@ -128,8 +124,7 @@ class SignalAction:
     mask: int
 
 
-@dataclass(frozen=True, slots=True)
-class Rseq:
+class Rseq(Struct, frozen=True):
     """A registered restartable-sequences area (rseq(2))."""
 
     address: int
@@ -138,8 +133,7 @@ class Rseq:
     flags: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class ThreadState:
+class ThreadState(Struct, frozen=True):
     """One thread, as it stood when it was frozen.
 
     Attributes:
@@ -173,8 +167,7 @@ class ThreadState:
     interrupted: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class IntervalTimer:
+class IntervalTimer(Struct, frozen=True):
     """An alarm of setitimer(2); ``which`` is 0 real, 1 virtual, 2 profiling. All in microseconds; ``value`` is what was left."""
 
     which: int
@@ -182,8 +175,7 @@ class IntervalTimer:
     value_us: int
 
 
-@dataclass(frozen=True, slots=True)
-class PosixTimer:
+class PosixTimer(Struct, frozen=True):
     """A timer of timer_create(2), with what was left of it.
 
     Attributes:
@@ -203,8 +195,7 @@ class PosixTimer:
     overrun: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Clocks:
+class Clocks(Struct, frozen=True):
     """The machine's clocks as the *program* reads them (inside its time namespace), at the freeze."""
 
     realtime_ns: int
@@ -212,8 +203,7 @@ class Clocks:
     boottime_ns: int
 
 
-@dataclass(frozen=True, slots=True)
-class Credentials:
+class Credentials(Struct, frozen=True):
     """User and group ids: (real, effective, saved, filesystem); capabilities as the five words of /proc/PID/status."""
 
     uids: tuple[int, int, int, int]
@@ -224,8 +214,7 @@ class Credentials:
     securebits: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class MemoryLayout:
+class MemoryLayout(Struct, frozen=True):
     """The kernel's own marks in an address space (struct prctl_mm_map of prctl(2), without the exe)."""
 
     start_code: int
@@ -242,8 +231,7 @@ class MemoryLayout:
     auxv: bytes = b""
 
 
-@dataclass(frozen=True, slots=True)
-class ProcessState:
+class ProcessState(Struct, frozen=True):
     """What belongs to the process as a whole.
 
     Attributes:
@@ -284,8 +272,7 @@ class ProcessState:
     isolated: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Resource:
+class Resource(Struct, frozen=True):
     """One thing that a process holds besides memory, described by its file in ``checkpoint.resources``.
 
     Attributes:
@@ -299,8 +286,7 @@ class Resource:
     facts: Mapping[str, Fact] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class Member:
+class Member(Struct, frozen=True):
     """One more process of a component, besides the first: a child, or a child's child.
 
     Attributes:
@@ -317,8 +303,7 @@ class Member:
     resources: tuple[Resource, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Zombie:
+class Zombie(Struct, frozen=True):
     """A process that has ended, and whose parent has not asked for it yet.
 
     Attributes:
@@ -336,8 +321,7 @@ class Zombie:
     exit_signal: int
 
 
-@dataclass(frozen=True, slots=True)
-class Machine:
+class Machine(Struct, frozen=True):
     """Where a snapshot was taken.
 
     Attributes:
@@ -359,8 +343,7 @@ class Machine:
     robot: str = ""
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Position:
+class Position(Struct, frozen=True, order=True):
     """A point in a component's history. Equal numbers with unequal digests mean the histories diverged.
 
     Attributes:
@@ -374,8 +357,7 @@ class Position:
     digest: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class OutputPiece:
+class OutputPiece(Struct, frozen=True):
     """Bytes that the component wrote to one of its streams since the parent position.
 
     Attributes:
@@ -388,8 +370,7 @@ class OutputPiece:
     content: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class Snapshot:
+class Snapshot(Struct, frozen=True):
     """The immutable state of one component at one instant: a base (whole), or a delta since ``parent``.
 
     A page that no snapshot of a chain holds is what a fresh mapping holds: zeros, or the file's content.

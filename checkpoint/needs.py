@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import stat
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint import carried
 from checkpoint.model import Fact, FileIdentity, Snapshot, Vma, VmaKind
@@ -29,8 +30,7 @@ PATH_ONLY: Final = 0o10000000
 """Bits of mmap(2)'s protection, and of open(2)'s flags: O_ACCMODE, O_PATH."""
 
 
-@dataclass(frozen=True, slots=True)
-class Need:
+class Need(Struct, frozen=True):
     """One file.
 
     Attributes:
@@ -64,8 +64,7 @@ def needs(state: Snapshot, *, opened: bool = True) -> tuple[Need, ...]:
     return tuple({need.path: need for need in found if not _is_below(need.path, carry)}.values())
 
 
-@dataclass(frozen=True, slots=True)
-class ProgramFile:
+class ProgramFile(Struct, frozen=True):
     """One file that a program of the cooperative engine is started again from; ``mode``: permissions of it."""
 
     path: str

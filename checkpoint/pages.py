@@ -11,10 +11,10 @@ accidents and diverged histories; it is no guard against a stranger (the file's 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import xxhash
+from msgspec import Struct
 
 from checkpoint.arrays import NDArray, np
 from checkpoint.model import PageCopy, PageRun, Vma
@@ -229,8 +229,7 @@ def _rows(contents: Buffer, page_size: int) -> NDArray[np.uint8]:
 # What a state holds at each page
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PageMap:
+class PageMap(Struct, frozen=True, eq=False):
     """Which pages a state holds, and two words about each (a digest, or where its content lies).
 
     Attributes:
@@ -289,8 +288,7 @@ def _covered_in_order(pages: Words, addresses: Words) -> Flags:
     return inside
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PageTable:
+class PageTable(Struct, frozen=True, eq=False):
     """The digest of every page of a state, and their sum. Immutable: ``apply`` answers with the next one.
 
     Kept by the side that captures, to know the sum without hashing the whole, and by the side that checks a chain.

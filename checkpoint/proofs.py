@@ -7,7 +7,8 @@ differences. What is not remembered (any more) is counted and read again from th
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+
+from msgspec import Struct
 
 from checkpoint import chain
 from checkpoint.arrays import np
@@ -21,8 +22,7 @@ from checkpoint.shelf import Entry, Shelf
 from checkpoint.validity import place
 
 
-@dataclass(frozen=True, slots=True)
-class Proved:
+class Proved(Struct, frozen=True):
     """The pages of a position that was proved.
 
     Attributes:

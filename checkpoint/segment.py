@@ -14,9 +14,10 @@ import enum
 import os
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.arrays import NDArray, np
 from checkpoint.errors import SegmentError
@@ -62,8 +63,7 @@ MAX_PLACES: Final = 1 << 20
 """Addresses for regions in one lineage. None is given twice: a delta could not tell a new region's zeros from old pages."""
 
 
-@dataclass(frozen=True, slots=True)
-class Region:
+class Region(Struct, frozen=True):
     """One piece of memory that survives.
 
     Attributes:
@@ -88,8 +88,7 @@ class Region:
         return self.address + self.page_count * PAGE
 
 
-@dataclass(frozen=True, slots=True)
-class Layout:
+class Layout(Struct, frozen=True):
     """What lies where in a segment; everything else follows from these.
 
     Attributes:
@@ -209,8 +208,7 @@ Outputs = tuple[int, int] | Pending | None
 """Bytes that a program had written to its standard output and error at a commit; None where nobody counts them."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Committed:
+class Committed(Struct, frozen=True, eq=False):
     """What a program committed, whole or since an earlier commit.
 
     Attributes:

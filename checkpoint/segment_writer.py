@@ -13,8 +13,9 @@ import os
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final, TypeAlias
+
+from msgspec import Struct
 
 from checkpoint.arrays import NDArray, np
 from checkpoint.errors import SegmentError
@@ -65,8 +66,7 @@ _fcntl = _libc.fcntl
 _fcntl.restype = ctypes.c_int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Source:
+class Source(Struct, frozen=True, eq=False):
     """What one region holds now.
 
     Attributes:

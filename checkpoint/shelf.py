@@ -6,11 +6,11 @@ Pure: ``store`` reads and writes the files, this says what they mean.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
 from blake3 import blake3
+from msgspec import Struct
 
 from checkpoint.model import Position
 from checkpoint.state import Header
@@ -25,8 +25,7 @@ MAX_NAME_SIZE = 160
 """Bytes of a folder's name; a component whose encoded path is longer is cut and told apart by a digest."""
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
+class Entry(Struct, frozen=True):
     """One snapshot file.
 
     Attributes:
@@ -46,8 +45,7 @@ class Entry:
         return self.epoch, self.position.generation, self.position.sequence
 
 
-@dataclass(frozen=True, slots=True)
-class Shelf:
+class Shelf(Struct, frozen=True):
     """The intact files of one component, in no particular order."""
 
     component: str

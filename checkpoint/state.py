@@ -8,12 +8,12 @@ so unknown fields, doubled keys and other spellings of the same value do not pas
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from itertools import pairwise
 from typing import Any, TypeVar
 
 import msgspec
 from blake3 import blake3
+from msgspec.structs import replace
 
 from checkpoint.errors import FormatError
 from checkpoint.model import (

@@ -17,8 +17,10 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from pathlib import Path
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from checkpoint import chain, format
 from checkpoint.contents import Contents
@@ -62,8 +64,7 @@ FOLDED_OUTPUT_SIZE = 1 << 20
 """Bytes of output of each stream that a folded base keeps; the whole is in the component's logs."""
 
 
-@dataclass(frozen=True, slots=True)
-class Kept:
+class Kept(Struct, frozen=True):
     """What the store has of one component, for people.
 
     Attributes:

@@ -11,8 +11,9 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.errors import TaskPacketError
 
@@ -41,8 +42,7 @@ _SAFE: Final = struct.Struct("<Q")
 _KINDS: Final = {"Hello": 1, "Begin": 2, "Refused": 3, "Keeps": 4, "Safe": 5}
 
 
-@dataclass(frozen=True, slots=True)
-class Origin:
+class Origin(Struct, frozen=True):
     """Where the state comes from that a program goes on with.
 
     Attributes:
@@ -58,13 +58,11 @@ class Origin:
     age_ns: int
 
 
-@dataclass(frozen=True, slots=True)
-class Hello:
+class Hello(Struct, frozen=True):
     """From the program, first of all: it has a state to keep, and waits to be told how to begin."""
 
 
-@dataclass(frozen=True, slots=True)
-class Begin:
+class Begin(Struct, frozen=True):
     """Begin, or go on. With descriptors: the counters of its streams, and its state as a segment if there is an origin.
 
     Attributes:
@@ -79,20 +77,17 @@ class Begin:
     origin: Origin | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Refused:
+class Refused(Struct, frozen=True):
     """The guard will not keep this process's state; it hangs up after saying why."""
 
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class Keeps:
+class Keeps(Struct, frozen=True):
     """From the program, after its first commit to each segment: a capture finds something there from now on."""
 
 
-@dataclass(frozen=True, slots=True)
-class Safe:
+class Safe(Struct, frozen=True):
     """A standby holds everything up to this commit of this program's lineage."""
 
     commit: int

@@ -8,8 +8,9 @@ what is known of chains, sums and frames holds for trees as it stands.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from typing import Final
+
+from msgspec.structs import replace
 
 from checkpoint import pages
 from checkpoint.arrays import NDArray, np

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 Registers = dict[str, int]
 """General registers by name, unsigned."""
@@ -13,8 +14,7 @@ TIMESPEC: Final = "timespec"
 SOCKET: Final = "socket"
 
 
-@dataclass(frozen=True, slots=True)
-class Timeout:
+class Timeout(Struct, frozen=True):
     """How long a call waits.
 
     Attributes:
@@ -30,16 +30,14 @@ class Timeout:
     option: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Call:
+class Call(Struct, frozen=True):
     """One system call to be made inside the tracee; its result goes to the next word of the table's results."""
 
     name: str
     arguments: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Unkept:
+class Unkept(Struct, frozen=True):
     """A question to a process about something that no restore can give it.
 
     Attributes:
@@ -52,8 +50,7 @@ class Unkept:
     what: str
 
 
-@dataclass(frozen=True, slots=True)
-class TablePlaces:
+class TablePlaces(Struct, frozen=True):
     """Addresses inside the borrowed table that the code reads and writes.
 
     Attributes:
@@ -73,8 +70,7 @@ class TablePlaces:
     frame: int
 
 
-@dataclass(frozen=True, slots=True)
-class EntryCalls:
+class EntryCalls(Struct, frozen=True):
     """What the first entry does, in this order: map the code pages, map the table pages, advise, open a userfaultfd."""
 
     code_pages: Call

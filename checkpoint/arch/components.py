@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from typing import Final
 
+from msgspec import Struct
 
-@dataclass(frozen=True, slots=True)
-class Component:
+
+class Component(Struct, frozen=True):
     """One component of a thread's extended state.
 
     Attributes:

@@ -14,8 +14,9 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 WORK_MAX: Final = 400_000
 """Places that are looked at in one search, over all its steps: some tenths of a second."""
@@ -23,8 +24,7 @@ ATTEMPTS_MIN: Final = 50
 """Steps of a search however many processes there are."""
 
 
-@dataclass(frozen=True, slots=True)
-class Wanted:
+class Wanted(Struct, frozen=True):
     """What a process must be when all are born.
 
     Attributes:
@@ -42,8 +42,7 @@ class Wanted:
         return self.session == self.pid
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
+class Place(Struct, frozen=True):
     """Where a process is born.
 
     Attributes:

@@ -15,8 +15,9 @@ from __future__ import annotations
 import itertools
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.engines import birth_places
@@ -70,8 +71,7 @@ GENERATIONS_MAX: Final = 200
 """In how many generations processes may descend from one another: whoever gives birth to one plans for its children, too."""
 
 
-@dataclass(frozen=True, slots=True)
-class Birth:
+class Birth(Struct, frozen=True):
     """``parent`` gives birth to ``pid``.
 
     Attributes:
@@ -86,31 +86,27 @@ class Birth:
     flags: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class NewSession:
+class NewSession(Struct, frozen=True):
     """``pid`` becomes the leader of a session."""
 
     pid: int
 
 
-@dataclass(frozen=True, slots=True)
-class Join:
+class Join(Struct, frozen=True):
     """``pid`` goes to a process group, or makes it when that is its own."""
 
     pid: int
     group: int
 
 
-@dataclass(frozen=True, slots=True)
-class End:
+class End(Struct, frozen=True):
     """``pid`` ends, and nothing is left of it: its parent takes note."""
 
     parent: int
     pid: int
 
 
-@dataclass(frozen=True, slots=True)
-class Reaper:
+class Reaper(Struct, frozen=True):
     """``pid`` is given the orphans among its descendants from now on, or no more.
 
     Attributes:
@@ -124,8 +120,7 @@ class Reaper:
 Step = Birth | NewSession | Join | End | Reaper
 
 
-@dataclass(frozen=True, slots=True)
-class Person:
+class Person(Struct, frozen=True):
     """What matters of a process here; pids are as the component sees them."""
 
     pid: int
@@ -229,8 +224,7 @@ def _require_few_generations(parents: Mapping[int, int]) -> None:
                 raise NoWayError(f"process {pid} has more than {GENERATIONS_MAX} ancestors in it, which is the limit")
 
 
-@dataclass(slots=True)
-class _Plan:
+class _Plan(Struct):
     """One plan in the making.
 
     Attributes:

@@ -17,10 +17,10 @@ from __future__ import annotations
 
 import itertools
 import time
-from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from msgspec import Struct, field
 
 from checkpoint import pages, side_by_side
 from checkpoint.engines.taken_memory import Taken, Unacknowledged, joined, since, with_one_tail
@@ -71,8 +71,7 @@ def _is_within(line: MapsLine, places: SharedPlaces) -> bool:
     return any(place[:2] == (device, inode) and place[2] <= first and last <= place[3] for place in places)
 
 
-@dataclass(slots=True)
-class RunningCopy:
+class RunningCopy(Struct):
     """What was copied while the program ran.
 
     Attributes:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from checkpoint.arch import cpu as arch
 from checkpoint.arch import extended

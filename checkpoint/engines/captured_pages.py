@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
+from msgspec import Struct
 
 from checkpoint import pages, tree
 from checkpoint.engines.captured_process import CapturedProcess, Look
@@ -14,8 +14,7 @@ from checkpoint.model import PageCopy, PageRun
 from checkpoint.resources.carried_trees import Parcel
 
 
-@dataclass(frozen=True, slots=True)
-class Pages:
+class Pages(Struct, frozen=True):
     """What a snapshot carries; the fields are those of ``checkpoint.model.Snapshot``.
 
     Attributes:

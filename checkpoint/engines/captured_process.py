@@ -9,7 +9,8 @@ import contextlib
 import functools
 import operator
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass
+
+from msgspec import Struct
 
 from checkpoint.arch import extended
 from checkpoint.engine import ProtectOrder
@@ -51,8 +52,7 @@ from checkpoint.resources import (
 NOBODY: SharedPlaces = frozenset()
 
 
-@dataclass(frozen=True, slots=True)
-class Look:
+class Look(Struct, frozen=True):
     """Everything that one freeze brought home of one process; nothing in it needs the process any more."""
 
     standing: Standing
@@ -65,8 +65,7 @@ class Look:
         return functools.reduce(operator.or_, (extended.in_use(reading.xstate) for reading in readings))
 
 
-@dataclass(frozen=True, slots=True)
-class Met:
+class Met(Struct, frozen=True):
     """A process that was found, and may be stopped; whoever could not let go of it yet must keep this.
 
     Attributes:

@@ -22,8 +22,10 @@ import operator
 import os
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import dataclass, field, replace
 from typing import Final, NoReturn
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from checkpoint import tree
 from checkpoint.engines import births
@@ -62,8 +64,7 @@ class MovedError(CaptureError):
     """Processes came, went or executed something in the middle of a capture: another one may succeed."""
 
 
-@dataclass(frozen=True, slots=True)
-class SeenProcess:
+class SeenProcess(Struct, frozen=True):
     """One process besides the first, and all that is said of it."""
 
     captured: CapturedProcess
@@ -86,8 +87,7 @@ class SeenProcess:
         return self.look.standing.stat
 
 
-@dataclass(slots=True)
-class SeenOthers:
+class SeenOthers(Struct):
     """What one freeze brought home of all processes besides the first.
 
     Attributes:

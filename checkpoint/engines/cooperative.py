@@ -26,8 +26,10 @@ import socket
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from checkpoint import carried, pages
 from checkpoint.arrays import NDArray, np
@@ -66,8 +68,7 @@ MAX_WAITING: Final = 64
 """Captures that wait for their acknowledgement; of older ones none is expected any more."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Mark:
+class _Mark(Struct, frozen=True, eq=False):
     """A commit that was captured.
 
     Attributes:

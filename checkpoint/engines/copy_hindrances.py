@@ -6,8 +6,9 @@ They come back from their chains, as ever.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Final
+
+from msgspec.structs import replace
 
 from checkpoint import carried, pages, room, tree
 from checkpoint.engines import restore_kinds, restore_memory

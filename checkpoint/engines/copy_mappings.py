@@ -14,11 +14,12 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Final
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from checkpoint import pages
 from checkpoint.engines import restore_memory
@@ -38,8 +39,7 @@ Backing = tuple[object, ...]
 """What a mapping is of, and how it lies there."""
 
 
-@dataclass(frozen=True, slots=True)
-class Change:
+class Change(Struct, frozen=True):
     """From one position to the next.
 
     Attributes:

@@ -6,8 +6,9 @@ import contextlib
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.arch import cpu as arch
 from checkpoint.engines.confinements import Confinements
@@ -30,8 +31,7 @@ LEAVE_TIMEOUT_S: Final = 0.5
 LEAVE_PAUSE_S: Final = 0.01
 
 
-@dataclass(frozen=True, slots=True)
-class Entered:
+class Entered(Struct, frozen=True):
     """What one session works with; ``notes`` are sentences for the operator."""
 
     pages: BorrowedPages

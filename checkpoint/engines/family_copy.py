@@ -23,10 +23,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from msgspec.structs import replace
 
 from checkpoint import chain, differences, pages, tree
 from checkpoint.differences import Rows

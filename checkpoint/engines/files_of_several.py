@@ -9,7 +9,8 @@ is gone is made before they are born, too.
 from __future__ import annotations
 
 from collections.abc import Container, Iterable, Sequence
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from checkpoint.engines.restore_memory import Object, is_object_mapping, object_of
 from checkpoint.linux.call_table import CallTable

@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from msgspec import Struct, field
 
 from checkpoint import pages
 from checkpoint.arrays import NDArray
@@ -37,8 +37,7 @@ MADV_DONTNEED: Final = 4
 NO_PAGES: Final[Words] = np.empty((0, 2), np.uint64)
 
 
-@dataclass(frozen=True, slots=True)
-class Legacy:
+class Legacy(Struct, frozen=True):
     """What one process is born with.
 
     Attributes:
@@ -63,8 +62,7 @@ class Legacy:
             table.call(f"empty {(end - start) >> 10} KiB at {start:#x}", "madvise", start, end - start, MADV_DONTNEED)
 
 
-@dataclass(frozen=True, slots=True)
-class Inheritance:
+class Inheritance(Struct, frozen=True):
     """What all of them are born with.
 
     Attributes:
@@ -109,8 +107,7 @@ class Inheritance:
                 memory.write_from(ranges, np.ascontiguousarray(contents[rows[some]]).reshape(-1))
 
 
-@dataclass(slots=True)
-class _Known:
+class _Known(Struct):
     """The first page that any process has at an address, in the order of addresses."""
 
     addresses: Words
@@ -119,8 +116,7 @@ class _Known:
     is_common: NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True)
-class _Told:
+class _Told(Struct, frozen=True):
     """A process as its snapshot tells of it, and the addresses of the pages that are carried."""
 
     view: Snapshot
@@ -191,8 +187,7 @@ def _whole(parts: Iterable[Words]) -> Words:
     return np.stack((every[begins, 0], every[np.roll(begins, -1), 1]), axis=1)
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
+class _Part(Struct, frozen=True):
     """Of one sort of memory: see `Inheritance`; legacies by the process."""
 
     regions: Words

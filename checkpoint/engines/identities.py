@@ -7,8 +7,9 @@ import os
 import stat
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Final
+
+from msgspec.structs import replace
 
 from checkpoint import pages
 from checkpoint.errors import CaptureError

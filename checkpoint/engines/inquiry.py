@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from checkpoint.engines.switches import Questions, Switch
 from checkpoint.linux import abi
@@ -27,8 +29,7 @@ TIMER_LIMIT: Final = 40
 """POSIX timers that one batch has room for."""
 
 
-@dataclass(frozen=True, slots=True)
-class Told:
+class Told(Struct, frozen=True):
     """What the process said about itself; the fields are those of ``checkpoint.model``.
 
     Attributes:

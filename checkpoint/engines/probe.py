@@ -7,8 +7,10 @@ import functools
 import os
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from checkpoint import portable
 from checkpoint.engine import KEPT, NO_TERMS, NOTED, REFUSED, Finding, Report, Streams, Terms
@@ -267,8 +269,7 @@ def _processor_findings(pid: int) -> Iterator[Finding]:
     yield Finding("process", "processor", KEPT, f"not started with failover run --portable: it may have chosen {needed}")
 
 
-@dataclass(frozen=True, slots=True)
-class _Mapped:
+class _Mapped(Struct, frozen=True):
     """What a process has mapped.
 
     Attributes:

@@ -21,8 +21,10 @@ import contextlib
 import gc
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
 from typing import Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from checkpoint import portable, room, side_by_side, tree
 from checkpoint.chain import position_of
@@ -66,8 +68,7 @@ MOVED_S: Final = 2.0
 MOVED_PAUSE_S: Final = 0.005
 
 
-@dataclass(frozen=True, slots=True)
-class Frozen:
+class Frozen(Struct, frozen=True):
     """Everything that one freeze brought home; nothing in it needs the process any more.
 
     Attributes:

@@ -24,9 +24,11 @@ import resource
 import signal
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from checkpoint import carried, epoch_variable, rights, room, side_by_side
 from checkpoint.arch import cpu, extended, stubs
@@ -85,8 +87,7 @@ REFUGE_SIZE: Final = 1 << 20
 """Bytes beside the area where vdso and its data stay while their old and new places are cleared."""
 
 
-@dataclass(slots=True)
-class RestoredProgram:
+class RestoredProgram(Struct):
     """A program that was brought back; see ``checkpoint.engine.Restored``.
 
     Attributes:
@@ -177,8 +178,7 @@ def _run_tree(
     return RestoredProgram(first, state.position, restoring.notes(), tuple(others))
 
 
-@dataclass(frozen=True, slots=True)
-class Estate:
+class Estate(Struct, frozen=True):
     """What a process of a component of several finds when it is born, and shares with others (`restore_tree`).
 
     Attributes:
@@ -203,8 +203,7 @@ def options_for(state: Snapshot) -> int:
     return OPTIONS | (abi.PTRACE_O_SUSPEND_SECCOMP if confined else 0)
 
 
-@dataclass(frozen=True, slots=True)
-class LaterTables:
+class LaterTables(Struct, frozen=True):
     """What comes after the pages: descriptors, marks, signals; what comes after the threads' birth; and each thread's own."""
 
     state: CallTable

@@ -21,8 +21,10 @@ import os
 import time
 from collections.abc import Container, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from checkpoint import chain, differences, pages
 from checkpoint.differences import Rows
@@ -108,8 +110,7 @@ def ended_on_error(copy: ReadyCopy | FamilyCopy, what: str) -> Iterator[None]:
         raise
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
+class Plan(Struct, frozen=True):
     """What a delta does to the copy of one process, worked out before any of it is done.
 
     Attributes:

@@ -10,9 +10,11 @@ import mmap
 import os
 import stat
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from checkpoint import carried, portable, tree
 from checkpoint.arch import cpu, extended
@@ -99,8 +101,7 @@ _CARRIED: str = f"{_FAR}; or, as the program writes to it, let it travel: --carr
 """While the program runs no copy would do for long."""
 
 
-@dataclass(frozen=True, slots=True)
-class Brought:
+class Brought(Struct, frozen=True):
     """Contents that are opened in place of this machine's own files, by the paths that the program knows.
 
     Attributes:

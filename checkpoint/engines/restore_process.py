@@ -9,15 +9,16 @@ Sources: prctl(2), rt_sigaction(2), timer_create(2), sched(7), credentials(7), c
 from __future__ import annotations
 
 import ctypes
-import dataclasses
 import os
 import signal
 import struct
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from checkpoint.engine import RestoreOptions
 from checkpoint.errors import MismatchError, RestoreError
@@ -74,8 +75,7 @@ NO_ID: Final = 0xFFFFFFFF
 _CAPABILITY_VERSION_3: Final = 0x20080522
 
 
-@dataclass(frozen=True, slots=True)
-class Vessel:
+class Vessel(Struct, frozen=True):
     """What the vessel is before it becomes the program.
 
     Attributes:
@@ -277,7 +277,7 @@ def posix_timers(
             _create_timer(table, PosixTimer(next_id, 1, 1, 0, 0, 0, 0, 0), inner_pid)
             table.call(f"delete timer {next_id}", "timer_delete", next_id)
             next_id += 1
-        known = dataclasses.replace(timer, clock=_clock_here(timer.clock, process.pid, inner_pid))
+        known = replace(timer, clock=_clock_here(timer.clock, process.pid, inner_pid))
         _create_timer(table, known, timer.tid if timer.tid in others else inner_pid)
         next_id = timer.timer_id + 1
     if chosen_ids:

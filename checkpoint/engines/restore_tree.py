@@ -24,9 +24,10 @@ import signal
 import struct
 import termios
 from collections.abc import Collection, Iterator
-from dataclasses import replace
 from itertools import groupby
 from typing import Final
+
+from msgspec.structs import replace
 
 from checkpoint import pages, tree
 from checkpoint.arch import cpu, stubs

@@ -21,8 +21,9 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Final
+
+from msgspec.structs import replace
 
 from checkpoint.arch import cpu
 from checkpoint.arch import stubs as arch

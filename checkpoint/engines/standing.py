@@ -6,8 +6,9 @@ import contextlib
 import functools
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import Registers
@@ -37,8 +38,7 @@ FEW: Final = 64
 """Descriptors that are read, in less than a millisecond, while the process makes its calls: it does not wait for us for ever."""
 
 
-@dataclass(frozen=True, slots=True)
-class Place(Read):
+class Place(Read, Struct, frozen=True):
     """Where the first thread stands, and the others.
 
     Attributes:
@@ -59,8 +59,7 @@ class Place(Read):
         return (*self.pending, *self.shared_pending, *(siginfo for other in self.others for siginfo in other.pending))
 
 
-@dataclass(frozen=True)
-class Standing:
+class Standing(Struct, frozen=True, dict=True):
     """Everything that was asked; nothing in it needs the process any more.
 
     Attributes:

@@ -11,8 +11,9 @@ import functools
 import os
 import struct
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final, NamedTuple
+
+from msgspec import Struct
 
 from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import Registers
@@ -59,8 +60,7 @@ class Read:
         return self.reading.rseq
 
 
-@dataclass(frozen=True, slots=True)
-class ThreadPlace(Read):
+class ThreadPlace(Read, Struct, frozen=True):
     """Where a thread stands.
 
     Attributes:
@@ -79,8 +79,7 @@ class ThreadPlace(Read):
     confinement: Confinement = FREE
 
 
-@dataclass(frozen=True)
-class ThreadStanding:
+class ThreadStanding(Struct, frozen=True, dict=True):
     """Everything that a thread was asked; nothing in it needs the process any more.
 
     Attributes:

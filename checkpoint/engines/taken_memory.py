@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+
+from msgspec import Struct, field
 
 from checkpoint import gathering, pages
 from checkpoint.gathering import Copy
@@ -15,8 +16,7 @@ from checkpoint.model import Position
 from checkpoint.pages import PageMap, Words
 
 
-@dataclass(frozen=True, slots=True)
-class Unacknowledged:
+class Unacknowledged(Struct, frozen=True):
     """What one scan found, kept until a position that holds it is acknowledged."""
 
     position: Position | None
@@ -24,8 +24,7 @@ class Unacknowledged:
     cleared: Words
 
 
-@dataclass(frozen=True, eq=False)
-class Taken:
+class Taken(Struct, frozen=True, dict=True, eq=False):
     """The memory of one capture, when the program stood still.
 
     Attributes:

@@ -36,8 +36,10 @@ import secrets
 import socket
 import struct
 import time
-from dataclasses import dataclass, replace
 from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import MILLISECONDS, SOCKET, Registers, Timeout
@@ -61,8 +63,7 @@ def makes_calls_again(pid: int) -> bool:
     return bool(_MAKES_CALLS_AGAIN.fullmatch(os.path.basename(procfs.read_link(pid, "exe"))))
 
 
-@dataclass(frozen=True, slots=True)
-class Wait:
+class Wait(Struct, frozen=True):
     """A call that was made again.
 
     Attributes:

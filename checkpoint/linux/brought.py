@@ -13,8 +13,9 @@ import contextlib
 import errno
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+
+from msgspec import Struct
 
 from checkpoint.linux import namespaces
 from checkpoint.linux.abi import PAGE_SIZE
@@ -25,8 +26,7 @@ ROOM = 64 << 20
 """Bytes that the program may add in memory to what was brought; without a limit it were half of the machine's."""
 
 
-@dataclass(frozen=True, slots=True)
-class User:
+class User(Struct, frozen=True):
     """Whose program it is; ``groups``: the supplementary ones."""
 
     uid: int
@@ -34,8 +34,7 @@ class User:
     groups: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class BroughtFile:
+class BroughtFile(Struct, frozen=True):
     """One file.
 
     Attributes:

@@ -11,8 +11,9 @@ import fcntl
 import itertools
 import os
 import signal
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 from checkpoint.arch import cpu
 from checkpoint.arch import stubs as arch
@@ -36,8 +37,7 @@ _WIDTH: Final = 47
 """Bits of the smallest address space of which that holds; in a smaller one it is looked for at the same parts of it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Call:
+class Call(Struct, frozen=True):
     """One system call of a table.
 
     Attributes:
@@ -54,8 +54,7 @@ class Call:
     lost: str = ""
 
 
-@dataclass(slots=True)
-class CallTable:
+class CallTable(Struct):
     """Calls and the bytes that they point to, to be laid at ``base`` of a vessel.
 
     Layout: a page for the loop, then the bytes, then the calls.

@@ -16,9 +16,10 @@ import errno
 import functools
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import abi, procfs
@@ -38,8 +39,7 @@ WHOLE_MACHINE: Final = ["0", "0", "4294967295"]
 """What uid_map says in the first user namespace (user_namespaces(7))."""
 
 
-@dataclass(frozen=True, slots=True)
-class Filter:
+class Filter(Struct, frozen=True):
     """One filter.
 
     Attributes:
@@ -51,8 +51,7 @@ class Filter:
     is_logged: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Confinement:
+class Confinement(Struct, frozen=True):
     """What one thread is confined to; the filters are told oldest first."""
 
     is_strict: bool = False

@@ -8,10 +8,10 @@ import os
 import re
 import socket
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from msgspec import Struct
 
 from checkpoint.errors import ProcessGoneError
 from checkpoint.linux import abi, procfs
@@ -28,8 +28,7 @@ BLOCK_SIZE: Final = 512
 """Bytes of what stat(2) counts as a block."""
 
 
-@dataclass(frozen=True, slots=True)
-class Descriptor:
+class Descriptor(Struct, frozen=True):
     """One open descriptor.
 
     Attributes:
@@ -142,8 +141,7 @@ def _opened(pid: int, name: str) -> Iterator[int]:
         os.close(directory)
 
 
-@dataclass(frozen=True, slots=True)
-class Standing:
+class Standing(Struct, frozen=True):
     """What must be asked, besides its fdinfo, to know that a descriptor is what it was.
 
     Attributes:
@@ -207,8 +205,7 @@ def _made(number: int, target: str, told: bytes, head: re.Match[bytes] | None, i
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Nameless:
+class _Nameless(Struct, frozen=True):
     """What all open files of one of the kernel's own file systems have in common, whoever has them; nobody can name a file there.
 
     Attributes:

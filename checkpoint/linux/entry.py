@@ -15,8 +15,9 @@ import itertools
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import Call, EntryCalls
@@ -48,8 +49,7 @@ FAULTS_TARGET: Final = "anon_inode:[userfaultfd]"
 """Where /proc/PID/fd says that it leads."""
 
 
-@dataclass(frozen=True, slots=True)
-class Entered:
+class Entered(Struct, frozen=True):
     """What the first entry brought.
 
     Attributes:

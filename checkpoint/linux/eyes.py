@@ -11,15 +11,15 @@ import ctypes
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 ROOT: Final = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Eyes:
+class Eyes(Struct, frozen=True):
     """Whose rights count for files."""
 
     uid: int

@@ -11,9 +11,11 @@ import contextlib
 import os
 import resource
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from checkpoint.linux import abi, namespaces
 
@@ -24,8 +26,7 @@ CAPABILITIES_MAX: Final = 64
 EVERY_CAPABILITY: Final = (1 << CAPABILITIES_MAX) - 1
 
 
-@dataclass(frozen=True, slots=True)
-class Inheritance:
+class Inheritance(Struct, frozen=True):
     """What execve(2) does not change, besides environment, directory, umask and descriptors, which a client sends.
 
     Attributes:

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection
-from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from checkpoint.linux.descriptors import Descriptor, Standing, head_of, standing_of
 from checkpoint.linux.own_calls import FIRST_ARGUMENT, ROW, OwnCalls, row
@@ -97,8 +98,7 @@ class _Column:
         return bytes(self._told[place * self._size : place * self._size + size])
 
 
-@dataclass(slots=True)
-class _Known:
+class _Known(Struct):
     """One descriptor as it was at the last look.
 
     Attributes:

@@ -9,10 +9,10 @@ from __future__ import annotations
 import ctypes
 import mmap
 import os
-from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from msgspec import Struct, field
 
 from checkpoint import pages
 from checkpoint.arch import number_of
@@ -28,8 +28,7 @@ SEGMENT_PAGE: Final = 4096
 """Only kernels with pages of this size tell in the segment's pages."""
 
 
-@dataclass(slots=True, eq=False)
-class Allocation:
+class Allocation(Struct, eq=False):
     """One piece of live memory.
 
     Attributes:

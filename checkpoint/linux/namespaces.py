@@ -12,9 +12,10 @@ import ctypes
 import errno
 import os
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.model import Clocks
 
@@ -79,8 +80,7 @@ def sibling(pid: int = 0) -> int:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Entered:
+class Entered(Struct, frozen=True):
     """Which namespaces of its own the caller's next child will have.
 
     Attributes:

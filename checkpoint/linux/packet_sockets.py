@@ -8,8 +8,9 @@ from __future__ import annotations
 import socket
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.linux import sock_diag
 
@@ -23,8 +24,7 @@ _RINGS: Final = {2: 5, 3: 13}
 """PACKET_DIAG_RX_RING and TX_RING, and the options that make them: PACKET_RX_RING and PACKET_TX_RING."""
 
 
-@dataclass(frozen=True, slots=True)
-class Membership:
+class Membership(Struct, frozen=True):
     """What a packet socket receives besides what is for this machine.
 
     Attributes:
@@ -38,8 +38,7 @@ class Membership:
     address: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class PacketSocket:
+class PacketSocket(Struct, frozen=True):
     """One packet socket.
 
     Attributes:

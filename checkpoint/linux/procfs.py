@@ -11,8 +11,9 @@ import contextlib
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.errors import MapsFormatError, ProbeError, ProcessGoneError
 from checkpoint.linux import abi
@@ -187,8 +188,7 @@ def outlook(pid: int) -> str:
 # Mappings
 
 
-@dataclass(frozen=True, slots=True)
-class MapsLine:
+class MapsLine(Struct, frozen=True):
     """One line of /proc/PID/maps."""
 
     start: int
@@ -272,8 +272,7 @@ def parse_fields(text: str) -> dict[str, str]:
     return fields
 
 
-@dataclass(frozen=True, slots=True)
-class Status:
+class Status(Struct, frozen=True):
     """/proc/PID/status, as far as we use it.
 
     Attributes:
@@ -392,8 +391,7 @@ def status(pid: int) -> Status:
     return parse_status(read_text(pid, "status"))
 
 
-@dataclass(frozen=True, slots=True)
-class Stat:
+class Stat(Struct, frozen=True):
     """/proc/PID/stat, as far as we use it. Addresses are 0 where we may not see them.
 
     Attributes:

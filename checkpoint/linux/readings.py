@@ -16,10 +16,10 @@ import struct
 import threading
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from msgspec import Struct
 
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.own_calls import OwnCalls, row
@@ -85,8 +85,7 @@ NICE_ORIGIN: Final = 20
 """getpriority(2) itself, of the kernel, answers with this less the nice value: a negative result is an error."""
 
 
-@dataclass(frozen=True, slots=True)
-class Reading:
+class Reading(Struct, frozen=True):
     """What was told of one thread.
 
     Attributes:

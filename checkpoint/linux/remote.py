@@ -35,8 +35,9 @@ import operator
 import struct
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Final, NamedTuple
+
+from msgspec import Struct
 
 from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import Call, Registers, TablePlaces
@@ -83,8 +84,7 @@ _NOTE: Final = struct.Struct("<Ii")
 """At the end of the large desk's table: a descriptor and one more (0: there is no note), and a number."""
 
 
-@dataclass(frozen=True)
-class Plan:
+class Plan(Struct, frozen=True, dict=True):
     """Where the parts of a desk's table begin: head, then results, then what the calls write.
 
     Attributes:

@@ -18,9 +18,10 @@ import socket
 import struct
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from ipaddress import ip_address
 from typing import Final
+
+from msgspec import Struct
 
 PREFIX: Final = "failover_"
 NS_PER_S: Final = 1_000_000_000
@@ -79,8 +80,7 @@ _Message = tuple[int, int, bytes]
 """Kind, flags, and what follows the header."""
 
 
-@dataclass(frozen=True, slots=True)
-class Connection:
+class Connection(Struct, frozen=True):
     """The two ends of a TCP connection, as its packets name them: IPv4 where both are.
 
     Attributes:

@@ -13,11 +13,11 @@ import socket
 import struct
 import termios
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Final
 
 import numpy as np
+from msgspec import Struct, field
 
 from checkpoint.arrays import NDArray
 from checkpoint.linux.own_calls import FIRST_ARGUMENT, ROW, OwnCalls, row
@@ -58,8 +58,7 @@ SETTINGS, STATE, ASIDE = range(3)
 """Parts of the memory in which the answers stand; the last is not compared."""
 
 
-@dataclass(frozen=True, slots=True)
-class Subject:
+class Subject(Struct, frozen=True):
     """What is asked of a socket follows from this.
 
     Attributes:
@@ -74,8 +73,7 @@ class Subject:
     groups: tuple[tuple[int, bytes], ...] = ()
 
 
-@dataclass(slots=True)
-class _Plan:
+class _Plan(Struct):
     """Rows whose addresses are still offsets in one of the parts."""
 
     images: tuple[bytearray, bytearray, bytearray] = field(default_factory=lambda: (bytearray(), bytearray(), bytearray()))
@@ -111,8 +109,7 @@ def _tagged(part: int, offset: int) -> int:
     return part << 32 | offset
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Questions:
+class Questions(Struct, frozen=True, eq=False):
     """All that is asked of sockets of one kind.
 
     Attributes:

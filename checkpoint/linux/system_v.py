@@ -8,9 +8,10 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct
 
 IPC_CREAT: Final = 0o1000
 IPC_EXCL: Final = 0o2000
@@ -28,8 +29,7 @@ _NEXT_ID: Final = Path("/proc/sys/kernel/shm_next_id")
 _libc: Final = ctypes.CDLL(None, use_errno=True)
 
 
-@dataclass(frozen=True, slots=True)
-class Segment:
+class Segment(Struct, frozen=True):
     """One segment.
 
     Attributes:

@@ -16,8 +16,9 @@ import socket
 import struct
 import termios
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 TCP_REPAIR: Final = 19
 TCP_REPAIR_QUEUE: Final = 20
@@ -78,8 +79,7 @@ class InUseError(CannotCarryError):
     """Somebody on this machine has it, perhaps not for long."""
 
 
-@dataclass(frozen=True, slots=True)
-class Kept:
+class Kept(Struct, frozen=True):
     """Everything that must be known of a connection to take it up elsewhere.
 
     Attributes:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.linux.procfs import parse_fields
 
 
-@dataclass(frozen=True, slots=True)
-class TimerLine:
+class TimerLine(Struct, frozen=True):
     """One timer of /proc/PID/timers; ``notify`` as of SIGEV_*, ``tid`` only with SIGEV_THREAD_ID."""
 
     timer_id: int

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from msgspec import Struct
 
 from checkpoint.linux import abi
 from checkpoint.linux.own_calls import FIRST_ARGUMENT, ROW, OwnCalls, row
@@ -24,8 +24,7 @@ STEP: Final = 16
 """By so many threads at a time the tables grow."""
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
+class Report(Struct, frozen=True):
     """What wait4(2) told of one thread.
 
     Attributes:

@@ -14,9 +14,9 @@ import errno
 import os
 import signal
 import time
-from dataclasses import dataclass
 from typing import Final
 
+from msgspec import Struct
 from ptrace.binding.func import ptrace as _ptrace
 from ptrace.error import PtraceError
 
@@ -55,8 +55,7 @@ PENDING_LIMIT: Final = 4096
 """Pending signals that we carry; RLIMIT_SIGPENDING is far above only for floods of queued signals."""
 
 
-@dataclass(frozen=True, slots=True)
-class Stop:
+class Stop(Struct, frozen=True):
     """Why a thread stands still.
 
     Attributes:

@@ -7,10 +7,10 @@ files are carried whole (`digests.SharedPages`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
+from msgspec import Struct
 
 from checkpoint import scratch
 from checkpoint.linux import abi, procfs
@@ -22,8 +22,7 @@ NOT_CARRIED: Final = frozenset(("[vdso]", "[vvar]", "[vvar_vclock]", "[vsyscall]
 """Mappings of the kernel's own: made anew on restore."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Scan:
+class Scan(Struct, frozen=True, eq=False):
     """What happened since the last scan.
 
     Attributes:

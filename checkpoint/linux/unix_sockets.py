@@ -10,8 +10,9 @@ import fcntl
 import os
 import socket
 import struct
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.linux import sock_diag
 
@@ -31,8 +32,7 @@ CLOSED: Final = 7
 LISTENING: Final = 10
 
 
-@dataclass(frozen=True, slots=True)
-class BoundFile:
+class BoundFile(Struct, frozen=True):
     """The file that a socket was bound to, as everybody may ask for it: it has this number still when it has no name.
 
     Attributes:
@@ -48,8 +48,7 @@ class BoundFile:
         return inode & 0xFFFFFFFF == self.number
 
 
-@dataclass(frozen=True, slots=True)
-class UnixSocket:
+class UnixSocket(Struct, frozen=True):
     """One unix socket.
 
     Attributes:

@@ -31,8 +31,9 @@ import signal
 import termios
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final, NoReturn
+
+from msgspec import Struct
 
 from checkpoint.arch import stubs
 from checkpoint.errors import ProbeError, ProcessGoneError, RestoreError
@@ -55,8 +56,7 @@ _REST_S: Final = 0.001
 """Before it is looked again whether a process that was killed has ended."""
 
 
-@dataclass(frozen=True, slots=True)
-class Birth:
+class Birth(Struct, frozen=True):
     """How a process is to come into the world.
 
     Attributes:
@@ -83,8 +83,7 @@ class Birth:
     counted_ns: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Born:
+class Born(Struct, frozen=True):
     """A process that has just been born.
 
     Attributes:
@@ -143,8 +142,7 @@ def discard(born: Born) -> None:
 # --- The caller ------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class _Lines:
+class _Lines(Struct, frozen=True):
     """Our end of the pipe on which everybody at a birth reports; the reports end when the last of them has executed or ended."""
 
     descriptor: int

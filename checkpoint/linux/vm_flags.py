@@ -11,8 +11,9 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 from checkpoint.linux import procfs
 from checkpoint.linux.procfs import MapsLine
@@ -66,8 +67,7 @@ REST: Final = 200
 REST_S_MIN: Final = 5.0
 
 
-@dataclass(slots=True)
-class FlagsReader:
+class FlagsReader(Struct):
     """Reads one process's flags again when its mappings have changed, and now and then, for advice to a whole mapping changes
     nothing else.
 

@@ -11,8 +11,10 @@ import functools
 import os
 import stat
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct, field
+from msgspec.structs import astuple, replace
 
 from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import KEPT, REFUSED, Finding
@@ -38,8 +40,7 @@ GLANCES_MORE: Final = 3
 """How often a process that runs is looked at again that was in the middle of something."""
 
 
-@dataclass(frozen=True, slots=True)
-class Kin:
+class Kin(Struct, frozen=True):
     """The processes of one component, and what they have among them.
 
     Attributes:
@@ -58,8 +59,7 @@ class Kin:
 ALONE: Final = Kin()
 
 
-@dataclass(frozen=True, slots=True)
-class OpenFile:
+class OpenFile(Struct, frozen=True, eq=False):
     """One open file description and every descriptor that shares it, lowest number first.
 
     Attributes:
@@ -87,8 +87,14 @@ class OpenFile:
     description: int = 0
     is_echo: bool = False
     lent: Lent | None = None
-    owners: Owners | None = field(default=None, compare=False)
+    owners: Owners | None = None
     signals: Signals | None = None
+
+    def __eq__(self, other: object) -> bool:
+        """What is known of owners makes no other open file of one."""
+        return isinstance(other, OpenFile) and astuple(replace(self, owners=None)) == astuple(replace(other, owners=None))
+
+    __hash__ = None  # type: ignore[assignment]
 
     @property
     def first(self) -> Descriptor:
@@ -106,8 +112,7 @@ class OpenFile:
         return [[one.number, int(bool(one.flags & os.O_CLOEXEC))] for one in self.descriptors]
 
 
-@dataclass(frozen=True, slots=True)
-class Surroundings:
+class Surroundings(Struct, frozen=True):
     """What the kinds must know about the process's guard.
 
     Attributes:
@@ -123,8 +128,7 @@ class Surroundings:
     is_first: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class Held:
+class Held(Struct, frozen=True):
     """What a process's descriptors are."""
 
     resources: tuple[Resource, ...]
@@ -143,8 +147,7 @@ def pipes_of(outputs: Sequence[int]) -> dict[str, int]:
     }
 
 
-@dataclass(frozen=True, slots=True)
-class Recalled:
+class Recalled(Struct, frozen=True):
     """What a socket answers as it did at the last look.
 
     Attributes:

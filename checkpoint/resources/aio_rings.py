@@ -18,9 +18,10 @@ import stat
 import struct
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError, RestoreError
@@ -135,8 +136,7 @@ def _under_way(place: Path) -> bool:
 # --- Restore -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Ring:
+class Ring(Struct, frozen=True):
     """One ring of the program.
 
     Attributes:

@@ -18,10 +18,11 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
 from typing import Final
 
 import msgspec
+from msgspec import Struct, field
+from msgspec.structs import asdict, replace
 
 from checkpoint.capability import Area, by_rule
 from checkpoint.errors import CheckpointError, RestoreError
@@ -55,8 +56,7 @@ TRACED: Final = "t"
 # --- Captured ----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Departing:
+class Departing(Struct, frozen=True):
     """The connections of a program that stands still, and may do so for good.
 
     Attributes:
@@ -167,8 +167,7 @@ def heard_again(opened: Iterable[OpenFile]) -> None:
 # --- Restored ----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class _Arrival:
+class _Arrival(Struct, frozen=True):
     """One connection.
 
     Attributes:

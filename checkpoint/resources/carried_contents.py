@@ -6,9 +6,9 @@ import functools
 import os
 import stat
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
+from msgspec import Struct
 
 from checkpoint import pages
 from checkpoint.gathering import Copy
@@ -21,8 +21,7 @@ Version = tuple[int, int, int, int, int]
 """Device, inode, size, time of modification, time of change: of one content of a file."""
 
 
-@dataclass(frozen=True, eq=False)
-class Content:
+class Content(Struct, frozen=True, dict=True, eq=False):
     """What one file held when it was read.
 
     Attributes:

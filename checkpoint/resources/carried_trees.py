@@ -20,10 +20,11 @@ import os
 import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from checkpoint import carried, gathering, pages
 from checkpoint.capability import Area, by_rule, refused
@@ -104,8 +105,7 @@ class Name(NamedTuple):
         return stat.S_IFMT(self.about.st_mode)
 
 
-@dataclass(frozen=True, slots=True)
-class Seen:
+class Seen(Struct, frozen=True):
     """What one look brought home.
 
     Attributes:
@@ -121,8 +121,7 @@ class Seen:
     read_size: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Parcel:
+class Parcel(Struct, frozen=True):
     """What a snapshot says of carried files.
 
     Attributes:
@@ -141,8 +140,7 @@ NO_PARCEL: Final = Parcel((), (), np.empty(0, dtype=np.uint64), memoryview(b""),
 """Of a program without carried files."""
 
 
-@dataclass(slots=True)
-class CarriedTrees:
+class CarriedTrees(Struct):
     """Follows the carried paths of one process; every call from one thread.
 
     Invariants: ``_at`` knows the pages of every position that is, or can still be, acknowledged, and ``_newest`` those of the

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Resource
@@ -27,8 +28,7 @@ Descriptors = dict[tuple[int, int], int]
 """A descriptor of each open file that was made, by its place among the nameless objects of `rebuilding.Rebuilding`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Departed:
+class Departed(Struct, frozen=True):
     """One process that has ended.
 
     Attributes:

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
+from msgspec import Struct
 
 from checkpoint.linux import abi
 from checkpoint.linux.descriptors import Descriptor
@@ -25,8 +25,7 @@ _SAME, _BEFORE = 0, 1
 """What kcmp(2) says of two."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Alike:
+class _Alike(Struct, frozen=True):
     """Descriptors that may lead to the same open file.
 
     Attributes:

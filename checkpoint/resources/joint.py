@@ -10,8 +10,9 @@ Source: clone(2), kcmp(2).
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from typing import Final
+
+from msgspec.structs import replace
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import ProcessGoneError

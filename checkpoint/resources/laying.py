@@ -22,8 +22,9 @@ import stat
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 from checkpoint import carried
 from checkpoint.carried import Entry, Tree
@@ -44,8 +45,7 @@ Pieces = Mapping[int, list[tuple[int, memoryview]]]
 """By place: (offset in the file, bytes in whole pages)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Laid:
+class Laid(Struct, frozen=True):
     """What was laid down.
 
     Attributes:
@@ -174,8 +174,7 @@ def _files_below(path: str) -> Iterator[str]:
                 yield full
 
 
-@dataclass(slots=True)
-class _Laying:
+class _Laying(Struct):
     """One tree on its way to its path: `compare`, `build`, `swap`, `settle`, `forget_oldest`; then, however it ends, `clear`.
 
     Until `forget_oldest`, `take_back` undoes it. Each of them raises OSError when it does not work.

@@ -5,8 +5,9 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
-from dataclasses import dataclass, field
 from typing import Final, NamedTuple
+
+from msgspec import Struct, field
 
 AT_FDCWD: Final = -100
 RENAME_NOREPLACE: Final = 1
@@ -22,8 +23,7 @@ class _Move(NamedTuple):
     flag: int
 
 
-@dataclass(slots=True)
-class Moves:
+class Moves(Struct):
     """What was moved, in order."""
 
     _made: list[_Move] = field(default_factory=list)

@@ -15,8 +15,10 @@ import fcntl
 import os
 import struct
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from checkpoint.linux.descriptors import copy_of, lending
 from checkpoint.resources import OpenFile, Owners
@@ -29,8 +31,7 @@ _O_ASYNC: Final = os.O_ASYNC
 _LEASE: Final = b" LEASE "
 
 
-@dataclass(frozen=True, slots=True)
-class Signals:
+class Signals(Struct, frozen=True):
     """What an open file sends, to whom.
 
     Attributes:

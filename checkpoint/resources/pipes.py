@@ -21,10 +21,10 @@ import select
 import stat
 import termios
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from msgspec.structs import replace
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError

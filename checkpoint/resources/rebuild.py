@@ -16,9 +16,10 @@ import os
 import stat
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from itertools import groupby
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint import rights
 from checkpoint.engine import RestoreOptions
@@ -133,8 +134,7 @@ NOT_OPEN: Final = (
 KINDS: Final = (files.KIND, streams.KIND, shared.KIND, pipes.KIND, terminals.KIND, *NOT_OPEN, *MADE, *SOCKETS)
 
 
-@dataclass(frozen=True, slots=True)
-class Wanted:
+class Wanted(Struct, frozen=True):
     """One descriptor that the program had."""
 
     number: int

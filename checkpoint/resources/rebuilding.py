@@ -5,8 +5,9 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 from checkpoint.engine import RestoreOptions
 from checkpoint.errors import RestoreError
@@ -16,8 +17,7 @@ from checkpoint.model import Clocks, Fact, Resource
 NO_DEVICE: Final = -1
 
 
-@dataclass(frozen=True, slots=True)
-class Rebuilding:
+class Rebuilding(Struct, frozen=True):
     """One restore.
 
     Attributes:

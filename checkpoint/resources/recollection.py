@@ -14,8 +14,10 @@ import select
 import socket
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from typing import Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from checkpoint.linux import socket_questions
 from checkpoint.linux.descriptors import Copier, copy_of
@@ -43,8 +45,7 @@ OF_SETTINGS: Final = ("socket", "family", "type", "protocol", "user", "options",
 """Facts that follow from what a program has set."""
 
 
-@dataclass(slots=True)
-class _Known:
+class _Known(Struct):
     """One socket as it was at the last look.
 
     Attributes:
@@ -68,8 +69,7 @@ class _Known:
     again: Recalled | None = None
 
 
-@dataclass(slots=True)
-class _Alike:
+class _Alike(Struct):
     """Sockets of one kind that are asked in one go.
 
     Attributes:
@@ -87,8 +87,7 @@ class _Alike:
     listed: list[tuple[OpenFile, _Known]] = field(default_factory=list)
 
 
-@dataclass(frozen=True, slots=True)
-class _AtATime:
+class _AtATime(Struct, frozen=True):
     """Sockets that are asked at a time, by their descriptors."""
 
     pid: int
@@ -107,8 +106,7 @@ class _AtATime:
         return cls(some[0][0].pid, Copier([one.first.number for one, _ in some]), list(kinds.values()))
 
 
-@dataclass(frozen=True, slots=True)
-class _Round:
+class _Round(Struct, frozen=True):
     """Who is asked, as long as the open files are the very same.
 
     Attributes:
@@ -130,8 +128,7 @@ class _Round:
         return all(opened.listings.groups(*key) == groups for key, groups in self.groups.items())
 
 
-@dataclass(frozen=True, slots=True)
-class _Answer:
+class _Answer(Struct, frozen=True):
     settings: bytes
     state: bytes
     listed: object

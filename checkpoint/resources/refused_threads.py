@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import ProbeError, ProcessGoneError
@@ -143,8 +144,7 @@ def of_dispatching(tid: int) -> str:
     return f"its thread {tid} handles its system calls itself (PR_SET_SYSCALL_USER_DISPATCH): run it without"
 
 
-@dataclass(frozen=True, slots=True)
-class _Shared:
+class _Shared(Struct, frozen=True):
     """What all threads of a program must have alike.
 
     Attributes:

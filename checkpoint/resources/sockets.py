@@ -25,9 +25,10 @@ import struct
 import termios
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.capability import Area, refused
 from checkpoint.linux.call_table import CallTable
@@ -126,8 +127,7 @@ _JUST_NOW: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOBUFS)
 _getsockopt = ctypes.CDLL(None, use_errno=True).getsockopt
 
 
-@dataclass(frozen=True, slots=True)
-class Form:
+class Form(Struct, frozen=True):
     """What socket(2) was told."""
 
     family: int
@@ -135,8 +135,7 @@ class Form:
     protocol: int
 
 
-@dataclass(frozen=True, slots=True)
-class Queue:
+class Queue(Struct, frozen=True):
     """What waits to be read.
 
     Attributes:
@@ -483,8 +482,7 @@ def _set_buffer(table: CallTable, made: int, number: int, size: int) -> None:
         table.attempt("", "setsockopt", made, socket.SOL_SOCKET, option, table.place(value), len(value))
 
 
-@dataclass(frozen=True, slots=True)
-class Way:
+class Way(Struct, frozen=True):
     """How a message gets to where it waited.
 
     Attributes:

@@ -15,8 +15,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from typing import Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import RestoreError
@@ -149,8 +151,7 @@ def mismatches(held: Resource) -> Iterator[str]:
         yield f"the key {wanted.key & 0xFFFFFFFF:#x} of its System V shared memory belongs to another segment here: {cure}"
 
 
-@dataclass(slots=True)
-class Segments:
+class Segments(Struct):
     """The segments of a program, made on this machine: once, however many of its processes tell of them.
 
     Attributes:

@@ -25,8 +25,9 @@ import stat
 import struct
 import termios
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError, CheckpointError
@@ -338,8 +339,7 @@ def _numbers_in_use(pid: int) -> Iterator[int]:
         yield from (int(name) for name in os.listdir(f"{procfs.outlook(pid)}/dev/pts") if name.isdigit())
 
 
-@dataclass(frozen=True, slots=True)
-class Controlling:
+class Controlling(Struct, frozen=True):
     """The controlling terminal of a session.
 
     Attributes:

@@ -12,8 +12,9 @@ Source: credentials(7); nptl(7) on why programs seldom do that.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 from checkpoint.capability import Area, preserved
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError
@@ -35,8 +36,7 @@ Odd = Mapping[int, tuple[int, Credentials]]
 """By thread id, as we see it: its id as it sees it itself, and its rights."""
 
 
-@dataclass(frozen=True, slots=True)
-class Seen:
+class Seen(Struct, frozen=True):
     """One look at all threads of a process.
 
     Attributes:

@@ -19,8 +19,9 @@ import functools
 import itertools
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError
@@ -85,8 +86,7 @@ def refuse(pid: int, tid: int, kinds: Own) -> Iterator[str]:
     yield from _against_twins(pid, tid, kinds)
 
 
-@dataclass(frozen=True, slots=True)
-class _Told:
+class _Told(Struct, frozen=True):
     """One thread, as the facts tell it, and what speaks against that."""
 
     fact: list[Fact]

@@ -19,8 +19,9 @@ import select
 import struct
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.capability import Area, preserved
 from checkpoint.errors import CaptureError
@@ -141,8 +142,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     return elsewhere.refuse(held, "a timerfd") if held.first.target == TARGET else None
 
 
-@dataclass(frozen=True, slots=True)
-class Left:
+class Left(Struct, frozen=True):
     """What is left of a timer when some time has gone by."""
 
     value_ns: int

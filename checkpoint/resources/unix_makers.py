@@ -13,8 +13,9 @@ import signal
 import socket
 import struct
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.capability import Area, preserved
 from checkpoint.errors import ProbeError, ProcessGoneError
@@ -53,8 +54,7 @@ def by_its_own_number(maker: Fact) -> Fact:
     return maker
 
 
-@dataclass(frozen=True, slots=True)
-class Disguise:
+class Disguise(Struct, frozen=True):
     """A vessel that can pass for another user for as long as it takes to make a socket, or to send.
 
     A connection tells the effective ids, a message (SCM_CREDENTIALS) the real ones.

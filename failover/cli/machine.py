@@ -9,9 +9,10 @@ import resource
 import shutil
 import subprocess
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+
+from msgspec import Struct
 
 from checkpoint.arch import EMULATED, cpu
 from checkpoint.channel import Capture, Captured, Protect, Protected, Release, Released
@@ -28,8 +29,7 @@ STAND_IN = ("sleep", "60")
 """An ordinary program, to be looked into and ended."""
 
 
-@dataclass(frozen=True, slots=True)
-class Offer:
+class Offer(Struct, frozen=True):
     """One thing looked at: ``missing`` means that nothing works without it, ``lesser`` that something works less well."""
 
     verdict: Literal["good", "lesser", "missing"]

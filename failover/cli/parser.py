@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import dataclass
 from textwrap import dedent
 from typing import Final
+
+from msgspec import Struct
 
 from failover import __version__
 from failover.cli import arguments
@@ -36,8 +37,7 @@ Files and environment:
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Verb:
+class Verb(Struct, frozen=True):
     """One verb of the command line.
 
     Attributes:

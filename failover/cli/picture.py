@@ -6,8 +6,9 @@ Pure: the agent's answer in (see `failover.client.control.STATUS`), rows of text
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final, Literal
+
+from msgspec import Struct
 
 Mood = Literal["good", "warning", "bad", "quiet"]
 
@@ -19,8 +20,7 @@ OVER_STATES: Final = frozenset({"ended", "released"})
 UNSETTLED_STATES: Final = frozenset({"starting", "restoring", "held", "frozen"})
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
+class Row(Struct, frozen=True):
     """One line of the tree; ``cells`` are in the order of `COLUMNS`."""
 
     cells: tuple[str, ...]

@@ -18,9 +18,10 @@ import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
+
+from msgspec import Struct
 
 from checkpoint.engines.cooperative import regions_of, this_machine
 from checkpoint.errors import CheckpointError
@@ -45,8 +46,7 @@ RESTARTED: Final = "restarted"
 _UNCHANGING: Final = (int, float, complex, str, bytes, bool, type(None), tuple, frozenset)
 
 
-@dataclass(frozen=True, slots=True)
-class Resumed:
+class Resumed(Struct, frozen=True):
     """Where the state came from that a program goes on with.
 
     Attributes:

@@ -17,8 +17,9 @@ import struct
 import threading
 import time
 import weakref
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from checkpoint.channel import close_all
 from checkpoint.errors import TaskPacketError
@@ -52,8 +53,7 @@ UNTOLD: Final = "cannot keep a state under the agent: its guard does not say how
 log = logging.getLogger("failover")
 
 
-@dataclass(frozen=True, slots=True)
-class Handed:
+class Handed(Struct, frozen=True):
     """What the guard gave at the beginning.
 
     Attributes:

@@ -15,10 +15,10 @@ from __future__ import annotations
 import copy
 import typing
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, Final, Protocol, TypeVar, overload
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from failover.client.task import PROCESS, Resumed, Task, open_task
@@ -98,8 +98,7 @@ def kept(
     return Kept(Field(default=default, factory=factory, dtype=dtype, shape=sizes, formerly=names, pickled=pickled))
 
 
-@dataclass(frozen=True, slots=True)
-class Declaration:
+class Declaration(Struct, frozen=True):
     """What `component` was told about a class.
 
     Attributes:

@@ -6,7 +6,7 @@ that component, and returns the epoch with the event that answers it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from msgspec import Struct
 
 from checkpoint.model import Position
 from failover.core.messages import Beat
@@ -14,8 +14,7 @@ from failover.core.story import Decision
 from failover.core.types import Ballot, ComponentSpec, Resumption
 
 
-@dataclass(frozen=True, slots=True)
-class Start:
+class Start(Struct, frozen=True):
     """Begin (or adopt) the program. → Started, ActFailed.
 
     Attributes:
@@ -30,8 +29,7 @@ class Start:
     generation: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Restore:
+class Restore(Struct, frozen=True):
     """Bring the program back from ``position``, which this robot's store holds. → Restored, ActFailed.
 
     Whatever is left of the component on this robot (a crashed process, an old guard) is cleared away first.
@@ -51,8 +49,7 @@ class Restore:
     generation: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Capture:
+class Capture(Struct, frozen=True):
     """Take a snapshot and keep it durably in this robot's store. → Captured, Unchanged, CaptureFailed. One at a time.
 
     Attributes:
@@ -68,8 +65,7 @@ class Capture:
     hold: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Ship:
+class Ship(Struct, frozen=True):
     """Send the snapshot at ``position`` over the bulk lane. → ShipEnded.
 
     Attributes:
@@ -86,8 +82,7 @@ class Ship:
     whole: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class CancelShip:
+class CancelShip(Struct, frozen=True):
     """Give up the transfer of ``position``; a delta that nobody waits for any more. No answer."""
 
     component: str
@@ -96,8 +91,7 @@ class CancelShip:
     to: str
 
 
-@dataclass(frozen=True, slots=True)
-class Acknowledge:
+class Acknowledge(Struct, frozen=True):
     """Tell the keeper that ``position`` is a checkpoint: the next delta counts from here. No answer.
 
     Attributes:
@@ -111,8 +105,7 @@ class Acknowledge:
     is_safe: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Admit:
+class Admit(Struct, frozen=True):
     """From now on snapshots of this component are taken from ``sender`` at ``epoch`` or later ("": from nobody). No answer."""
 
     component: str
@@ -120,16 +113,14 @@ class Admit:
     sender: str
 
 
-@dataclass(frozen=True, slots=True)
-class Freeze:
+class Freeze(Struct, frozen=True):
     """Stop every thread of the component. No answer; the guard does it by itself when the lease has run out."""
 
     component: str
     epoch: int
 
 
-@dataclass(frozen=True, slots=True)
-class Thaw:
+class Thaw(Struct, frozen=True):
     """Let it go on; ``lease_until_ns`` is given to the guard first (0 = no lease). No answer."""
 
     component: str
@@ -137,8 +128,7 @@ class Thaw:
     lease_until_ns: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class SetLease:
+class SetLease(Struct, frozen=True):
     """The guard freezes the component when its clock passes ``until_ns``; 0 = no lease. No answer."""
 
     component: str
@@ -146,8 +136,7 @@ class SetLease:
     until_ns: int
 
 
-@dataclass(frozen=True, slots=True)
-class KeepAside:
+class KeepAside(Struct, frozen=True):
     """Keep the state of a copy that lost as a snapshot of its own, for inspection, before the Stop that follows. No answer."""
 
     component: str
@@ -155,8 +144,7 @@ class KeepAside:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class Forget:
+class Forget(Struct, frozen=True):
     """The snapshots of ``generations`` lost against the present primary: they leave the chain (aside, if they are kept)."""
 
     component: str
@@ -164,8 +152,7 @@ class Forget:
     generations: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class End:
+class End(Struct, frozen=True):
     """End the program: with ``signal`` as the operator asked. → Exited."""
 
     component: str
@@ -173,24 +160,21 @@ class End:
     signal: int
 
 
-@dataclass(frozen=True, slots=True)
-class Stop:
+class Stop(Struct, frozen=True):
     """Kill this robot's copy at once and clear it away; there may be none. → Stopped. Its exit is nobody's result."""
 
     component: str
     epoch: int
 
 
-@dataclass(frozen=True, slots=True)
-class LetGo:
+class LetGo(Struct, frozen=True):
     """Detach keeper and guard; the program runs on unprotected. No answer."""
 
     component: str
     epoch: int
 
 
-@dataclass(frozen=True, slots=True)
-class Warm:
+class Warm(Struct, frozen=True):
     """Have the program wait before its next step, under no epoch and no lease, until Restore uses it. → Warmed.
 
     One that keeps its state is started in advance; of any other a stopped process holds the newest checkpoint's memory.
@@ -204,16 +188,14 @@ class Warm:
     spec: ComponentSpec
 
 
-@dataclass(frozen=True, slots=True)
-class Cool:
+class Cool(Struct, frozen=True):
     """What waits of this component on this robot ends. No answer."""
 
     component: str
     epoch: int
 
 
-@dataclass(frozen=True, slots=True)
-class Inquire:
+class Inquire(Struct, frozen=True):
     """Ask robot ``to`` what it lacks of what the component needs to go on there. → Inquired, unless the robot cannot be asked."""
 
     component: str
@@ -221,8 +203,7 @@ class Inquire:
     to: str
 
 
-@dataclass(frozen=True, slots=True)
-class Prune:
+class Prune(Struct, frozen=True):
     """Snapshots that are not needed to restore ``oldest`` or a later position may go."""
 
     component: str
@@ -230,16 +211,14 @@ class Prune:
     oldest: Position
 
 
-@dataclass(frozen=True, slots=True)
-class Drop:
+class Drop(Struct, frozen=True):
     """Forget every snapshot of the component on this robot."""
 
     component: str
     epoch: int
 
 
-@dataclass(frozen=True, slots=True)
-class ReportExit:
+class ReportExit(Struct, frozen=True):
     """The end of the component is a record: tell whoever waits for it (``failover run``).
 
     Attributes:
@@ -256,8 +235,7 @@ class ReportExit:
     reason: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
+class Answer(Struct, frozen=True):
     """The reply to an operator's command; ``sentence`` says what was done, or why not and what to do about it.
 
     Attributes:
@@ -296,8 +274,7 @@ Act = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Ready:
+class Ready(Struct, frozen=True):
     """The obligations after one step, in the order in which they are met.
 
     Attributes:

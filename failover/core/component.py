@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import enum
 from collections import deque
-from dataclasses import dataclass, field
+
+from msgspec import Struct, field
 
 from checkpoint.model import Position
 from failover.core.acts import Act
@@ -81,8 +82,7 @@ TABLE: dict[tuple[State, Cause], State] = {
 """Every arrow there is. What is not here does not happen: ``Component.move`` asserts it."""
 
 
-@dataclass(slots=True)
-class Flight:
+class Flight(Struct):
     """The one snapshot that is being taken, shipped or waited for.
 
     Attributes:
@@ -104,8 +104,7 @@ class Flight:
     state_ns: int = 0
 
 
-@dataclass(slots=True)
-class Handing:
+class Handing(Struct):
     """A handover under way. ``yielded``: the last delta is acknowledged, ``to`` may claim."""
 
     to: str
@@ -114,8 +113,7 @@ class Handing:
     yielded: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Wanted:
+class Wanted(Struct, frozen=True):
     """The checkpoint that a robot needs to carry out an operator's order; ``giver`` has at least ``position``."""
 
     request: int
@@ -124,8 +122,7 @@ class Wanted:
     until_ns: int
 
 
-@dataclass(slots=True)
-class Component:
+class Component(Struct):
     """What one robot knows of one component. The first block survives a restart (``types.Record`` explains it).
 
     Attributes:
@@ -325,8 +322,7 @@ class Component:
         )
 
 
-@dataclass(slots=True)
-class Turn:
+class Turn(Struct):
     """One step: its instant, what the rules may look at, what they order, and what they say about it.
 
     Attributes:

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from msgspec import Struct
 
 from checkpoint.model import Position
 from failover.core.messages import Beat
 from failover.core.types import ComponentSpec
 
 
-@dataclass(frozen=True, slots=True)
-class Tick:
+class Tick(Struct, frozen=True):
     """The instant that ``next_deadline_ns`` asked for has come (or nothing else has happened)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Received:
+class Received(Struct, frozen=True):
     """A beat that passed ``wire.Receiver``: whole, authentic, of our team and version, not seen before.
 
     Attributes:
@@ -31,16 +29,14 @@ class Received:
     came_ns: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Started:
+class Started(Struct, frozen=True):
     """The act Start is done: the program runs (or, adopted, has been running) and its keeper is ready."""
 
     component: str
     epoch: int
 
 
-@dataclass(frozen=True, slots=True)
-class Captured:
+class Captured(Struct, frozen=True):
     """The act Capture is done. The snapshot is durable in this robot's own store and can be shipped and restored from.
 
     Attributes:
@@ -58,8 +54,7 @@ class Captured:
     age_ns: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Unchanged:
+class Unchanged(Struct, frozen=True):
     """The act Capture found what was acknowledged at ``position``: a program that commits has committed nothing since.
 
     Attributes:
@@ -72,8 +67,7 @@ class Unchanged:
     position: Position
 
 
-@dataclass(frozen=True, slots=True)
-class CaptureFailed:
+class CaptureFailed(Struct, frozen=True):
     """The act Capture came to nothing; the program runs on and nothing was forgotten.
 
     Attributes:
@@ -88,8 +82,7 @@ class CaptureFailed:
     needs_base: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class NothingToCapture:
+class NothingToCapture(Struct, frozen=True):
     """The act Capture came too early: the program keeps its state itself and has committed nothing yet. `Committed` follows."""
 
     component: str
@@ -97,16 +90,14 @@ class NothingToCapture:
     message: str
 
 
-@dataclass(frozen=True, slots=True)
-class Committed:
+class Committed(Struct, frozen=True):
     """A program that keeps its state has made its first commit, or the first to another segment: a capture finds it now."""
 
     component: str
     epoch: int
 
 
-@dataclass(frozen=True, slots=True)
-class ShipEnded:
+class ShipEnded(Struct, frozen=True):
     """The transfer ordered by the act Ship has ended: ``ok`` when the last byte was taken by the other side.
 
     The acknowledgement itself comes with the standby's beats.
@@ -120,8 +111,7 @@ class ShipEnded:
     reason: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Stored:
+class Stored(Struct, frozen=True):
     """On the standby: a snapshot that was admitted is verified, fits the chain, and is durable in this robot's store.
 
     Attributes:
@@ -136,8 +126,7 @@ class Stored:
     keeps_state: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class StoreFailed:
+class StoreFailed(Struct, frozen=True):
     """On the standby: a snapshot did not fit, or could not be written. What the store already held is intact.
 
     Attributes:
@@ -151,8 +140,7 @@ class StoreFailed:
     needs_base: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Restored:
+class Restored(Struct, frozen=True):
     """The act Restore is done: the program runs from ``position``, which was captured ``age_ns`` ago (-1: not known)."""
 
     component: str
@@ -161,8 +149,7 @@ class Restored:
     age_ns: int = -1
 
 
-@dataclass(frozen=True, slots=True)
-class ActFailed:
+class ActFailed(Struct, frozen=True):
     """Start or Restore came to nothing and left nothing behind. ``message`` says what to do about it."""
 
     component: str
@@ -170,16 +157,14 @@ class ActFailed:
     message: str
 
 
-@dataclass(frozen=True, slots=True)
-class Stopped:
+class Stopped(Struct, frozen=True):
     """The act Stop is done: no process of this component is left on this robot (asked or not, its keeper and guard are gone)."""
 
     component: str
     epoch: int
 
 
-@dataclass(frozen=True, slots=True)
-class Warmed:
+class Warmed(Struct, frozen=True):
     """How it stands with the act Warm, each time that this changes: it waits and is ready, or ``message`` says why not."""
 
     component: str
@@ -188,8 +173,7 @@ class Warmed:
     message: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Inquired:
+class Inquired(Struct, frozen=True):
     """What robot ``to`` said that it lacks of what the component needs to go on there: nothing, or a sentence for each."""
 
     component: str
@@ -198,8 +182,7 @@ class Inquired:
     lacks: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Exited:
+class Exited(Struct, frozen=True):
     """The program ended by itself.
 
     Attributes:
@@ -214,8 +197,7 @@ class Exited:
     refusal: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Noticed:
+class Noticed(Struct, frozen=True):
     """Something that belongs in the story and changes nothing: about a component, or ("") about this robot.
 
     Attributes:
@@ -227,24 +209,21 @@ class Noticed:
     output_pending: int = -1
 
 
-@dataclass(frozen=True, slots=True)
-class Run:
+class Run(Struct, frozen=True):
     """Operator: start this program here (or, with ``spec.launch.pid``, protect it where it runs). Answered by the act Answer."""
 
     request: int
     spec: ComponentSpec
 
 
-@dataclass(frozen=True, slots=True)
-class Release:
+class Release(Struct, frozen=True):
     """Operator: let the program run on without protection, and forget its checkpoints everywhere."""
 
     request: int
     component: str
 
 
-@dataclass(frozen=True, slots=True)
-class Stop:
+class Stop(Struct, frozen=True):
     """Operator: end the program with ``signal``; its end is a record like any other."""
 
     request: int
@@ -252,8 +231,7 @@ class Stop:
     signal: int = 15
 
 
-@dataclass(frozen=True, slots=True)
-class Handover:
+class Handover(Struct, frozen=True):
     """Operator: move the component to robot ``to`` ("" for its standby)."""
 
     request: int
@@ -261,8 +239,7 @@ class Handover:
     to: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Promote:
+class Promote(Struct, frozen=True):
     """Operator: this robot runs what nobody else is heard to run, without waiting for robots that are silent.
 
     Attributes:
@@ -274,16 +251,14 @@ class Promote:
     is_trial: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Failback:
+class Failback(Struct, frozen=True):
     """Operator: move the component back to the robot that is preferred, or else to where it was started."""
 
     request: int
     component: str
 
 
-@dataclass(frozen=True, slots=True)
-class Prefer:
+class Prefer(Struct, frozen=True):
     """Operator: robot ``robot`` runs the component whenever it can ("" for no preference)."""
 
     request: int

@@ -9,7 +9,8 @@ taken back before anybody is judged.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+
+from msgspec import Struct, field
 
 from failover.core.messages import RULES, Beat, Echo, Entry
 from failover.core.story import Sighting
@@ -34,16 +35,14 @@ SUSPECT_BEATS = 3
 """Beats that may be missing before a peer is called suspect."""
 
 
-@dataclass(slots=True)
-class _Known:
+class _Known(Struct):
     """What is known of one component from one beat."""
 
     entry: Entry
     counter: int
 
 
-@dataclass(slots=True)
-class Peer:
+class Peer(Struct):
     """What one peer has told us.
 
     Attributes:

@@ -6,11 +6,10 @@ ours that was sent after our decision decided later (`failover.core.telling`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from msgspec import Struct
 
 
-@dataclass(frozen=True, slots=True)
-class Sighting:
+class Sighting(Struct, frozen=True):
     """One peer, as this robot had heard it.
 
     Attributes:
@@ -34,8 +33,7 @@ class Sighting:
     says: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Facts:
+class Facts(Struct, frozen=True):
     """What this robot knew when it decided.
 
     Attributes:
@@ -62,8 +60,7 @@ class Facts:
     seen: tuple[Sighting, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Decision:
+class Decision(Struct, frozen=True):
     """What was decided about which component ("" for the robot), when by this robot's clock, and what it knew."""
 
     at_ns: int
@@ -72,8 +69,7 @@ class Decision:
     facts: Facts = Facts()
 
 
-@dataclass(frozen=True, slots=True)
-class Line:
+class Line(Struct, frozen=True):
     """One decision of one robot as it is kept and told.
 
     Attributes:

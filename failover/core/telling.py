@@ -8,13 +8,13 @@ read on one common clock; where those are too close to tell, the lower epoch com
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+
+from msgspec import Struct
 
 from failover.core.story import Line
 
 
-@dataclass(frozen=True, slots=True)
-class Timed:
+class Timed(Struct, frozen=True):
     """A line, and when it was by the clock of whoever tells the story; that may be wrong by ``doubt_ns`` either way."""
 
     line: Line

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import enum
 import functools
-from dataclasses import dataclass, field
+
+from msgspec import Struct, field
 
 from checkpoint.model import Position
 from failover.errors import RulesError
@@ -121,8 +122,7 @@ CARRY = "carry"
 """They are taken along where it goes on from the state in which it stood still for good: by a handover, a failback."""
 
 
-@dataclass(frozen=True, slots=True)
-class Launch:
+class Launch(Struct, frozen=True):
     """How a program begins. The rules carry it and never look inside.
 
     Attributes:
@@ -154,8 +154,7 @@ class Launch:
     connections: str = RESET
 
 
-@dataclass(frozen=True, slots=True)
-class Rules:
+class Rules(Struct, frozen=True):
     """The operator's choices for one component.
 
     Attributes:
@@ -183,8 +182,7 @@ class Rules:
             raise RulesError(f"crash_limit = {self.crash_limit}: choose between 0 and 100")
 
 
-@dataclass(frozen=True, slots=True)
-class ComponentSpec:
+class ComponentSpec(Struct, frozen=True):
     """One supervised program: its name, where it belongs, how it begins, and by which rules it lives.
 
     Attributes:
@@ -200,8 +198,7 @@ class ComponentSpec:
     owner: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Waiting:
+class Waiting(Struct, frozen=True):
     """What was started in advance: another command line, or another owner, is another program.
 
     Attributes:
@@ -213,8 +210,7 @@ class Waiting:
     keeps_state: bool
 
 
-@dataclass(frozen=True)
-class Config:
+class Config(Struct, frozen=True, dict=True):
     """What one robot's node is told at birth.
 
     Attributes:
@@ -338,8 +334,7 @@ HISTORY_MAX = 8
 """Restorable positions that are remembered per component."""
 
 
-@dataclass(frozen=True, slots=True)
-class Record:
+class Record(Struct, frozen=True):
     """What one robot must not forget about one component.
 
     Attributes:
@@ -372,15 +367,13 @@ class Record:
     bare: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Ballot:
+class Ballot(Struct, frozen=True):
     """All that a robot's rules must not forget: durable before any message that depends on it leaves."""
 
     records: tuple[Record, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Held:
+class Held(Struct, frozen=True):
     """Restorable positions that this robot's own store holds of one component, oldest first (at most ``HISTORY_MAX`` count).
 
     Attributes:
@@ -392,8 +385,7 @@ class Held:
     keeps_state: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Found:
+class Found(Struct, frozen=True):
     """A component whose guard was found alive when the agent started.
 
     Attributes:
@@ -408,8 +400,7 @@ class Found:
     status: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class PeerView:
+class PeerView(Struct, frozen=True):
     """One peer as this robot sees it: ``state`` is alive, suspect, dead or unheard; ``silent_ns`` since its last beat."""
 
     robot: str
@@ -421,8 +412,7 @@ class PeerView:
     links: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class ComponentView:
+class ComponentView(Struct, frozen=True):
     """One component as this robot sees it, for ``failover status``.
 
     Attributes:
@@ -461,8 +451,7 @@ class ComponentView:
     unstored: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class StatusView:
+class StatusView(Struct, frozen=True):
     """Everything ``failover status`` shows, seen from one robot. ``healthy`` is False when anything failed or is degraded."""
 
     robot: str

@@ -5,7 +5,7 @@ Nothing is decided here: `membership` judges, this only tells.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from msgspec import Struct, field
 
 from failover.core.component import Turn
 from failover.core.events import Event, Received
@@ -15,8 +15,7 @@ TOLD_SHARE = 2
 """An own stall is told from this part of the loyalty on: shorter ones come and go."""
 
 
-@dataclass(slots=True)
-class Watch:
+class Watch(Struct):
     """What was noticed so far.
 
     Attributes:

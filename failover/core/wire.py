@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from hashlib import blake2b
 
 import msgspec
+from msgspec import Struct
 
 from checkpoint.errors import UNDECODABLE
 from failover.core.messages import VERSION, Beat, Bulk, Entry
@@ -127,8 +128,7 @@ def _code(key: bytes, header: bytes, body: bytes) -> bytes:
     return blake2b(header + body, digest_size=_CODE_SIZE, key=key[:64], person=_PERSON).digest()
 
 
-@dataclass(slots=True)
-class _Window:
+class _Window(Struct):
     """Which beats of one sender were seen: all of earlier lives, all up to ``highest`` that ``seen`` (bit i: highest - i) has."""
 
     boot: int = 0

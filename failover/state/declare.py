@@ -8,9 +8,10 @@ class Pose:
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Final
+
+from msgspec import Struct
 
 
 class _Missing(Enum):
@@ -35,8 +36,7 @@ class Pickled:
     """In ``Annotated``: this one value is stored by pickle."""
 
 
-@dataclass(frozen=True)
-class Field:
+class Field(Struct, frozen=True, dict=True):
     """One kept field of a component.
 
     Attributes:

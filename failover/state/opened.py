@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
+
+from msgspec import Struct
 
 from failover.state.choices import AS
 from failover.state.kinds import Build, Kind, Walk
@@ -48,8 +49,7 @@ class PlainRecordKind(Kind):
         return value
 
 
-@dataclass(frozen=True, slots=True)
-class Labelled:
+class Labelled(Struct, frozen=True):
     """A value of a union, where the wire has to say of which of its types it is."""
 
     label: str

@@ -8,8 +8,9 @@ declaration that does not say so itself.
 from __future__ import annotations
 
 import pickle
-from dataclasses import dataclass
 from typing import Any
+
+from msgspec import Struct
 
 from failover.state.kinds import Build, Kind, Walk
 from failover.state.wire import Place, Wire, mark_of
@@ -20,8 +21,7 @@ PROTOCOL = 4
 """Read by every Python that we support."""
 
 
-@dataclass(frozen=True, slots=True)
-class Unread:
+class Unread(Struct, frozen=True):
     """Pickled bytes that nobody unpickled: what a migration meets in the place of a pickled value, and leaves as it is."""
 
     packed: bytes

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
 from typing import Any
+
+from msgspec import Struct
 
 from failover.errors import FitError, KeepError
 from failover.state.containers import MAP
@@ -21,8 +22,7 @@ from failover.state.kinds import FIT_CURE, Build, Kind, Walk
 from failover.state.wire import SAME, Place, Wire, entry_step, mark_of, text_of
 
 
-@dataclass(frozen=True, slots=True)
-class RecordField:
+class RecordField(Struct, frozen=True):
     """One field of a record.
 
     Attributes:

@@ -7,12 +7,12 @@ The bytes are msgpack: an array of four, [``FORMAT``, version, fingerprint, stat
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 import numpy as np
 from blake3 import blake3
+from msgspec import Struct
 
 from failover.errors import FitError, KeepError, SchemaError, StateError, StateFormatError
 from failover.state.annotations import Compiler, default_of
@@ -34,8 +34,7 @@ Migration = Callable[[Any], Any]
 (a dict), values of a union ``Labelled`` where it takes that, pickled ones ``Unread``; everything else is itself."""
 
 
-@dataclass(frozen=True, slots=True)
-class Encoded:
+class Encoded(Struct, frozen=True):
     """A state as bytes.
 
     Attributes:
@@ -47,8 +46,7 @@ class Encoded:
     regions: tuple[Region, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Decoded:
+class Decoded(Struct, frozen=True):
     """A state that was read.
 
     Attributes:
@@ -62,8 +60,7 @@ class Decoded:
     version: int
 
 
-@dataclass(frozen=True, slots=True)
-class Stored:
+class Stored(Struct, frozen=True):
     """What the bytes say of themselves, before anything is built.
 
     Attributes:
@@ -77,8 +74,7 @@ class Stored:
     shared: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Schema:
+class Schema(Struct, frozen=True):
     """How one program's state is stored. Made once, when the program starts.
 
     Attributes:

@@ -10,10 +10,10 @@ import dataclasses
 import sys
 import typing
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import msgspec
+from msgspec import Struct
 
 from failover.state.declare import MISSING
 from failover.state.records import PlainObjects, Style, attribute_reader, foreign_slots, undeclared
@@ -21,8 +21,7 @@ from failover.state.records import PlainObjects, Style, attribute_reader, foreig
 FIELDS_SET = "__fields_set__"
 
 
-@dataclass(frozen=True, slots=True)
-class Member:
+class Member(Struct, frozen=True):
     """A field as its class declares it.
 
     Attributes:
@@ -37,8 +36,7 @@ class Member:
     optional: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Record:
+class Record(Struct, frozen=True):
     """A class of records: its fields in order, and its objects."""
 
     members: tuple[Member, ...]

@@ -9,11 +9,11 @@ import signal
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import pytest
+from msgspec.structs import replace
 
 from agent import births, nursery
 from agent.births import Program

@@ -6,10 +6,10 @@ import os
 import random
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from checkpoint.arch import cpu, stubs
 from checkpoint.engines.restore_memory import content_at

@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from checkpoint.arch import x86_64_xstate as xstate
 from checkpoint.arch.x86_64_xstate import Component, Layout

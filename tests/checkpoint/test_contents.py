@@ -6,11 +6,11 @@ import itertools
 import os
 import stat
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from blake3 import blake3
+from msgspec.structs import replace
 
 from checkpoint import contents as keeping
 from checkpoint.channel import memfd_holding

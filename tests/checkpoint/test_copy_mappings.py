@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from msgspec.structs import replace
 
 from checkpoint import pages
 from checkpoint.engines.copy_mappings import NO_PAGES, Change

@@ -8,10 +8,10 @@ import os
 import signal
 import subprocess
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from agent.freezer import SignalFreezer
 from checkpoint.engine import CaptureOrder, ProtectOrder

@@ -6,9 +6,9 @@ import errno
 import os
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from checkpoint import channel, foreign
 from checkpoint.chain import position_of

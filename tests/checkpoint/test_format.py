@@ -8,12 +8,12 @@ import resource
 import subprocess
 import sys
 import threading
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from checkpoint import format, layout, validity
 from checkpoint.errors import FormatError

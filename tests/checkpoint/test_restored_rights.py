@@ -6,10 +6,10 @@ import os
 import socket
 import stat
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from checkpoint.arch import stubs
 from checkpoint.linux import procfs

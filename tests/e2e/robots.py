@@ -13,9 +13,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
+
+from msgspec.structs import replace
 
 from failover.cli.demo import robots as demo
 from failover.cli.demo.robots import CABLES, Means, RobotMachine, Stage, agent_command, ip_inside

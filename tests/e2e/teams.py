@@ -5,8 +5,9 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
+
+from msgspec.structs import replace
 
 from failover.cli import keys
 from failover.cli.demo.robots import RobotMachine, Stage, agent_command, free_ports, host_command

@@ -9,11 +9,11 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from failover.cli.demo.robots import RobotMachine, Stage
 from tests.checkpoint.test_carried_files import COUNTER

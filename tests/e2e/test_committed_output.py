@@ -15,11 +15,11 @@ import time
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 import pytest
+from msgspec.structs import replace
 
 from agent.pump import HOLD_LIMIT, READ_SIZE
 from failover.cli.demo.robots import RobotMachine, Stage

@@ -6,8 +6,9 @@ Everything takes a while and may fail.
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
 
 from checkpoint.model import Position
 from failover.core import acts

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from typing import Any
 from unittest.mock import patch
+
+from msgspec.structs import replace
 
 from failover.core import acts, archive, contest, election, endings, handover, lease, majority, node, replication, warmth
 from failover.core.component import Component, Turn

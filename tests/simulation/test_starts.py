@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import permutations
 from random import Random
 
 import pytest
+from msgspec.structs import replace
 
 from failover.core.names import weight
 from failover.core.types import MS, ComponentSpec, Config, Launch, Rule, State

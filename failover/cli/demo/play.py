@@ -9,9 +9,10 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from failover.cli import picture, render
 from failover.cli.demo import programs, robots
@@ -46,8 +47,7 @@ DRAW_S: Final = 0.1
 RESULT_COLUMNS: Final = ("program", "outage", "lag at the cut", "freeze median", "freeze max", "output", "equal")
 
 
-@dataclass(slots=True)
-class Act:
+class Act(Struct):
     """One program in the play, and what was seen of it.
 
     Attributes:

@@ -16,9 +16,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
+
+from msgspec import Struct
 
 from failover.cli import keys
 from failover.cli.demo.host import descendants
@@ -55,8 +56,7 @@ GO: Final = b"g"
 """What a host waits for before it starts its agent."""
 
 
-@dataclass(frozen=True, slots=True)
-class Means:
+class Means(Struct, frozen=True):
     """What this machine allows: each True makes the robots more like two machines."""
 
     own_pids: bool
@@ -98,8 +98,7 @@ def host_command(own_pids: bool, command: list[str]) -> list[str]:
     return [sys.executable, "-m", "failover.cli.demo.host", *(["--pids"] if own_pids else []), "--", *command]
 
 
-@dataclass(slots=True)
-class RobotMachine:
+class RobotMachine(Struct):
     """One robot: its host process and how to talk to its agent.
 
     Attributes:

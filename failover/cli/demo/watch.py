@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct, field
 
 from failover.client.control import Control, Output
 from failover.errors import FailoverError
@@ -15,8 +16,7 @@ AGAIN_S: Final = 0.02
 """Pause before asking an agent again that does not know the component yet."""
 
 
-@dataclass(slots=True)
-class Watcher:
+class Watcher(Struct):
     """Follows standard output and standard error of one component on one robot, in a thread of its own.
 
     Attributes:
