@@ -10,6 +10,7 @@ As root more is measured (CRIU, beats on the wire). Nothing else should run mean
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import tempfile
@@ -109,6 +110,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
 def main() -> int:
     """Measure, print, write."""
     arguments = _parser().parse_args()
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # of what is installed the bytecode is there
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that whatever was started is ended
     share = machine.busy_share()
     warning = machine.warning(share)

@@ -47,8 +47,8 @@ def costs(quick: bool, directory: Path) -> Findings:
     return Findings(
         "What protection takes",
         f"The work of a Python program with {RESIDENT_MB} MB resident that writes 4 MB/s, protected and released in turns, "
-        f"{WINDOW_S} s each, by snapshots a second, on a machine that plays both robots, without a ready copy; processor time of "
-        "the processes of the robot that runs it. Bytes of a delta's file, which is what travels, per byte of its pages: of a "
+        f"{WINDOW_S:g} s each, by snapshots a second, on a machine that plays both robots, without a ready copy; processor time "
+        "of the processes of the robot that runs it. Bytes of a delta's file, which is what travels, per byte of its pages: of a "
         f"Python program with {CELLS:,} objects in a dictionary, {CHANGES} of them replaced each 50 ms. What an agent takes that "
         "protects nothing (beats each 20 ms; guard and keeper wait in advance for the first program).",
         tuple(figures),
