@@ -41,6 +41,9 @@ CALL_S: Final = 30.0
 FILES: Final = 65536
 """Descriptors that it may have, as its unit says."""
 
+COLLECTED_AFTER: Final = 512
+"""Requests after which what holds itself (an error and the frames that it came through) is looked for."""
+
 STREAM_DESCRIPTORS: Final = 5
 """Counters, two outputs, two logs: what a message brings along for streams."""
 
@@ -83,8 +86,10 @@ class Keeper:
         try:
             with waking() as await_readable:  # who is held and killed meanwhile waits for us
                 while True:
-                    await_readable(self._link.fileno())
-                    self._serve_one()
+                    for _ in range(COLLECTED_AFTER):
+                        await_readable(self._link.fileno())
+                        self._serve_one()
+                    gc.collect()
         except ChannelClosedError:
             pass
         finally:
@@ -402,7 +407,8 @@ def main(arguments: list[str]) -> int:
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # a Ctrl-C at the terminal is for our peer to act on
     _allow_many_files()
-    gc.disable()  # no collection inside a freeze; what a capture makes is freed by counting
+    gc.disable()  # no collection inside a freeze: nearly all that a capture makes is freed by counting
+    gc.freeze()
     try:
         end = socket.socket(fileno=int(arguments[1])) if arguments[1].isdigit() else called_at(arguments[1])
     except OSError as error:

@@ -100,7 +100,7 @@ class SeenOthers(Struct):
     ended: tuple[tuple[Status, Stat], ...]
     taken: list[tuple[CapturedProcess, Look]] = field(default_factory=list)
     processes: list[SeenProcess] = field(default_factory=list)
-    later: list[tuple[CapturedProcess, Callable[[], SeenProcess]]] = field(default_factory=list)
+    later: list[tuple[CapturedProcess, Callable[[SeenOthers], SeenProcess]]] = field(default_factory=list)
 
     @property
     def pids(self) -> frozenset[int]:
@@ -121,7 +121,7 @@ class SeenOthers(Struct):
         for process, tell in self.later:
             try:
                 with _gone_if_ended(process.pid):
-                    self.processes.append(tell())
+                    self.processes.append(tell(self))
                 if not process.onlooker.is_entered():
                     raise MovedError(f"process {process.pid} has executed another program; capture it again")
             except ProcessGoneError as error:
@@ -208,7 +208,10 @@ class CapturedTree:
         self._kin.close()
         for process in self._known.values():
             process.close()
+        for met in self._met.values():
+            met.threads.close()
         self._known.clear()
+        self._met.clear()
 
     def follow(self, first: CapturedProcess) -> None:
         """The first process is looked at anew."""
@@ -232,7 +235,8 @@ class CapturedTree:
         others = self._kin.others()
         for pid in [pid for pid, known in self._known.items() if pid not in others or not _is_same(known)]:
             self._forget(pid)
-        self._met = {pid: met for pid, met in self._met.items() if pid in others}
+        for pid in [pid for pid in self._met if pid not in others]:
+            self._met.pop(pid).threads.close()
         self._first.threads.is_one_of_many = bool(others)
         if not others:
             return
@@ -276,6 +280,8 @@ class CapturedTree:
         """
         met = self._met.get(pid)
         if met is None or met.born != procfs.stat(pid).start_time:
+            if met is not None:
+                self._met.pop(pid).threads.close()
             met = self._met[pid] = Met.of(pid)
             met.threads.is_one_of_many = True
         return met
@@ -402,9 +408,9 @@ class CapturedTree:
                     told |= process.memory.shared_places()
                     stopped_by = 0 if is_held else threads.leader.stopped_by
                     seen.taken.append((process, look))
-                    tell = functools.partial(_told_of, process, look, seen, around, stopped_by)
+                    tell = functools.partial(_told_of, process, look, around, stopped_by)  # not of `seen`, which holds it
                     if process.is_new:
-                        seen.processes.append(tell())
+                        seen.processes.append(tell(seen))
                     else:
                         seen.later.append((process, tell))
             except ProcessGoneError as error:
@@ -502,7 +508,7 @@ def _end_of(pid: int) -> tuple[Status, Stat] | None:
         time.sleep(0.0005)
 
 
-def _told_of(process: CapturedProcess, look: Look, seen: SeenOthers, around: Surroundings, stopped_by: int) -> SeenProcess:
+def _told_of(process: CapturedProcess, look: Look, around: Surroundings, stopped_by: int, seen: SeenOthers) -> SeenProcess:
     """All that is said of a process.
 
     Args:

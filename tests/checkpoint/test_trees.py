@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import subprocess
@@ -14,11 +15,13 @@ import pytest
 
 from checkpoint import tree
 from checkpoint.engine import CaptureOrder, RestoreOptions
+from checkpoint.engines.captured_process import CapturedProcess, Look
+from checkpoint.engines.captured_tree import SeenOthers
 from checkpoint.engines.probe import probe
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import kinship, procfs
 from checkpoint.linux.vessel import Birth, spawn_vessel
-from checkpoint.model import Resource, Snapshot
+from checkpoint.model import ProcessState, Resource, Snapshot
 from checkpoint.resources import OpenFile, Surroundings, pidfds
 from tests.checkpoint.round_trip import (
     ENGINE,
@@ -247,7 +250,8 @@ def test_captures_that_race_with_births_and_ends_of_processes_lose_nothing(tmp_p
                 snapshot = captured_at_last(session, CaptureOrder(base=sequence % 10 == 1, sequence=sequence))
                 if sequence % 2:
                     session.acknowledge(snapshot.position)
-        assert sorted(os.listdir("/proc/self/fd")) == before
+        now = {n: os.readlink(f"/proc/self/fd/{n}") for n in os.listdir("/proc/self/fd") if os.path.lexists(f"/proc/self/fd/{n}")}
+        assert sorted(os.listdir("/proc/self/fd")) == before, {n: w for n, w in now.items() if n not in before}
         assert not any(tracers((program.pid, *kinship.descendants(program.pid))))
         size = (tmp_path / "lines").stat().st_size
         program.wait_until(lambda: (tmp_path / "lines").stat().st_size > size + 20, "that it goes on")
@@ -258,6 +262,31 @@ def test_captures_that_race_with_births_and_ends_of_processes_lose_nothing(tmp_p
         program.wait_until(lambda: (tmp_path / "lines").stat().st_size > len(lines) + 20, "that it goes on")
     numbers = [int(line) for line in (tmp_path / "lines").read_text().split()]
     assert numbers == list(range(1, len(numbers) + 1)), "none is missing, none came twice"
+
+
+def test_a_capture_that_breaks_off_while_it_describes_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = start(["/bin/sh", "-c", "sleep 1000 & sleep 1000 & wait"], tmp_path, isolate=True)
+    describe, gone = CapturedProcess.process, [True]
+
+    def ends_once(process: CapturedProcess, look: Look) -> ProcessState:
+        if gone and process.slot:
+            gone.clear()
+            raise ProcessGoneError(f"process {process.pid} has ended")
+        return describe(process, look)
+
+    with ended(program), protected(program) as session:
+        session.acknowledge(captured_at_last(session, CaptureOrder(sequence=1)).position)
+        monkeypatch.setattr(CapturedProcess, "process", ends_once)
+        gc.collect()
+        gc.disable()
+        try:
+            session.capture(CaptureOrder(sequence=2))
+            assert not gone, "one broke off"
+            assert [one for one in gc.get_objects() if isinstance(one, SeenOthers)] == []
+        finally:
+            gc.enable()
 
 
 POOL = """

@@ -1,0 +1,50 @@
+"""A keeper lives for weeks, and no collection may fall into a freeze: it looks for garbage itself, between requests."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+from checkpoint import channel, keeper
+from checkpoint.channel import Channel, Reply
+
+MAKES_GARBAGE = """
+import os, sys, weakref
+from checkpoint import keeper
+from checkpoint.errors import ProbeError
+
+class Held:
+    pass
+
+class Tracer:
+    name = "ptrace"
+
+    def probe(self, pid):
+        one = Held()
+        one.itself = one
+        weakref.finalize(one, print, "collected", flush=True)
+        raise ProbeError("it may not")
+
+keeper.engine.engine_named = lambda name: Tracer()
+os._exit(keeper.main(["keeper", sys.argv[1]]))
+"""
+
+
+def test_what_holds_itself_is_found_after_some_requests() -> None:
+    ours, theirs = channel.pair()
+    command = [sys.executable, "-c", MAKES_GARBAGE, str(theirs.fileno())]
+    with theirs:
+        process = subprocess.Popen(
+            command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
+        )
+    link: Channel[Reply] = Channel(ours, Reply)
+    try:
+        for _ in range(keeper.COLLECTED_AFTER):
+            link.send(channel.Probe(1))
+            reply, _ = link.receive()
+            assert isinstance(reply, channel.Failed)
+    finally:
+        link.close()
+        told, _ = process.communicate()
+    assert told == "collected\n" * keeper.COLLECTED_AFTER
+    assert process.returncode == 0
