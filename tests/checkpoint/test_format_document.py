@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from pathlib import Path
 from typing import Any
@@ -40,8 +39,6 @@ MAPS = {
 
 
 def fields_of(kind: Any) -> list[str]:
-    if dataclasses.is_dataclass(kind):
-        return [field.name for field in dataclasses.fields(kind)]
     return [field.name for field in msgspec.structs.fields(kind)]
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from blake3 import blake3
+from msgspec.structs import replace
 
 from checkpoint import program_files
 from checkpoint.linux.brought import BroughtFile
@@ -213,8 +214,6 @@ def test_a_resource_that_says_anything_else_names_no_file() -> None:
 
     made = snapshot({1: page("x")})
     facts = {"files": [["/a/../etc/shadow", 1, bytes(32), 0o4755], ["relative", 1, b"", 0], "x", ["/fine", 1, bytes(32), 0o6755]]}
-    from dataclasses import replace
-
     found = program_of(replace(made, resources=(Resource("program", "/test", facts),)))  # type: ignore[arg-type]
     assert [(file.path, file.mode) for file in found] == [("/fine", 0o755)]
 

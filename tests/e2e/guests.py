@@ -8,7 +8,6 @@ import os
 import subprocess
 import tarfile
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -54,7 +53,6 @@ def _card(name: str, backend: str) -> tuple[str, ...]:
     return ("-netdev", backend, "-device", f"virtio-net-pci,netdev=wire,mac={address_of_card(name)},romfile=")
 
 
-@dataclass(slots=True)
 class Guest(RobotMachine):
     """A robot that is an emulated machine. Its agent's socket has an end here, by ssh, whose process is ``process``."""
 
