@@ -1,6 +1,6 @@
 """What the heart and the lanes say to each other, over a `checkpoint.channel` between the two processes.
 
-The core's acts and events are plain dataclasses; each travels as its class name and its msgpack.
+The core's acts and events are plain Structs; each travels as its class name and its msgpack.
 """
 
 from __future__ import annotations
