@@ -245,16 +245,16 @@ class MemoryCapture:
         buffer = np.empty(pages.total_size(wanted) + ROOM_SIZE, dtype=np.uint8).data
         found, filled = [], 0
         chunks = digests.chunks_of(wanted)
-        ends = list(itertools.accumulate(map(pages.total_size, chunks)))
+        bounds = itertools.pairwise(itertools.accumulate(map(pages.total_size, chunks), initial=0))
+        places = [(chunk, begin, end) for chunk, (begin, end) in zip(chunks, bounds, strict=True)]
 
-        def read(place: tuple[Words, int]) -> Words:
-            chunk, end = place
-            return Memory(self._memory.pid).readable_pages_into(chunk, buffer[end - pages.total_size(chunk) : end])
+        def read(place: tuple[Words, int, int]) -> Words:
+            chunk, begin, end = place
+            return Memory(self._memory.pid).readable_pages_into(chunk, buffer[begin:end])
 
-        threads = self.readers if len(chunks) > 1 else 1
-        answers = side_by_side.in_order(read, zip(chunks, ends, strict=True), threads)
-        for chunk, end, readable in zip(chunks, ends, answers, strict=True):
-            size, begin = pages.total_size(readable), end - pages.total_size(chunk)
+        answers = side_by_side.in_order(read, places, self.readers if len(places) > 1 else 1)
+        for (_, begin, _), readable in zip(places, answers, strict=True):
+            size = pages.total_size(readable)
             if begin != filled:  # of one before it there was less than was wanted
                 buffer[filled : filled + size] = buffer[begin : begin + size]
             found.append(readable)

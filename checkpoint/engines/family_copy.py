@@ -48,7 +48,6 @@ from checkpoint.model import Position, Snapshot, Vma
 from checkpoint.pages import Words
 from checkpoint.resources import carried_connections, joint
 
-CLONE_FILES: Final = 0x400
 STANDARD: Final = frozenset((0, 1, 2))
 PUNCH_HOLE: Final = 1 | 2
 """FALLOC_FL_KEEP_SIZE, FALLOC_FL_PUNCH_HOLE."""
@@ -95,7 +94,7 @@ class MemberCopy(ReadyCopy):
     def own_table(self, others: Iterable[MemberCopy]) -> None:
         """Part with the common table of descriptors, and close what others have in it."""
         table = CallTable(self._stub.base)
-        table.call("have a table of descriptors alone", "unshare", CLONE_FILES)
+        table.call("have a table of descriptors alone", "unshare", joint.CLONE_FILES)
         for other in others:
             if other is not self and other._executable is not None:
                 table.close(other._executable)
@@ -120,7 +119,7 @@ class FamilyCopy(TreeRestore):
         torn: a delta was begun and not finished; nothing can be made of it any more.
     """
 
-    _born_with = CLONE_FILES
+    _born_with = joint.CLONE_FILES
 
     def __init__(self, vessel_pid: int, base: Snapshot, options: RestoreOptions) -> None:
         super().__init__(vessel_pid, base, options, tuple(Brought() for _ in base.processes))
