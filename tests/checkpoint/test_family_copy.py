@@ -16,13 +16,13 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from checkpoint import chain, format, pages
+from checkpoint import chain, pages
 from checkpoint.engine import CaptureOrder, RestoreOptions
 from checkpoint.engines import ready_copy, restore_memory, restore_threads
 from checkpoint.engines.family_copy import FamilyCopy
 from checkpoint.engines.ptrace_restore import RestoredProgram
 from checkpoint.engines.restore_memory import KERNEL_NAMES
-from checkpoint.errors import CaptureError, ChainError, FormatError, RestoreError, UnsupportedError
+from checkpoint.errors import CaptureError, RestoreError, UnsupportedError
 from checkpoint.hot_pages import Sender
 from checkpoint.linux import procfs
 from checkpoint.linux.memory import Memory
@@ -42,7 +42,7 @@ from tests.checkpoint.round_trip import (
     start,
     transported,
 )
-from tests.checkpoint.test_ready_copy import age_ns, base_of, deltas_of, vessel_for
+from tests.checkpoint.test_ready_copy import age_ns, base_of, deltas_of, takes_whole_continuing_deltas_only, vessel_for
 from tests.checkpoint.test_tree_states import BORN_LATE, PREAMBLE, STOPPED, shared_out
 from tests.checkpoint.test_trees import FAMILY, POOL
 
@@ -308,15 +308,7 @@ def test_what_does_not_continue_it_or_has_not_come_whole_changes_nothing_of_any_
     with ended(mutable(tmp_path)) as program, protected(program) as session:
         base = base_of(session)
         with laid(base, tmp_path) as standby:
-            first, second = deltas_of(session, random.Random(3), 2)
-            with pytest.raises(ChainError):
-                standby.copy.advance(second)
-            whole = format.encode_bytes(first)
-            with pytest.raises(FormatError):
-                standby.copy.advance(format.decode(whole[: len(whole) // 2]))
-            assert not standby.copy.torn
-            standby.copy.advance(first)
-            standby.copy.advance(second)
+            takes_whole_continuing_deltas_only(standby.copy, session)
             program.kill()
             goes_on_to_its_end(standby.becomes_the_program())
 

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import pytest
 
 from checkpoint import channel, format, room
-from checkpoint.engine import COPY_CLOCKS_AHEAD_NS, CaptureOrder, RestoreOptions, Session
+from checkpoint.engine import COPY_CLOCKS_AHEAD_NS, CaptureOrder, Copy, RestoreOptions, Session
 from checkpoint.engines import ready_copy, restore_memory
 from checkpoint.engines.ready_copy import ReadyCopy
 from checkpoint.errors import CaptureError, ChainError, FormatError, RestoreError, UnsupportedError
@@ -145,20 +145,25 @@ def test_a_delta_that_breaks_off_halfway_leaves_a_torn_copy_of_which_nothing_is_
                         use()
 
 
+def takes_whole_continuing_deltas_only(copy: Copy, session: Session) -> None:
+    """Two deltas that come in the wrong order, then in halves, then as they should."""
+    first, second = deltas_of(session, random.Random(3), 2)
+    with pytest.raises(ChainError):
+        copy.advance(second)
+    whole = format.encode_bytes(first)
+    with pytest.raises(FormatError):
+        copy.advance(format.decode(whole[: len(whole) // 2]))
+    assert not copy.torn
+    copy.advance(first)
+    copy.advance(second)
+
+
 def test_what_does_not_continue_a_copy_or_has_not_come_whole_changes_nothing(compiled: Compiled, tmp_path: Path) -> None:
     with ended(start_tracee(compiled("mutator", "-O2"), tmp_path, "wp", "1", "1000000", NAP_US, isolate=True)) as tracee:
         with protected(tracee) as session:
             base = base_of(session)
             with laid(base, tmp_path) as standby:
-                first, second = deltas_of(session, random.Random(3), 2)
-                with pytest.raises(ChainError):
-                    standby.copy.advance(second)
-                whole = format.encode_bytes(first)
-                with pytest.raises(FormatError):
-                    standby.copy.advance(format.decode(whole[: len(whole) // 2]))
-                assert not standby.copy.torn
-                standby.copy.advance(first)
-                standby.copy.advance(second)
+                takes_whole_continuing_deltas_only(standby.copy, session)
                 tracee.kill()
                 back = standby.becomes_the_program()
                 back.tell()

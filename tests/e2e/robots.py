@@ -107,6 +107,17 @@ def until_taken_over(robot: RobotMachine, name: str = "count") -> None:
     until(lambda: component(robot, name).get("restores"), f"{robot.name} to resume {name}")
 
 
+def counts_on_elsewhere(first: RobotMachine, second: RobotMachine, more: int) -> None:
+    """A component counts, the first robot's power is cut, and it goes on at the second: each number once."""
+    until(lambda: len(numbers(first)) > more, "some numbers")
+    first.cut_power()
+    until_taken_over(second)
+    before = len(numbers(second))
+    until(lambda: len(numbers(second)) > before + more, "it to go on")
+    counted = numbers(second)
+    assert counted == list(range(len(counted))), "each number once, in order"
+
+
 def until_status(robot: RobotMachine, returncode: int, *words: str) -> str:
     """What `failover status` shows there, once it ends with this exit status and says all the words."""
     shown: subprocess.CompletedProcess[str] | None = None

@@ -59,13 +59,7 @@ def test_a_program_of_several_processes_goes_on_from_its_ready_copy(tmp_path: Pa
         robots.until(lambda: copy_at(second)["position"] != shown["position"], "the copy to be brought on")
         robots.until(lambda: "robot2, ready" in robots.failover(first, "status").stdout, "the primary to know")
         assert "ready copy at robot2" in robots.failover(second, "status").stdout
-        robots.until(lambda: len(robots.numbers(first)) > 30, "some numbers")
-        first.cut_power()
-        robots.until_taken_over(second)
-        before = len(robots.numbers(second))
-        robots.until(lambda: len(robots.numbers(second)) > before + 30, "it to go on")
-        counted = robots.numbers(second)
-        assert counted == list(range(len(counted))), "each number once, in order"
+        robots.counts_on_elsewhere(first, second, 30)
         told = robots.failover(second, "why", "count").stdout
         assert "taking the ready copy" in told
         assert "its descriptors, timers and registers" in told, "and it was not restored from its chain instead"

@@ -56,10 +56,4 @@ def test_all_threads_of_a_program_go_on_at_the_other_robot(tmp_path: Path) -> No
     with robots.two_robots(tmp_path, "") as (first, second):
         robots.run(first, "count", "/usr/bin/python3", "-S", "-c", COUNTING)
         robots.until_protected(first)
-        robots.until(lambda: len(robots.numbers(first)) > 50, "some numbers")
-        first.cut_power()
-        robots.until_taken_over(second)
-        before = len(robots.numbers(second))
-        robots.until(lambda: len(robots.numbers(second)) > before + 50, "it to go on")
-        counted = robots.numbers(second)
-        assert counted == list(range(len(counted))), "each number once, in order"
+        robots.counts_on_elsewhere(first, second, 50)
