@@ -7,51 +7,26 @@ and what does not hold together is refused with FormatError, whatever the bytes.
 
 from __future__ import annotations
 
-import errno
 import io
-import mmap
-import os
-import stat
 import struct
-from collections.abc import Iterable, Iterator
-from contextlib import closing, contextmanager
-from queue import SimpleQueue
-from typing import BinaryIO, Protocol
+from collections.abc import Iterable
+from contextlib import closing
 
-import zstandard
 from blake3 import blake3
 from msgspec import Struct
 from msgspec.structs import replace
 
-from checkpoint import layout, pages, side_by_side, state
+from checkpoint import compression, layout, pages, side_by_side, state
 from checkpoint.arrays import NDArray, np
+from checkpoint.byte_sources import Reader, Source, opened
 from checkpoint.differences import Rows
 from checkpoint.errors import FormatError
-from checkpoint.layout import Codec, FrameHead, Preamble, Section, SectionKind
+from checkpoint.frames import Frame, Packer, Sink, check_digest, frames_of, read_frame, write_all, write_frame
+from checkpoint.layout import Codec, Preamble, Section, SectionKind
 from checkpoint.model import PageCopy, PageRun, Snapshot
 from checkpoint.pages import Flags, Words
 from checkpoint.state import Header
 from checkpoint.validity import check_snapshot
-
-Source = int | str | os.PathLike[str] | bytes | bytearray | memoryview | mmap.mmap | BinaryIO
-"""Where a file's bytes are: a descriptor, a path, the bytes themselves, or an open file. Read from its first byte on."""
-
-
-class Sink(Protocol):
-    """Where a file goes: a binary file, or anything that takes bytes and says how many."""
-
-    def write(self, content: bytes | memoryview, /) -> int | None: ...
-
-
-COMPRESSION_LEVEL = -1
-"""zstd's fastest useful level: about 1 GB/s and 5× on a Python heap, 2.7 GB/s on what does not compress.
-
-The same for every link: levels 1 and 3 make a Python heap's base 3 and 4 % smaller, its deltas 5 and 10 % (``python -m benchmarks
-encoding``), which no link is slow enough to be asked for.
-"""
-
-WORTH_COMPRESSING = 15 / 16
-"""A frame is stored compressed when that takes less than this part of its size."""
 
 WORTH_THREADS = 8
 """Frames that are worth threads of their own."""
@@ -80,18 +55,17 @@ def encode(snapshot: Snapshot, file: Sink, *, threads: int = 1) -> int:
     """
     check_snapshot(snapshot)
     contents = memoryview(snapshot.contents).cast("B")
-    compressor = zstandard.ZstdCompressor(level=COMPRESSION_LEVEL)
-    sections, stored = _pack_sections(snapshot, compressor)
+    sections, stored = _pack_sections(snapshot)
     preamble = Preamble(len(contents), sections, _version_of(snapshot))
     seal = blake3(preamble.pack())
-    _write_all(file, preamble.pack() + b"".join(stored))
+    write_all(file, preamble.pack() + b"".join(stored))
     offset = preamble.frames_offset
     raws = (contents[index * layout.FRAME_SIZE :][: layout.FRAME_SIZE] for index in range(preamble.frame_count))
-    with closing(side_by_side.in_order(_Packer(threads), raws, _worth(threads, preamble))) as bodies:
+    with closing(side_by_side.in_order(Packer(threads), raws, _worth(threads, preamble))) as bodies:
         for body in bodies:
-            offset += _write_frame(file, body, offset, seal)
+            offset += write_frame(file, body, offset, seal)
     file_size = offset + layout.TRAILER_SIZE
-    _write_all(file, layout.pack_trailer(file_size, seal))
+    write_all(file, layout.pack_trailer(file_size, seal))
     return file_size
 
 
@@ -112,7 +86,7 @@ def encode_bytes(snapshot: Snapshot) -> bytes:
     return file.getvalue()
 
 
-def _pack_sections(snapshot: Snapshot, compressor: zstandard.ZstdCompressor) -> tuple[tuple[Section, ...], list[bytes]]:
+def _pack_sections(snapshot: Snapshot) -> tuple[tuple[Section, ...], list[bytes]]:
     """The section table, and the stored bytes of every section."""
     raw = {
         SectionKind.HEADER: state.encode_header(state.header_of(snapshot)),
@@ -120,75 +94,18 @@ def _pack_sections(snapshot: Snapshot, compressor: zstandard.ZstdCompressor) -> 
         SectionKind.RUNS: _pack_runs(snapshot),
         SectionKind.OUTPUT: state.encode_output(snapshot.output),
     }
+    compressor = compression.compressor()
     sections: list[Section] = []
     stored: list[bytes] = []
     offset = layout.PREAMBLE_SIZE
     for kind, content in raw.items():
         layout.check_sizes(f"section {kind.name.lower()}", Codec.RAW, len(content), len(content), layout.SECTION_LIMITS[kind])
         # The header stays readable without a decompressor.
-        codec, body = (Codec.RAW, content) if kind is SectionKind.HEADER else _stored(content, compressor)
+        codec, body = (Codec.RAW, content) if kind is SectionKind.HEADER else compression.stored(content, compressor)
         sections.append(Section(kind, codec, offset, len(body), len(content), layout.digest_of(body)))
         stored.append(bytes(body))
         offset += len(body)
     return tuple(sections), stored
-
-
-def _stored(raw: bytes | memoryview, compressor: zstandard.ZstdCompressor) -> tuple[Codec, bytes | memoryview]:
-    """Compressed where it is worth it."""
-    compressed = compressor.compress(raw)
-    if len(compressed) < len(raw) * WORTH_COMPRESSING:
-        return Codec.ZSTD, compressed
-    return Codec.RAW, raw
-
-
-class _Body(Struct, frozen=True):
-    """A frame that is ready to be written, wherever it will lie."""
-
-    codec: Codec
-    content: bytes | memoryview
-    raw_size: int
-    digest: bytes
-
-
-class _Packer:
-    """Makes bodies of frames, in several threads at once: each borrows a compressor, for none may be used twice at a time."""
-
-    def __init__(self, threads: int) -> None:
-        self._compressors: SimpleQueue[zstandard.ZstdCompressor] = SimpleQueue()
-        for _ in range(threads):
-            self._compressors.put(zstandard.ZstdCompressor(level=COMPRESSION_LEVEL))
-
-    def __call__(self, raw: memoryview) -> _Body:
-        compressor = self._compressors.get()
-        try:
-            codec, content = _stored(raw, compressor)
-        finally:
-            self._compressors.put(compressor)
-        return _Body(codec, content, len(raw), layout.digest_of(content))
-
-
-def _write_frame(file: Sink, body: _Body, offset: int, seal: blake3) -> int:
-    """Write one frame whose head lies at ``offset``; answer how many bytes it took."""
-    padding = layout.padding_at(offset, body.codec)
-    head = FrameHead(body.codec, padding, len(body.content), body.raw_size, body.digest).pack()
-    seal.update(head)
-    _write_all(file, head + bytes(padding))
-    _write_all(file, body.content)
-    return len(head) + padding + len(body.content)
-
-
-def _write_all(file: Sink, content: bytes | memoryview) -> None:
-    """Write all of it: an unbuffered file may take less at a time.
-
-    Raises:
-        OSError: it takes nothing more, and says no reason.
-    """
-    rest = memoryview(content)
-    while rest:
-        taken = file.write(rest)
-        if not taken:
-            raise OSError(errno.EIO, "the file takes nothing more")
-        rest = rest[taken:]
 
 
 def _pack_runs(snapshot: Snapshot) -> bytes:
@@ -220,19 +137,19 @@ def decode(source: Source, max_contents_size: int = layout.MAX_CONTENTS_SIZE, *,
     Raises:
         FormatError: not a whole, unaltered snapshot of a version that we read; says what and where.
     """
-    with _opened(source) as reader:
+    with opened(source) as reader:
         preamble = _read_preamble(reader)
         outline = _read_outline(reader, preamble)
         if preamble.contents_size > max_contents_size:
             raise FormatError(f"preamble: claims {preamble.contents_size} bytes of pages; the limit here is {max_contents_size}")
         contents = np.empty(preamble.contents_size, dtype=np.uint8).data
 
-        def read(numbered: tuple[int, _Frame]) -> None:
+        def read(numbered: tuple[int, Frame]) -> None:
             index, frame = numbered
             target = contents[index * layout.FRAME_SIZE :][: frame.head.raw_size]
-            _read_frame(reader, frame, target, zstandard.ZstdDecompressor())
+            read_frame(reader, frame, target, compression.Decompressor())
 
-        frames = enumerate(_frames(reader, preamble))
+        frames = enumerate(frames_of(reader, preamble))
         for _ in side_by_side.in_order(read, frames, _worth(threads, preamble)):
             pass
     return replace(outline, contents=contents.toreadonly())
@@ -244,7 +161,7 @@ def read_header(source: Source) -> Header:
     Raises:
         FormatError: no header of ours; the rest of the file is not looked at.
     """
-    with _opened(source) as reader:
+    with opened(source) as reader:
         preamble = _read_preamble(reader)
         return _read_header(reader, preamble)
 
@@ -255,7 +172,7 @@ def read_outline(source: Source) -> Snapshot:
     Raises:
         FormatError: as ``decode``; the pages are not looked at.
     """
-    with _opened(source) as reader:
+    with opened(source) as reader:
         return _read_outline(reader, _read_preamble(reader))
 
 
@@ -271,7 +188,7 @@ def read_pages(source: Source, wanted: Words) -> tuple[Snapshot, Flags, Rows]:
     Raises:
         FormatError: as ``decode``; frames without any of these pages are not looked at.
     """
-    with _opened(source) as reader:
+    with opened(source) as reader:
         preamble = _read_preamble(reader)
         outline = _read_outline(reader, preamble)
         page_size = outline.machine.page_size
@@ -280,10 +197,10 @@ def read_pages(source: Source, wanted: Words) -> tuple[Snapshot, Flags, Rows]:
         frame_of = places * page_size // layout.FRAME_SIZE
         needed = set(frame_of.tolist())
         buffer = np.empty(layout.FRAME_SIZE, dtype=np.uint8)
-        decompressor = zstandard.ZstdDecompressor()
-        for index, frame in enumerate(_frames(reader, preamble)):
+        decompressor = compression.Decompressor()
+        for index, frame in enumerate(frames_of(reader, preamble)):
             if index in needed:
-                _read_frame(reader, frame, buffer.data[: frame.head.raw_size], decompressor)
+                read_frame(reader, frame, buffer.data[: frame.head.raw_size], decompressor)
                 ours = frame_of == index
                 rows[ours] = buffer.reshape(-1, page_size)[places[ours] - index * (layout.FRAME_SIZE // page_size)]
     return outline, found, rows
@@ -318,26 +235,26 @@ def verified_outline(source: Source) -> Snapshot:
     Raises:
         FormatError: as ``decode``.
     """
-    with _opened(source) as reader:
+    with opened(source) as reader:
         preamble = _read_preamble(reader)
         outline = _read_outline(reader, preamble)
-        for frame in _frames(reader, preamble):
-            _check_digest(reader.read(frame.body_offset, frame.head.stored_size), frame)
+        for frame in frames_of(reader, preamble):
+            check_digest(reader.read(frame.body_offset, frame.head.stored_size), frame)
     return outline
 
 
-def _read_preamble(reader: _Reader) -> Preamble:
+def _read_preamble(reader: Reader) -> Preamble:
     return Preamble.parse(reader.read(0, layout.PREAMBLE_SIZE))
 
 
-def _read_header(reader: _Reader, preamble: Preamble) -> Header:
+def _read_header(reader: Reader, preamble: Preamble) -> Header:
     header = state.decode_header(_read_section(reader, preamble, SectionKind.HEADER))
     if header.contents_size != preamble.contents_size:
         raise FormatError(f"header: {header.contents_size} bytes of pages where the preamble says {preamble.contents_size}")
     return header
 
 
-def _read_outline(reader: _Reader, preamble: Preamble) -> Snapshot:
+def _read_outline(reader: Reader, preamble: Preamble) -> Snapshot:
     """Every section, checked against one another."""
     header = _read_header(reader, preamble)
     decoded = state.decode_state(_read_section(reader, preamble, SectionKind.STATE), is_tree=preamble.is_tree)
@@ -374,7 +291,7 @@ def _read_outline(reader: _Reader, preamble: Preamble) -> Snapshot:
     return snapshot
 
 
-def _read_section(reader: _Reader, preamble: Preamble, kind: SectionKind) -> bytes | memoryview:
+def _read_section(reader: Reader, preamble: Preamble, kind: SectionKind) -> bytes | memoryview:
     """The raw bytes of one section, verified."""
     section = preamble.sections[kind - 1]
     where = f"section {kind.name.lower()}, {section.stored_size} bytes at {section.offset}"
@@ -385,21 +302,7 @@ def _read_section(reader: _Reader, preamble: Preamble, kind: SectionKind) -> byt
         raise FormatError(f"{where}: does not match its digest: the file was altered or damaged")
     if section.codec is Codec.RAW:
         return stored
-    return _decompressed(stored, section.raw_size, where, zstandard.ZstdDecompressor())
-
-
-def _decompressed(stored: bytes | memoryview, raw_size: int, where: str, decompressor: zstandard.ZstdDecompressor) -> bytes:
-    """Decompress what holds exactly ``raw_size`` bytes; nothing is allocated on the compressed bytes' own word."""
-    try:
-        declared = zstandard.get_frame_parameters(stored).content_size
-        if declared != raw_size:
-            raise FormatError(f"{where}: compressed bytes declare {declared} bytes where {raw_size} belong")
-        raw = decompressor.decompress(stored, max_output_size=raw_size, allow_extra_data=False)
-    except zstandard.ZstdError as error:
-        raise FormatError(f"{where}: cannot be decompressed: {error}") from error
-    if len(raw) != raw_size:
-        raise FormatError(f"{where}: decompressed to {len(raw)} bytes where {raw_size} belong")
-    return raw
+    return compression.decompressed(stored, section.raw_size, where, compression.Decompressor())
 
 
 class _RunTable(Struct, frozen=True):
@@ -445,135 +348,3 @@ def _part(table: bytes | memoryview, begin: int, end: int) -> bytes | memoryview
 def _runs(packed: bytes | memoryview) -> tuple[PageRun, ...]:
     pairs = np.frombuffer(packed, dtype="<u8").reshape(-1, 2)
     return tuple(map(PageRun, pairs[:, 0].tolist(), pairs[:, 1].tolist()))
-
-
-class _Frame(Struct, frozen=True):
-    """A frame's head and where its body lies."""
-
-    where: str
-    head: FrameHead
-    body_offset: int
-
-
-def _frames(reader: _Reader, preamble: Preamble) -> Iterator[_Frame]:
-    """Every frame in order; after the last one the trailer has been checked, and that nothing follows."""
-    seal = blake3(preamble.pack())
-    offset = preamble.frames_offset
-    for index in range(preamble.frame_count):
-        where = f"frame {index} at byte {offset}"
-        packed = reader.read(offset, layout.FRAME_HEAD_SIZE)
-        head = FrameHead.parse(packed, offset, preamble.frame_raw_size(index), where)
-        seal.update(packed)
-        offset += layout.FRAME_HEAD_SIZE
-        if bytes(reader.read(offset, head.padding)) != bytes(head.padding):
-            raise FormatError(f"{where}: its padding is not all zero, or cut off")
-        yield _Frame(where, head, offset + head.padding)
-        offset += head.padding + head.stored_size
-    file_size = offset + layout.TRAILER_SIZE
-    layout.check_trailer(reader.read(offset, layout.TRAILER_SIZE), file_size, seal)
-    if reader.size != file_size:
-        raise FormatError(f"{reader.size - file_size} bytes follow the trailer: the file was added to")
-
-
-def _read_frame(reader: _Reader, frame: _Frame, target: memoryview, decompressor: zstandard.ZstdDecompressor) -> None:
-    """Put a frame's contents into ``target``, verified before they are decompressed."""
-    if frame.head.codec is Codec.RAW:
-        reader.read_into(frame.body_offset, target, frame.where)
-        _check_digest(target, frame)
-        return
-    stored = reader.read(frame.body_offset, frame.head.stored_size)
-    _check_digest(stored, frame)
-    target[:] = _decompressed(stored, frame.head.raw_size, frame.where, decompressor)
-
-
-def _check_digest(stored: bytes | memoryview, frame: _Frame) -> None:
-    if len(stored) < frame.head.stored_size:
-        raise FormatError(f"{frame.where}: the file ends inside its body: it is cut off")
-    if layout.digest_of(stored) != frame.head.digest:
-        raise FormatError(f"{frame.where}: its body does not match its digest: the file was altered or damaged")
-
-
-# Sources of bytes
-
-
-class _Reader(Protocol):
-    """Bytes by offset. Reading beyond the end answers with what there is."""
-
-    size: int
-
-    def read(self, offset: int, size: int) -> bytes | memoryview: ...
-
-    def read_into(self, offset: int, target: memoryview, where: str) -> None: ...
-
-
-class _FileReader:
-    """A regular file, read by offset: a file that shrinks meanwhile is an error, not a SIGBUS."""
-
-    def __init__(self, descriptor: int) -> None:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            raise FormatError("not a snapshot file: it is no regular file")
-        self._descriptor = descriptor
-        self.size = status.st_size
-
-    def read(self, offset: int, size: int) -> bytes:
-        try:
-            return os.pread(self._descriptor, min(size, max(0, self.size - offset)), offset)
-        except OSError as error:
-            raise FormatError(f"cannot read {size} bytes at {offset}: {error.strerror}") from error
-
-    def read_into(self, offset: int, target: memoryview, where: str) -> None:
-        try:
-            count = os.preadv(self._descriptor, [target], offset)
-        except OSError as error:
-            raise FormatError(f"{where}: cannot read {len(target)} bytes: {error.strerror}") from error
-        if count < len(target):
-            raise FormatError(f"{where}: the file ends inside its body: it is cut off")
-
-
-class _BytesReader:
-    """A file that is already in memory."""
-
-    def __init__(self, content: bytes | bytearray | memoryview | mmap.mmap) -> None:
-        self._content = memoryview(content).cast("B")
-        self.size = len(self._content)
-
-    def read(self, offset: int, size: int) -> memoryview:
-        return self._content[offset : offset + size]
-
-    def read_into(self, offset: int, target: memoryview, where: str) -> None:
-        found = self.read(offset, len(target))
-        if len(found) < len(target):
-            raise FormatError(f"{where}: the file ends inside its body: it is cut off")
-        target[:] = found
-
-
-@contextmanager
-def _opened(source: Source) -> Iterator[_Reader]:
-    """A reader of the source; a path is opened and closed, everything else is borrowed."""
-    if isinstance(source, str | os.PathLike):
-        with _opened_path(source) as reader:
-            yield reader
-    elif isinstance(source, int):
-        yield _FileReader(source)
-    elif isinstance(source, bytes | bytearray | memoryview | mmap.mmap):
-        yield _BytesReader(source)
-    elif isinstance(source, io.BytesIO):
-        yield _BytesReader(source.getbuffer())
-    else:
-        yield _FileReader(source.fileno())
-
-
-@contextmanager
-def _opened_path(path: str | os.PathLike[str]) -> Iterator[_Reader]:
-    """A reader of the file at a path; refusals name the path."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    except OSError as error:
-        raise FormatError(f"cannot open snapshot {os.fspath(path)}: {error.strerror}") from error
-    try:
-        yield _FileReader(descriptor)
-    except FormatError as error:
-        raise FormatError(f"snapshot {os.fspath(path)}: {error}") from error
-    finally:
-        os.close(descriptor)

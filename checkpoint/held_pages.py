@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 from checkpoint import format, pages
 from checkpoint.arrays import np
+from checkpoint.byte_sources import Source
 from checkpoint.differences import Rows
 from checkpoint.errors import ChainError
-from checkpoint.format import Source
 from checkpoint.model import Snapshot
 from checkpoint.pages import Flags, Words
 from checkpoint.tree import every_mapping

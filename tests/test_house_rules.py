@@ -42,7 +42,7 @@ IMPURE_CALLS = frozenset({"open", "print", "input", "exec", "eval"})
 
 DOORS = {
     "ptrace": ("checkpoint/linux/tracee.py",),
-    "zstandard": ("checkpoint/format.py",),
+    "zstandard": ("checkpoint/compression.py",),
     "zmq": ("agent/transport.py",),
     "pickle": ("failover/state/pickled.py",),
     "psutil": ("agent/processes.py",),

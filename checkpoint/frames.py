@@ -1,0 +1,123 @@
+"""The frames of a snapshot file: its contents, piece by piece, each with its own digest.
+
+A frame is verified before anything is made of it, and stays in a processor's cache from the first to the last thing that is done
+to it.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from queue import SimpleQueue
+from typing import Protocol
+
+from blake3 import blake3
+from msgspec import Struct
+
+from checkpoint import compression, layout
+from checkpoint.byte_sources import Reader
+from checkpoint.compression import Compressor, Decompressor
+from checkpoint.errors import FormatError
+from checkpoint.layout import Codec, FrameHead, Preamble
+
+
+class Sink(Protocol):
+    """Where a file goes: a binary file, or anything that takes bytes and says how many."""
+
+    def write(self, content: bytes | memoryview, /) -> int | None: ...
+
+
+class Body(Struct, frozen=True):
+    """A frame that is ready to be written, wherever it will lie."""
+
+    codec: Codec
+    content: bytes | memoryview
+    raw_size: int
+    digest: bytes
+
+
+class Packer:
+    """Makes bodies of frames, in several threads at once: each borrows a compressor, for none may be used twice at a time."""
+
+    def __init__(self, threads: int) -> None:
+        self._compressors: SimpleQueue[Compressor] = SimpleQueue()
+        for _ in range(threads):
+            self._compressors.put(compression.compressor())
+
+    def __call__(self, raw: memoryview) -> Body:
+        borrowed = self._compressors.get()
+        try:
+            codec, content = compression.stored(raw, borrowed)
+        finally:
+            self._compressors.put(borrowed)
+        return Body(codec, content, len(raw), layout.digest_of(content))
+
+
+def write_frame(file: Sink, body: Body, offset: int, seal: blake3) -> int:
+    """Write one frame whose head lies at ``offset``; answer how many bytes it took."""
+    padding = layout.padding_at(offset, body.codec)
+    head = FrameHead(body.codec, padding, len(body.content), body.raw_size, body.digest).pack()
+    seal.update(head)
+    write_all(file, head + bytes(padding))
+    write_all(file, body.content)
+    return len(head) + padding + len(body.content)
+
+
+def write_all(file: Sink, content: bytes | memoryview) -> None:
+    """Write all of it: an unbuffered file may take less at a time.
+
+    Raises:
+        OSError: it takes nothing more, and says no reason.
+    """
+    rest = memoryview(content)
+    while rest:
+        taken = file.write(rest)
+        if not taken:
+            raise OSError(errno.EIO, "the file takes nothing more")
+        rest = rest[taken:]
+
+
+class Frame(Struct, frozen=True):
+    """A frame's head and where its body lies."""
+
+    where: str
+    head: FrameHead
+    body_offset: int
+
+
+def frames_of(reader: Reader, preamble: Preamble) -> Iterator[Frame]:
+    """Every frame in order; after the last one the trailer has been checked, and that nothing follows."""
+    seal = blake3(preamble.pack())
+    offset = preamble.frames_offset
+    for index in range(preamble.frame_count):
+        where = f"frame {index} at byte {offset}"
+        packed = reader.read(offset, layout.FRAME_HEAD_SIZE)
+        head = FrameHead.parse(packed, offset, preamble.frame_raw_size(index), where)
+        seal.update(packed)
+        offset += layout.FRAME_HEAD_SIZE
+        if bytes(reader.read(offset, head.padding)) != bytes(head.padding):
+            raise FormatError(f"{where}: its padding is not all zero, or cut off")
+        yield Frame(where, head, offset + head.padding)
+        offset += head.padding + head.stored_size
+    file_size = offset + layout.TRAILER_SIZE
+    layout.check_trailer(reader.read(offset, layout.TRAILER_SIZE), file_size, seal)
+    if reader.size != file_size:
+        raise FormatError(f"{reader.size - file_size} bytes follow the trailer: the file was added to")
+
+
+def read_frame(reader: Reader, frame: Frame, target: memoryview, unpacker: Decompressor) -> None:
+    """Put a frame's contents into ``target``, verified before they are decompressed."""
+    if frame.head.codec is Codec.RAW:
+        reader.read_into(frame.body_offset, target, frame.where)
+        check_digest(target, frame)
+        return
+    body = reader.read(frame.body_offset, frame.head.stored_size)
+    check_digest(body, frame)
+    target[:] = compression.decompressed(body, frame.head.raw_size, frame.where, unpacker)
+
+
+def check_digest(body: bytes | memoryview, frame: Frame) -> None:
+    if len(body) < frame.head.stored_size:
+        raise FormatError(f"{frame.where}: the file ends inside its body: it is cut off")
+    if layout.digest_of(body) != frame.head.digest:
+        raise FormatError(f"{frame.where}: its body does not match its digest: the file was altered or damaged")
