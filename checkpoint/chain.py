@@ -86,12 +86,26 @@ def check_state(snapshot: Snapshot, page_sum: bytes) -> None:
     Raises:
         ChainError: the state is not what the sender had; the cure is a new base.
     """
-    named = f"position {place(snapshot.position)} of {snapshot.component}"
+    check_sum(snapshot, page_sum)
+    _check_digest(snapshot)
+
+
+def check_sum(snapshot: Snapshot, page_sum: bytes) -> None:
+    """Refuse pages that are not those of a snapshot. Raises and arguments as `check_state`."""
     if page_sum != snapshot.page_sum:
-        raise ChainError(f"the pages do not add up to {named}: {_unequal(page_sum, snapshot.page_sum)}; ask for a base")
+        wrong = _unequal(page_sum, snapshot.page_sum)
+        raise ChainError(f"the pages do not add up to {_named(snapshot)}: {wrong}; ask for a base")
+
+
+def _check_digest(snapshot: Snapshot) -> None:
     digest = state_digest(snapshot)
     if digest != snapshot.position.digest:
-        raise ChainError(f"the state is not that of {named}: {_unequal(digest, snapshot.position.digest)}; ask for a base")
+        wrong = _unequal(digest, snapshot.position.digest)
+        raise ChainError(f"the state is not that of {_named(snapshot)}: {wrong}; ask for a base")
+
+
+def _named(snapshot: Snapshot) -> str:
+    return f"position {place(snapshot.position)} of {snapshot.component}"
 
 
 def _unequal(found: bytes, expected: bytes) -> str:
@@ -115,8 +129,8 @@ def fold(chain: Sequence[Snapshot]) -> Snapshot:
     page_size = newest.machine.page_size
     if len(chain) == 1:  # all of it is where it belongs already
         nothing = PageTable.empty(page_size)
-        check_state(newest, nothing.apply((), newest.runs, newest.contents, every_mapping(newest), newest.copies).page_sum)
-        return replace(newest, cleared=(), output=_joined_output(chain), notes=tuple(dict.fromkeys(newest.notes)))
+        check_sum(newest, nothing.apply((), newest.runs, newest.contents, every_mapping(newest), newest.copies).page_sum)
+        return by_itself(newest)
     sources, layers = _newest_sources(chain, page_size)
     has_copies = newest.is_tree and any(snapshot.copies for snapshot in chain)  # one process alone has none
     carried, copies = _told_once(sources, layers, page_size) if has_copies else (sources, ())
@@ -137,6 +151,17 @@ def fold(chain: Sequence[Snapshot]) -> Snapshot:
         output=_joined_output(chain),
         notes=tuple(dict.fromkeys(note for snapshot in chain for note in snapshot.notes)),
     )
+
+
+def by_itself(base: Snapshot) -> Snapshot:
+    """As `fold`, of a base that nothing continues: the pages, which may be elsewhere, remain to be proved (`check_sum`).
+
+    Raises:
+        ChainError: it is no base, or not the state that its position names.
+    """
+    _check_chain((base,))
+    _check_digest(base)
+    return replace(base, cleared=(), output=_joined_output((base,)), notes=tuple(dict.fromkeys(base.notes)))
 
 
 class _Layer(Struct, frozen=True, eq=False):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from collections.abc import Sequence
+from threading import local
+from typing import Final, TypeAlias
 
 import zstandard
 
@@ -19,9 +21,10 @@ encoding``), which no link is slow enough to be asked for.
 WORTH_COMPRESSING = 15 / 16
 """A frame is stored compressed when that takes less than this part of its size."""
 
+_of_thread: Final = local()
+
 Compressor: TypeAlias = zstandard.ZstdCompressor
-Decompressor: TypeAlias = zstandard.ZstdDecompressor
-"""Neither may be used by two threads at a time."""
+"""None may be used by two threads at a time."""
 
 
 def compressor() -> Compressor:
@@ -37,15 +40,51 @@ def stored(raw: bytes | memoryview, compressor: Compressor) -> tuple[Codec, byte
     return Codec.RAW, raw
 
 
-def decompressed(stored: bytes | memoryview, raw_size: int, where: str, decompressor: Decompressor) -> bytes:
+def stored_each(raws: Sequence[memoryview], compressor: Compressor) -> list[tuple[Codec, memoryview]]:
+    """As `stored`, of several; threads disturb each other less than where each is told by itself."""
+    packed = compressor.multi_compress_to_buffer(list(raws))
+    contents = [memoryview(packed[index]) for index in range(len(raws))]  # type: ignore[arg-type]  # which are buffers
+    return list(map(_better, raws, contents))
+
+
+def _better(raw: memoryview, packed: memoryview) -> tuple[Codec, memoryview]:
+    return (Codec.ZSTD, packed) if len(packed) < len(raw) * WORTH_COMPRESSING else (Codec.RAW, raw)
+
+
+def decompressed(stored: bytes | memoryview, raw_size: int, where: str) -> bytes:
     """Decompress what holds exactly ``raw_size`` bytes; nothing is allocated on the compressed bytes' own word."""
     try:
-        declared = zstandard.get_frame_parameters(stored).content_size
-        if declared != raw_size:
-            raise FormatError(f"{where}: compressed bytes declare {declared} bytes where {raw_size} belong")
-        raw = decompressor.decompress(stored, max_output_size=raw_size, allow_extra_data=False)
+        _check_declared(stored, raw_size, where)
+        raw = _decompressor().decompress(stored, max_output_size=raw_size, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise FormatError(f"{where}: cannot be decompressed: {error}") from error
     if len(raw) != raw_size:
         raise FormatError(f"{where}: decompressed to {len(raw)} bytes where {raw_size} belong")
     return raw
+
+
+def decompress_into(target: memoryview, stored: bytes | memoryview, where: str) -> None:
+    """The same into memory that is used again and again: a new piece of it is given by the kernel, page by page."""
+    filled = 0
+    try:
+        _check_declared(stored, len(target), where)
+        reader = _decompressor().stream_reader(stored)
+        while filled < len(target) and (more := reader.readinto(target[filled:])):
+            filled += more
+    except zstandard.ZstdError as error:
+        raise FormatError(f"{where}: cannot be decompressed: {error}") from error
+    if filled != len(target):
+        raise FormatError(f"{where}: decompressed to {filled} bytes where {len(target)} belong")
+
+
+def _check_declared(stored: bytes | memoryview, raw_size: int, where: str) -> None:
+    declared = zstandard.get_frame_parameters(stored).content_size
+    if declared != raw_size:
+        raise FormatError(f"{where}: compressed bytes declare {declared} bytes where {raw_size} belong")
+
+
+def _decompressor() -> zstandard.ZstdDecompressor:
+    """This thread's own: none may be used by two at a time, and to make one takes longer than to decompress a frame."""
+    if not hasattr(_of_thread, "decompressor"):
+        _of_thread.decompressor = zstandard.ZstdDecompressor()
+    return _of_thread.decompressor  # type: ignore[no-any-return]

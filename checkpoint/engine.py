@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os.path
 from collections.abc import Mapping
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from msgspec import Struct
 
@@ -16,6 +16,10 @@ from checkpoint.device_rules import DeviceRule
 from checkpoint.digests_of_files import DigestOf
 from checkpoint.errors import ProbeError, RestoreError
 from checkpoint.model import Position, Snapshot
+
+if TYPE_CHECKING:
+    from checkpoint.stored_base import StoredBase
+    from checkpoint.unread_base import UnreadBase
 
 PTRACE: Final = "ptrace"
 COOPERATIVE: Final = "cooperative"
@@ -230,6 +234,11 @@ class Session(Protocol):
         """
         ...
 
+    def capture_standing(self, order: CaptureOrder) -> Snapshot | UnreadBase:
+        """As `capture`, of what is to stand still until the session is closed: a large program's pages may stay where they are,
+        to be read once, when they are written to a file. It cannot be acknowledged."""
+        ...
+
     def acknowledge(self, position: Position) -> None:
         """A standby holds everything up to ``position``: what was written before it may be forgotten."""
         ...
@@ -355,10 +364,11 @@ class Engine(Protocol):
         """
         ...
 
-    def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
+    def restore(self, vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -> Restored:
         """Turn a waiting vessel into the program of a base.
 
         Raises:
+            FormatError, ChainError: its pages, where they still were in a file, are not what they were; as RestoreError.
             MismatchError: this machine lacks something; nothing was started.
             RestoreError: it did not work; the caller kills the vessel and nothing is left.
         """

@@ -25,7 +25,7 @@ from checkpoint.frames import Frame, Packer, Sink, check_digest, frames_of, read
 from checkpoint.layout import Codec, Preamble, Section, SectionKind
 from checkpoint.model import PageCopy, PageRun, Snapshot
 from checkpoint.pages import Flags, Words
-from checkpoint.state import Header
+from checkpoint.state import Header, State
 from checkpoint.validity import check_snapshot
 
 WORTH_THREADS = 8
@@ -55,21 +55,32 @@ def encode(snapshot: Snapshot, file: Sink, *, threads: int = 1) -> int:
     """
     check_snapshot(snapshot)
     contents = memoryview(snapshot.contents).cast("B")
-    sections, stored = _pack_sections(snapshot)
-    preamble = Preamble(len(contents), sections, _version_of(snapshot))
+    preamble, sections = begin(snapshot, len(contents))
     seal = blake3(preamble.pack())
-    write_all(file, preamble.pack() + b"".join(stored))
+    write_all(file, preamble.pack() + sections)
     offset = preamble.frames_offset
     raws = (contents[index * layout.FRAME_SIZE :][: layout.FRAME_SIZE] for index in range(preamble.frame_count))
-    with closing(side_by_side.in_order(Packer(threads), raws, _worth(threads, preamble))) as bodies:
+    with closing(side_by_side.in_order(Packer(threads), raws, worth(threads, preamble))) as bodies:
         for body in bodies:
-            offset += write_frame(file, body, offset, seal)
+            head, size = write_frame(file, body, offset)
+            seal.update(head)
+            offset += size
     file_size = offset + layout.TRAILER_SIZE
     write_all(file, layout.pack_trailer(file_size, seal))
     return file_size
 
 
-def _worth(threads: int, preamble: Preamble) -> int:
+def begin(snapshot: Snapshot, contents_size: int) -> tuple[Preamble, bytes]:
+    """What stands before the frames: the preamble, and all sections as they are stored.
+
+    Raises:
+        FormatError: a section is larger than the format allows.
+    """
+    sections, stored = _pack_sections(snapshot)
+    return Preamble(contents_size, sections, _version_of(snapshot)), b"".join(stored)
+
+
+def worth(threads: int, preamble: Preamble) -> int:
     """So many of these threads as the frames are worth."""
     return threads if preamble.frame_count >= WORTH_THREADS else 1
 
@@ -138,8 +149,7 @@ def decode(source: Source, max_contents_size: int = layout.MAX_CONTENTS_SIZE, *,
         FormatError: not a whole, unaltered snapshot of a version that we read; says what and where.
     """
     with opened(source) as reader:
-        preamble = _read_preamble(reader)
-        outline = _read_outline(reader, preamble)
+        preamble, outline = outlined(reader)
         if preamble.contents_size > max_contents_size:
             raise FormatError(f"preamble: claims {preamble.contents_size} bytes of pages; the limit here is {max_contents_size}")
         contents = np.empty(preamble.contents_size, dtype=np.uint8).data
@@ -147,10 +157,10 @@ def decode(source: Source, max_contents_size: int = layout.MAX_CONTENTS_SIZE, *,
         def read(numbered: tuple[int, Frame]) -> None:
             index, frame = numbered
             target = contents[index * layout.FRAME_SIZE :][: frame.head.raw_size]
-            read_frame(reader, frame, target, compression.Decompressor())
+            read_frame(reader, frame, target)
 
         frames = enumerate(frames_of(reader, preamble))
-        for _ in side_by_side.in_order(read, frames, _worth(threads, preamble)):
+        for _ in side_by_side.in_order(read, frames, worth(threads, preamble)):
             pass
     return replace(outline, contents=contents.toreadonly())
 
@@ -173,7 +183,17 @@ def read_outline(source: Source) -> Snapshot:
         FormatError: as ``decode``; the pages are not looked at.
     """
     with opened(source) as reader:
-        return _read_outline(reader, _read_preamble(reader))
+        return outlined(reader)[1]
+
+
+def read_state(source: Source) -> State:
+    """Read and verify what a restore needs besides the pages, and which: cheap, and nothing is checked against the rest of it.
+
+    Raises:
+        FormatError: no state of ours; the rest of the file is not looked at.
+    """
+    with opened(source) as reader:
+        return _read_state(reader, _read_preamble(reader))
 
 
 def read_pages(source: Source, wanted: Words) -> tuple[Snapshot, Flags, Rows]:
@@ -189,18 +209,16 @@ def read_pages(source: Source, wanted: Words) -> tuple[Snapshot, Flags, Rows]:
         FormatError: as ``decode``; frames without any of these pages are not looked at.
     """
     with opened(source) as reader:
-        preamble = _read_preamble(reader)
-        outline = _read_outline(reader, preamble)
+        preamble, outline = outlined(reader)
         page_size = outline.machine.page_size
         found, places = _places_of(outline, wanted)
         rows = np.empty((len(places), page_size), dtype=np.uint8)
         frame_of = places * page_size // layout.FRAME_SIZE
         needed = set(frame_of.tolist())
         buffer = np.empty(layout.FRAME_SIZE, dtype=np.uint8)
-        decompressor = compression.Decompressor()
         for index, frame in enumerate(frames_of(reader, preamble)):
             if index in needed:
-                read_frame(reader, frame, buffer.data[: frame.head.raw_size], decompressor)
+                read_frame(reader, frame, buffer.data[: frame.head.raw_size])
                 ours = frame_of == index
                 rows[ours] = buffer.reshape(-1, page_size)[places[ours] - index * (layout.FRAME_SIZE // page_size)]
     return outline, found, rows
@@ -236,11 +254,16 @@ def verified_outline(source: Source) -> Snapshot:
         FormatError: as ``decode``.
     """
     with opened(source) as reader:
-        preamble = _read_preamble(reader)
-        outline = _read_outline(reader, preamble)
+        preamble, outline = outlined(reader)
         for frame in frames_of(reader, preamble):
             check_digest(reader.read(frame.body_offset, frame.head.stored_size), frame)
     return outline
+
+
+def outlined(reader: Reader) -> tuple[Preamble, Snapshot]:
+    """The preamble of a file, and what `read_outline` answers."""
+    preamble = _read_preamble(reader)
+    return preamble, _read_outline(reader, preamble)
 
 
 def _read_preamble(reader: Reader) -> Preamble:
@@ -254,10 +277,14 @@ def _read_header(reader: Reader, preamble: Preamble) -> Header:
     return header
 
 
+def _read_state(reader: Reader, preamble: Preamble) -> State:
+    return state.decode_state(_read_section(reader, preamble, SectionKind.STATE), is_tree=preamble.is_tree)
+
+
 def _read_outline(reader: Reader, preamble: Preamble) -> Snapshot:
     """Every section, checked against one another."""
     header = _read_header(reader, preamble)
-    decoded = state.decode_state(_read_section(reader, preamble, SectionKind.STATE), is_tree=preamble.is_tree)
+    decoded = _read_state(reader, preamble)
     table = _parse_runs(_read_section(reader, preamble, SectionKind.RUNS), preamble)
     output = state.decode_output(_read_section(reader, preamble, SectionKind.OUTPUT))
     snapshot = Snapshot(
@@ -302,7 +329,7 @@ def _read_section(reader: Reader, preamble: Preamble, kind: SectionKind) -> byte
         raise FormatError(f"{where}: does not match its digest: the file was altered or damaged")
     if section.codec is Codec.RAW:
         return stored
-    return compression.decompressed(stored, section.raw_size, where, compression.Decompressor())
+    return compression.decompressed(stored, section.raw_size, where)
 
 
 class _RunTable(Struct, frozen=True):

@@ -7,7 +7,8 @@ to it.
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from queue import SimpleQueue
 from typing import Protocol
 
@@ -16,7 +17,7 @@ from msgspec import Struct
 
 from checkpoint import compression, layout
 from checkpoint.byte_sources import Reader
-from checkpoint.compression import Compressor, Decompressor
+from checkpoint.compression import Compressor
 from checkpoint.errors import FormatError
 from checkpoint.layout import Codec, FrameHead, Preamble
 
@@ -45,22 +46,34 @@ class Packer:
             self._compressors.put(compression.compressor())
 
     def __call__(self, raw: memoryview) -> Body:
-        borrowed = self._compressors.get()
-        try:
-            codec, content = compression.stored(raw, borrowed)
-        finally:
-            self._compressors.put(borrowed)
+        """The body of one frame."""
+        with self._borrowed() as compressor:
+            codec, content = compression.stored(raw, compressor)
         return Body(codec, content, len(raw), layout.digest_of(content))
 
+    def each(self, raws: Sequence[memoryview]) -> list[Body]:
+        """Those of several."""
+        with self._borrowed() as compressor:
+            stored = compression.stored_each(raws, compressor)
+        told = zip(raws, stored, strict=True)
+        return [Body(codec, content, len(raw), layout.digest_of(content)) for raw, (codec, content) in told]
 
-def write_frame(file: Sink, body: Body, offset: int, seal: blake3) -> int:
-    """Write one frame whose head lies at ``offset``; answer how many bytes it took."""
+    @contextmanager
+    def _borrowed(self) -> Iterator[Compressor]:
+        compressor = self._compressors.get()
+        try:
+            yield compressor
+        finally:
+            self._compressors.put(compressor)
+
+
+def write_frame(file: Sink, body: Body, offset: int) -> tuple[bytes, int]:
+    """Write one frame whose head lies at ``offset``; its head, and how many bytes all of it took."""
     padding = layout.padding_at(offset, body.codec)
     head = FrameHead(body.codec, padding, len(body.content), body.raw_size, body.digest).pack()
-    seal.update(head)
     write_all(file, head + bytes(padding))
     write_all(file, body.content)
-    return len(head) + padding + len(body.content)
+    return head, len(head) + padding + len(body.content)
 
 
 def write_all(file: Sink, content: bytes | memoryview) -> None:
@@ -105,15 +118,25 @@ def frames_of(reader: Reader, preamble: Preamble) -> Iterator[Frame]:
         raise FormatError(f"{reader.size - file_size} bytes follow the trailer: the file was added to")
 
 
-def read_frame(reader: Reader, frame: Frame, target: memoryview, unpacker: Decompressor) -> None:
-    """Put a frame's contents into ``target``, verified before they are decompressed."""
+def content_of(reader: Reader, frame: Frame) -> bytes | memoryview:
+    """A frame's contents, verified before they are decompressed."""
+    body = _verified(reader, frame)
+    return body if frame.head.codec is Codec.RAW else compression.decompressed(body, frame.head.raw_size, frame.where)
+
+
+def read_frame(reader: Reader, frame: Frame, target: memoryview) -> None:
+    """The same, put into ``target``."""
     if frame.head.codec is Codec.RAW:
         reader.read_into(frame.body_offset, target, frame.where)
         check_digest(target, frame)
-        return
+    else:
+        compression.decompress_into(target, _verified(reader, frame), frame.where)
+
+
+def _verified(reader: Reader, frame: Frame) -> bytes | memoryview:
     body = reader.read(frame.body_offset, frame.head.stored_size)
     check_digest(body, frame)
-    target[:] = compression.decompressed(body, frame.head.raw_size, frame.where, unpacker)
+    return body
 
 
 def check_digest(body: bytes | memoryview, frame: Frame) -> None:

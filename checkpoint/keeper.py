@@ -14,7 +14,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -30,6 +30,8 @@ from checkpoint.linux.address import address_of
 from checkpoint.linux.waking import waking
 from checkpoint.model import Position, Snapshot
 from checkpoint.needs import names_of_contents, needs
+from checkpoint.stored_base import stored_base
+from checkpoint.unread_base import UnreadBase
 
 if TYPE_CHECKING:
     from checkpoint.engines.guarded_task import GuardedTask
@@ -49,6 +51,22 @@ STREAM_DESCRIPTORS: Final = 5
 
 Descriptors = tuple[int, ...]
 Answer = tuple[Reply, Descriptors]
+
+
+class _Encoded(msgspec.Struct, frozen=True):
+    """A capture as bytes.
+
+    Attributes:
+        snapshot: its pages are of no account any more.
+        size: bytes of the file; ``dirty_bytes``: of the pages in it; ``known_bytes``: of those told as differences.
+        descriptors: the file, where nobody has brought one.
+    """
+
+    snapshot: Snapshot
+    size: int
+    dirty_bytes: int
+    known_bytes: int = 0
+    descriptors: Descriptors = ()
 
 
 class Keeper:
@@ -139,28 +157,37 @@ class Keeper:
         if unchanged := _unchanged(session, request):
             return unchanged, ()
         order = CaptureOrder(request.base, request.generation, request.sequence, request.epoch, self._robot, request.hold)
-        snapshot = session.capture(order)
-        told, known_bytes = self._sender.told(snapshot, request.xor_cache)
-        threads = side_by_side.thread_count() if request.hold else 1  # a program that runs needs the processors itself
-        if target is None:
-            encoded, size = encoded_in_memory(told, threads)
-        else:
-            encoded, size = None, encoded_in(target, told, threads)
+        captured = session.capture(order) if target is None else session.capture_standing(order)
+        made = self._encoded(captured, target, request)
+        snapshot = made.snapshot
         commit, age_ns = _commit_at(session, snapshot.position)
         answer = channel.Captured(
             position=snapshot.position,
             parent=snapshot.parent,
-            size=size,
+            size=made.size,
             freeze_us=snapshot.freeze_us,
-            dirty_bytes=len(snapshot.contents),
+            dirty_bytes=made.dirty_bytes,
             notes=snapshot.notes,
             totals=session.totals,
             commit=commit,
             age_ns=age_ns,
-            known_bytes=known_bytes,
+            known_bytes=made.known_bytes,
             frozen_bytes=session.frozen_size,
         )
-        return answer, () if encoded is None else (encoded,)
+        return answer, made.descriptors
+
+    def _encoded(self, captured: Snapshot | UnreadBase, target: int | None, request: channel.Capture) -> _Encoded:
+        """Encode what was captured, into the target, or into a memory file where there is none."""
+        threads = side_by_side.thread_count() if request.hold else 1  # a program that runs needs the processors itself
+        if not isinstance(captured, Snapshot):
+            assert target is not None, "it was to be read otherwise"
+            snapshot, size = written_in(target, captured, threads)
+            return _Encoded(snapshot, size, sum(run.size for run in snapshot.runs))
+        told, known_bytes = self._sender.told(captured, request.xor_cache)
+        if target is not None:
+            return _Encoded(captured, encoded_in(target, told, threads), len(captured.contents), known_bytes)
+        descriptor, size = encoded_in_memory(told, threads)
+        return _Encoded(captured, size, len(captured.contents), known_bytes, (descriptor,))
 
     def _acknowledge(self, request: channel.Acknowledge, _: Descriptors) -> None:
         if self._session is not None:
@@ -176,14 +203,23 @@ class Keeper:
             if self._is_busy:
                 raise RestoreError(f"cannot restore into pid {request.pid}: this keeper follows a process already")
             with foreign.facts(f"restore {request.component}"):
-                state = carried.relocated(folded(files), dict(request.terms.carry.places))
-                names = names_of_contents(needs(state), request.contents) if request.robot else None
+                self._restored, names = self._restored_from(files, request)
         finally:
             channel.close_all(files)
-        with foreign.facts(f"restore {request.component}"):
-            self._restored = self._tracer.restore(request.pid, state, _options(request))
         self._revived, self._names = (request, ends), names
         return channel.Restored(self._restored.pid, self._restored.position, self._restored.notes), ()
+
+    def _restored_from(self, files: Descriptors, request: channel.Restore) -> tuple[Restored, dict[str, str] | None]:
+        """Restore what a chain's files amount to; and what its program knows its files by, where a robot keeps them."""
+        places = dict(request.terms.carry.places)
+        if len(files) != 1:
+            state = carried.relocated(folded(files), places)
+            names = _names_of(state, request)
+            return self._tracer.restore(request.pid, state, _options(request)), names
+        with stored_base(files[0]) as base:
+            base.relocate(places)
+            names = _names_of(base.outline, request)
+            return self._tracer.restore(request.pid, base, _options(request)), names
 
     def _lay(self, request: channel.Lay, descriptors: Descriptors) -> Answer:
         try:
@@ -315,6 +351,10 @@ class Keeper:
             session.close()
 
 
+def _names_of(state: Snapshot, request: channel.Restore) -> dict[str, str] | None:
+    return names_of_contents(needs(state), request.contents) if request.robot else None
+
+
 def _options(order: channel.Restore) -> RestoreOptions:
     return RestoreOptions(
         order.elapsed_ns,
@@ -377,11 +417,22 @@ def encoded_in(descriptor: int, snapshot: Snapshot, threads: int) -> int:
     Raises:
         StoreError: the file does not take it.
     """
+    with _written(snapshot.component), open(descriptor, "wb", buffering=0, closefd=False) as file:
+        return format.encode(snapshot, file, threads=threads)
+
+
+def written_in(descriptor: int, base: UnreadBase, threads: int) -> tuple[Snapshot, int]:
+    """The same of one whose pages are still in its program; raises as `UnreadBase.write`, too."""
+    with _written(base.outline.component), open(descriptor, "wb", buffering=0, closefd=False) as file:
+        return base.write(file, threads)
+
+
+@contextlib.contextmanager
+def _written(component: str) -> Iterator[None]:
     try:
-        with open(descriptor, "wb", buffering=0, closefd=False) as file:
-            return format.encode(snapshot, file, threads=threads)
+        yield
     except OSError as error:
-        raise StoreError(f"cannot write a snapshot of {snapshot.component}: {error.strerror}") from error
+        raise StoreError(f"cannot write a snapshot of {component}: {error.strerror}") from error
 
 
 def _has_several_processes(files: Descriptors) -> bool:

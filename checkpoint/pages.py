@@ -121,6 +121,30 @@ def total_size(pages: Words) -> int:
     return int((pages[:, 1] - pages[:, 0]).sum()) if len(pages) else 0
 
 
+def place_in(pages: Words, address: int, size: int) -> int | None:
+    """How many bytes of the set lie before an address; None where not all of so many bytes from there on are in one extent."""
+    index = int(np.searchsorted(pages[:, 1], np.uint64(address), side="right"))
+    if index == len(pages) or int(pages[index, 0]) > address or address + size > int(pages[index, 1]):
+        return None
+    return total_size(pages[:index]) + address - int(pages[index, 0])
+
+
+def cut(pages: Words, size: int) -> list[Words]:
+    """The same set in pieces of so many bytes, the last one perhaps shorter; also of stretches that are in no order."""
+    lengths = pages[:, 1] - pages[:, 0]
+    ends = np.cumsum(lengths, dtype=np.uint64)
+    begins = ends - lengths
+    total = int(lengths.sum())
+    heads = np.array(range(0, total, size), np.uint64)
+    if not len(heads):
+        return []
+    cuts = distinct(np.concatenate([begins, heads]))
+    within = np.searchsorted(ends, cuts, side="right")
+    starts = pages[within, 0] + (cuts - begins[within])
+    parts = np.column_stack([starts, starts + np.append(cuts[1:], np.uint64(total)) - cuts])
+    return np.split(parts, np.searchsorted(cuts, heads)[1:])
+
+
 def addresses_of(pages: Words, page_size: int) -> Words:
     """The address of every page of the set, in order."""
     counts = ((pages[:, 1] - pages[:, 0]) // np.uint64(page_size)).astype(np.int64)

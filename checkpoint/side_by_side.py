@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
+from itertools import islice
 from typing import TYPE_CHECKING, Final, TypeVar
 
 if TYPE_CHECKING:
@@ -60,6 +61,13 @@ def in_order(work: Callable[[A], B], pieces: Iterable[A], threads: int) -> Gener
                 one.cancel()
     if trouble is not None:
         raise trouble
+
+
+def in_rows(pieces: Iterable[A], count: int) -> Iterator[tuple[A, ...]]:
+    """So many pieces at a time, as `in_order` takes them where each is soon done; the last row may be shorter."""
+    rest = iter(pieces)
+    while row := tuple(islice(rest, count)):
+        yield row
 
 
 def _come_as(policy: int, priority: os.sched_param) -> None:

@@ -38,6 +38,8 @@ from checkpoint.model import Position
 from checkpoint.pages import Words
 from checkpoint.resources import aio_rings, system_v_memory
 
+READ_CHUNK: Final = 8 << 20
+"""Bytes that are read at a time while the program runs."""
 BUFFER_SIZE: Final = 8 << 20
 """Bytes that a freeze may copy without asking for memory first."""
 ROOM_SIZE: Final = 64 << 10
@@ -132,7 +134,7 @@ class MemoryCapture:
         self._mapped: Words = NONE
         self._vdso: Words = NONE
         self._followed: Words = NONE
-        self._buffer = bytearray(BUFFER_SIZE)
+        self._buffer = bytearray()
         self._is_armed = False
         self._unacknowledged: list[Unacknowledged] = []
         self._left_out: Words = NONE
@@ -183,6 +185,8 @@ class MemoryCapture:
                 with the program; 0: as few as is worth it.
         """
         self.refresh()
+        if not self._buffer:
+            self._buffer = bytearray(BUFFER_SIZE)
         copied = RunningCopy()
         if base:
             self._copy_everything(copied)
@@ -244,7 +248,7 @@ class MemoryCapture:
         """Read a set as far as it is there."""
         buffer = np.empty(pages.total_size(wanted) + ROOM_SIZE, dtype=np.uint8).data
         found, filled = [], 0
-        chunks = digests.chunks_of(wanted)
+        chunks = pages.cut(wanted, READ_CHUNK)
         bounds = itertools.pairwise(itertools.accumulate(map(pages.total_size, chunks), initial=0))
         places = [(chunk, begin, end) for chunk, (begin, end) in zip(chunks, bounds, strict=True)]
 
@@ -283,6 +287,24 @@ class MemoryCapture:
         except CaptureError:  # a page that has become a guard cannot be read
             guards = self._guards.found_everywhere(self._mapped, self._tracker.watched)
             return self._taken(copied, scan, guards, base=base)
+
+    def take_unread(self) -> Taken:
+        """All that exists, still to be read where it stands; what is followed, and since when, stays as it is."""
+        self._refresh_if_moved()
+        existing = pages.union(self._tracker.existing(self._private), self._shared.existing(self._shared_lines))
+        guards = self._guards.found_everywhere(self._mapped, self._tracker.watched)
+        unread = pages.union(pages.difference(pages.intersection(existing, self._mapped), guards), self._vdso)
+        return Taken(
+            lines=self.lines,
+            mapped=self._mapped,
+            is_base=True,
+            guards=guards,
+            scans=(),
+            valid=NONE,
+            copies=(),
+            unread=unread,
+            untouched=self._untouched(),
+        )
 
     def confirm(self) -> bool:
         """Whether the last look took everything; see `Tracker.confirm`."""

@@ -189,13 +189,17 @@ class CapturedProcess:
 
     # Before the freeze
 
-    def copy_running(self, *, base: bool, enough: int = 0) -> RunningCopy:
-        """As `MemoryCapture.copy_running`; for a base the files are looked at before, too, for that takes long."""
+    def prepare(self, *, base: bool) -> None:
+        """Look at what is asked again while it stands still; for a base at the files, too, for that takes long."""
         self.onlooker.prepare()
         if base:
             self.memory.refresh()
             self._flags.refresh(self.memory.lines, anew=True)
             self.identities.vmas(self.memory.lines, self._flags.flags, NONE)
+
+    def copy_running(self, *, base: bool, enough: int = 0) -> RunningCopy:
+        """As `MemoryCapture.copy_running`, with what is prepared before."""
+        self.prepare(base=base)
         copied = self.memory.copy_running(base=base, enough=enough)
         if base:  # which takes long: a thread may have confined itself since
             self.onlooker.rights.prepare()
@@ -214,10 +218,11 @@ class CapturedProcess:
 
     # While it stands still
 
-    def look(self, copied: RunningCopy, outputs: Outputs | None, *, base: bool, opened: Opened | None = None) -> Look:
+    def look(self, copied: RunningCopy | None, outputs: Outputs | None, *, base: bool, opened: Opened | None = None) -> Look:
         """Everything that needs it to stand still.
 
         Args:
+            copied: None: nothing is, and nothing will be before the look is over (`MemoryCapture.take_unread`).
             opened: see `Onlooker.ask`.
 
         Raises:
@@ -227,7 +232,7 @@ class CapturedProcess:
         is_awaited = self.memory.has_rings
         if is_awaited:
             aio_rings.await_requests(self.order.component, gather(self.pid) if opened is None else opened)
-        taken = self.memory.take(copied, base=base)
+        taken = self.memory.take(copied, base=base) if copied is not None else self.memory.take_unread()
         if self.memory.has_rings and not is_awaited:
             raise CaptureError(f"cannot capture {self.order.component}: it has just made a ring of asynchronous I/O; try again")
         return Look(self.onlooker.ask(place, outputs, opened), taken)

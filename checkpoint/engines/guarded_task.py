@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from checkpoint import program_files
 from checkpoint.contents import DIGEST_SIZE, digest_of_file, path_in
@@ -34,6 +34,9 @@ from checkpoint.model import Position, Snapshot
 from checkpoint.needs import program_of
 from checkpoint.resources import carried_trees
 from checkpoint.resources.carried_trees import CarriedTrees
+
+if TYPE_CHECKING:
+    from checkpoint.stored_base import StoredBase
 
 LOOK_S: Final = 10.0
 """Between two looks at the files that a program is started again from."""
@@ -69,6 +72,10 @@ class GuardedTask:
             program = program_files.describe(spokesman_of(self.pid), self.component, arguments, directory)
             session.program = (program,) if program is not None else ()
         return session.capture(order)
+
+    def capture_standing(self, order: CaptureOrder) -> Snapshot:
+        """See `checkpoint.engine.Session.capture_standing`: its segment holds what was committed, whatever it does."""
+        return self.capture(order)
 
     @property
     def frozen_size(self) -> int:
@@ -166,9 +173,10 @@ class CooperativeEngine:
         gone = [file.path for file in files if not os.path.lexists(file.path) and not _is_brought(options, file.digest)]
         return tuple(f"{path} is missing, from which it is started again: install it here" for path in gone)
 
-    def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
+    def restore(self, vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -> Restored:
         """Refused: see the class."""
-        raise RestoreError(f"cannot restore {state.component} into pid {vessel_pid}: a {COOPERATIVE} program is started again")
+        component = base.component if isinstance(base, Snapshot) else base.outline.component
+        raise RestoreError(f"cannot restore {component} into pid {vessel_pid}: a {COOPERATIVE} program is started again")
 
     def lay(self, vessel_pid: int, base: Snapshot, options: RestoreOptions) -> Copy:
         """Refused: what waits for such a program is the program itself, started in advance."""

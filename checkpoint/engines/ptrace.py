@@ -14,6 +14,7 @@ from checkpoint.engines.ptrace_capture import PtraceSession
 from checkpoint.engines.ptrace_restore import restore
 from checkpoint.linux.processor import require_supported
 from checkpoint.model import Snapshot
+from checkpoint.stored_base import StoredBase
 
 
 class PtraceEngine:
@@ -35,9 +36,9 @@ class PtraceEngine:
         """See ``checkpoint.engine.Engine.lacks``."""
         return restore_checks.lacks(outline, options, digest_of)
 
-    def restore(self, vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restored:
+    def restore(self, vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -> Restored:
         """See ``checkpoint.engine.Engine.restore``."""
-        return restore(vessel_pid, state, options)
+        return restore(vessel_pid, base, options)
 
     def lay(self, vessel_pid: int, base: Snapshot, options: RestoreOptions) -> Copy:
         """See ``checkpoint.engine.Engine.lay``."""

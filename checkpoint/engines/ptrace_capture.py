@@ -26,7 +26,7 @@ from typing import Final
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from checkpoint import portable, room, side_by_side, tree
+from checkpoint import pages, portable, room, side_by_side, tree
 from checkpoint.chain import position_of
 from checkpoint.engine import PTRACE, CaptureOrder, ProtectOrder
 from checkpoint.engines import description
@@ -40,13 +40,14 @@ from checkpoint.engines.outputs import Outputs
 from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux import abi, kinship, procfs, system_v
 from checkpoint.linux.kinship import Kinship
+from checkpoint.linux.memory import Memory
 from checkpoint.linux.precedence import Precedence
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.reports import Reports
 from checkpoint.linux.spokesman import SPOKESMEN_MAX, told_by_spokesman
 from checkpoint.linux.system_v import Segment
 from checkpoint.model import Position, Snapshot
-from checkpoint.pages import PageTable
+from checkpoint.pages import PageTable, Words
 from checkpoint.resources import (
     OpenFile,
     Surroundings,
@@ -61,6 +62,7 @@ from checkpoint.resources import (
 from checkpoint.resources.carried_connections import Departing
 from checkpoint.resources.carried_trees import NO_PARCEL, CarriedTrees, Parcel, Seen
 from checkpoint.stream_counts import Totals
+from checkpoint.unread_base import UnreadBase
 
 NS_PER_US: Final = 1000
 MOVED_S: Final = 2.0
@@ -199,22 +201,31 @@ class PtraceSession:
 
     def capture(self, order: CaptureOrder) -> Snapshot:
         """See ``checkpoint.engine.Session.capture``."""
+        captured = self._captured(order, may_stay=False)
+        assert isinstance(captured, Snapshot), "it was to be read"
+        return captured
+
+    def capture_standing(self, order: CaptureOrder) -> Snapshot | UnreadBase:
+        """See ``checkpoint.engine.Session.capture_standing``: pages of one process alone stay where they are."""
+        return self._captured(order, may_stay=order.base and order.hold and self._carried is None)
+
+    def _captured(self, order: CaptureOrder, *, may_stay: bool) -> Snapshot | UnreadBase:
         for _ in range(SPOKESMEN_MAX):
             try:
-                return self._captured(order)
+                return self._captured_once(order, may_stay=may_stay)
             except CaptureError:
                 if not self._speaks_by_another():
                     raise
         raise CaptureError(f"cannot capture {self.component} (pid {self.pid}): its threads end while it is looked at; try again")
 
-    def _captured(self, order: CaptureOrder) -> Snapshot:
+    def _captured_once(self, order: CaptureOrder, *, may_stay: bool) -> Snapshot | UnreadBase:
         parent = None if order.base else self._first.memory.acknowledged
         if self._refused:
             self._look_from_outside()
         try:
             if self._carried:
                 self._carried.prepare(carried_trees.mapped_shared(self._first.pid))
-            frozen = self._frozen(order, base=parent is None)
+            frozen = self._frozen(order, base=parent is None, may_stay=may_stay)
         except CaptureError as error:
             explained = self._explained(error)
             if explained is error:
@@ -248,8 +259,12 @@ class PtraceSession:
             self._carried.pid = first.pid
         return True
 
-    def _frozen(self, order: CaptureOrder, *, base: bool) -> Frozen:
-        """One freeze; again where processes came and went in the middle of it."""
+    def _frozen(self, order: CaptureOrder, *, base: bool, may_stay: bool) -> Frozen:
+        """One freeze; again where processes came and went in the middle of it.
+
+        Args:
+            may_stay: the pages of a single process need not be read.
+        """
         deadline = time.monotonic() + MOVED_S
         self._longest_us = 0
         while True:
@@ -257,10 +272,7 @@ class PtraceSession:
                 self._tree.admit(held=self._held)
                 if base and (others := self._tree.processes()):
                     self._refuse(room.refuse_capture((self.pid, *(process.pid for process in others))))
-                enough = self._enough()
-                self._first.memory.readers = side_by_side.thread_count() if order.hold else 1  # it is not to run on by itself
-                copied = self._first.copy_running(base=base, enough=enough)
-                self._tree.copy_running(base=base, enough=enough)
+                copied = None if may_stay and not self._tree.processes() else self._copied_running(order, base=base)
                 frozen = self._frozen_look(copied, base=base, hold=order.hold)
                 if not order.hold:
                     self._require_whole(frozen.first, frozen.others)
@@ -268,9 +280,18 @@ class PtraceSession:
                     frozen.others.describe()
                 return frozen
             except MovedError:
+                may_stay = False
                 if time.monotonic() > deadline:
                     raise
                 time.sleep(MOVED_PAUSE_S)
+
+    def _copied_running(self, order: CaptureOrder, *, base: bool) -> RunningCopy:
+        """What is copied of the first process before the freeze; those of the others are kept by the tree."""
+        enough = self._enough()
+        self._first.memory.readers = side_by_side.thread_count() if order.hold else 1  # it is not to run on by itself
+        copied = self._first.copy_running(base=base, enough=enough)
+        self._tree.copy_running(base=base, enough=enough)
+        return copied
 
     def _enough(self) -> int:
         """Pages that each process may leave for the freeze; 0 where nobody has set a budget."""
@@ -303,15 +324,19 @@ class PtraceSession:
 
     # While it stands still
 
-    def _frozen_look(self, copied: RunningCopy, *, base: bool, hold: bool) -> Frozen:
+    def _frozen_look(self, copied: RunningCopy | None, *, base: bool, hold: bool) -> Frozen:
         """Everything that needs the program to stand still."""
-        if not self._held:
+        if copied is None:
+            self._first.prepare(base=base)
+        elif not self._held:
             for process in (self._first, *self._tree.processes()):
                 process.rehearse()
         began = self._freeze()
         try:
             others = None
             if self._tree.stand_still():
+                if copied is None:
+                    raise MovedError(f"pid {self.pid} is not alone any more; capture it again")
                 self._refuse(refused_threads.refuse_kin(self._first.threads))
                 others = self._tree.begin_look()
             first = self._first.look(copied, self._outputs, base=base, opened=others.opened[self._first.pid] if others else None)
@@ -416,9 +441,10 @@ class PtraceSession:
 
     # Describing, while the program runs
 
-    def _described(self, order: CaptureOrder, parent: Position | None, frozen: Frozen) -> Snapshot:
+    def _described(self, order: CaptureOrder, parent: Position | None, frozen: Frozen) -> Snapshot | UnreadBase:
         """The snapshot of what a freeze brought home."""
         first, others = frozen.first, frozen.others
+        totals = first.standing.totals
         held = look(first.standing.opened, self._surroundings)
         of_files = self._carried.reasons(frozen.seen) if self._carried else ()
         of_others = others.reasons(first) if others else ()
@@ -428,13 +454,8 @@ class PtraceSession:
         of_segments = system_v_memory.refuse(_lines_of_all(first, others), frozen.segments)
         self._refuse((*held.reasons, *of_all, *self._first.reasons(first, pids), *of_others, *of_segments, *of_files))
         parcel = self._carried.parcel(frozen.seen, parent) if self._carried else NO_PARCEL
-        looks = [(self._first, first), *(others.looks() if others else ())]
-        taken = joined(looks, is_base=parent is None)
-        self.frozen_size = taken.frozen_size
-        self._budget.note(frozen.freeze_us * NS_PER_US, sum(look.taken.copy_ns for _, look in looks), taken.frozen_size)
-        totals = first.standing.totals
-        snapshot = replace(
-            self._with_pages(self._outline(order, parent, frozen, parcel), with_parcel(taken, parcel, is_base=parent is None)),
+        outline = replace(
+            self._outline(order, parent, frozen, parcel),
             resources=(
                 *self._first.known(held.resources),
                 *self._first.unopened(first),
@@ -443,7 +464,15 @@ class PtraceSession:
             ),
             output=self._outputs.pieces(self._output_since(parent), totals) if self._outputs else (),
         )
-        snapshot = frozen.departing.added_to(snapshot)
+        outline = frozen.departing.added_to(outline)
+        if len(first.taken.unread):
+            self.totals = totals
+            return self._unread(outline, first.taken.unread)
+        looks = [(self._first, first), *(others.looks() if others else ())]
+        taken = joined(looks, is_base=parent is None)
+        self.frozen_size = taken.frozen_size
+        self._budget.note(frozen.freeze_us * NS_PER_US, sum(look.taken.copy_ns for _, look in looks), taken.frozen_size)
+        snapshot = self._with_pages(outline, with_parcel(taken, parcel, is_base=parent is None))
         snapshot = replace(snapshot, position=position_of(snapshot, order.generation, order.sequence))
         for process, _ in looks:
             process.settle(snapshot.position)
@@ -452,6 +481,15 @@ class PtraceSession:
         self._totals_at[snapshot.position] = self.totals = totals
         self._forget_totals()
         return snapshot
+
+    def _unread(self, outline: Snapshot, unread: Words) -> UnreadBase:
+        """The base whose pages are where they were; those that are zero are carried, for to look for them is to read all."""
+        self.frozen_size = pages.total_size(unread)
+        pid = self._first.pid
+        return UnreadBase(
+            replace(outline, runs=pages.page_runs(unread), page_sum=pages.EMPTY_SUM),
+            lambda piece, buffer: Memory(pid).read_pages_into(piece, buffer),
+        )
 
     def _output_since(self, parent: Position | None) -> Totals:
         """Where a snapshot's output begins: a base may go to a robot that has nothing yet."""
@@ -483,16 +521,16 @@ class PtraceSession:
             zombies=others.zombies(first) if others else (),
         )
 
-    def _with_pages(self, outline: Snapshot, pages: Pages) -> Snapshot:
+    def _with_pages(self, outline: Snapshot, taken: Pages) -> Snapshot:
         """Add the pages: zero pages of anonymous memory are told, not carried."""
         before = PageTable.empty(abi.PAGE_SIZE) if outline.parent is None else self._table
-        self._table = before.apply(pages.forgotten, pages.runs, pages.contents, tree.every_mapping(outline), pages.copies)
+        self._table = before.apply(taken.forgotten, taken.runs, taken.contents, tree.every_mapping(outline), taken.copies)
         return replace(
             outline,
-            cleared=pages.forgotten,
-            runs=pages.runs,
-            contents=pages.contents,
-            copies=pages.copies,
+            cleared=taken.forgotten,
+            runs=taken.runs,
+            contents=taken.contents,
+            copies=taken.copies,
             page_sum=self._table.page_sum,
         )
 

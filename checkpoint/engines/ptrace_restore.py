@@ -34,6 +34,7 @@ from checkpoint import carried, epoch_variable, rights, room, side_by_side
 from checkpoint.arch import cpu, extended, stubs
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import (
+    description,
     restore_checks,
     restore_kinds,
     restore_memory,
@@ -46,11 +47,12 @@ from checkpoint.engines import (
 from checkpoint.engines.forked_memory import Legacy
 from checkpoint.engines.restore_checks import Brought
 from checkpoint.engines.restore_process import Vessel, pending_traps
-from checkpoint.errors import CheckpointError, MismatchError, RestoreError
+from checkpoint.errors import ChainError, CheckpointError, FormatError, MismatchError, RestoreError
 from checkpoint.linux import abi, call_table, processor, procfs, vdso
 from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee
+from checkpoint.linux.tracking import MEMORY_PLACE
 from checkpoint.model import Credentials, PageRun, Position, Snapshot, ThreadState, Vma
 from checkpoint.pages import Words
 from checkpoint.resources import (
@@ -78,6 +80,7 @@ from checkpoint.resources.departed import Departed
 from checkpoint.resources.rebuild import deleted_directory, open_here, rebuild_all, rebuild_last
 from checkpoint.resources.rebuilding import number_of
 from checkpoint.resources.system_v_memory import Segments
+from checkpoint.stored_base import StoredBase
 
 PTRACE_EVENT_EXEC: Final = 4
 OPTIONS: Final = abi.PTRACE_O_EXITKILL | abi.PTRACE_O_TRACESYSGOOD | abi.PTRACE_O_TRACEEXEC | abi.PTRACE_O_TRACECLONE
@@ -120,8 +123,10 @@ class RestoredProgram(Struct):
                 threads.thaw()
 
 
-def restore(vessel_pid: int, state: Snapshot, options: RestoreOptions) -> RestoredProgram:
+def restore(vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -> RestoredProgram:
     """See ``checkpoint.engine.Engine.restore``."""
+    stored = base if isinstance(base, StoredBase) and _may_be_proved_later(base.outline) else None
+    state = stored.outline if stored else base.whole(side_by_side.thread_count()) if isinstance(base, StoredBase) else base
     if not state.is_base:
         raise RestoreError("cannot restore a delta by itself: fold its chain first")
     if reasons := room.refuse_restore(state):
@@ -137,20 +142,38 @@ def restore(vessel_pid: int, state: Snapshot, options: RestoreOptions) -> Restor
         restored = (
             _run_tree(vessel_pid, program, options, brought, arriving)
             if state.is_tree
-            else _run_one(vessel_pid, program, options, brought[0], arriving)
+            else _run_one(vessel_pid, program, options, brought[0], arriving, stored)
         )
         restored.arriving = arriving
         restored.notes += arriving.notes
         restored.notes += laid.notes
         return restored
-    except RestoreError:
+    except (RestoreError, FormatError, ChainError):
         raise
     except CheckpointError as error:
         raise RestoreError(f"cannot restore {state.component} into pid {vessel_pid}: {error}") from error
 
 
-def _run_one(vessel_pid: int, state: Snapshot, options: RestoreOptions, brought: Brought, arriving: Arriving) -> RestoredProgram:
-    restoring = ProcessRestore(Tracee(vessel_pid), state, options, brought)
+def _may_be_proved_later(outline: Snapshot) -> bool:
+    """Whether the pages of a base may go into the vessel before all of them were proved, and none is wanted before.
+
+    Nothing that comes before pages outlives a vessel that is given up, but files that are made with them: those that travel with
+    the program, and its shared memory. A program of another kernel needs the old vdso early.
+    """
+    makes_files = any(vma.file is not None and vma.file.path.startswith(MEMORY_PLACE) for vma in outline.vmas)
+    is_of_this_kernel = outline.machine.vdso_digest == description.this_machine().vdso_digest
+    return not outline.is_tree and not makes_files and is_of_this_kernel and carried.without(outline) is outline
+
+
+def _run_one(
+    vessel_pid: int,
+    state: Snapshot,
+    options: RestoreOptions,
+    brought: Brought,
+    arriving: Arriving,
+    stored: StoredBase | None,
+) -> RestoredProgram:
+    restoring = ProcessRestore(Tracee(vessel_pid), state, options, brought, stored=stored)
     try:
         restoring.prepare()
         restoring.build()
@@ -225,6 +248,7 @@ class ProcessRestore:
         state: of this process alone.
         estate: None for a component of one process.
         legacy: what it has in common with others.
+        stored: the same base, where ``state`` has no pages.
     """
 
     def __init__(
@@ -235,7 +259,9 @@ class ProcessRestore:
         brought: Brought,
         estate: Estate | None = None,
         legacy: Legacy = restore_memory.NOTHING,
+        stored: StoredBase | None = None,
     ) -> None:
+        self._stored = stored
         self.has_table_of_parent = bool(joint.flags_of(state.resources) & joint.CLONE_FILES)
         self._state = joint.without_descriptors(state) if self.has_table_of_parent else state
         self._legacy = legacy
@@ -318,7 +344,7 @@ class ProcessRestore:
                 (reason,),
             )
         head = self._thread.robust_list[0]
-        listed = restore_memory.content_at(self._state, head, ROBUST_HEAD.size) if head else None
+        listed = self._content_at(head, ROBUST_HEAD.size) if head else None
         if listed is None:
             return
         first, _, acquiring = ROBUST_HEAD.unpack(listed)
@@ -395,7 +421,10 @@ class ProcessRestore:
             self._make_rings(self._stub, self._rings, first.descriptors)
         restore_threads.open_what_is_left(self._tracee, self._start_registers, self._stub, self._ended, first.descriptors)
         threads = side_by_side.thread_count()
-        restore_memory.fill(self._tracee.memory, self._state, self._legacy, self._untouched, threads)
+        if self._stored is not None:
+            restore_memory.fill_from(self._tracee.memory, self._stored, self._untouched, threads)
+        else:
+            restore_memory.fill(self._tracee.memory, self._state, self._legacy, self._untouched, threads)
 
     def _complete(self, later: LaterTables) -> None:
         """Everything but mappings and pages, which are there."""
@@ -627,6 +656,8 @@ class ProcessRestore:
 
     def _content_at(self, address: int, size: int) -> bytes | None:
         """Bytes of the program's memory as it was captured; None where no page is carried."""
+        if self._stored is not None:
+            return self._stored.content_at(address, size)
         return restore_memory.content_at(self._state, address, size)
 
     def _execute_program(self) -> None:

@@ -28,8 +28,9 @@ from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.tracking import MEMORY_PLACE, NONE
 from checkpoint.model import PageRun, Snapshot, Vma, VmaKind
-from checkpoint.pages import Words
+from checkpoint.pages import Buffer, Words
 from checkpoint.resources import aio_rings, memory_files, nameless, system_v_memory
+from checkpoint.stored_base import StoredBase
 
 OWNERS_ALONE: Final = 0o600
 MREMAP_MAYMOVE_FIXED: Final = 1 | 2
@@ -314,25 +315,63 @@ def fill(memory: Memory, snapshot: Snapshot, legacy: Legacy = NOTHING, untouched
     """Write every page that the snapshot carries, but for those of the kernel's own mappings, and those that are there.
 
     By several threads, if there is much of it: most of the time is the kernel's, which finds and clears a page for each of ours.
+    """
+    _write(memory, pages.extents(snapshot.runs), snapshot.contents, _filled(snapshot, legacy, untouched), threads)
+
+
+def fill_from(memory: Memory, base: StoredBase, untouched: Words = NONE, threads: int = 1) -> None:
+    """The same from a base that lies in a file: each page is still in a processor's cache when it is written.
+
+    Memory without a file is zero by itself: its pages of zeros, which such a base carries, are left as they are.
+
+    Raises:
+        FormatError, ChainError: its pages are not what they were; some were written.
+    """
+    filled = _filled(base.outline, NOTHING, untouched)
+    zero = pages.extents(vma for vma in base.outline.vmas if vma.file is None)
+
+    def written(row: Words, content: Buffer) -> None:
+        _write(Memory(memory.pid), *_without_zeros(row, content, zero), filled)
+
+    base.each(written, threads)
+
+
+def _without_zeros(row: Words, content: Buffer, zero: Words) -> tuple[Words, Buffer]:
+    """What is left of pages and their bytes without pages of zeros where there are zeros already."""
+    is_zero = pages.zero_pages(content, abi.PAGE_SIZE)
+    if not is_zero.any():
+        return row, content
+    addresses = pages.addresses_of(row, abi.PAGE_SIZE)
+    kept = ~(is_zero & pages.covered(zero, addresses))
+    rows = np.frombuffer(content, np.uint8).reshape(-1, abi.PAGE_SIZE)[kept]
+    return pages.extents_of_addresses(addresses[kept], abi.PAGE_SIZE), rows.reshape(-1).data
+
+
+def _filled(snapshot: Snapshot, legacy: Legacy, untouched: Words) -> Words:
+    """Where pages are written.
 
     Droppable memory begins empty, as its program must expect at any time: seeds of random numbers lie there (vgetrandom), which
     two lives must not have in common.
     """
-    contents, position = np.frombuffer(snapshot.contents, np.uint8), 0
     mapped = pages.extents(vma for vma in snapshot.vmas if vma.kind not in KERNEL_KINDS and vm_flags.DROPPABLE not in vma.flags)
-    mapped = pages.difference(pages.difference(mapped, legacy.there), untouched)
-    for is_wanted, piece in _cut(snapshot.runs, mapped):
-        ranges = piece.copy()
-        ranges[:, 1] -= ranges[:, 0]
-        size = int(ranges[:, 1].sum())
+    return pages.difference(pages.difference(mapped, legacy.there), untouched)
+
+
+def _write(memory: Memory, carried: Words, content: Buffer, filled: Words, threads: int = 1) -> None:
+    """Write those of the carried pages that are to be filled."""
+    contents, position = np.frombuffer(content, np.uint8), 0
+    for is_wanted, piece in _cut(carried, filled):
+        size = pages.total_size(piece)
         if is_wanted:
-            memory.write_side_by_side(ranges, contents[position : position + size], threads)
+            memory.write_side_by_side(piece, contents[position : position + size], threads)
         position += size
 
 
-def _cut(runs: Sequence[PageRun], mapped: Words) -> Iterator[tuple[bool, Words]]:
-    """The runs in order, as few pieces as there are changes between what is in a set and what is not."""
-    whole = pages.extents(runs)
+def _cut(whole: Words, mapped: Words) -> Iterator[tuple[bool, Words]]:
+    """Pages in order, as few pieces as there are changes between what is in a set and what is not."""
+    if pages.covers(mapped, whole):
+        yield True, whole
+        return
     outside = pages.difference(whole, mapped)
     begin = 0
     for first, last in outside.tolist():

@@ -22,7 +22,6 @@ from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.tracking import NONE, Scan, extents_of, is_orphan, is_shared_anonymous, is_shared_object
 from checkpoint.pages import PageMap, Words
 
-READ_CHUNK: Final = 8 << 20
 DIGESTED: Final = 1 << 20
 """Bytes that are read, and then digested, at a time."""
 PIECES_FOR_THREADS: Final = 8
@@ -105,25 +104,10 @@ def digests_of(memory: Memory, existing: Words) -> Words:
         memory.read_pages_into(piece, buffers.own)
         return pages.digest_pages(buffers.own[: len(addresses) * abi.PAGE_SIZE], addresses, abi.PAGE_SIZE)
 
-    pieces = chunks_of(existing, DIGESTED)
+    pieces = pages.cut(existing, DIGESTED)
     threads = side_by_side.thread_count() if len(pieces) >= PIECES_FOR_THREADS else 1
     found = list(side_by_side.in_order(digested, pieces, threads))
     return np.concatenate(found) if found else NONE
-
-
-def chunks_of(ranges: Words, size: int = READ_CHUNK) -> list[Words]:
-    """The same set in parts of at most ``size`` bytes."""
-    parts: list[list[tuple[int, int]]] = [[]]
-    room = size
-    for start, end in ranges.tolist():
-        while start < end:
-            step = min(room, end - start)
-            parts[-1].append((start, start + step))
-            start, room = start + step, room - step
-            if not room:
-                parts.append([])
-                room = size
-    return [np.array(part, dtype=np.uint64) for part in parts if part]
 
 
 def filled_extents(file: int, begin: int = 0) -> Iterator[tuple[int, int]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
-from collections.abc import Iterator
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -35,22 +34,6 @@ def address_of(buffer: bytearray | memoryview | NDArray[np.uint8]) -> int:
     if isinstance(buffer, np.ndarray):
         return int(buffer.ctypes.data)
     return ctypes.addressof(ctypes.c_char.from_buffer(buffer))
-
-
-def in_pieces(ranges: Ranges, size: int) -> Iterator[tuple[Ranges, int]]:
-    """Ranges cut after each ``size`` bytes: those of one piece, and where its bytes begin among all."""
-    ends = np.cumsum(ranges[:, 1], dtype=np.uint64)
-    begins = ends - ranges[:, 1]
-    total = int(ranges[:, 1].sum())
-    heads = np.array(range(0, total, size), np.uint64)
-    if not len(heads):
-        return
-    cuts = pages.distinct(np.concatenate([begins, heads]))
-    within = np.searchsorted(ends, cuts, side="right")
-    lengths = np.append(cuts[1:], np.uint64(total)) - cuts
-    rows = np.column_stack([ranges[within, 0] + (cuts - begins[within]), lengths])
-    for number, piece in enumerate(np.split(rows, np.searchsorted(cuts, heads)[1:])):
-        yield piece, number * size
 
 
 class Memory:
@@ -172,14 +155,21 @@ class Memory:
         """Write ``buffer`` to the ranges, one after the other. The mappings must be writable."""
         self._transfer(abi.process_vm_writev, "write", ranges, address_of(buffer))
 
-    def write_side_by_side(self, ranges: Ranges, buffer: NDArray[np.uint8], threads: int) -> None:
-        """As `write_from`, by several threads where there is enough for them; no two ranges may have a page in common."""
+    def write_pages_from(self, extents: Ranges, buffer: bytes | bytearray | memoryview | NDArray[np.uint8]) -> None:
+        """Write the pages of a set, rows ``[start, end)``, in order. The mappings must be writable."""
+        ranges = extents.copy()
+        ranges[:, 1] -= ranges[:, 0]
+        self.write_from(ranges, np.frombuffer(buffer, np.uint8))
 
-        def write(piece: tuple[Ranges, int]) -> None:
-            rows, offset = piece
-            Memory(self.pid).write_from(rows, buffer[offset:])
+    def write_side_by_side(self, extents: Ranges, buffer: NDArray[np.uint8], threads: int) -> None:
+        """As `write_pages_from`, by several threads where there is enough for them."""
 
-        for _ in side_by_side.in_order(write, in_pieces(ranges, PIECE), threads if len(buffer) > PIECE else 1):
+        def write(numbered: tuple[int, Ranges]) -> None:
+            number, piece = numbered
+            Memory(self.pid).write_pages_from(piece, buffer[number * PIECE :])
+
+        pieces = enumerate(pages.cut(extents, PIECE))
+        for _ in side_by_side.in_order(write, pieces, threads if len(buffer) > PIECE else 1):
             pass
 
     def write(self, address: int, content: bytes) -> None:

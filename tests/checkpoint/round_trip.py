@@ -26,6 +26,7 @@ from checkpoint.linux import abi
 from checkpoint.linux.namespaces import prctl
 from checkpoint.linux.vessel import Birth, Born, discard, spawn_program, spawn_vessel
 from checkpoint.model import Snapshot
+from checkpoint.stored_base import StoredBase, stored_base
 
 ENGINE = engine_named("ptrace")
 LIVES = 3
@@ -218,8 +219,25 @@ def captured_and_killed(program: Program, devices: tuple[DeviceRule, ...] = ()) 
     return snapshot
 
 
+def written_and_killed(program: Program, file: Path) -> None:
+    """One base, straight from its memory to a file while it stands still, then its end: as `failover capture` does it."""
+    with protected(program) as session, open(file, "wb", buffering=0) as target:
+        base = at_last(lambda: session.capture_standing(CaptureOrder(hold=True)))
+        if isinstance(base, Snapshot):  # of several processes
+            format.encode(base, target)
+        else:
+            base.write(target, threads=2)
+        program.kill()
+
+
+def restored_from(file: Path, directory: Path) -> Program:
+    """Bring such a base back, straight from its file."""
+    with stored_base(file) as base:
+        return restored(base, directory)
+
+
 def restored(
-    state: Snapshot | Sequence[Snapshot],
+    state: Snapshot | Sequence[Snapshot] | StoredBase,
     directory: Path,
     *,
     keep_pid: bool = True,
@@ -230,17 +248,17 @@ def restored(
     isolate: bool = False,
 ) -> Program:
     """Bring a base, or a base with its deltas, back as a child of ours and let it run."""
-    snapshots = [state] if isinstance(state, Snapshot) else list(state)
-    whole = chain.fold(snapshots) if len(snapshots) > 1 else snapshots[0]
-    elapsed_ns = max(time.time_ns() - whole.clocks.realtime_ns, 0)
+    base = state if isinstance(state, Snapshot | StoredBase) else chain.fold(state) if len(state) > 1 else state[0]
+    outline = base if isinstance(base, Snapshot) else base.outline
+    elapsed_ns = max(time.time_ns() - outline.clocks.realtime_ns, 0)
     with _stdio(directory) as stdio:
-        isolate = isolate or whole.process.isolated
-        clocks = whole.clocks if isolate else None
-        inner_pid = whole.process.pid if keep_pid else 0
+        isolate = isolate or outline.process.isolated
+        clocks = outline.clocks if isolate else None
+        inner_pid = outline.process.pid if keep_pid else 0
         born = spawn_vessel(Birth(inner_pid=inner_pid, isolate=isolate, clocks=clocks, elapsed_ns=elapsed_ns, stdio=stdio))
     try:
         options = RestoreOptions(elapsed_ns, accept_changed, own_eyes, contents=str(contents), terms=Terms(devices=devices))
-        program = ENGINE.restore(born.pid, whole, options)
+        program = ENGINE.restore(born.pid, base, options)
         program.resume()
     except BaseException:
         discard(born)
@@ -248,13 +266,28 @@ def restored(
     return Program(born, directory)
 
 
+def copied(program: Program, directory: Path) -> Program:
+    """It is captured while it runs, is killed, and comes back from a snapshot in memory."""
+    return restored(captured_and_killed(program), directory)
+
+
+def straight(program: Program, directory: Path) -> Program:
+    """It stands still for good, and its pages go from its memory to a file, and back from there."""
+    file = directory.with_name(f"{directory.name}.straight")  # not beside what it may look for
+    written_and_killed(program, file)
+    return restored_from(file, directory)
+
+
 def expect_three_lives(tracee: Program, directory: Path) -> None:
-    """Capture, kill and restore a tracee three times, each time captured twice, and have it say what differs."""
-    for _ in range(LIVES):
+    """Capture, kill and restore a tracee three times, each time captured twice, and have it say what differs.
+
+    One of the times it goes straight into a file, and comes straight from there.
+    """
+    for life in range(LIVES):
         with ended(tracee):
             captured(tracee)
-            snapshot = captured_and_killed(tracee)
-        tracee = restored(snapshot, directory)
+            again = straight if life == LIVES // 2 else copied
+            tracee = again(tracee, directory)
     with ended(tracee):
         captured(tracee)
         tracee.tell()

@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 
 from checkpoint import pages
-from checkpoint.engines.capture_memory import MemoryCapture, RunningCopy
+from checkpoint.engines.capture_memory import READ_CHUNK, MemoryCapture, RunningCopy
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import abi
-from checkpoint.linux.digests import READ_CHUNK
-from checkpoint.linux.memory import PIECE, Memory, address_of, in_pieces, ranges_of
+from checkpoint.linux.memory import PIECE, Memory, address_of
 
 
 def test_a_process_that_ends_between_two_ways_to_read_it_is_said_to_have_ended(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -33,37 +32,41 @@ def test_a_process_that_ends_between_two_ways_to_read_it_is_said_to_have_ended(m
         memory.read_pages(np.array([[abi.PAGE_SIZE, 2 * abi.PAGE_SIZE]], dtype=np.uint64))
 
 
+def extents_from(pairs: list[tuple[int, int]]) -> pages.Words:
+    return np.array(pairs, np.uint64).reshape(-1, 2)
+
+
 @pytest.mark.parametrize("lengths", [(), (1,), (10,), (11,), (3, 7, 10), (25, 1, 4), (100,), (1,) * 30], ids=str)
-def test_ranges_are_cut_after_each_so_many_bytes(lengths: tuple[int, ...]) -> None:
-    ranges = ranges_of([(1_000 * number, length) for number, length in enumerate(lengths, 1)])
-    pieces = [(offset, [tuple(row) for row in piece.tolist()]) for piece, offset in in_pieces(ranges, 10)]
-    assert [offset for offset, _ in pieces] == list(range(0, sum(lengths), 10))
-    assert all(sum(length for _, length in rows) == 10 for _, rows in pieces[:-1])
-    each = [address + at for address, length in ranges.tolist() for at in range(length)]
-    assert [address + at for _, rows in pieces for address, length in rows for at in range(length)] == each
+def test_stretches_are_cut_after_each_so_many_bytes(lengths: tuple[int, ...]) -> None:
+    stretches = extents_from([(1_000 * number, 1_000 * number + length) for number, length in enumerate(lengths, 1)])
+    pieces = [[tuple(row) for row in piece.tolist()] for piece in pages.cut(stretches, 10)]
+    assert len(pieces) == -(-sum(lengths) // 10)
+    assert all(sum(end - begin for begin, end in rows) == 10 for rows in pieces[:-1])
+    each = [place for begin, end in stretches.tolist() for place in range(begin, end)]
+    assert [place for rows in pieces for begin, end in rows for place in range(begin, end)] == each
 
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_what_several_threads_write_is_what_one_writes(threads: int) -> None:
     memory, dice = np.zeros(3 * PIECE, np.uint8), random.Random(5)
     cuts = [0, *sorted(dice.sample(range(1, 3 * PIECE), 200))]
-    pairs = [(address_of(memory) + begin, end - begin) for begin, end in zip(cuts[::2], cuts[1::2], strict=False)]
+    pairs = [(address_of(memory) + begin, address_of(memory) + end) for begin, end in zip(cuts[::2], cuts[1::2], strict=False)]
     dice.shuffle(pairs)
-    content = np.frombuffer(dice.randbytes(sum(length for _, length in pairs)), np.uint8)
-    Memory(os.getpid()).write_side_by_side(ranges_of(pairs), content, threads)
+    content = np.frombuffer(dice.randbytes(sum(end - begin for begin, end in pairs)), np.uint8)
+    Memory(os.getpid()).write_side_by_side(extents_from(pairs), content, threads)
     expected, position = np.zeros_like(memory), 0
-    for address, length in pairs:
-        begin = address - address_of(memory)
-        expected[begin : begin + length] = content[position : position + length]
-        position += length
+    for begin, end in pairs:
+        place = begin - address_of(memory)
+        expected[place : place + end - begin] = content[position : position + end - begin]
+        position += end - begin
     assert np.array_equal(memory, expected)
 
 
 def test_memory_that_is_not_there_is_refused_by_several_threads_as_by_one() -> None:
     content = np.zeros(2 * PIECE, np.uint8)
-    ranges = ranges_of([(address_of(content), PIECE), (abi.PAGE_SIZE, PIECE)])
+    stretches = extents_from([(address_of(content), address_of(content) + PIECE), (abi.PAGE_SIZE, abi.PAGE_SIZE + PIECE)])
     with pytest.raises(CaptureError, match=f"at {abi.PAGE_SIZE:#x}: Bad address"):
-        Memory(os.getpid()).write_side_by_side(ranges, content, 2)
+        Memory(os.getpid()).write_side_by_side(stretches, content, 2)
 
 
 HOLLOW = """

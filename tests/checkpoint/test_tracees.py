@@ -15,7 +15,17 @@ from pathlib import Path
 import pytest
 from _pytest.mark import ParameterSet
 
-from tests.checkpoint.round_trip import Program, captured, captured_and_killed, ended, expect_ok, restored, start_tracee
+from tests.checkpoint.round_trip import (
+    Program,
+    captured,
+    captured_and_killed,
+    copied,
+    ended,
+    expect_ok,
+    restored,
+    start_tracee,
+    straight,
+)
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
@@ -169,12 +179,16 @@ def expected(found: list[Case], not_yet: dict[str, str]) -> list[ParameterSet]:
     return [pytest.param(case, id=str(case), marks=mark) for (case, _), mark in zip(reasons, marks, strict=True)]
 
 
+Way = Callable[[Program, Path], Program]
+
+
+@pytest.mark.parametrize("way", [copied, straight])
 @pytest.mark.parametrize("case", expected(PRESERVED, NOT_YET))
-def test_a_restored_program_finds_everything_as_it_was(case: Case, compiled: Compiled, tmp_path: Path) -> None:
+def test_a_restored_program_finds_everything_as_it_was(case: Case, way: Way, compiled: Compiled, tmp_path: Path) -> None:
     tracee = start_tracee(compiled(case.program, "-O2"), tmp_path, *case.arguments)
     with ended(tracee):
-        snapshot = captured_and_killed(tracee)
-    with ended(restored(snapshot, tmp_path)) as tracee:
+        again = way(tracee, tmp_path)
+    with ended(again) as tracee:
         case.tell(tracee)
         expect_ok(tracee)
 
