@@ -9,8 +9,13 @@ from checkpoint import quiet
 
 
 def main() -> int:
-    """Load and run the keeper."""
+    """Load and run what the words of this process say."""
     quiet.begin()
+    return quiet.left(run(sys.argv[1:]))
+
+
+def run(words: list[str]) -> int:
+    """Load and run the keeper."""
     gc.disable()  # of what is loaded nothing is rubbish, and what captures make is freed by counting
     from checkpoint import lean
 
@@ -18,7 +23,7 @@ def main() -> int:
     lean.load_numpy()
     from checkpoint import keeper
 
-    return quiet.left(keeper.main(sys.argv[1:]))
+    return keeper.main(words)
 
 
 if __name__ == "__main__":

@@ -9,15 +9,25 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from typing import IO, TYPE_CHECKING, Final, NamedTuple
+from typing import IO, TYPE_CHECKING, Final, NamedTuple, Protocol
 
 if TYPE_CHECKING:
     import socket
-    import subprocess
+    from collections.abc import Callable
 
 WITH_A_KEEPER: Final = ("capture", "restore", "check")
 """Verbs that ask a keeper of their own."""
 HELP: Final = frozenset({"-h", "--help"})
+
+
+class Child(Protocol):
+    """A process of ours, as `subprocess.Popen` is one."""
+
+    pid: int
+
+    def wait(self, timeout: float | None = None) -> int: ...
+
+    def kill(self) -> None: ...
 
 
 class Started(NamedTuple):
@@ -28,7 +38,7 @@ class Started(NamedTuple):
         complaints: what it writes to standard error.
     """
 
-    process: subprocess.Popen[bytes]
+    process: Child
     ours: socket.socket
     complaints: IO[bytes]
 
@@ -37,15 +47,19 @@ _ahead: Final[list[Started]] = []
 
 
 def start_for(words: list[str]) -> None:
-    """Start the one that the verb of a command's words will ask; other verbs ask none."""
+    """Start the one that the verb of a command's words will ask; other verbs ask none.
+
+    Only as the first thing that a command does: the keeper is its child as it is now, which takes half the time of another
+    interpreter, and must not find anything in it that a command has made.
+    """
     if words and words[0] in WITH_A_KEEPER and not HELP.intersection(words):
         with contextlib.suppress(OSError):  # the verb tries it again, and tells
-            _ahead.append(_started())
+            _ahead.append(_started(_forked))
 
 
 def taken() -> Started:
     """The one that was started ahead, or a new one; the caller's from now on."""
-    return _ahead.pop() if _ahead else _started()
+    return _ahead.pop() if _ahead else _started(_spawned)
 
 
 def forsake() -> None:
@@ -58,18 +72,78 @@ def forsake() -> None:
         left.process.wait()
 
 
-def _started() -> Started:
+def _started(born: Callable[[socket.socket, IO[bytes]], Child]) -> Started:
     import socket
-    import subprocess
 
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
     complaints = open(os.memfd_create("complaints"), "w+b")  # noqa: SIM115  # whoever takes it closes it
     with theirs:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "checkpoint", "keeper", str(theirs.fileno())],
-            pass_fds=(theirs.fileno(),),
-            stdin=subprocess.DEVNULL,
-            stderr=complaints,
-            process_group=0,  # a Ctrl-C at the terminal is ours to act on
-        )
-    return Started(process, ours, complaints)
+        return Started(born(theirs, complaints), ours, complaints)
+
+
+def _spawned(theirs: socket.socket, complaints: IO[bytes]) -> Child:
+    import subprocess
+
+    return subprocess.Popen(
+        [sys.executable, "-m", "checkpoint", "keeper", str(theirs.fileno())],
+        pass_fds=(theirs.fileno(),),
+        stdin=subprocess.DEVNULL,
+        stderr=complaints,
+        process_group=0,  # a Ctrl-C at the terminal is ours to act on
+    )
+
+
+def _forked(theirs: socket.socket, complaints: IO[bytes]) -> Child:
+    pid = os.fork()
+    if pid:
+        return _Forked(pid)
+    status = 1
+    try:
+        status = _as_keeper(theirs.fileno(), complaints.fileno())
+    except BaseException:  # noqa: BLE001  # nothing of the command may be done twice
+        sys.excepthook(*sys.exc_info())
+    finally:
+        sys.stderr.flush()
+        os._exit(status)
+
+
+def _as_keeper(theirs: int, complaints: int) -> int:
+    """Be in the child what `_spawned` starts."""
+    os.setpgid(0, 0)
+    null = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(null, 0)
+    os.dup2(complaints, 2)
+    os.closerange(3, theirs)
+    os.closerange(theirs + 1, os.sysconf("SC_OPEN_MAX"))
+    from checkpoint.__main__ import run
+
+    return run(["keeper", str(theirs)])
+
+
+class _Forked:
+    """See `Child`."""
+
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+        self._status: int | None = None
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Reap it; its exit status. Raises TimeoutError."""
+        if self._status is None:
+            if timeout is not None and not self._has_ended(timeout):
+                raise TimeoutError(f"the keeper (pid {self.pid}) has not ended after {timeout:.0f} s")
+            self._status = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+        return self._status
+
+    def _has_ended(self, timeout: float) -> bool:
+        import select
+
+        end = os.pidfd_open(self.pid)
+        try:
+            return bool(select.select([end], [], [], timeout)[0])
+        finally:
+            os.close(end)
+
+    def kill(self) -> None:
+        """End it now."""
+        os.kill(self.pid, 9)

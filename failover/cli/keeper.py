@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import os
 import select
-import subprocess
 from typing import IO, TypeVar
 
 import msgspec
@@ -27,7 +26,7 @@ A = TypeVar("A", bound=msgspec.Struct)
 class Keeper:
     """One keeper process and our end of its channel. A context manager; leaving it lets go of the tracee."""
 
-    def __init__(self, process: subprocess.Popen[bytes], link: Channel[Reply], complaints: IO[bytes]) -> None:
+    def __init__(self, process: ahead.Child, link: Channel[Reply], complaints: IO[bytes]) -> None:
         self._process = process
         self._link = link
         self._complaints = complaints
