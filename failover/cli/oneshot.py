@@ -28,7 +28,7 @@ from checkpoint.errors import (
 )
 from checkpoint.linux import kinship, namespaces, procfs, vessel
 from checkpoint.linux.vessel import Birth, Born
-from checkpoint.model import Snapshot
+from checkpoint.state import State
 from failover.cli import picture, render
 from failover.cli.components import exit_like
 from failover.cli.keeper import Keeper
@@ -199,38 +199,39 @@ def restore(arguments: argparse.Namespace) -> int:
         file = os.open(arguments.file, os.O_RDONLY | os.O_CLOEXEC)
     except OSError as error:
         raise FailoverError(f"cannot read {arguments.file}: {error.strerror}") from error
-    outline = format.read_outline(file)
-    elapsed_ns, terms = vessel.elapsed_since(outline.clocks), terms_of(arguments)
-    birth = birth_of(outline, elapsed_ns, own_session=not arguments.wait)
+    state = format.read_state(file)
+    elapsed_ns, terms = vessel.elapsed_since(state.clocks), terms_of(arguments)
+    birth = birth_of(state, elapsed_ns, own_session=not arguments.wait)
     with Keeper.spawn() as keeper, _born(birth) as born:
-        order = Restore(born.pid, outline.component, elapsed_ns, terms=terms, stood_still=terms.connections, follow=False)
+        order = Restore(born.pid, state.component, elapsed_ns, terms=terms, stood_still=terms.connections, follow=False)
         restored, _ = keeper.ask(order, Restored, (file,))
         resumed, _ = keeper.ask(Resume(), Resumed)
         if not arguments.wait:
             keeper.release()
-    moved = (OWN_PIDS,) if born.isolated and not outline.process.isolated else ()
+    moved = (OWN_PIDS,) if born.isolated and not state.process.isolated else ()
     _tell_restore(arguments, restored.pid, born.notes + moved + restored.notes + resumed.notes)
     return _wait_for(born) if arguments.wait else 0
 
 
-def birth_of(outline: Snapshot, elapsed_ns: int, own_session: bool) -> Birth:
+def birth_of(state: State, elapsed_ns: int, own_session: bool) -> Birth:
     """How the vessel for a snapshot must be born.
 
     On the boot that it was captured on, a program that lived in the machine's own PIDs and clocks finds them as they were.
     One that knows itself by several PIDs, which cannot be had here, gets PIDs of its own.
     """
-    isolated = outline.process.isolated
-    here = Path("/proc/sys/kernel/random/boot_id").read_text().strip() == outline.machine.boot_id
-    clocks = None if here and not isolated else outline.clocks
-    return Birth(outline.process.pid, isolated or _lacks_its_ids(outline), clocks, elapsed_ns, own_session=own_session)
+    isolated = state.process.isolated
+    here = Path("/proc/sys/kernel/random/boot_id").read_text().strip() == state.machine.boot_id
+    clocks = None if here and not isolated else state.clocks
+    return Birth(state.process.pid, isolated or _lacks_its_ids(state), clocks, elapsed_ns, own_session=own_session)
 
 
-def _lacks_its_ids(outline: Snapshot) -> bool:
+def _lacks_its_ids(state: State) -> bool:
     """Whether a program of several processes or threads finds one of its ids taken, or may not choose them at all.
 
     Ids of what has just ended are waited for, for a while: its parent, or init, has yet to take note of that.
     """
-    ids = {thread.tid for one in outline.processes for thread in one.threads} | {zombie.pid for zombie in outline.zombies}
+    threads = (*state.threads, *(thread for member in state.members for thread in member.threads))
+    ids = {thread.tid for thread in threads} | {zombie.pid for zombie in state.zombies}
     if len(ids) == 1 or not namespaces.may_choose_pids():
         return len(ids) > 1
     deadline = time.monotonic() + IDS_TIMEOUT_S
