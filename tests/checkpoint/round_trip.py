@@ -10,6 +10,7 @@ import contextlib
 import os
 import signal
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -273,9 +274,9 @@ def copied(program: Program, directory: Path) -> Program:
 
 def straight(program: Program, directory: Path) -> Program:
     """It stands still for good, and its pages go from its memory to a file, and back from there."""
-    file = directory.with_name(f"{directory.name}.straight")  # not beside what it may look for
-    written_and_killed(program, file)
-    return restored_from(file, directory)
+    with tempfile.TemporaryDirectory() as place:  # not beside what it may look for
+        written_and_killed(program, Path(place) / "base")
+        return restored_from(Path(place) / "base", directory)
 
 
 def expect_three_lives(tracee: Program, directory: Path) -> None:
