@@ -143,7 +143,7 @@ def _taken_over_once(content: int, pid: int) -> tuple[float, float]:
 
 def _restored_once(content: int, pid: int, megabytes: int) -> float:
     with Keeper.spawn() as keeper:
-        _wait_until_ready(keeper)
+        wait_until_ready(keeper)
         machine.touch_memory(ROOM * megabytes)
         began_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         born = vessel.spawn_vessel(Birth(pid))
@@ -155,6 +155,6 @@ def _restored_once(content: int, pid: int, megabytes: int) -> float:
             vessel.discard(born)
 
 
-def _wait_until_ready(keeper: Keeper) -> None:
+def wait_until_ready(keeper: Keeper) -> None:
     """A standby's keeper runs already when it is needed: the interpreter's start is not part of a restore."""
     keeper.ask(channel.Probe(os.getpid()), channel.Probed)

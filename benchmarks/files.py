@@ -15,11 +15,18 @@ from benchmarks.alternatives import Criu, call
 from benchmarks.beside import fresh, images
 from benchmarks.figures import OURS, Absent, Figure, Findings
 from benchmarks.running import wait_until_gone
+from checkpoint import channel, format
+from checkpoint.linux import vessel
+from checkpoint.linux.vessel import Born
+from failover.cli import oneshot
+from failover.cli.keeper import Keeper
 
 SIZES_MB: Final = (100, 500)
 COUNT: Final = 8
 QUICK_COUNT: Final = 3
 TO_FILE, BACK, SIZE = "to a file, the program is ended", "back from it, until it runs", "size of the file"
+
+READY: Final = f"{OURS}, its keeper running"
 
 Times = dict[str, list[float]]
 
@@ -31,7 +38,7 @@ def files(quick: bool, directory: Path) -> Findings:
     with images() as place:
         with fresh(place) as probe:
             reason = criu.why_absent(probe)
-        makers: dict[str, Callable[[int, Path], Times]] = {OURS: _ours}
+        makers: dict[str, Callable[[int, Path], Times]] = {OURS: _ours, READY: _ready}
         if not reason:
             makers[criu.name] = lambda pid, image: _theirs(criu, pid, image)
         for megabytes in SIZES_MB[: 1 if quick else None]:
@@ -47,8 +54,9 @@ def files(quick: bool, directory: Path) -> Findings:
         "To a file and back, as commands",
         "`failover capture PID -o FILE` and `failover restore FILE`, from the start of the command to its end, beside "
         "`criu dump` and `criu restore`; files are in memory. Ours are encoded, and every byte is verified before it is used; "
-        "the content, one page of chance again and again, compresses well. Ours contain the start of two interpreters, the "
-        "command's and its keeper's.",
+        "the content, one page of chance again and again, compresses well. Ours contain the start of an interpreter and of two "
+        "processes' modules, the command's and its keeper's; beside them the same orders to a keeper that runs already, as "
+        "an agent's does.",
         tuple(sorted(figures, key=lambda figure: (TO_FILE, BACK, SIZE).index(figure.benchmark))),
         (Absent(criu.name, reason),) if reason else (),
     )
@@ -68,6 +76,43 @@ def _ours(pid: int, image: Path) -> Times:
     brought = _timed(lambda: _failover("restore", str(file)))
     _end_stranger(pid)
     return {TO_FILE: [taken], BACK: [brought], SIZE: [size]}
+
+
+def _ready(pid: int, image: Path) -> Times:
+    """What the commands order, without their start."""
+    file = image / "snapshot"
+    with Keeper.spawn() as keeper:
+        engine.wait_until_ready(keeper)
+        taken = _timed(lambda: _to_file(keeper, pid, file))
+    size = file.stat().st_blocks * 512 / 1e6
+    with Keeper.spawn() as keeper:
+        engine.wait_until_ready(keeper)
+        born: list[Born] = []
+        brought = _timed(lambda: born.append(_back(keeper, file)))
+    vessel.discard(born[0])
+    return {TO_FILE: [taken], BACK: [brought], SIZE: [size]}
+
+
+def _to_file(keeper: Keeper, pid: int, file: Path) -> None:
+    keeper.ask(channel.Protect(pid, "/benchmark"), channel.Protected)
+    with open(file, "xb", buffering=0) as target:
+        order = channel.Capture(base=True, generation=1, sequence=1, hold=True)
+        keeper.ask(order, channel.Captured, (target.fileno(),))
+        os.fsync(target.fileno())
+    os.kill(pid, signal.SIGKILL)
+    keeper.release()
+    os.waitpid(pid, 0)
+
+
+def _back(keeper: Keeper, file: Path) -> Born:
+    descriptor = os.open(file, os.O_RDONLY | os.O_CLOEXEC)
+    state = format.read_state(descriptor)
+    born = vessel.spawn_vessel(oneshot.birth_of(state, 0, own_session=True))
+    keeper.ask(channel.Restore(born.pid, state.component, follow=False), channel.Restored, (descriptor,))
+    keeper.ask(channel.Resume(), channel.Resumed)
+    keeper.release()
+    os.close(descriptor)
+    return born
 
 
 def _theirs(criu: Criu, pid: int, image: Path) -> Times:
