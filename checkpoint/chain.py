@@ -131,26 +131,41 @@ def fold(chain: Sequence[Snapshot]) -> Snapshot:
         nothing = PageTable.empty(page_size)
         check_sum(newest, nothing.apply((), newest.runs, newest.contents, every_mapping(newest), newest.copies).page_sum)
         return by_itself(newest)
-    sources, layers = _newest_sources(chain, page_size)
+    origins = Origins.of(chain)
     has_copies = newest.is_tree and any(snapshot.copies for snapshot in chain)  # one process alone has none
-    carried, copies = _told_once(sources, layers, page_size) if has_copies else (sources, ())
-    gathered = gathered_bytes([snapshot.contents for snapshot in chain], carried, page_size)
-    for layer in layers:
-        _lay_on(gathered, carried, layer, page_size)
-    contents = gathered.data.toreadonly()
+    carried, copies = _told_once(origins.sources, origins.layers, page_size) if has_copies else (origins.sources, ())
+    contents = origins.gathered(chain, carried).data.toreadonly()
     runs = pages.page_runs(pages.extents_of_addresses(carried.addresses, page_size))
     check_state(newest, PageTable.empty(page_size).apply((), runs, contents, every_mapping(newest), copies).page_sum)
+    return replace(_joined(chain), runs=runs, contents=contents, copies=copies)
+
+
+def _joined(chain: Sequence[Snapshot]) -> Snapshot:
+    """A whole chain as one base, but for its pages."""
     return replace(
-        newest,
+        chain[-1],
         parent=None,
         cleared=(),
-        runs=runs,
-        contents=contents,
-        copies=copies,
         differences=(),
         output=_joined_output(chain),
         notes=tuple(dict.fromkeys(note for snapshot in chain for note in snapshot.notes)),
     )
+
+
+def outlined(chain: Sequence[Snapshot]) -> tuple[Snapshot, Origins]:
+    """As `fold`, but for the pages, which remain to be put together and to be proved (`check_sum`).
+
+    Args:
+        chain: of one process; the base needs no contents.
+
+    Raises:
+        ChainError: as `fold`.
+    """
+    _check_chain(chain)
+    _check_digest(chain[-1])
+    origins = Origins.of(chain)
+    runs = pages.page_runs(pages.extents_of_addresses(origins.sources.addresses, chain[-1].machine.page_size))
+    return replace(_joined(chain), runs=runs, contents=b""), origins
 
 
 def by_itself(base: Snapshot) -> Snapshot:
@@ -161,10 +176,10 @@ def by_itself(base: Snapshot) -> Snapshot:
     """
     _check_chain((base,))
     _check_digest(base)
-    return replace(base, cleared=(), output=_joined_output((base,)), notes=tuple(dict.fromkeys(base.notes)))
+    return _joined((base,))
 
 
-class _Layer(Struct, frozen=True, eq=False):
+class Layer(Struct, frozen=True, eq=False):
     """The pages that one snapshot tells as differences.
 
     Attributes:
@@ -176,15 +191,44 @@ class _Layer(Struct, frozen=True, eq=False):
     addresses: Words
     differences: Rows
 
+    def laid_on(self, rows: Rows, state: PageMap) -> None:
+        """Change those pages of a state that no later snapshot has set or taken away.
 
-def _lay_on(gathered: NDArray[np.uint8], carried: PageMap, layer: _Layer, page_size: int) -> None:
-    """Change those pages of a layer that no later snapshot has set or taken away."""
-    found, places = pages.found_among(carried.addresses, layer.addresses)
-    still = carried.words[places, 0] < np.uint64(layer.index)
-    gathered.reshape(-1, page_size)[places[still]] ^= layer.differences[found][still]
+        Args:
+            rows: the bytes of the state's pages so far.
+        """
+        found, places = pages.found_among(state.addresses, self.addresses)
+        still = state.words[places, 0] < np.uint64(self.index)
+        rows[places[still]] ^= self.differences[found][still]
 
 
-def _told_once(sources: PageMap, layers: Sequence[_Layer], page_size: int) -> tuple[PageMap, tuple[PageCopy, ...]]:
+class Origins(Struct, frozen=True, eq=False):
+    """Where the pages of a chain's newest state come from.
+
+    Attributes:
+        sources: for each where it was last told whole: (index in the chain, index of the page there).
+        layers: what was told as differences since, oldest first.
+    """
+
+    sources: PageMap
+    layers: tuple[Layer, ...]
+
+    @classmethod
+    def of(cls, chain: Sequence[Snapshot]) -> Origins:
+        """Those of a chain; a base needs no contents."""
+        sources, layers = _newest_sources(chain, chain[-1].machine.page_size)
+        return cls(sources, tuple(layers))
+
+    def gathered(self, chain: Sequence[Snapshot], wanted: PageMap) -> NDArray[np.uint8]:
+        """The bytes of some of the pages."""
+        page_size = chain[-1].machine.page_size
+        gathered = gathered_bytes([snapshot.contents for snapshot in chain], wanted, page_size)
+        for layer in self.layers:
+            layer.laid_on(gathered.reshape(-1, page_size), wanted)
+        return gathered
+
+
+def _told_once(sources: PageMap, layers: Sequence[Layer], page_size: int) -> tuple[PageMap, tuple[PageCopy, ...]]:
     """Pages that lie at different places, and copies of them: those that lie at the same one, and that no layer changes."""
     changed = np.unique(np.concatenate([np.empty(0, dtype=np.uint64), *(layer.addresses for layer in layers)]))
     own = np.where(np.isin(sources.addresses, changed, assume_unique=True), sources.addresses, np.uint64(0))
@@ -217,7 +261,7 @@ def _check_kin(parent: Snapshot, delta: Snapshot) -> None:
         )
 
 
-def _newest_sources(chain: Sequence[Snapshot], page_size: int) -> tuple[PageMap, list[_Layer]]:
+def _newest_sources(chain: Sequence[Snapshot], page_size: int) -> tuple[PageMap, list[Layer]]:
     """For every page of the folded state where it was last told whole: (index in the chain, index of the page there).
 
     Returns:
@@ -227,7 +271,7 @@ def _newest_sources(chain: Sequence[Snapshot], page_size: int) -> tuple[PageMap,
         ChainError: a page is told as the difference from one that is not there.
     """
     state = PageMap.empty()
-    layers: list[_Layer] = []
+    layers: list[Layer] = []
     for index, snapshot in enumerate(chain):
         addresses = differences.addresses_of(snapshot.runs, page_size)
         places = np.empty((len(addresses), 2), dtype=np.uint64)
@@ -246,10 +290,10 @@ def _newest_sources(chain: Sequence[Snapshot], page_size: int) -> tuple[PageMap,
     return state, layers
 
 
-def _layer_of(snapshot: Snapshot, index: int, carried: Words, page_size: int) -> _Layer:
+def _layer_of(snapshot: Snapshot, index: int, carried: Words, page_size: int) -> Layer:
     addresses = differences.addresses_of(snapshot.differences, page_size)
     rows = differences.rows_of(snapshot.contents, page_size)
-    return _Layer(index, addresses, rows[np.searchsorted(carried, addresses)])
+    return Layer(index, addresses, rows[np.searchsorted(carried, addresses)])
 
 
 def _check_there(snapshot: Snapshot, wanted: Words, held: Words) -> None:

@@ -374,7 +374,7 @@ class Engine(Protocol):
         """
         ...
 
-    def lay(self, vessel_pid: int, base: Snapshot, options: RestoreOptions) -> Copy:
+    def lay(self, vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -> Copy:
         """Begin a ready copy in a waiting vessel.
 
         Raises:

@@ -196,6 +196,16 @@ def read_state(source: Source) -> State:
         return _read_state(reader, _read_preamble(reader))
 
 
+def is_of_several_processes(source: Source) -> bool:
+    """Whether a file's preamble says so.
+
+    Raises:
+        FormatError: no file of ours; the rest of it is not looked at.
+    """
+    with opened(source) as reader:
+        return _read_preamble(reader).is_tree
+
+
 def read_pages(source: Source, wanted: Words) -> tuple[Snapshot, Flags, Rows]:
     """Read some pages of a file, and nothing of the others but the heads of their frames.
 

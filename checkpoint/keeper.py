@@ -212,11 +212,11 @@ class Keeper:
     def _restored_from(self, files: Descriptors, request: channel.Restore) -> tuple[Restored, dict[str, str] | None]:
         """Restore what a chain's files amount to; and what its program knows its files by, where a robot keeps them."""
         places = dict(request.terms.carry.places)
-        if len(files) != 1:
+        if not files or _has_several_processes(files):
             state = carried.relocated(folded(files), places)
             names = _names_of(state, request)
             return self._tracer.restore(request.pid, state, _options(request)), names
-        with stored_base(files[0]) as base:
+        with stored_base(*files) as base:
             base.relocate(places)
             names = _names_of(base.outline, request)
             return self._tracer.restore(request.pid, base, _options(request)), names
@@ -228,8 +228,11 @@ class Keeper:
             options = RestoreOptions(own_eyes=request.own_eyes, contents=request.contents, terms=request.terms)
             with foreign.facts(f"lay a ready copy of {request.component}"):
                 is_whole = _has_several_processes(descriptors)  # who came or went within the chain is not followed
-                base = folded(descriptors) if is_whole else format.decode(descriptors[0])
-                self._copy = self._tracer.lay(request.pid, base, options)
+                if is_whole:
+                    self._copy = self._tracer.lay(request.pid, folded(descriptors), options)
+                else:
+                    with stored_base(descriptors[0]) as base:
+                        self._copy = self._tracer.lay(request.pid, base, options)
             return self._brought_on(self._copy, () if is_whole else descriptors[1:], request.elapsed_ns)
         finally:
             channel.close_all(descriptors)
@@ -436,7 +439,7 @@ def _written(component: str) -> Iterator[None]:
 
 
 def _has_several_processes(files: Descriptors) -> bool:
-    return any(format.read_outline(file).is_tree for file in files)
+    return any(map(format.is_of_several_processes, files))
 
 
 def folded(files: Descriptors) -> Snapshot:

@@ -1,12 +1,15 @@
 """A base that lies in a file, its pages taken out piece by piece: of a large program no copy is made besides the program itself.
 
-The outline is verified when the file is opened, each frame before anything is made of it, and what the pages add up to after the
-last one: whoever takes pieces undoes everything where that fails.
+With the deltas that continue it, which are much smaller and are held in memory, it is what they amount to. A base of several
+processes has its pages put together only as a whole, and so has a chain of such.
+
+The outline is verified when the files are opened, each frame before anything is made of it, and what the pages add up to after
+the last one: whoever takes pieces undoes everything where that fails.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from threading import local
 from typing import Final
@@ -16,10 +19,12 @@ from msgspec.structs import replace
 
 from checkpoint import carried, chain, format, frames, pages, side_by_side
 from checkpoint.byte_sources import Reader, Source, opened
+from checkpoint.chain import Origins
+from checkpoint.differences import rows_of
 from checkpoint.frames import Frame
 from checkpoint.layout import FRAME_SIZE
 from checkpoint.model import Snapshot
-from checkpoint.pages import Buffer, Words
+from checkpoint.pages import Buffer, PageMap, Words
 
 NOTHING: Final = np.zeros((1, 2), dtype=np.uint64)
 
@@ -33,24 +38,29 @@ KEPT: Final = 4
 
 
 class StoredBase:
-    """A base and the file that it lies in, which stays open.
+    """What a chain's files amount to, of which the first one, the base's, stays open.
 
     Attributes:
         outline: the base without its bytes.
 
     Raises:
-        FormatError: as ``checkpoint.format.read_outline``.
-        ChainError: it is no base, or not the state that its position names.
+        FormatError: as ``checkpoint.format.decode``, but for what the base's pages would tell.
+        ChainError: it is no chain, or not the state that its position names.
     """
 
-    def __init__(self, source: Source, reader: Reader) -> None:
+    def __init__(self, source: Source, reader: Reader, deltas: Sequence[Snapshot] = ()) -> None:
         self._source = source
         self._reader = reader
-        self._preamble, outline = format.outlined(reader)
-        self.outline = chain.by_itself(outline)
-        self._set = pages.extents(outline.runs)
+        self._preamble, base = format.outlined(reader)
+        self._chain = (base, *deltas)
+        self._set = pages.extents(base.runs)
         self._frames: list[Frame] = []
         self._decoded: dict[int, bytes] = {}
+        self._origins: Origins | None = None
+        if deltas:
+            self.outline, self._origins = chain.outlined(self._chain)
+        else:
+            self.outline = chain.by_itself(base)
 
     def relocate(self, places: Mapping[str, str]) -> None:
         """See `checkpoint.carried.relocated`."""
@@ -62,8 +72,10 @@ class StoredBase:
         Raises:
             FormatError, ChainError: they are not what they were.
         """
-        proved = chain.fold([format.decode(self._source, threads=threads)])
+        proved = chain.fold([format.decode(self._source, threads=threads), *self._chain[1:]])
         return replace(self.outline, contents=proved.contents)
+
+    # All pages
 
     def each(self, take: Taker, threads: int) -> None:
         """Have all pages taken, a few frames at a time.
@@ -71,7 +83,12 @@ class StoredBase:
         Raises:
             FormatError, ChainError: they are not what they were; some were taken.
         """
-        page_size, own = self.outline.machine.page_size, local()
+        sums = [NOTHING, *self._of_base(take, threads), *self._of_deltas(take)]
+        chain.check_sum(self.outline, pages.sum_of(np.concatenate(sums)))
+
+    def _of_base(self, take: Taker, threads: int) -> Iterator[Words]:
+        """Have those taken that the base tells; the sums of their digests."""
+        own = local()
 
         def taken(numbered: tuple[Words, tuple[Frame, ...]]) -> Words:
             row, told = numbered
@@ -80,14 +97,52 @@ class StoredBase:
             content = own.buffer[: pages.total_size(row)]
             for index, frame in enumerate(told):
                 frames.read_frame(self._reader, frame, content[index * FRAME_SIZE :][: frame.head.raw_size])
-            digests = pages.digest_pages(content, pages.addresses_of(row, page_size), page_size)
-            take(row, content)
-            return digests.sum(axis=0, keepdims=True, dtype=np.uint64)  # type: ignore[no-any-return]
+            return self._passed_on(take, *self._current(row, content))
 
         every = side_by_side.in_rows(frames.frames_of(self._reader, self._preamble), ROW)
         rows = zip(pages.cut(self._set, ROW * FRAME_SIZE), every, strict=True)
-        sums = side_by_side.in_order(taken, rows, format.worth(threads, self._preamble))
-        chain.check_sum(self.outline, pages.sum_of(np.concatenate([NOTHING, *sums])))
+        yield from side_by_side.in_order(taken, rows, format.worth(threads, self._preamble))
+
+    def _current(self, row: Words, content: memoryview) -> tuple[Words, Buffer]:
+        """What the deltas have left of pages of the base, with what they have changed in them."""
+        if self._origins is None:
+            return row, content
+        sources, addresses = self._origins.sources, pages.addresses_of(row, self._page_size)
+        found, places = pages.found_among(sources.addresses, addresses)
+        found[found] = sources.words[places, 0] == 0
+        state = PageMap(addresses[found], np.zeros((int(found.sum()), 2), dtype=np.uint64))
+        rows = rows_of(content, self._page_size)
+        rows = rows if found.all() else rows[found]
+        for layer in self._origins.layers:
+            layer.laid_on(rows, state)
+        return pages.extents_of_addresses(state.addresses, self._page_size), rows.reshape(-1).data
+
+    def _of_deltas(self, take: Taker) -> Iterator[Words]:
+        """Have those taken that deltas have told whole; the sums of their digests."""
+        if self._origins is None:
+            return
+        sources = self._origins.sources
+        later = sources.words[:, 0] > 0
+        theirs = PageMap(sources.addresses[later], sources.words[later])
+        contents, position = self._origins.gathered(self._chain, theirs).data, 0
+        for row in pages.cut(pages.extents_of_addresses(theirs.addresses, self._page_size), ROW * FRAME_SIZE):
+            size = pages.total_size(row)
+            yield self._passed_on(take, row, contents[position : position + size])
+            position += size
+
+    def _passed_on(self, take: Taker, row: Words, content: Buffer) -> Words:
+        if not len(row):
+            return NOTHING
+        digests = pages.digest_pages(content, pages.addresses_of(row, self._page_size), self._page_size)
+        take(row, content)
+        summed: Words = digests.sum(axis=0, keepdims=True, dtype=np.uint64)
+        return summed
+
+    @property
+    def _page_size(self) -> int:
+        return self.outline.machine.page_size
+
+    # Single bytes
 
     def content_at(self, address: int, size: int) -> bytes | None:
         """Bytes of the program's memory, as far as the base carries the pages in one run; None where it does not.
@@ -95,12 +150,28 @@ class StoredBase:
         Raises:
             FormatError: they are not what they were.
         """
-        place = pages.place_in(self._set, address, size)
-        if place is None:
+        if pages.place_in(self._carried, address, size) is None:
             return None
-        first, last = place // FRAME_SIZE, (place + max(size, 1) - 1) // FRAME_SIZE
-        content = b"".join(map(self._frame, range(first, last + 1)))
-        return content[place - first * FRAME_SIZE :][:size]
+        first = address // self._page_size * self._page_size
+        content = b"".join(map(self._page, range(first, address + size, self._page_size)))
+        return content[address - first :][:size]
+
+    @property
+    def _carried(self) -> Words:
+        return self._set if self._origins is None else pages.extents(self.outline.runs)
+
+    def _page(self, address: int) -> bytes:
+        if self._origins is not None:
+            sources = self._origins.sources
+            index = int(np.searchsorted(sources.addresses, np.uint64(address)))
+            one = PageMap(sources.addresses[index : index + 1], sources.words[index : index + 1])
+            if one.words[0, 0] > 0:
+                return self._origins.gathered(self._chain, one).tobytes()
+        place = pages.place_in(self._set, address, self._page_size)
+        assert place is not None, "it is carried"
+        content = self._frame(place // FRAME_SIZE)[place % FRAME_SIZE :][: self._page_size]
+        page = np.array([[address, address + self._page_size]], dtype=np.uint64)
+        return bytes(self._current(page, memoryview(bytearray(content)))[1])
 
     def _frame(self, index: int) -> bytes:
         if index not in self._decoded:
@@ -112,7 +183,12 @@ class StoredBase:
 
 
 @contextmanager
-def stored_base(source: Source) -> Iterator[StoredBase]:
-    """Open one; a descriptor is borrowed for as long as it is used."""
-    with opened(source) as reader:
-        yield StoredBase(source, reader)
+def stored_base(*sources: Source) -> Iterator[StoredBase]:
+    """Open what a chain's files amount to; a descriptor is borrowed for as long as it is used.
+
+    Raises:
+        FormatError, ChainError: see `StoredBase`.
+    """
+    base, *deltas = sources
+    with opened(base) as reader:
+        yield StoredBase(base, reader, [format.decode(delta) for delta in deltas])

@@ -175,10 +175,15 @@ class CooperativeEngine:
 
     def restore(self, vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -> Restored:
         """Refused: see the class."""
-        component = base.component if isinstance(base, Snapshot) else base.outline.component
-        raise RestoreError(f"cannot restore {component} into pid {vessel_pid}: a {COOPERATIVE} program is started again")
+        raise RestoreError(
+            f"cannot restore {_component_of(base)} into pid {vessel_pid}: a {COOPERATIVE} program is started again"
+        )
 
-    def lay(self, vessel_pid: int, base: Snapshot, options: RestoreOptions) -> Copy:
+    def lay(self, vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -> Copy:
         """Refused: what waits for such a program is the program itself, started in advance."""
         reason = "it keeps its state itself, and waits started"
-        raise UnsupportedError(f"{base.component} can have no ready copy: {reason}", (reason,))
+        raise UnsupportedError(f"{_component_of(base)} can have no ready copy: {reason}", (reason,))
+
+
+def _component_of(base: Snapshot | StoredBase) -> str:
+    return base.component if isinstance(base, Snapshot) else base.outline.component

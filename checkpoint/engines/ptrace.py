@@ -40,6 +40,6 @@ class PtraceEngine:
         """See ``checkpoint.engine.Engine.restore``."""
         return restore(vessel_pid, base, options)
 
-    def lay(self, vessel_pid: int, base: Snapshot, options: RestoreOptions) -> Copy:
+    def lay(self, vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -> Copy:
         """See ``checkpoint.engine.Engine.lay``."""
         return ready_copy.lay(vessel_pid, base, options)

@@ -125,8 +125,7 @@ class RestoredProgram(Struct):
 
 def restore(vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -> RestoredProgram:
     """See ``checkpoint.engine.Engine.restore``."""
-    stored = base if isinstance(base, StoredBase) and _may_be_proved_later(base.outline) else None
-    state = stored.outline if stored else base.whole(side_by_side.thread_count()) if isinstance(base, StoredBase) else base
+    state, stored = held_or_stored(base)
     if not state.is_base:
         raise RestoreError("cannot restore a delta by itself: fold its chain first")
     if reasons := room.refuse_restore(state):
@@ -152,6 +151,15 @@ def restore(vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOption
         raise
     except CheckpointError as error:
         raise RestoreError(f"cannot restore {state.component} into pid {vessel_pid}: {error}") from error
+
+
+def held_or_stored(base: Snapshot | StoredBase) -> tuple[Snapshot, StoredBase | None]:
+    """A base with its pages, or without them and where they are."""
+    if isinstance(base, Snapshot):
+        return base, None
+    if _may_be_proved_later(base.outline):
+        return base.outline, base
+    return base.whole(side_by_side.thread_count()), None
 
 
 def _may_be_proved_later(outline: Snapshot) -> bool:

@@ -39,6 +39,7 @@ from checkpoint.engines.ptrace_restore import (
     LaterTables,
     ProcessRestore,
     RestoredProgram,
+    held_or_stored,
     look_at_vessel,
     options_for,
 )
@@ -53,6 +54,7 @@ from checkpoint.model import Fact, Position, Snapshot, ThreadState
 from checkpoint.pages import Words
 from checkpoint.resources import carried_connections, seccomp
 from checkpoint.resources.rebuilding import number_of
+from checkpoint.stored_base import StoredBase
 
 if TYPE_CHECKING:
     from checkpoint.engines.family_copy import FamilyCopy
@@ -68,7 +70,7 @@ AHEAD_NS: Final = 60_000_000_000
 checkpoint was on its way."""
 
 
-def lay(vessel_pid: int, base: Snapshot, options: RestoreOptions) -> Copy:
+def lay(vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -> Copy:
     """Map and fill everything of a base in a vessel, and leave it standing there.
 
     Raises:
@@ -76,18 +78,21 @@ def lay(vessel_pid: int, base: Snapshot, options: RestoreOptions) -> Copy:
         MismatchError: this machine lacks a file that is mapped.
         RestoreError: it did not work; the caller kills the vessel.
     """
-    require_covered(base)
-    require_room(base)
-    copy = _copy_of(vessel_pid, base, options)
-    with ended_on_error(copy, f"lay a ready copy of {base.component} in pid {vessel_pid}"):
+    state, stored = held_or_stored(base)
+    require_covered(state)
+    require_room(state)
+    copy = _copy_of(vessel_pid, state, options, stored)
+    with ended_on_error(copy, f"lay a ready copy of {state.component} in pid {vessel_pid}"):
         copy.lay()
     return copy
 
 
-def _copy_of(vessel_pid: int, base: Snapshot, options: RestoreOptions) -> ReadyCopy | FamilyCopy:
+def _copy_of(vessel_pid: int, state: Snapshot, options: RestoreOptions, stored: StoredBase | None) -> ReadyCopy | FamilyCopy:
     from checkpoint.engines.family_copy import FamilyCopy
 
-    return FamilyCopy(vessel_pid, base, options) if base.is_tree else ReadyCopy(Tracee(vessel_pid), base, options)
+    if state.is_tree:
+        return FamilyCopy(vessel_pid, state, options)
+    return ReadyCopy(Tracee(vessel_pid), state, options, stored=stored)
 
 
 @contextmanager
@@ -141,8 +146,9 @@ class ReadyCopy(ProcessRestore):
         options: RestoreOptions,
         estate: Estate | None = None,
         legacy: Legacy = restore_memory.NOTHING,
+        stored: StoredBase | None = None,
     ) -> None:
-        super().__init__(tracee, base, options, Brought(), estate, legacy)
+        super().__init__(tracee, base, options, Brought(), estate, legacy, stored)
         self.position: Position = base.position
         self.torn = False
         self._extents, self._stiff = pages.extents(base.runs), legacy.kept
@@ -199,6 +205,7 @@ class ReadyCopy(ProcessRestore):
         self._check_room(first)
         self._lay_stub(base, mappings, self._room)
         self._lay_out(first)
+        self._stored = None
         self._descriptors = first.descriptors
         self._forget_pages(self._state)
 

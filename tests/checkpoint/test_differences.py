@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import struct
 import subprocess
 import sys
@@ -21,11 +22,12 @@ from checkpoint.errors import ChainError, FormatError
 from checkpoint.held_pages import pages_at
 from checkpoint.hot_pages import WHOLE_MAX, HotPages, Sender, Step
 from checkpoint.model import PageRun, Snapshot
-from checkpoint.pages import PageTable
+from checkpoint.pages import Buffer, PageTable, Words
 from checkpoint.store import open_store
+from checkpoint.stored_base import stored_base
 from failover.cli.keeper import Keeper
 from tests.checkpoint.round_trip import at_last
-from tests.checkpoint.snapshots import COMPONENT, PAGE, START, family, page, pages_of, runs_of, snapshot
+from tests.checkpoint.snapshots import COMPONENT, PAGE, START, family, page, pages_of, runs_of, snapshot, vma
 
 STEPS = st.lists(
     st.tuples(st.dictionaries(st.integers(0, 30), st.integers(0, 9), max_size=6), st.frozensets(st.integers(0, 30), max_size=6)),
@@ -55,6 +57,68 @@ def as_told(whole: Sequence[Snapshot], limit: int = ROOM) -> list[Snapshot]:
         made.append(sender.told(one, limit)[0])
         sender.acknowledge(one.position)
     return made
+
+
+def taken_straight(files: Sequence[bytes], threads: int) -> dict[int, bytes]:
+    """The pages, by number, that are taken out of a chain's files one by one; single bytes are asked for besides."""
+    found: dict[int, bytes] = {}
+    with stored_base(*files) as base:
+
+        def take(row: Words, content: Buffer) -> None:
+            for index, address in enumerate(pages.addresses_of(row, PAGE).tolist()):
+                assert (address - START) // PAGE not in found, "each once"
+                found[(address - START) // PAGE] = bytes(memoryview(content)[index * PAGE :][:PAGE])
+
+        base.each(take, threads)
+        assert base.outline.runs == runs_of(found)
+        for run in base.outline.runs:
+            number, size = (run.start - START) // PAGE, min(run.size, 3 * PAGE) - 2
+            expected = b"".join(found[number + index] for index in range(-(-size // PAGE)))[1 : size + 1]
+            assert base.content_at(run.start + 1, size) == expected
+            assert base.content_at(run.end - 1, 2) is None
+    return found
+
+
+@settings(max_examples=60, deadline=None)
+@given(STEPS)
+def test_what_is_taken_straight_from_a_chains_files_is_what_they_fold_to(
+    steps: list[tuple[dict[int, int], frozenset[int]]],
+) -> None:
+    told = as_told(whole_chain(steps))
+    files = [format.encode_bytes(one) for one in told]
+    folded = chain.fold(told)
+    assert taken_straight(files, 1) == pages_of(folded)
+    with stored_base(*files) as base:
+        assert base.outline == replace(folded, contents=b"")
+        assert base.whole(1) == replace(folded, contents=base.whole(1).contents)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_large_chains_are_taken_straight_by_several_threads(threads: int) -> None:
+    dice, count = random.Random(3), 4000
+    state = {number: dice.randbytes(PAGE) for number in range(count)}
+    room = (vma(0, count + 100),)
+    made = [snapshot(state, vmas=room)]
+    for sequence in range(2, 6):
+        gone = frozenset(dice.sample(sorted(state), 40))
+        changed = {number: bytes([sequence]) + state[number][1:] for number in dice.sample(sorted(state), 300)}
+        carried = changed | {count + sequence: page(f"new {sequence}")}
+        state = {number: content for number, content in state.items() if number not in gone} | carried
+        made.append(snapshot(state, carried=carried, cleared=gone, parent=made[-1].position, sequence=sequence, vmas=room))
+    told = as_told(made, count * PAGE * 2)
+    assert any(one.differences for one in told)
+    assert taken_straight([format.encode_bytes(one) for one in told], threads) == state
+
+
+def test_a_chain_that_does_not_add_up_is_refused_when_its_last_page_was_taken() -> None:
+    told = as_told(busy())
+    last = told[-1]
+    wrong = replace(last, contents=bytes(last.contents[:-1]) + bytes([last.contents[-1] ^ 1]))
+    files = [format.encode_bytes(one) for one in (*told[:-1], wrong)]
+    with pytest.raises(ChainError, match="the pages do not add up"):
+        taken_straight(files, 1)
+    with pytest.raises(ChainError, match="continues"), stored_base(files[0], *files[2:]):
+        pass
 
 
 def busy(length: int = 4) -> list[Snapshot]:
