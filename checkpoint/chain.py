@@ -12,16 +12,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 
-from msgspec import Struct
 from msgspec.structs import replace
 
-from checkpoint import differences, pages
-from checkpoint.arrays import NDArray, np
-from checkpoint.differences import Rows
+from checkpoint import pages
+from checkpoint.arrays import np
 from checkpoint.errors import ChainError
-from checkpoint.gathering import gathered_bytes
 from checkpoint.model import OutputPiece, PageCopy, Position, Snapshot
-from checkpoint.pages import PageMap, PageTable, Words
+from checkpoint.origins import Origins
+from checkpoint.pages import PageMap, PageTable
 from checkpoint.state import state_digest
 from checkpoint.tree import every_mapping
 from checkpoint.validity import STREAMS, place
@@ -133,7 +131,7 @@ def fold(chain: Sequence[Snapshot]) -> Snapshot:
         return by_itself(newest)
     origins = Origins.of(chain)
     has_copies = newest.is_tree and any(snapshot.copies for snapshot in chain)  # one process alone has none
-    carried, copies = _told_once(origins.sources, origins.layers, page_size) if has_copies else (origins.sources, ())
+    carried, copies = _told_once(origins, page_size) if has_copies else (origins.sources, ())
     contents = origins.gathered(chain, carried).data.toreadonly()
     runs = pages.page_runs(pages.extents_of_addresses(carried.addresses, page_size))
     check_state(newest, PageTable.empty(page_size).apply((), runs, contents, every_mapping(newest), copies).page_sum)
@@ -179,59 +177,10 @@ def by_itself(base: Snapshot) -> Snapshot:
     return _joined((base,))
 
 
-class Layer(Struct, frozen=True, eq=False):
-    """The pages that one snapshot tells as differences.
-
-    Attributes:
-        index: of the snapshot in its chain.
-        differences: of ``addresses``, which are in order, one row a page.
-    """
-
-    index: int
-    addresses: Words
-    differences: Rows
-
-    def laid_on(self, rows: Rows, state: PageMap) -> None:
-        """Change those pages of a state that no later snapshot has set or taken away.
-
-        Args:
-            rows: the bytes of the state's pages so far.
-        """
-        found, places = pages.found_among(state.addresses, self.addresses)
-        still = state.words[places, 0] < np.uint64(self.index)
-        rows[places[still]] ^= self.differences[found][still]
-
-
-class Origins(Struct, frozen=True, eq=False):
-    """Where the pages of a chain's newest state come from.
-
-    Attributes:
-        sources: for each where it was last told whole: (index in the chain, index of the page there).
-        layers: what was told as differences since, oldest first.
-    """
-
-    sources: PageMap
-    layers: tuple[Layer, ...]
-
-    @classmethod
-    def of(cls, chain: Sequence[Snapshot]) -> Origins:
-        """Those of a chain; a base needs no contents."""
-        sources, layers = _newest_sources(chain, chain[-1].machine.page_size)
-        return cls(sources, tuple(layers))
-
-    def gathered(self, chain: Sequence[Snapshot], wanted: PageMap) -> NDArray[np.uint8]:
-        """The bytes of some of the pages."""
-        page_size = chain[-1].machine.page_size
-        gathered = gathered_bytes([snapshot.contents for snapshot in chain], wanted, page_size)
-        for layer in self.layers:
-            layer.laid_on(gathered.reshape(-1, page_size), wanted)
-        return gathered
-
-
-def _told_once(sources: PageMap, layers: Sequence[Layer], page_size: int) -> tuple[PageMap, tuple[PageCopy, ...]]:
-    """Pages that lie at different places, and copies of them: those that lie at the same one, and that no layer changes."""
-    changed = np.unique(np.concatenate([np.empty(0, dtype=np.uint64), *(layer.addresses for layer in layers)]))
-    own = np.where(np.isin(sources.addresses, changed, assume_unique=True), sources.addresses, np.uint64(0))
+def _told_once(origins: Origins, page_size: int) -> tuple[PageMap, tuple[PageCopy, ...]]:
+    """Pages that lie at different places, and copies of them: those that lie at the same one, and that no difference changes."""
+    sources = origins.sources
+    own = np.where(np.isin(sources.addresses, origins.changed, assume_unique=True), sources.addresses, np.uint64(0))
     words = np.column_stack((sources.words, own))
     _, firsts, which = np.unique(words, axis=0, return_index=True, return_inverse=True)
     source = sources.addresses[firsts[which.reshape(-1)]]
@@ -258,59 +207,6 @@ def _check_kin(parent: Snapshot, delta: Snapshot) -> None:
         raise ChainError(
             f"snapshot {place(delta.position)} of {delta.component} has pages of {delta.machine.page_size} bytes, "
             f"the chain of {parent.machine.page_size}; ask for a base"
-        )
-
-
-def _newest_sources(chain: Sequence[Snapshot], page_size: int) -> tuple[PageMap, list[Layer]]:
-    """For every page of the folded state where it was last told whole: (index in the chain, index of the page there).
-
-    Returns:
-        That, and what was told as differences, oldest first.
-
-    Raises:
-        ChainError: a page is told as the difference from one that is not there.
-    """
-    state = PageMap.empty()
-    layers: list[Layer] = []
-    for index, snapshot in enumerate(chain):
-        addresses = differences.addresses_of(snapshot.runs, page_size)
-        places = np.empty((len(addresses), 2), dtype=np.uint64)
-        places[:, 0] = index
-        places[:, 1] = np.arange(len(addresses))
-        state, _ = state.without(pages.extents(every_mapping(snapshot)), pages.extents(snapshot.cleared))
-        whole = np.ones(len(addresses), dtype=np.bool_)
-        if snapshot.differences:
-            layers.append(_layer_of(snapshot, index, addresses, page_size))
-            whole = ~pages.covered(pages.extents(snapshot.differences), addresses)
-            _check_there(snapshot, layers[-1].addresses, state.addresses)
-        if snapshot.copies:
-            copied, taken_from = pages.copied_pages(snapshot.copies, addresses, page_size)
-            state, _ = state.overlaid(copied, places[taken_from])
-        state, _ = state.overlaid(addresses[whole], places[whole])
-    return state, layers
-
-
-def _layer_of(snapshot: Snapshot, index: int, carried: Words, page_size: int) -> Layer:
-    addresses = differences.addresses_of(snapshot.differences, page_size)
-    rows = differences.rows_of(snapshot.contents, page_size)
-    return Layer(index, addresses, rows[np.searchsorted(carried, addresses)])
-
-
-def _check_there(snapshot: Snapshot, wanted: Words, held: Words) -> None:
-    """Refuse a delta that tells a page as the difference from one that its parent's state does not hold.
-
-    Args:
-        wanted, held: addresses, in order.
-
-    Raises:
-        ChainError: names the first one.
-    """
-    found, _ = pages.found_among(held, wanted)
-    lacking = wanted[~found]
-    if len(lacking):
-        raise ChainError(
-            f"delta {place(snapshot.position)} of {snapshot.component} tells the page at {int(lacking[0]):#x} as a difference "
-            "from one that its parent does not hold; ask for a base"
         )
 
 

@@ -23,9 +23,11 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from checkpoint import chain, format
+from checkpoint.byte_sources import opened
 from checkpoint.contents import Contents
-from checkpoint.disk import Disk, lock_exclusively
+from checkpoint.disk import Disk, DiskFile, lock_exclusively
 from checkpoint.errors import ChainError, FormatError, StoreError
+from checkpoint.folding import fold_into
 from checkpoint.history import HISTORY_FOLDER, History, Retention
 from checkpoint.hot_pages import CACHE_SIZE
 from checkpoint.model import OutputPiece, Position, Snapshot
@@ -33,6 +35,7 @@ from checkpoint.needs import needs
 from checkpoint.proofs import Proofs
 from checkpoint.shelf import BASE_SUFFIX, DELTA_SUFFIX, FOLDER_PREFIX, Entry, Shelf, file_name, folder_name, order_of_name
 from checkpoint.state import header_of
+from checkpoint.stored_base import StoredBase
 from checkpoint.validity import place
 from checkpoint.whole_files import TEMPORARY_PREFIX, WholeFiles, disk_trouble
 
@@ -181,6 +184,17 @@ class Store:
 
     def _try_fold(self, component: str, entries: tuple[Entry, ...]) -> Snapshot | None:
         """The folded chain, or None when a file of it had to be set out of use."""
+        snapshots = self._all_decoded(component, entries)
+        if snapshots is None:
+            return None
+        try:
+            return chain.fold(snapshots)
+        except ChainError as error:
+            self._set_out_of_use(component, entries[-1], str(error))
+            return None
+
+    def _all_decoded(self, component: str, entries: tuple[Entry, ...]) -> list[Snapshot] | None:
+        """All of these files, or None when one of them had to be set out of use."""
         snapshots = []
         for entry in entries:
             try:
@@ -188,11 +202,7 @@ class Store:
             except FormatError as error:
                 self._set_out_of_use(component, entry, str(error))
                 return None
-        try:
-            return chain.fold(snapshots)
-        except ChainError as error:
-            self._set_out_of_use(component, entries[-1], str(error))
-            return None
+        return snapshots
 
     def kept(self, component: str) -> Kept | None:
         """What is here of a component; None if nothing is."""
@@ -311,15 +321,39 @@ class Store:
         Raises:
             StoreError: the position cannot be loaded, or the disk does not take the base.
         """
-        folded = self.load(component, position)
-        folded = replace(folded, output=_newest_output(folded.output))
-        final = self._root / folder_name(component) / file_name(header_of(folded))
-        size = self._files.write(final, lambda file: format.encode(folded, file))
+        entries = self.chain_of(component, position)
+        written = self._write_fold(component, entries)
+        if written is None:
+            raise StoreError(f"position {place(position)} of {component} cannot be restored: {self.notices[-1]}")
         with self._change_of(component):
             if self._shelf(component).order_of(position) is None:  # dropped or set aside meanwhile
-                self._files.remove(final)
+                self._files.remove(written.path)
             else:
-                self._add(component, _entry_of(final, folded, size))
+                self._add(component, written)
+
+    def _write_fold(self, component: str, entries: tuple[Entry, ...]) -> Entry | None:
+        """Write a chain as one base, or answer None when a file of it had to be set out of use."""
+        base, deltas = entries[0], self._all_decoded(component, entries[1:])
+        if deltas is None:
+            return None
+        try:
+            with opened(base.path) as reader:
+                if not deltas or format.is_of_several_processes(base.path) or any(delta.is_tree for delta in deltas):
+                    folded = chain.fold([format.decode(base.path), *deltas])
+                    return self._write_base(folded, lambda file, folded: format.encode(folded, file))
+                stored = StoredBase(base.path, reader, deltas)
+                return self._write_base(stored.outline, lambda file, folded: fold_into(file, stored, folded))
+        except FormatError as error:
+            self._set_out_of_use(component, base, str(error))
+        except ChainError as error:
+            self._set_out_of_use(component, entries[-1], str(error))
+        return None
+
+    def _write_base(self, folded: Snapshot, write: Callable[[DiskFile, Snapshot], int]) -> Entry:
+        folded = replace(folded, output=_newest_output(folded.output))
+        final = self._root / folder_name(folded.component) / file_name(header_of(folded))
+        size = self._files.write(final, lambda file: write(file, folded))
+        return _entry_of(final, folded, size)
 
     def _fold_is_due(self, component: str, oldest: Position) -> bool:
         with self._lock:

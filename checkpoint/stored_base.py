@@ -14,19 +14,17 @@ from contextlib import contextmanager
 from threading import local
 from typing import Final
 
-import numpy as np
 from msgspec.structs import replace
 
 from checkpoint import carried, chain, format, frames, pages, side_by_side
+from checkpoint.arrays import np
 from checkpoint.byte_sources import Reader, Source, opened
-from checkpoint.chain import Origins
 from checkpoint.differences import rows_of
 from checkpoint.frames import Frame
 from checkpoint.layout import FRAME_SIZE
 from checkpoint.model import Snapshot
+from checkpoint.origins import Origins
 from checkpoint.pages import Buffer, PageMap, Words
-
-NOTHING: Final = np.zeros((1, 2), dtype=np.uint64)
 
 Taker = Callable[[Words, Buffer], None]
 """Does something with a set of pages and their bytes; several threads call it at once."""
@@ -41,7 +39,10 @@ class StoredBase:
     """What a chain's files amount to, of which the first one, the base's, stays open.
 
     Attributes:
-        outline: the base without its bytes.
+        outline: what they amount to, without its bytes.
+        reader: of the base's file; ``preamble``: its own; ``base_pages``: those that it tells.
+        chain: what was read: the base without its bytes, and the deltas.
+        origins: where its pages come from; None where there are no deltas.
 
     Raises:
         FormatError: as ``checkpoint.format.decode``, but for what the base's pages would tell.
@@ -50,15 +51,15 @@ class StoredBase:
 
     def __init__(self, source: Source, reader: Reader, deltas: Sequence[Snapshot] = ()) -> None:
         self._source = source
-        self._reader = reader
-        self._preamble, base = format.outlined(reader)
-        self._chain = (base, *deltas)
-        self._set = pages.extents(base.runs)
+        self.reader = reader
+        self.preamble, base = format.outlined(reader)
+        self.chain = (base, *deltas)
+        self.base_pages = pages.extents(base.runs)
         self._frames: list[Frame] = []
         self._decoded: dict[int, bytes] = {}
-        self._origins: Origins | None = None
+        self.origins: Origins | None = None
         if deltas:
-            self.outline, self._origins = chain.outlined(self._chain)
+            self.outline, self.origins = chain.outlined(self.chain)
         else:
             self.outline = chain.by_itself(base)
 
@@ -72,7 +73,7 @@ class StoredBase:
         Raises:
             FormatError, ChainError: they are not what they were.
         """
-        proved = chain.fold([format.decode(self._source, threads=threads), *self._chain[1:]])
+        proved = chain.fold([format.decode(self._source, threads=threads), *self.chain[1:]])
         return replace(self.outline, contents=proved.contents)
 
     # All pages
@@ -83,7 +84,7 @@ class StoredBase:
         Raises:
             FormatError, ChainError: they are not what they were; some were taken.
         """
-        sums = [NOTHING, *self._of_base(take, threads), *self._of_deltas(take)]
+        sums = [_nothing(), *self._of_base(take, threads), *self._of_deltas(take)]
         chain.check_sum(self.outline, pages.sum_of(np.concatenate(sums)))
 
     def _of_base(self, take: Taker, threads: int) -> Iterator[Words]:
@@ -96,35 +97,33 @@ class StoredBase:
                 own.buffer = memoryview(bytearray(ROW * FRAME_SIZE))
             content = own.buffer[: pages.total_size(row)]
             for index, frame in enumerate(told):
-                frames.read_frame(self._reader, frame, content[index * FRAME_SIZE :][: frame.head.raw_size])
+                frames.read_frame(self.reader, frame, content[index * FRAME_SIZE :][: frame.head.raw_size])
             return self._passed_on(take, *self._current(row, content))
 
-        every = side_by_side.in_rows(frames.frames_of(self._reader, self._preamble), ROW)
-        rows = zip(pages.cut(self._set, ROW * FRAME_SIZE), every, strict=True)
-        yield from side_by_side.in_order(taken, rows, format.worth(threads, self._preamble))
+        every = side_by_side.in_rows(frames.frames_of(self.reader, self.preamble), ROW)
+        rows = zip(pages.cut(self.base_pages, ROW * FRAME_SIZE), every, strict=True)
+        yield from side_by_side.in_order(taken, rows, format.worth(threads, self.preamble))
 
     def _current(self, row: Words, content: memoryview) -> tuple[Words, Buffer]:
         """What the deltas have left of pages of the base, with what they have changed in them."""
-        if self._origins is None:
+        if self.origins is None:
             return row, content
-        sources, addresses = self._origins.sources, pages.addresses_of(row, self._page_size)
+        sources, addresses = self.origins.sources, pages.addresses_of(row, self._page_size)
         found, places = pages.found_among(sources.addresses, addresses)
         found[found] = sources.words[places, 0] == 0
-        state = PageMap(addresses[found], np.zeros((int(found.sum()), 2), dtype=np.uint64))
         rows = rows_of(content, self._page_size)
         rows = rows if found.all() else rows[found]
-        for layer in self._origins.layers:
-            layer.laid_on(rows, state)
-        return pages.extents_of_addresses(state.addresses, self._page_size), rows.reshape(-1).data
+        self.origins.lay_on(rows, addresses[found])
+        return pages.extents_of_addresses(addresses[found], self._page_size), rows.reshape(-1).data
 
     def _of_deltas(self, take: Taker) -> Iterator[Words]:
         """Have those taken that deltas have told whole; the sums of their digests."""
-        if self._origins is None:
+        if self.origins is None:
             return
-        sources = self._origins.sources
+        sources = self.origins.sources
         later = sources.words[:, 0] > 0
         theirs = PageMap(sources.addresses[later], sources.words[later])
-        contents, position = self._origins.gathered(self._chain, theirs).data, 0
+        contents, position = self.origins.gathered(self.chain, theirs).data, 0
         for row in pages.cut(pages.extents_of_addresses(theirs.addresses, self._page_size), ROW * FRAME_SIZE):
             size = pages.total_size(row)
             yield self._passed_on(take, row, contents[position : position + size])
@@ -132,7 +131,7 @@ class StoredBase:
 
     def _passed_on(self, take: Taker, row: Words, content: Buffer) -> Words:
         if not len(row):
-            return NOTHING
+            return _nothing()
         digests = pages.digest_pages(content, pages.addresses_of(row, self._page_size), self._page_size)
         take(row, content)
         summed: Words = digests.sum(axis=0, keepdims=True, dtype=np.uint64)
@@ -158,16 +157,16 @@ class StoredBase:
 
     @property
     def _carried(self) -> Words:
-        return self._set if self._origins is None else pages.extents(self.outline.runs)
+        return self.base_pages if self.origins is None else pages.extents(self.outline.runs)
 
     def _page(self, address: int) -> bytes:
-        if self._origins is not None:
-            sources = self._origins.sources
+        if self.origins is not None:
+            sources = self.origins.sources
             index = int(np.searchsorted(sources.addresses, np.uint64(address)))
             one = PageMap(sources.addresses[index : index + 1], sources.words[index : index + 1])
             if one.words[0, 0] > 0:
-                return self._origins.gathered(self._chain, one).tobytes()
-        place = pages.place_in(self._set, address, self._page_size)
+                return self.origins.gathered(self.chain, one).tobytes()
+        place = pages.place_in(self.base_pages, address, self._page_size)
         assert place is not None, "it is carried"
         content = self._frame(place // FRAME_SIZE)[place % FRAME_SIZE :][: self._page_size]
         page = np.array([[address, address + self._page_size]], dtype=np.uint64)
@@ -175,11 +174,16 @@ class StoredBase:
 
     def _frame(self, index: int) -> bytes:
         if index not in self._decoded:
-            self._frames = self._frames or list(frames.frames_of(self._reader, self._preamble))
+            self._frames = self._frames or list(frames.frames_of(self.reader, self.preamble))
             while len(self._decoded) >= KEPT:
                 del self._decoded[next(iter(self._decoded))]
-            self._decoded[index] = bytes(frames.content_of(self._reader, self._frames[index]))
+            self._decoded[index] = bytes(frames.content_of(self.reader, self._frames[index]))
         return self._decoded[index]
+
+
+def _nothing() -> Words:
+    """The sum of no digests."""
+    return np.zeros((1, 2), dtype=np.uint64)
 
 
 @contextmanager

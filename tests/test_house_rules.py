@@ -16,7 +16,7 @@ FLOORS = ("checkpoint", "failover", "agent")
 
 PURE_CHECKPOINT = (
     *("errors", "model", "pages", "layout", "state", "validity", "chain", "gathering", "task_channel", "tree", "differences"),
-    *("hot_pages", "arrays"),
+    *("hot_pages", "arrays", "origins"),
 )
 
 PURE_FILES = (

@@ -1,0 +1,165 @@
+"""A chain's files folded into the file of one base, frame by frame: none of them is held whole.
+
+A frame in which no page was changed, came or went is copied as it is stored. So the work is that of what has changed, and of
+what has moved: a page that comes or goes moves all that follow it.
+
+The result is proved without looking at what was only copied: a page sum is a sum, so that the newest one is the base's, less the
+digests of pages that went or were replaced, and those of what is there now added. The base's own was proved when it came.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from blake3 import blake3
+
+from checkpoint import chain, format, frames, layout, pages
+from checkpoint.arrays import np
+from checkpoint.differences import Rows, rows_of
+from checkpoint.frames import Body, Packer, Sink
+from checkpoint.layout import FRAME_SIZE
+from checkpoint.model import Snapshot
+from checkpoint.pages import Flags, PageMap, Words
+from checkpoint.stored_base import StoredBase
+
+KEPT: Final = 2
+"""Frames of the base that stay decompressed: those of a new one lie in one of them or two, unless very many pages went."""
+
+
+def fold_into(file: Sink, stored: StoredBase, outline: Snapshot) -> int:
+    """Write what a chain amounts to as one base.
+
+    Args:
+        file: empty, at its position.
+        outline: the base's, as it is to be written.
+
+    Returns:
+        Bytes written.
+
+    Raises:
+        FormatError: the base's file is not as it was written.
+        ChainError: the pages do not add up to the newest position.
+        OSError: the file does not take it.
+    """
+    return _Folding(stored, outline).write(file)
+
+
+class _Folding:
+    """One fold.
+
+    Attributes:
+        added, removed: digests of pages that are there now and that were there before.
+    """
+
+    def __init__(self, stored: StoredBase, outline: Snapshot) -> None:
+        self._stored = stored
+        self._outline = outline
+        self._page_size = outline.machine.page_size
+        self._count = FRAME_SIZE // self._page_size
+        origins = stored.origins
+        assert origins is not None, "a base by itself is folded"
+        self._origins = origins
+        self._base_addresses = pages.addresses_of(stored.base_pages, self._page_size)
+        self._told_anew = self._pages_told_anew()
+        self._gone = self._pages_gone()
+        self._frames = list(frames.frames_of(stored.reader, stored.preamble))
+        self._decoded: dict[int, Rows] = {}
+        self._seen: set[int] = set()
+        self._packer = Packer(1)
+        self.added: list[Words] = [np.empty((0, 2), dtype=np.uint64)]
+        self.removed: list[Words] = [np.empty((0, 2), dtype=np.uint64)]
+
+    def _pages_told_anew(self) -> Flags:
+        """Of the state's pages, those that a delta has told, whole or as a difference."""
+        anew: Flags = self._origins.sources.words[:, 0] > 0
+        anew[np.searchsorted(self._origins.sources.addresses, self._origins.changed)] = True
+        return anew
+
+    def _pages_gone(self) -> Flags:
+        """Of the base's pages, those whose content is not the state's any more."""
+        kept = self._origins.sources.addresses[~self._told_anew]
+        gone: Flags = np.ones(len(self._base_addresses), dtype=np.bool_)
+        gone[np.searchsorted(self._base_addresses, kept)] = False
+        return gone
+
+    def write(self, file: Sink) -> int:
+        """See `fold_into`."""
+        contents_size = len(self._origins.sources.addresses) * self._page_size
+        preamble, sections = format.begin(self._outline, contents_size)
+        seal = blake3(preamble.pack())
+        frames.write_all(file, preamble.pack() + sections)
+        offset = preamble.frames_offset
+        for body in self._bodies(preamble.frame_count):
+            head, size = frames.write_frame(file, body, offset)
+            seal.update(head)
+            offset += size
+        self._require_sum()
+        file_size = offset + layout.TRAILER_SIZE
+        frames.write_all(file, layout.pack_trailer(file_size, seal))
+        return file_size
+
+    def _require_sum(self) -> None:
+        for index in np.unique(np.flatnonzero(self._gone) // self._count).tolist():
+            self._rows_of_base(index)  # what went of it is seen now, if it was not before
+        before = chain.by_itself(self._stored.chain[0])
+        after = pages.add_to_sum(before.page_sum, np.concatenate(self.added), np.concatenate(self.removed))
+        chain.check_sum(self._outline, after)
+
+    def _bodies(self, count: int) -> Iterator[Body]:
+        """Every frame of the result."""
+        sources = self._origins.sources
+        moved = sources.words[:, 1] != np.arange(len(sources.addresses), dtype=np.uint64)
+        other = np.add.reduceat(self._told_anew | moved, np.arange(0, len(moved), self._count)) if len(moved) else moved
+        for index in range(count):
+            first = index * self._count
+            last = min(first + self._count, len(sources.addresses))
+            is_as_it_was = not other[index] and self._frames[index].head.raw_size == (last - first) * self._page_size
+            yield self._copied(index) if is_as_it_was else self._made(first, last)
+
+    def _copied(self, index: int) -> Body:
+        """A frame of the base, as it is stored."""
+        frame = self._frames[index]
+        body = self._stored.reader.read(frame.body_offset, frame.head.stored_size)
+        frames.check_digest(body, frame)
+        return Body(frame.head.codec, body, frame.head.raw_size, frame.head.digest)
+
+    def _made(self, first: int, last: int) -> Body:
+        """A frame of some of the state's pages."""
+        sources, anew = self._origins.sources, self._told_anew[first:last]
+        state = PageMap(sources.addresses[first:last], sources.words[first:last])
+        rows = self._rows(state)
+        self._origins.lay_on(rows, state.addresses)
+        if anew.any():
+            self.added.append(pages.digest_pages(rows[anew].data, state.addresses[anew], self._page_size))
+        return self._packer(rows.reshape(-1).data)
+
+    def _rows(self, state: PageMap) -> Rows:
+        """The pages as they were last told whole."""
+        rows = np.empty((len(state.addresses), self._page_size), dtype=np.uint8)
+        is_base = state.words[:, 0] == 0
+        places = state.words[is_base, 1].astype(np.intp)
+        chosen = np.flatnonzero(is_base)
+        for index in np.unique(places // self._count).tolist():
+            here = places // self._count == index
+            rows[chosen[here]] = self._rows_of_base(index)[places[here] % self._count]
+        if not is_base.all():
+            later = PageMap(state.addresses[~is_base], state.words[~is_base])
+            rows[~is_base] = rows_of(self._origins.whole(self._stored.chain, later).data, self._page_size)
+        return rows
+
+    def _rows_of_base(self, index: int) -> Rows:
+        """The pages of one of the base's frames; those that went are counted when they are seen for the first time."""
+        if index not in self._decoded:
+            while len(self._decoded) >= KEPT:
+                del self._decoded[next(iter(self._decoded))]
+            content = frames.content_of(self._stored.reader, self._frames[index])
+            self._decoded[index] = rows_of(content, self._page_size)
+        rows = self._decoded[index]
+        if index not in self._seen:
+            self._seen.add(index)
+            here = slice(index * self._count, index * self._count + len(rows))
+            gone = self._gone[here]
+            if gone.any():
+                self.removed.append(pages.digest_pages(rows[gone].data, self._base_addresses[here][gone], self._page_size))
+        return rows
