@@ -15,12 +15,25 @@ from types import FrameType
 from typing import Final
 
 INTERRUPTED: Final = 128 + signal.SIGINT
+STREAMS: Final = ("stdin", "stdout", "stderr")
 
 
 def begin() -> None:
-    """From here on Ctrl-C ends this process; not where it was told to ignore it."""
+    """From here on Ctrl-C ends this process; not where it was told to ignore it. Every standard stream leads somewhere."""
+    for number, name in enumerate(STREAMS):
+        if getattr(sys, name) is None:  # it was closed: the next file that is opened would be taken for it
+            _lead_nowhere(number, name)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end)
+
+
+def _lead_nowhere(number: int, name: str) -> None:
+    descriptor = os.open(os.devnull, os.O_RDWR)
+    if descriptor != number:
+        os.dup2(descriptor, number)
+        os.close(descriptor)
+    os.set_inheritable(number, True)
+    setattr(sys, name, os.fdopen(number, "w" if number else "r"))
 
 
 def loaded() -> None:

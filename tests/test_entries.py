@@ -75,3 +75,13 @@ def test_what_cannot_be_written_at_the_end_is_an_error_as_ever() -> None:
         ran = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, check=False)
     assert ran.returncode == 120
     assert b"No space left on device" in ran.stderr
+
+
+@pytest.mark.parametrize("closed", [(0,), (1,), (2,), (0, 1), (0, 1, 2)], ids=str)
+def test_a_command_whose_streams_are_closed_does_what_it_was_told(closed: tuple[int, ...]) -> None:
+    """Its keeper's channel would be taken for one of them otherwise."""
+    streams = {0: "<&-", 1: ">&-", 2: "2>&-"}
+    words = f"{sys.executable} -m failover check --table {' '.join(streams[number] for number in closed)}"
+    ran = subprocess.run(words, shell=True, capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert ("threads" in ran.stdout) == (1 not in closed)

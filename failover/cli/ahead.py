@@ -109,9 +109,11 @@ def _forked(theirs: socket.socket, complaints: IO[bytes]) -> Child:
 
 def _as_keeper(theirs: int, complaints: int) -> int:
     """Be in the child what `_spawned` starts."""
+    import fcntl
+
     os.setpgid(0, 0)
-    null = os.open(os.devnull, os.O_RDONLY)
-    os.dup2(null, 0)
+    theirs, complaints = (fcntl.fcntl(one, fcntl.F_DUPFD_CLOEXEC, 3) for one in (theirs, complaints))  # 0 to 2 may be among them
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     os.dup2(complaints, 2)
     os.closerange(3, theirs)
     os.closerange(theirs + 1, os.sysconf("SC_OPEN_MAX"))
