@@ -12,63 +12,65 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from blake3 import blake3
-
-from checkpoint import chain, format, frames, layout, pages
+from checkpoint import chain, format, frames, pages
 from checkpoint.arrays import np
 from checkpoint.differences import Rows, rows_of
-from checkpoint.frames import Body, Packer, Sink
+from checkpoint.frames import Body, DecodedFrames, FrameWriter, Packer, Sink
 from checkpoint.layout import FRAME_SIZE
 from checkpoint.model import Snapshot
 from checkpoint.pages import Flags, PageMap, Words
 from checkpoint.stored_base import StoredBase
+from checkpoint.validity import check_snapshot
 
 KEPT: Final = 2
 """Frames of the base that stay decompressed: those of a new one lie in one of them or two, unless very many pages went."""
 
 
-def fold_into(file: Sink, stored: StoredBase, outline: Snapshot) -> int:
-    """Write what a chain amounts to as one base.
+class Folding:
+    """One chain of a base and deltas, about to be written as one base.
 
     Args:
-        file: empty, at its position.
+        stored: the chain.
         outline: the base's, as it is to be written.
 
-    Returns:
-        Bytes written.
-
     Raises:
-        FormatError: the base's file is not as it was written.
-        ChainError: the pages do not add up to the newest position.
-        OSError: the file does not take it.
-    """
-    return _Folding(stored, outline).write(file)
-
-
-class _Folding:
-    """One fold.
-
-    Attributes:
-        added, removed: digests of pages that are there now and that were there before.
+        FormatError: it would not hold together; the chain's own files are as they were.
     """
 
     def __init__(self, stored: StoredBase, outline: Snapshot) -> None:
-        self._stored = stored
-        self._outline = outline
-        self._page_size = outline.machine.page_size
-        self._count = FRAME_SIZE // self._page_size
         origins = stored.origins
         assert origins is not None, "a base by itself is folded"
+        self._stored = stored
+        self._outline = outline
         self._origins = origins
+        self._page_size = outline.machine.page_size
+        self._count = FRAME_SIZE // self._page_size
+        contents_size = len(origins.sources.addresses) * self._page_size
+        check_snapshot(outline, contents_size)
+        self._preamble, self._sections = format.begin(outline, contents_size)
         self._base_addresses = pages.addresses_of(stored.base_pages, self._page_size)
         self._told_anew = self._pages_told_anew()
         self._gone = self._pages_gone()
-        self._frames = list(frames.frames_of(stored.reader, stored.preamble))
-        self._decoded: dict[int, Rows] = {}
+        self._decoded = DecodedFrames(stored.reader, stored.preamble, KEPT)
         self._seen: set[int] = set()
         self._packer = Packer(1)
-        self.added: list[Words] = [np.empty((0, 2), dtype=np.uint64)]
-        self.removed: list[Words] = [np.empty((0, 2), dtype=np.uint64)]
+        self._added: list[Words] = [np.empty((0, 2), dtype=np.uint64)]
+        self._removed: list[Words] = [np.empty((0, 2), dtype=np.uint64)]
+
+    def write(self, file: Sink) -> int:
+        """Write it to an empty file; its size in bytes.
+
+        Raises:
+            FormatError: the base's file is not as it was written.
+            ChainError: the pages do not add up to the newest position.
+            OSError: the file does not take it.
+        """
+        frames.write_all(file, self._preamble.pack() + self._sections)
+        writer = FrameWriter(file, self._preamble.frames_offset)
+        for body in self._bodies():
+            writer.add(body)
+        self._require_sum()
+        return writer.finish(self._preamble)
 
     def _pages_told_anew(self) -> Flags:
         """Of the state's pages, those that a delta has told, whole or as a difference."""
@@ -83,43 +85,29 @@ class _Folding:
         gone[np.searchsorted(self._base_addresses, kept)] = False
         return gone
 
-    def write(self, file: Sink) -> int:
-        """See `fold_into`."""
-        contents_size = len(self._origins.sources.addresses) * self._page_size
-        preamble, sections = format.begin(self._outline, contents_size)
-        seal = blake3(preamble.pack())
-        frames.write_all(file, preamble.pack() + sections)
-        offset = preamble.frames_offset
-        for body in self._bodies(preamble.frame_count):
-            head, size = frames.write_frame(file, body, offset)
-            seal.update(head)
-            offset += size
-        self._require_sum()
-        file_size = offset + layout.TRAILER_SIZE
-        frames.write_all(file, layout.pack_trailer(file_size, seal))
-        return file_size
-
     def _require_sum(self) -> None:
         for index in np.unique(np.flatnonzero(self._gone) // self._count).tolist():
             self._rows_of_base(index)  # what went of it is seen now, if it was not before
         before = chain.by_itself(self._stored.chain[0])
-        after = pages.add_to_sum(before.page_sum, np.concatenate(self.added), np.concatenate(self.removed))
+        after = pages.add_to_sum(before.page_sum, np.concatenate(self._added), np.concatenate(self._removed))
         chain.check_sum(self._outline, after)
 
-    def _bodies(self, count: int) -> Iterator[Body]:
+    def _bodies(self) -> Iterator[Body]:
         """Every frame of the result."""
         sources = self._origins.sources
+        if not len(sources.addresses):
+            return
         moved = sources.words[:, 1] != np.arange(len(sources.addresses), dtype=np.uint64)
-        other = np.add.reduceat(self._told_anew | moved, np.arange(0, len(moved), self._count)) if len(moved) else moved
-        for index in range(count):
+        other = np.logical_or.reduceat(self._told_anew | moved, np.arange(0, len(moved), self._count))
+        for index in range(self._preamble.frame_count):
             first = index * self._count
             last = min(first + self._count, len(sources.addresses))
-            is_as_it_was = not other[index] and self._frames[index].head.raw_size == (last - first) * self._page_size
+            is_as_it_was = not other[index] and self._decoded.frames[index].head.raw_size == (last - first) * self._page_size
             yield self._copied(index) if is_as_it_was else self._made(first, last)
 
     def _copied(self, index: int) -> Body:
         """A frame of the base, as it is stored."""
-        frame = self._frames[index]
+        frame = self._decoded.frames[index]
         body = self._stored.reader.read(frame.body_offset, frame.head.stored_size)
         frames.check_digest(body, frame)
         return Body(frame.head.codec, body, frame.head.raw_size, frame.head.digest)
@@ -131,7 +119,7 @@ class _Folding:
         rows = self._rows(state)
         self._origins.lay_on(rows, state.addresses)
         if anew.any():
-            self.added.append(pages.digest_pages(rows[anew].data, state.addresses[anew], self._page_size))
+            self._added.append(pages.digest_pages(rows[anew].data, state.addresses[anew], self._page_size))
         return self._packer(rows.reshape(-1).data)
 
     def _rows(self, state: PageMap) -> Rows:
@@ -150,16 +138,11 @@ class _Folding:
 
     def _rows_of_base(self, index: int) -> Rows:
         """The pages of one of the base's frames; those that went are counted when they are seen for the first time."""
-        if index not in self._decoded:
-            while len(self._decoded) >= KEPT:
-                del self._decoded[next(iter(self._decoded))]
-            content = frames.content_of(self._stored.reader, self._frames[index])
-            self._decoded[index] = rows_of(content, self._page_size)
-        rows = self._decoded[index]
+        rows = rows_of(self._decoded[index], self._page_size)
         if index not in self._seen:
             self._seen.add(index)
             here = slice(index * self._count, index * self._count + len(rows))
             gone = self._gone[here]
             if gone.any():
-                self.removed.append(pages.digest_pages(rows[gone].data, self._base_addresses[here][gone], self._page_size))
+                self._removed.append(pages.digest_pages(rows[gone].data, self._base_addresses[here][gone], self._page_size))
         return rows

@@ -12,7 +12,6 @@ import struct
 from collections.abc import Iterable
 from contextlib import closing
 
-from blake3 import blake3
 from msgspec import Struct
 from msgspec.structs import replace
 
@@ -21,7 +20,7 @@ from checkpoint.arrays import NDArray, np
 from checkpoint.byte_sources import Reader, Source, opened
 from checkpoint.differences import Rows
 from checkpoint.errors import FormatError
-from checkpoint.frames import Frame, Packer, Sink, check_digest, frames_of, read_frame, write_all, write_frame
+from checkpoint.frames import Frame, FrameWriter, Packer, Sink, check_digest, frames_of, read_frame, write_all
 from checkpoint.layout import Codec, Preamble, Section, SectionKind
 from checkpoint.model import PageCopy, PageRun, Snapshot
 from checkpoint.pages import Flags, Words
@@ -56,28 +55,34 @@ def encode(snapshot: Snapshot, file: Sink, *, threads: int = 1) -> int:
     check_snapshot(snapshot)
     contents = memoryview(snapshot.contents).cast("B")
     preamble, sections = begin(snapshot, len(contents))
-    seal = blake3(preamble.pack())
     write_all(file, preamble.pack() + sections)
-    offset = preamble.frames_offset
+    writer = FrameWriter(file, preamble.frames_offset)
     raws = (contents[index * layout.FRAME_SIZE :][: layout.FRAME_SIZE] for index in range(preamble.frame_count))
     with closing(side_by_side.in_order(Packer(threads), raws, worth(threads, preamble))) as bodies:
         for body in bodies:
-            head, size = write_frame(file, body, offset)
-            seal.update(head)
-            offset += size
-    file_size = offset + layout.TRAILER_SIZE
-    write_all(file, layout.pack_trailer(file_size, seal))
-    return file_size
+            writer.add(body)
+    return writer.finish(preamble)
 
 
 def begin(snapshot: Snapshot, contents_size: int) -> tuple[Preamble, bytes]:
     """What stands before the frames: the preamble, and all sections as they are stored.
 
     Raises:
-        FormatError: a section is larger than the format allows.
+        FormatError: a section, or all pages together, are larger than the format allows.
     """
+    check_contents_size(contents_size)
     sections, stored = _pack_sections(snapshot)
     return Preamble(contents_size, sections, _version_of(snapshot)), b"".join(stored)
+
+
+def check_contents_size(size: int, limit: int = layout.MAX_CONTENTS_SIZE) -> None:
+    """Refuse more bytes of pages than that.
+
+    Raises:
+        FormatError: says how many.
+    """
+    if size > limit:
+        raise FormatError(f"preamble: claims {size} bytes of pages; the limit here is {limit}")
 
 
 def worth(threads: int, preamble: Preamble) -> int:
@@ -150,8 +155,7 @@ def decode(source: Source, max_contents_size: int = layout.MAX_CONTENTS_SIZE, *,
     """
     with opened(source) as reader:
         preamble, outline = outlined(reader)
-        if preamble.contents_size > max_contents_size:
-            raise FormatError(f"preamble: claims {preamble.contents_size} bytes of pages; the limit here is {max_contents_size}")
+        check_contents_size(preamble.contents_size, max_contents_size)
         contents = np.empty(preamble.contents_size, dtype=np.uint8).data
 
         def read(numbered: tuple[int, Frame]) -> None:

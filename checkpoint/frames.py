@@ -9,8 +9,9 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from queue import SimpleQueue
-from typing import Protocol
+from typing import Final, Protocol
 
 from blake3 import blake3
 from msgspec import Struct
@@ -20,6 +21,9 @@ from checkpoint.byte_sources import Reader
 from checkpoint.compression import Compressor
 from checkpoint.errors import FormatError
 from checkpoint.layout import Codec, FrameHead, Preamble
+
+ROW: Final = 4
+"""Frames that a thread works on at once: to be woken, and to wait for the interpreter, take it as long as one of them."""
 
 
 class Sink(Protocol):
@@ -67,13 +71,34 @@ class Packer:
             self._compressors.put(compressor)
 
 
-def write_frame(file: Sink, body: Body, offset: int) -> tuple[bytes, int]:
-    """Write one frame whose head lies at ``offset``; its head, and how many bytes all of it took."""
-    padding = layout.padding_at(offset, body.codec)
-    head = FrameHead(body.codec, padding, len(body.content), body.raw_size, body.digest).pack()
-    write_all(file, head + bytes(padding))
-    write_all(file, body.content)
-    return head, len(head) + padding + len(body.content)
+class FrameWriter:
+    """Writes frames one after the other, and what stands behind the last one.
+
+    Args:
+        file: at the first frame's place.
+        offset: that place.
+    """
+
+    def __init__(self, file: Sink, offset: int) -> None:
+        self._file = file
+        self._offset = offset
+        self._heads: list[bytes] = []
+
+    def add(self, body: Body) -> None:
+        """Write one frame. Raises OSError."""
+        padding = layout.padding_at(self._offset, body.codec)
+        head = FrameHead(body.codec, padding, len(body.content), body.raw_size, body.digest).pack()
+        write_all(self._file, head + bytes(padding))
+        write_all(self._file, body.content)
+        self._heads.append(head)
+        self._offset += len(head) + padding + len(body.content)
+
+    def finish(self, preamble: Preamble) -> int:
+        """Write the trailer; the size of the whole file. Raises OSError."""
+        file_size = self._offset + layout.TRAILER_SIZE
+        seal = blake3(preamble.pack() + b"".join(self._heads))
+        write_all(self._file, layout.pack_trailer(file_size, seal))
+        return file_size
 
 
 def write_all(file: Sink, content: bytes | memoryview) -> None:
@@ -131,6 +156,29 @@ def read_frame(reader: Reader, frame: Frame, target: memoryview) -> None:
         check_digest(target, frame)
     else:
         compression.decompress_into(target, _verified(reader, frame), frame.where)
+
+
+class DecodedFrames:
+    """Contents of single frames of a file, of which the last few that were asked for stay decompressed."""
+
+    def __init__(self, reader: Reader, preamble: Preamble, kept: int) -> None:
+        self._reader = reader
+        self._preamble = preamble
+        self._kept = kept
+        self._contents: dict[int, bytes | memoryview] = {}
+
+    @cached_property
+    def frames(self) -> list[Frame]:
+        """All of them, when they are first asked for. Raises FormatError."""
+        return list(frames_of(self._reader, self._preamble))
+
+    def __getitem__(self, index: int) -> bytes | memoryview:
+        """The contents of one, verified. Raises FormatError."""
+        if index not in self._contents:
+            while len(self._contents) >= self._kept:
+                del self._contents[next(iter(self._contents))]
+            self._contents[index] = content_of(self._reader, self.frames[index])
+        return self._contents[index]
 
 
 def _verified(reader: Reader, frame: Frame) -> bytes | memoryview:

@@ -24,7 +24,7 @@ from checkpoint import carried, chain, channel, engine, foreign, format, side_by
 from checkpoint.channel import Channel, ChannelClosedError, ChannelError, Failed, Reply, Request
 from checkpoint.digests_of_files import DigestsOfFiles
 from checkpoint.engine import CaptureOrder, Copy, Engine, ProtectOrder, Restored, RestoreOptions, Session, Streams
-from checkpoint.errors import CaptureError, CheckpointError, FormatError, RestoreError, StoreError
+from checkpoint.errors import CaptureError, CheckpointError, FormatError, ProcessGoneError, RestoreError, StoreError
 from checkpoint.hot_pages import Sender
 from checkpoint.linux.address import address_of
 from checkpoint.linux.waking import waking
@@ -157,8 +157,7 @@ class Keeper:
         if unchanged := _unchanged(session, request):
             return unchanged, ()
         order = CaptureOrder(request.base, request.generation, request.sequence, request.epoch, self._robot, request.hold)
-        captured = session.capture(order) if target is None else session.capture_standing(order)
-        made = self._encoded(captured, target, request)
+        made = self._made(session, order, target, request)
         snapshot = made.snapshot
         commit, age_ns = _commit_at(session, snapshot.position)
         answer = channel.Captured(
@@ -176,13 +175,21 @@ class Keeper:
         )
         return answer, made.descriptors
 
-    def _encoded(self, captured: Snapshot | UnreadBase, target: int | None, request: channel.Capture) -> _Encoded:
-        """Encode what was captured, into the target, or into a memory file where there is none."""
+    def _made(self, session: Session, order: CaptureOrder, target: int | None, request: channel.Capture) -> _Encoded:
+        """Capture, and encode what was captured: into the target, or into a memory file where there is none."""
         threads = side_by_side.thread_count() if request.hold else 1  # a program that runs needs the processors itself
+        captured = session.capture(order) if target is None else session.capture_standing(order)
         if not isinstance(captured, Snapshot):
             assert target is not None, "it was to be read otherwise"
-            snapshot, size = written_in(target, captured, threads)
-            return _Encoded(snapshot, size, sum(run.size for run in snapshot.runs))
+            try:
+                snapshot, size = written_in(target, captured, threads)
+                return _Encoded(snapshot, size, sum(run.size for run in snapshot.runs))
+            except ProcessGoneError:
+                raise
+            except CaptureError:  # a page that nobody can read (a guard that this kernel does not tell): a copy leaves it out
+                os.ftruncate(target, 0)
+                os.lseek(target, 0, os.SEEK_SET)
+                captured = session.capture(order)
         told, known_bytes = self._sender.told(captured, request.xor_cache)
         if target is not None:
             return _Encoded(captured, encoded_in(target, told, threads), len(captured.contents), known_bytes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from itertools import islice
@@ -68,6 +69,25 @@ def in_rows(pieces: Iterable[A], count: int) -> Iterator[tuple[A, ...]]:
     rest = iter(pieces)
     while row := tuple(islice(rest, count)):
         yield row
+
+
+class OwnBuffers:
+    """A buffer of each thread's own, which stays in its processor's cache."""
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._of_thread = threading.local()
+
+    @property
+    def own(self) -> memoryview:
+        """That of the calling thread."""
+        if not hasattr(self._of_thread, "buffer"):
+            self._of_thread.buffer = memoryview(bytearray(self._size))
+        return self._of_thread.buffer  # type: ignore[no-any-return]
+
+    def give_away(self) -> None:
+        """Leave it to whoever has a part of it: the next one is new."""
+        del self._of_thread.buffer
 
 
 def _come_as(policy: int, priority: os.sched_param) -> None:

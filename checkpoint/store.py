@@ -11,6 +11,7 @@ stands behind a snapshot that is being written, proved or folded.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import threading
@@ -18,16 +19,16 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 from msgspec import Struct
 from msgspec.structs import replace
 
 from checkpoint import chain, format
-from checkpoint.byte_sources import opened
 from checkpoint.contents import Contents
 from checkpoint.disk import Disk, DiskFile, lock_exclusively
 from checkpoint.errors import ChainError, FormatError, StoreError
-from checkpoint.folding import fold_into
+from checkpoint.folding import Folding
 from checkpoint.history import HISTORY_FOLDER, History, Retention
 from checkpoint.hot_pages import CACHE_SIZE
 from checkpoint.model import OutputPiece, Position, Snapshot
@@ -35,7 +36,7 @@ from checkpoint.needs import needs
 from checkpoint.proofs import Proofs
 from checkpoint.shelf import BASE_SUFFIX, DELTA_SUFFIX, FOLDER_PREFIX, Entry, Shelf, file_name, folder_name, order_of_name
 from checkpoint.state import header_of
-from checkpoint.stored_base import StoredBase
+from checkpoint.stored_base import stored_chain
 from checkpoint.validity import place
 from checkpoint.whole_files import TEMPORARY_PREFIX, WholeFiles, disk_trouble
 
@@ -65,6 +66,9 @@ NOTHING_OLD = Retention()
 
 FOLDED_OUTPUT_SIZE = 1 << 20
 """Bytes of output of each stream that a folded base keeps; the whole is in the component's logs."""
+
+
+A = TypeVar("A")
 
 
 class Kept(Struct, frozen=True):
@@ -320,6 +324,7 @@ class Store:
 
         Raises:
             StoreError: the position cannot be loaded, or the disk does not take the base.
+            FormatError: see `_write_fold`.
         """
         entries = self.chain_of(component, position)
         written = self._write_fold(component, entries)
@@ -332,28 +337,46 @@ class Store:
                 self._add(component, written)
 
     def _write_fold(self, component: str, entries: tuple[Entry, ...]) -> Entry | None:
-        """Write a chain as one base, or answer None when a file of it had to be set out of use."""
-        base, deltas = entries[0], self._all_decoded(component, entries[1:])
-        if deltas is None:
+        """Write a chain as one base, or answer None when a file of it had to be set out of use.
+
+        Raises:
+            FormatError: what it amounts to cannot be written; its files are not to blame, and stay.
+        """
+        deltas = self._all_decoded(component, entries[1:])
+        is_tree = self._read(component, entries, lambda: format.is_of_several_processes(entries[0].path))
+        if deltas is None or is_tree is None:
             return None
+        if deltas and not is_tree and not any(delta.is_tree for delta in deltas):
+            return self._write_straight(component, entries, deltas)
+        folded = self._try_fold(component, entries)
+        if folded is None:
+            return None
+        folded = replace(folded, output=_newest_output(folded.output))
+        return self._write_base(folded, lambda file: format.encode(folded, file))
+
+    def _write_straight(self, component: str, entries: tuple[Entry, ...], deltas: list[Snapshot]) -> Entry | None:
+        """The same of one process, frame by frame."""
+        with contextlib.ExitStack() as open_files:
+            stored = self._read(component, entries, lambda: open_files.enter_context(stored_chain(entries[0].path, deltas)))
+            if stored is None:
+                return None
+            folded = replace(stored.outline, output=_newest_output(stored.outline.output))
+            folding = Folding(stored, folded)
+            return self._read(component, entries, lambda: self._write_base(folded, folding.write))
+
+    def _read(self, component: str, entries: tuple[Entry, ...], act: Callable[[], A]) -> A | None:
+        """What an act answers that reads a chain's base, or None when a file had to be set out of use."""
         try:
-            with opened(base.path) as reader:
-                if not deltas or format.is_of_several_processes(base.path) or any(delta.is_tree for delta in deltas):
-                    folded = chain.fold([format.decode(base.path), *deltas])
-                    return self._write_base(folded, lambda file, folded: format.encode(folded, file))
-                stored = StoredBase(base.path, reader, deltas)
-                return self._write_base(stored.outline, lambda file, folded: fold_into(file, stored, folded))
+            return act()
         except FormatError as error:
-            self._set_out_of_use(component, base, str(error))
+            self._set_out_of_use(component, entries[0], str(error))
         except ChainError as error:
             self._set_out_of_use(component, entries[-1], str(error))
         return None
 
-    def _write_base(self, folded: Snapshot, write: Callable[[DiskFile, Snapshot], int]) -> Entry:
-        folded = replace(folded, output=_newest_output(folded.output))
+    def _write_base(self, folded: Snapshot, write: Callable[[DiskFile], int]) -> Entry:
         final = self._root / folder_name(folded.component) / file_name(header_of(folded))
-        size = self._files.write(final, lambda file: write(file, folded))
-        return _entry_of(final, folded, size)
+        return _entry_of(final, folded, self._files.write(final, write))
 
     def _fold_is_due(self, component: str, oldest: Position) -> bool:
         with self._lock:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from threading import local
+from pathlib import Path
 from typing import Final
 
 from msgspec.structs import replace
@@ -20,17 +20,17 @@ from checkpoint import carried, chain, format, frames, pages, side_by_side
 from checkpoint.arrays import np
 from checkpoint.byte_sources import Reader, Source, opened
 from checkpoint.differences import rows_of
-from checkpoint.frames import Frame
+from checkpoint.errors import FormatError
+from checkpoint.frames import ROW, DecodedFrames, Frame
 from checkpoint.layout import FRAME_SIZE
 from checkpoint.model import Snapshot
 from checkpoint.origins import Origins
 from checkpoint.pages import Buffer, PageMap, Words
+from checkpoint.side_by_side import OwnBuffers
 
 Taker = Callable[[Words, Buffer], None]
 """Does something with a set of pages and their bytes; several threads call it at once."""
 
-ROW: Final = 4
-"""Frames that a thread takes at once: to be woken, and to wait for the interpreter, take it as long as one of them."""
 KEPT: Final = 4
 """Frames of which single bytes were asked, that stay decompressed: threads keep things of the same kind beside each other."""
 
@@ -55,8 +55,8 @@ class StoredBase:
         self.preamble, base = format.outlined(reader)
         self.chain = (base, *deltas)
         self.base_pages = pages.extents(base.runs)
-        self._frames: list[Frame] = []
-        self._decoded: dict[int, bytes] = {}
+        format.check_contents_size(self.preamble.contents_size)
+        self._decoded = DecodedFrames(reader, self.preamble, KEPT)
         self.origins: Origins | None = None
         if deltas:
             self.outline, self.origins = chain.outlined(self.chain)
@@ -89,13 +89,11 @@ class StoredBase:
 
     def _of_base(self, take: Taker, threads: int) -> Iterator[Words]:
         """Have those taken that the base tells; the sums of their digests."""
-        own = local()
+        buffers = OwnBuffers(ROW * FRAME_SIZE)
 
         def taken(numbered: tuple[Words, tuple[Frame, ...]]) -> Words:
             row, told = numbered
-            if not hasattr(own, "buffer"):
-                own.buffer = memoryview(bytearray(ROW * FRAME_SIZE))
-            content = own.buffer[: pages.total_size(row)]
+            content = buffers.own[: pages.total_size(row)]
             for index, frame in enumerate(told):
                 frames.read_frame(self.reader, frame, content[index * FRAME_SIZE :][: frame.head.raw_size])
             return self._passed_on(take, *self._current(row, content))
@@ -168,17 +166,9 @@ class StoredBase:
                 return self.origins.gathered(self.chain, one).tobytes()
         place = pages.place_in(self.base_pages, address, self._page_size)
         assert place is not None, "it is carried"
-        content = self._frame(place // FRAME_SIZE)[place % FRAME_SIZE :][: self._page_size]
+        content = self._decoded[place // FRAME_SIZE][place % FRAME_SIZE :][: self._page_size]
         page = np.array([[address, address + self._page_size]], dtype=np.uint64)
         return bytes(self._current(page, memoryview(bytearray(content)))[1])
-
-    def _frame(self, index: int) -> bytes:
-        if index not in self._decoded:
-            self._frames = self._frames or list(frames.frames_of(self.reader, self.preamble))
-            while len(self._decoded) >= KEPT:
-                del self._decoded[next(iter(self._decoded))]
-            self._decoded[index] = bytes(frames.content_of(self.reader, self._frames[index]))
-        return self._decoded[index]
 
 
 def _nothing() -> Words:
@@ -196,3 +186,14 @@ def stored_base(*sources: Source) -> Iterator[StoredBase]:
     base, *deltas = sources
     with opened(base) as reader:
         yield StoredBase(base, reader, [format.decode(delta) for delta in deltas])
+
+
+@contextmanager
+def stored_chain(base: Path, deltas: Sequence[Snapshot]) -> Iterator[StoredBase]:
+    """The same of deltas that have been read. What the body raises is not of the file, and does not name it."""
+    try:
+        file = open(base, "rb", buffering=0)  # noqa: SIM115
+    except OSError as error:
+        raise FormatError(f"cannot open snapshot {base}: {error.strerror}") from error
+    with file, opened(file.fileno()) as reader:
+        yield StoredBase(base, reader, deltas)

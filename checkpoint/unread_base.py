@@ -9,23 +9,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import closing
 from io import RawIOBase
-from threading import local
-from typing import Final
 
 import numpy as np
-from blake3 import blake3
 from msgspec import Struct
 from msgspec.structs import replace
 
-from checkpoint import chain, format, frames, layout, pages, side_by_side
-from checkpoint.frames import Body, Packer
+from checkpoint import chain, format, pages, side_by_side
+from checkpoint.frames import ROW, Body, FrameWriter, Packer, write_all
 from checkpoint.layout import FRAME_SIZE, Codec, Preamble
 from checkpoint.model import Snapshot
 from checkpoint.pages import Words
+from checkpoint.side_by_side import OwnBuffers
 from checkpoint.validity import check_snapshot
-
-ROW: Final = 4
-"""Frames that a thread makes at once: to be woken, and to wait for the interpreter, take it as long as one of them."""
 
 
 class UnreadBase(Struct, frozen=True):
@@ -54,30 +49,25 @@ class UnreadBase(Struct, frozen=True):
         check_snapshot(self.outline, contents_size)
         preamble = format.begin(self.outline, contents_size)[0]
         file.seek(preamble.frames_offset)
-        heads: list[bytes] = []
-        sums, offset = [np.zeros((1, 2), dtype=np.uint64)], preamble.frames_offset
+        writer, sums = FrameWriter(file, preamble.frames_offset), [np.zeros((1, 2), dtype=np.uint64)]
         wanted = pages.cut(pages.extents(self.outline.runs), ROW * FRAME_SIZE)
         with closing(side_by_side.in_order(_Frames(self, threads), wanted, format.worth(threads, preamble))) as rows:
             for bodies, summed in rows:
                 sums.append(summed)
                 for body in bodies:
-                    head, size = frames.write_frame(file, body, offset)
-                    heads.append(head)
-                    offset += size
-        return self._finish(file, pages.sum_of(np.concatenate(sums)), preamble, heads, offset)
+                    writer.add(body)
+        return self._finish(file, writer, preamble, pages.sum_of(np.concatenate(sums)))
 
-    def _finish(self, file: RawIOBase, page_sum: bytes, draft: Preamble, heads: list[bytes], end: int) -> tuple[Snapshot, int]:
+    def _finish(self, file: RawIOBase, writer: FrameWriter, draft: Preamble, page_sum: bytes) -> tuple[Snapshot, int]:
         """Write what is known now, after the frames and before them."""
         told = replace(self.outline, page_sum=page_sum)
         position = chain.position_of(told, told.position.generation, told.position.sequence)
         told = replace(told, position=position)
         preamble, sections = format.begin(told, draft.contents_size)
         assert preamble.frames_offset == draft.frames_offset, "a sum and a digest are as long whatever they are"
-        seal = blake3(preamble.pack() + b"".join(heads))
-        file_size = end + layout.TRAILER_SIZE
-        frames.write_all(file, layout.pack_trailer(file_size, seal))
+        file_size = writer.finish(preamble)
         file.seek(0)
-        frames.write_all(file, preamble.pack() + sections)
+        write_all(file, preamble.pack() + sections)
         return told, file_size
 
 
@@ -88,19 +78,14 @@ class _Frames:
         self._read = base.read
         self._page_size = base.outline.machine.page_size
         self._packer = Packer(threads)
-        self._own = local()
+        self._buffers = OwnBuffers(ROW * FRAME_SIZE)
 
     def __call__(self, row: Words) -> tuple[list[Body], Words]:
         """The frames of these pages, and the sum of their digests."""
-        raw = self._buffer()[: pages.total_size(row)]
+        raw = self._buffers.own[: pages.total_size(row)]
         self._read(row, raw)
         digests = pages.digest_pages(raw, pages.addresses_of(row, self._page_size), self._page_size)
         bodies = self._packer.each([raw[begin : begin + FRAME_SIZE] for begin in range(0, len(raw), FRAME_SIZE)])
         if any(body.codec is Codec.RAW for body in bodies):
-            del self._own.buffer  # it is theirs now
+            self._buffers.give_away()
         return bodies, digests.sum(axis=0, keepdims=True, dtype=np.uint64)
-
-    def _buffer(self) -> memoryview:
-        if not hasattr(self._own, "buffer"):
-            self._own.buffer = memoryview(bytearray(ROW * FRAME_SIZE))
-        return self._own.buffer  # type: ignore[no-any-return]

@@ -85,3 +85,18 @@ def test_a_command_whose_streams_are_closed_does_what_it_was_told(closed: tuple[
     ran = subprocess.run(words, shell=True, capture_output=True, text=True, check=False)
     assert (ran.returncode, ran.stderr) == (0, "")
     assert ("threads" in ran.stdout) == (1 not in closed)
+
+
+@pytest.mark.parametrize(
+    ("words", "status"), [(["check", "--table"], 0), (["capture"], 2), (["restore", "/nowhere"], 1)], ids=str
+)
+def test_whoever_ignores_the_ends_of_children_can_start_commands(words: list[str], status: int) -> None:
+    """Nobody can wait for the keeper then."""
+    ran = subprocess.run(
+        [sys.executable, "-m", "failover", *words],
+        preexec_fn=lambda: signal.signal(signal.SIGCHLD, signal.SIG_IGN),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (ran.returncode, "Traceback" in ran.stderr, "child" in ran.stderr) == (status, False, False), ran.stderr

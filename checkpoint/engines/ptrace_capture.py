@@ -465,7 +465,7 @@ class PtraceSession:
             output=self._outputs.pieces(self._output_since(parent), totals) if self._outputs else (),
         )
         outline = frozen.departing.added_to(outline)
-        if len(first.taken.unread):
+        if first.taken.unread is not None:
             self.totals = totals
             return self._unread(outline, first.taken.unread)
         looks = [(self._first, first), *(others.looks() if others else ())]

@@ -34,7 +34,6 @@ from checkpoint import carried, epoch_variable, rights, room, side_by_side
 from checkpoint.arch import cpu, extended, stubs
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import (
-    description,
     restore_checks,
     restore_kinds,
     restore_memory,
@@ -52,7 +51,7 @@ from checkpoint.linux import abi, call_table, processor, procfs, vdso
 from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Stop, Tracee
-from checkpoint.linux.tracking import MEMORY_PLACE
+from checkpoint.linux.vm_flags import MAY_WRITE
 from checkpoint.model import Credentials, PageRun, Position, Snapshot, ThreadState, Vma
 from checkpoint.pages import Words
 from checkpoint.resources import (
@@ -165,12 +164,19 @@ def held_or_stored(base: Snapshot | StoredBase) -> tuple[Snapshot, StoredBase | 
 def _may_be_proved_later(outline: Snapshot) -> bool:
     """Whether the pages of a base may go into the vessel before all of them were proved, and none is wanted before.
 
-    Nothing that comes before pages outlives a vessel that is given up, but files that are made with them: those that travel with
-    the program, and its shared memory. A program of another kernel needs the old vdso early.
+    Not where something outlives a vessel that is given up: files that travel with the program, a directory that is made for it,
+    memory that others see, a file that is written to by being mapped. A program of another kernel needs the old vdso early.
     """
-    makes_files = any(vma.file is not None and vma.file.path.startswith(MEMORY_PLACE) for vma in outline.vmas)
-    is_of_this_kernel = outline.machine.vdso_digest == description.this_machine().vdso_digest
-    return not outline.is_tree and not makes_files and is_of_this_kernel and carried.without(outline) is outline
+    leaves_nothing = not any(map(_outlives, outline.vmas)) and not restore_checks.missing_directories(outline)
+    is_of_this_kernel = restore_vdso.fits(outline, restore_checks.own_kernel_pages())
+    return not outline.is_tree and leaves_nothing and is_of_this_kernel and carried.without(outline) is outline
+
+
+def _outlives(vma: Vma) -> bool:
+    """Whether what is written to a mapping is seen beyond the process that writes it."""
+    if system_v_memory.is_segment(vma):
+        return True
+    return vma.shared and restore_memory.is_file_mapping(vma) and bool(vma.protection & abi.PROT_WRITE or MAY_WRITE in vma.flags)
 
 
 def _run_one(

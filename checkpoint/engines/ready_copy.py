@@ -78,9 +78,10 @@ def lay(vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -
         MismatchError: this machine lacks a file that is mapped.
         RestoreError: it did not work; the caller kills the vessel.
     """
+    outline = base if isinstance(base, Snapshot) else base.outline
+    require_covered(outline)
+    require_room(outline)
     state, stored = held_or_stored(base)
-    require_covered(state)
-    require_room(state)
     copy = _copy_of(vessel_pid, state, options, stored)
     with ended_on_error(copy, f"lay a ready copy of {state.component} in pid {vessel_pid}"):
         copy.lay()
@@ -262,9 +263,7 @@ class ReadyCopy(ProcessRestore):
     def fill(self, plan: Plan) -> None:
         """The other half."""
         for extents, content in plan.rescued:
-            ranges = extents.copy()
-            ranges[:, 1] -= ranges[:, 0]
-            self._tracee.memory.write_from(ranges, content)
+            self._tracee.memory.write_pages_from(extents, content)
         restore_memory.fill(self._tracee.memory, plan.delta)
         self._descriptors = plan.table.descriptors
         self._extents, self._stiff = plan.change.carried, plan.change.stiff

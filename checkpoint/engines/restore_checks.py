@@ -192,7 +192,7 @@ def _of_machine(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
     if machine.page_size != abi.PAGE_SIZE:
         yield f"its pages are {machine.page_size} bytes, this kernel's {abi.PAGE_SIZE}: boot a kernel with the same"
     yield from _of_threads(state)
-    if state.contents and not restore_vdso.fits(state, _own_kernel_pages()):
+    if state.contents and not restore_vdso.fits(state, own_kernel_pages()):
         yield from restore_vdso.refuse(state)
     if listed := ", ".join(portable.lacking(machine.features, here.features)):
         cure = "use one that has them, or start it with failover run --portable"
@@ -210,7 +210,7 @@ def _of_machine(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
 
 
 @functools.cache
-def _own_kernel_pages() -> list[procfs.MapsLine]:
+def own_kernel_pages() -> list[procfs.MapsLine]:
     """Where our own vdso and its data lie, as long as we live."""
     return kernel_pages(procfs.parse_maps(procfs.read_text(os.getpid(), "maps")))
 

@@ -38,7 +38,7 @@ class Taken(Struct, frozen=True, dict=True, eq=False):
             the others are this capture's alone.
         untouched: see `checkpoint.resources.untouched`.
         copy_ns: how long that last copy took.
-        unread: pages that are still to be read where they stand, in place of all copies.
+        unread: pages that are still to be read where they stand, in place of all copies; None where they are read.
     """
 
     lines: tuple[MapsLine, ...]
@@ -50,7 +50,7 @@ class Taken(Struct, frozen=True, dict=True, eq=False):
     copies: tuple[Copy, ...]
     untouched: Words = field(default_factory=lambda: NONE)
     copy_ns: int = 0
-    unread: Words = field(default_factory=lambda: NONE)
+    unread: Words | None = None
 
     @functools.cached_property
     def _named(self) -> tuple[Words, Words]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
-import threading
 from collections.abc import Iterator, Sequence
 from typing import Final
 
@@ -95,11 +94,9 @@ def compared(before: PageMap, now: PageMap) -> Scan:
 
 def digests_of(memory: Memory, existing: Words) -> Words:
     """The digest of each page. Much is read by several threads, each into a buffer that stays in its processor's cache."""
-    buffers = threading.local()
+    buffers = side_by_side.OwnBuffers(DIGESTED)
 
     def digested(piece: Words) -> Words:
-        if not hasattr(buffers, "own"):
-            buffers.own = memoryview(bytearray(DIGESTED))
         addresses = pages.addresses_of(piece, abi.PAGE_SIZE)
         memory.read_pages_into(piece, buffers.own)
         return pages.digest_pages(buffers.own[: len(addresses) * abi.PAGE_SIZE], addresses, abi.PAGE_SIZE)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
 from typing import IO, TYPE_CHECKING, Final, NamedTuple, Protocol
 
@@ -115,8 +116,10 @@ def _as_keeper(theirs: int, complaints: int) -> int:
     theirs, complaints = (fcntl.fcntl(one, fcntl.F_DUPFD_CLOEXEC, 3) for one in (theirs, complaints))  # 0 to 2 may be among them
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     os.dup2(complaints, 2)
-    os.closerange(3, theirs)
-    os.closerange(theirs + 1, os.sysconf("SC_OPEN_MAX"))
+    for other in map(int, os.listdir("/proc/self/fd")):
+        if other > 2 and other != theirs:
+            with contextlib.suppress(OSError):  # that of the listing
+                os.close(other)
     from checkpoint.__main__ import run
 
     return run(["keeper", str(theirs)])
@@ -130,17 +133,25 @@ class _Forked:
         self._status: int | None = None
 
     def wait(self, timeout: float | None = None) -> int:
-        """Reap it; its exit status. Raises TimeoutError."""
+        """Reap it; its exit status, as `subprocess.Popen.wait` tells it, and raises."""
         if self._status is None:
             if timeout is not None and not self._has_ended(timeout):
-                raise TimeoutError(f"the keeper (pid {self.pid}) has not ended after {timeout:.0f} s")
-            self._status = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+                import subprocess
+
+                raise subprocess.TimeoutExpired("keeper", timeout)
+            try:
+                self._status = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+            except ChildProcessError:  # whoever started this command ignores SIGCHLD, and so do we
+                self._status = 0
         return self._status
 
     def _has_ended(self, timeout: float) -> bool:
         import select
 
-        end = os.pidfd_open(self.pid)
+        try:
+            end = os.pidfd_open(self.pid)
+        except ProcessLookupError:
+            return True
         try:
             return bool(select.select([end], [], [], timeout)[0])
         finally:
@@ -148,4 +159,5 @@ class _Forked:
 
     def kill(self) -> None:
         """End it now."""
-        os.kill(self.pid, 9)
+        if self._status is None:
+            os.kill(self.pid, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""A keeper of our own for one command: the tracer's process, spawned, asked, and gone when we are.
+"""A keeper of our own for one command: the tracer's process, started, asked, and gone when we are.
 
 The one-shot verbs go through the same program that the agent uses, so that python-ptrace is never in this process.
 """

@@ -20,6 +20,8 @@ from checkpoint.device_rules import DeviceRule, rule_from
 from checkpoint.engine import Terms
 from checkpoint.errors import (
     CaptureError,
+    ChainError,
+    FormatError,
     NothingCommittedError,
     ProbeError,
     ProcessGoneError,
@@ -199,6 +201,13 @@ def restore(arguments: argparse.Namespace) -> int:
         file = os.open(arguments.file, os.O_RDONLY | os.O_CLOEXEC)
     except OSError as error:
         raise FailoverError(f"cannot read {arguments.file}: {error.strerror}") from error
+    try:
+        return _restored(arguments, file)
+    except (FormatError, ChainError) as error:
+        raise FailoverError(f"cannot restore {arguments.file}: {error}") from error
+
+
+def _restored(arguments: argparse.Namespace, file: int) -> int:
     state = format.read_state(file)
     elapsed_ns, terms = vessel.elapsed_since(state.clocks), terms_of(arguments)
     birth = birth_of(state, elapsed_ns, own_session=not arguments.wait)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import random
 from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -13,11 +14,12 @@ from msgspec.structs import replace
 from checkpoint import chain, format, frames
 from checkpoint.byte_sources import opened
 from checkpoint.errors import ChainError, FormatError
-from checkpoint.folding import fold_into
+from checkpoint.folding import Folding
 from checkpoint.layout import FRAME_SIZE
-from checkpoint.model import Snapshot
+from checkpoint.model import PageRun, Snapshot
+from checkpoint.store import open_store
 from checkpoint.stored_base import stored_base
-from tests.checkpoint.snapshots import PAGE, page, pages_of, snapshot, vma
+from tests.checkpoint.snapshots import COMPONENT, PAGE, START, page, pages_of, snapshot, vma
 from tests.checkpoint.test_differences import STEPS, as_told, whole_chain
 
 IN_A_FRAME = FRAME_SIZE // PAGE
@@ -29,7 +31,7 @@ def folded_file(files: Sequence[bytes]) -> bytes:
     """The file that these are folded into."""
     file = io.BytesIO()
     with stored_base(*files) as base:
-        size = fold_into(file, base, base.outline)
+        size = Folding(base, base.outline).write(file)
     assert size == len(file.getvalue())
     return file.getvalue()
 
@@ -114,8 +116,34 @@ def test_a_base_that_was_damaged_on_the_disk_is_found(base: Snapshot, number: in
         preamble, _ = format.outlined(reader)
         frame = list(frames.frames_of(reader, preamble))[number // IN_A_FRAME]
     file[frame.body_offset + frame.head.stored_size // 2] ^= 1
-    with (
-        stored_base(bytes(file), format.encode_bytes(told[1])) as stored,
-        pytest.raises(FormatError, match="its body does not match"),
-    ):
-        fold_into(io.BytesIO(), stored, stored.outline)
+    with pytest.raises(FormatError, match="its body does not match"):
+        folded_file([bytes(file), format.encode_bytes(told[1])])
+
+
+def test_what_would_not_hold_together_is_refused_before_anything_is_written(base: Snapshot) -> None:
+    """A guard over a page that the chain still carries: the delta should have cleared it."""
+    (whole,) = base.vmas
+    guarded = replace(whole, guards=(PageRun(START + PAGE, START + 2 * PAGE),))
+    delta = snapshot(pages_of(base), carried={}, parent=base.position, sequence=2, vmas=(guarded,))
+    with stored_base(format.encode_bytes(base), format.encode_bytes(delta)) as stored, pytest.raises(FormatError, match="guards"):
+        Folding(stored, stored.outline)
+
+
+def test_a_fold_that_cannot_be_written_blames_no_file(base: Snapshot, tmp_path: Path) -> None:
+    (whole,) = base.vmas
+    guarded = replace(whole, guards=(PageRun(START + PAGE, START + 2 * PAGE),))
+    delta = snapshot(pages_of(base), carried={}, parent=base.position, sequence=2, vmas=(guarded,))
+    store = open_store(tmp_path / "store")
+    try:
+        for one in (base, delta):
+            file = tmp_path / "one"
+            file.write_bytes(format.encode_bytes(one))
+            with open(file, "rb") as source:
+                store.put(source.fileno())
+        with pytest.raises(FormatError, match="guards"):
+            store.fold(COMPONENT, delta.position)
+        assert store.positions(COMPONENT) == (base.position, delta.position)
+        assert pages_of(store.load(COMPONENT)) == pages_of(base)
+        assert not store.notices
+    finally:
+        store.close()

@@ -14,14 +14,16 @@ import pytest
 from msgspec.structs import replace
 
 from checkpoint import chain, compression, format, pages, side_by_side
-from checkpoint.engine import CaptureOrder, RestoreOptions
+from checkpoint.channel import Capture
+from checkpoint.engine import CaptureOrder, RestoreOptions, Session
 from checkpoint.engines.captured_tree import CapturedTree
 from checkpoint.errors import CaptureError, ChainError, FormatError
+from checkpoint.keeper import Keeper
 from checkpoint.layout import FRAME_SIZE, Codec
 from checkpoint.linux import abi
 from checkpoint.linux.memory import Memory
-from checkpoint.linux.vessel import Birth, spawn_vessel
-from checkpoint.model import Snapshot, VmaKind
+from checkpoint.linux.vessel import Birth, discard, spawn_vessel
+from checkpoint.model import PageRun, Snapshot, Vma, VmaKind
 from checkpoint.stored_base import stored_base
 from checkpoint.unread_base import UnreadBase
 from tests.checkpoint.round_trip import (
@@ -232,6 +234,75 @@ def _expect_no_program(file: Path, error: type[Exception], match: str) -> None:
     with stored_base(file) as base, pytest.raises(error, match=match):
         ENGINE.restore(born.pid, base, RestoreOptions())
     assert not Path(f"/proc/{born.pid}").exists(), "it was ended, and reaped by its tracer"
+
+
+def test_a_file_that_others_see_is_not_touched_by_a_restore_that_fails(tmp_path: Path) -> None:
+    """What is written to a shared mapping is in its file at once: all frames are proved before."""
+    script = tmp_path / "script"
+    script.write_text(
+        f"#!{sys.executable}\nimport mmap, os, random, time\n"
+        f"with open('shown', 'w+b') as file:\n    file.write(b'A' * {FRAME_SIZE})\n    file.flush()\n"
+        f"    shown = mmap.mmap(file.fileno(), {FRAME_SIZE})\nshown[:] = b'A' * {FRAME_SIZE}\n"
+        f"chance = mmap.mmap(-1, {12 * FRAME_SIZE}, flags=mmap.MAP_PRIVATE)\nchance.write(os.urandom({12 * FRAME_SIZE}))\n"
+        "print('ready', flush=True)\ntime.sleep(600)\n"
+    )
+    script.chmod(0o755)
+    with ended(start_tracee(script, tmp_path)) as program:
+        written_and_killed(program, tmp_path / "base")
+    (tmp_path / "shown").write_bytes(b"Z" * FRAME_SIZE)
+    content = bytearray((tmp_path / "base").read_bytes())
+    content[-100_000] ^= 1
+    (tmp_path / "base").write_bytes(content)
+    born = spawn_vessel(Birth())
+    try:
+        with stored_base(tmp_path / "base") as base, pytest.raises(FormatError, match="does not match its digest"):
+            ENGINE.restore(born.pid, base, RestoreOptions(accept_changed=(str(tmp_path / "shown"),)))
+    finally:
+        discard(born)
+    assert (tmp_path / "shown").read_bytes() == b"Z" * FRAME_SIZE
+
+
+def test_a_page_that_nobody_can_read_is_left_out_by_a_copy(program: Program, tmp_path: Path) -> None:
+    """As guard pages are where the kernel installs them and does not tell (Linux 6.13)."""
+
+    def read(piece: pages.Words, buffer: memoryview) -> None:
+        raise CaptureError("cannot read memory")
+
+    class Unreadable:
+        """A session one page of which cannot be read where it stands."""
+
+        def __init__(self, session: Session) -> None:
+            self.capture = session.capture
+            self._standing = session.capture_standing
+
+        def capture_standing(self, order: CaptureOrder) -> Snapshot | UnreadBase:
+            base = self._standing(order)
+            assert isinstance(base, UnreadBase)
+            return replace(base, read=read)
+
+    with protected(program) as session, open(tmp_path / "base", "wb") as file:
+        order, request = CaptureOrder(hold=True), Capture(base=True, generation=1, sequence=1, hold=True)
+        keeper = Keeper(None, ENGINE)  # type: ignore[arg-type]  # nobody is answered
+        file.write(b"of a try before this one")
+        file.flush()
+        keeper._made(Unreadable(session), order, file.fileno(), request)  # type: ignore[arg-type]
+    assert chain.fold([format.decode(tmp_path / "base")])
+    program.tell()
+    expect_ok(program)
+
+
+def test_a_file_that_claims_more_than_anybody_holds_is_refused_at_once(base_file: Path, tmp_path: Path) -> None:
+    outline, size = format.read_outline(base_file), 1 << 44
+    run = PageRun(1 << 45, (1 << 45) + size)
+    claims = replace(outline, runs=(run,), vmas=(Vma(run.start, run.end, 3, False, VmaKind.ANONYMOUS),))
+    with pytest.raises(FormatError, match="the limit here is"):
+        format.begin(claims, size)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(format, "check_contents_size", lambda _: None)
+        preamble, sections = format.begin(claims, size)
+    (tmp_path / "claims").write_bytes(preamble.pack() + sections)
+    with pytest.raises(FormatError, match="the limit here is"), stored_base(tmp_path / "claims"):
+        pass
 
 
 def test_what_is_no_base_or_not_the_state_that_it_names_is_refused_at_once(base_file: Path, tmp_path: Path) -> None:
