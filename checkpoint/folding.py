@@ -86,7 +86,7 @@ class Folding:
         return gone
 
     def _require_sum(self) -> None:
-        for index in np.unique(np.flatnonzero(self._gone) // self._count).tolist():
+        for index in pages.distinct(np.flatnonzero(self._gone).astype(np.uint64) // np.uint64(self._count)).tolist():
             self._rows_of_base(index)  # what went of it is seen now, if it was not before
         before = chain.by_itself(self._stored.chain[0])
         after = pages.add_to_sum(before.page_sum, np.concatenate(self._added), np.concatenate(self._removed))
@@ -126,11 +126,11 @@ class Folding:
         """The pages as they were last told whole."""
         rows = np.empty((len(state.addresses), self._page_size), dtype=np.uint8)
         is_base = state.words[:, 0] == 0
-        places = state.words[is_base, 1].astype(np.intp)
+        places = state.words[is_base, 1]
         chosen = np.flatnonzero(is_base)
-        for index in np.unique(places // self._count).tolist():
-            here = places // self._count == index
-            rows[chosen[here]] = self._rows_of_base(index)[places[here] % self._count]
+        for index in pages.distinct(places // np.uint64(self._count)).tolist():
+            here = places // np.uint64(self._count) == index
+            rows[chosen[here]] = self._rows_of_base(index)[(places[here] % np.uint64(self._count)).astype(np.intp)]
         if not is_base.all():
             later = PageMap(state.addresses[~is_base], state.words[~is_base])
             rows[~is_base] = rows_of(self._origins.whole(self._stored.chain, later).data, self._page_size)
