@@ -23,6 +23,7 @@ from typing import Final
 
 from benchmarks import (
     beside,
+    chains,
     costs,
     crowd,
     cuts,
@@ -95,6 +96,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "beside": beside.beside,
     "restore": _restore,
     "families": families.families,
+    "chains": chains.chains,
     "files": files.files,
     "outage": _outage,
     "cuts": cuts.cuts,

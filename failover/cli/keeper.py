@@ -38,6 +38,11 @@ class Keeper:
         process, ours, complaints = ahead.taken()
         return cls(process, Channel(ours, Reply), complaints)
 
+    @property
+    def pid(self) -> int:
+        """Of its process."""
+        return self._process.pid
+
     def ask(self, request: msgspec.Struct, wanted: type[A], descriptors: tuple[int, ...] = ()) -> tuple[A, tuple[int, ...]]:
         """Send one request and wait for its answer: it, and the descriptors that came with it, now ours.
 
