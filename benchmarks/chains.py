@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks import engine, machine
@@ -31,8 +32,17 @@ def chains(quick: bool, directory: Path) -> Findings:
     megabytes = 100 if quick else MEGABYTES
     pid, files = _chain(megabytes, directory)
     case, figures = f"{megabytes} MB", []
-    for what, orders in (("restore", _restored), ("laying of a ready copy", _laid)):
-        found = [orders(pid, files[:RESTORED], megabytes) for _ in range(2 if quick else COUNT)]
+    few = files[:RESTORED]
+
+    def restored(keeper: Keeper, born: int) -> None:
+        keeper.ask(channel.Restore(born, "/benchmark", follow=False), channel.Restored, few)
+        keeper.ask(channel.Resume(), channel.Resumed)
+
+    def laid(keeper: Keeper, born: int) -> None:
+        keeper.ask(channel.Lay(born, "/benchmark"), channel.Laid, few)
+
+    for what, obey in (("restore", restored), ("laying of a ready copy", laid)):
+        found = [_measured(obey, pid, megabytes) for _ in range(2 if quick else COUNT)]
         figures += [
             Figure(f"{what}, a base and {RESTORED - 1} deltas", case, "ms", tuple(ms for ms, _ in found)),
             Figure(f"… the most that its keeper held, besides {case}", case, "MB", tuple(mb for _, mb in found)),
@@ -66,28 +76,14 @@ def _chain(megabytes: int, directory: Path) -> tuple[int, tuple[int, ...]]:
     return pid, tuple(files)
 
 
-def _restored(pid: int, files: tuple[int, ...], megabytes: int) -> tuple[float, float]:
-    """Milliseconds until it runs, and MB that the keeper held at most."""
+def _measured(obey: Callable[[Keeper, int], object], pid: int, megabytes: int) -> tuple[float, float]:
+    """Milliseconds from a vessel's birth until orders about it are obeyed, and MB that the keeper held at most."""
     with Keeper.spawn() as keeper:
         engine.wait_until_ready(keeper)
         machine.touch_memory(engine.ROOM * megabytes)
         began = time.perf_counter()
         born = vessel.spawn_vessel(Birth(pid))
-        keeper.ask(channel.Restore(born.pid, "/benchmark", follow=False), channel.Restored, files)
-        keeper.ask(channel.Resume(), channel.Resumed)
-        found = (time.perf_counter() - began) * 1000, _peak_mb(keeper.pid)
-    vessel.discard(born)
-    return found
-
-
-def _laid(pid: int, files: tuple[int, ...], megabytes: int) -> tuple[float, float]:
-    """The same until a ready copy stands."""
-    with Keeper.spawn() as keeper:
-        engine.wait_until_ready(keeper)
-        machine.touch_memory(engine.ROOM * megabytes)
-        began = time.perf_counter()
-        born = vessel.spawn_vessel(Birth(pid))
-        keeper.ask(channel.Lay(born.pid, "/benchmark"), channel.Laid, files)
+        obey(keeper, born.pid)
         found = (time.perf_counter() - began) * 1000, _peak_mb(keeper.pid)
     vessel.discard(born)
     return found

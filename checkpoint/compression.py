@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from threading import local
-from typing import Final, TypeAlias
+from typing import Final, TypeAlias, TypeVar
 
 import zstandard
 
@@ -23,6 +23,8 @@ WORTH_COMPRESSING = 15 / 16
 
 _of_thread: Final = local()
 
+A = TypeVar("A", bound=bytes | memoryview)
+
 Compressor: TypeAlias = zstandard.ZstdCompressor
 """None may be used by two threads at a time."""
 
@@ -34,10 +36,7 @@ def compressor() -> Compressor:
 
 def stored(raw: bytes | memoryview, compressor: Compressor) -> tuple[Codec, bytes | memoryview]:
     """Compressed where it is worth it."""
-    compressed = compressor.compress(raw)
-    if len(compressed) < len(raw) * WORTH_COMPRESSING:
-        return Codec.ZSTD, compressed
-    return Codec.RAW, raw
+    return _better(raw, compressor.compress(raw))
 
 
 def stored_each(raws: Sequence[memoryview], compressor: Compressor) -> list[tuple[Codec, memoryview]]:
@@ -47,7 +46,7 @@ def stored_each(raws: Sequence[memoryview], compressor: Compressor) -> list[tupl
     return list(map(_better, raws, contents))
 
 
-def _better(raw: memoryview, packed: memoryview) -> tuple[Codec, memoryview]:
+def _better(raw: A, packed: A) -> tuple[Codec, A]:
     return (Codec.ZSTD, packed) if len(packed) < len(raw) * WORTH_COMPRESSING else (Codec.RAW, raw)
 
 

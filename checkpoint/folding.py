@@ -108,8 +108,7 @@ class Folding:
     def _copied(self, index: int) -> Body:
         """A frame of the base, as it is stored."""
         frame = self._decoded.frames[index]
-        body = self._stored.reader.read(frame.body_offset, frame.head.stored_size)
-        frames.check_digest(body, frame)
+        body = frames.verified(self._stored.reader, frame)
         return Body(frame.head.codec, body, frame.head.raw_size, frame.head.digest)
 
     def _made(self, first: int, last: int) -> Body:

@@ -20,7 +20,7 @@ from checkpoint.arrays import NDArray, np
 from checkpoint.byte_sources import Reader, Source, opened
 from checkpoint.differences import Rows
 from checkpoint.errors import FormatError
-from checkpoint.frames import Frame, FrameWriter, Packer, Sink, check_digest, frames_of, read_frame, write_all
+from checkpoint.frames import Frame, FrameWriter, Packer, Sink, frames_of, read_frame, verified, write_all
 from checkpoint.layout import Codec, Preamble, Section, SectionKind
 from checkpoint.model import PageCopy, PageRun, Snapshot
 from checkpoint.pages import Flags, Words
@@ -270,7 +270,7 @@ def verified_outline(source: Source) -> Snapshot:
     with opened(source) as reader:
         preamble, outline = outlined(reader)
         for frame in frames_of(reader, preamble):
-            check_digest(reader.read(frame.body_offset, frame.head.stored_size), frame)
+            verified(reader, frame)
     return outline
 
 

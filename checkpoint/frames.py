@@ -145,7 +145,7 @@ def frames_of(reader: Reader, preamble: Preamble) -> Iterator[Frame]:
 
 def content_of(reader: Reader, frame: Frame) -> bytes | memoryview:
     """A frame's contents, verified before they are decompressed."""
-    body = _verified(reader, frame)
+    body = verified(reader, frame)
     return body if frame.head.codec is Codec.RAW else compression.decompressed(body, frame.head.raw_size, frame.where)
 
 
@@ -155,7 +155,7 @@ def read_frame(reader: Reader, frame: Frame, target: memoryview) -> None:
         reader.read_into(frame.body_offset, target, frame.where)
         check_digest(target, frame)
     else:
-        compression.decompress_into(target, _verified(reader, frame), frame.where)
+        compression.decompress_into(target, verified(reader, frame), frame.where)
 
 
 class DecodedFrames:
@@ -181,7 +181,8 @@ class DecodedFrames:
         return self._contents[index]
 
 
-def _verified(reader: Reader, frame: Frame) -> bytes | memoryview:
+def verified(reader: Reader, frame: Frame) -> bytes | memoryview:
+    """A frame's body, as it is stored. Raises FormatError."""
     body = reader.read(frame.body_offset, frame.head.stored_size)
     check_digest(body, frame)
     return body

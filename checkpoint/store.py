@@ -348,10 +348,10 @@ class Store:
             return None
         if deltas and not is_tree and not any(delta.is_tree for delta in deltas):
             return self._write_straight(component, entries, deltas)
-        folded = self._try_fold(component, entries)
-        if folded is None:
+        whole = self._read(component, entries, lambda: chain.fold([format.decode(entries[0].path), *deltas]))
+        if whole is None:
             return None
-        folded = replace(folded, output=_newest_output(folded.output))
+        folded = replace(whole, output=_newest_output(whole.output))
         return self._write_base(folded, lambda file: format.encode(folded, file))
 
     def _write_straight(self, component: str, entries: tuple[Entry, ...], deltas: list[Snapshot]) -> Entry | None:
