@@ -26,6 +26,7 @@ from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
 from checkpoint.linux import abi
 from checkpoint.linux.namespaces import prctl
 from checkpoint.linux.vessel import Birth, Born, discard, spawn_program, spawn_vessel
+from checkpoint.linux.waking import waking
 from checkpoint.model import Snapshot
 from checkpoint.stored_base import StoredBase, stored_base
 
@@ -122,13 +123,27 @@ class Program:
         """End it as a power cut does, and reap it."""
         if self.status is None:
             os.kill(self.pid, signal.SIGKILL)
-            self.status = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+            self.status = os.waitstatus_to_exitcode(_reaped(self.pid))
         self._reap_first_process()
 
     def _reap_first_process(self) -> None:
         if self.born.init_pid:
             with contextlib.suppress(ChildProcessError):  # reaped already
-                os.waitpid(self.born.init_pid, 0)
+                _reaped(self.born.init_pid)
+
+
+def _reaped(pid: int) -> int:
+    """Wait for the end of a child of ours; its wait status.
+
+    A session of ours that holds what must end first takes note of that in a handler, so signals must reach us meanwhile.
+    """
+    with contextlib.suppress(ProcessLookupError), waking() as await_readable:
+        end = os.pidfd_open(pid)
+        try:
+            await_readable(end)
+        finally:
+            os.close(end)
+    return os.waitpid(pid, 0)[1]
 
 
 def start(argv: Sequence[str | Path], directory: Path, *, env: Mapping[str, str] | None = None, isolate: bool = False) -> Program:

@@ -22,7 +22,7 @@ from checkpoint.engines import ready_copy, restore_memory, restore_threads
 from checkpoint.engines.family_copy import FamilyCopy
 from checkpoint.engines.ptrace_restore import RestoredProgram
 from checkpoint.engines.restore_memory import KERNEL_NAMES
-from checkpoint.errors import CaptureError, RestoreError, UnsupportedError
+from checkpoint.errors import CaptureError, ProcessGoneError, RestoreError, UnsupportedError
 from checkpoint.hot_pages import Sender
 from checkpoint.linux import procfs
 from checkpoint.linux.memory import Memory
@@ -358,9 +358,16 @@ def test_who_is_killed_in_the_middle_of_a_delta_takes_all_of_them_along(tmp_path
         goes_on_to_its_end(standby.becomes_the_program())
 
 
+def lives(pid: int) -> bool:
+    try:
+        return procfs.stat(pid).state not in "ZX"
+    except ProcessGoneError:
+        return False
+
+
 def until_gone(pids: Iterable[int]) -> None:
     deadline = time.monotonic() + PATIENCE_S
-    while left := [pid for pid in pids if Path(f"/proc/{pid}").exists() and procfs.stat(pid).state not in "ZX"]:
+    while left := [pid for pid in pids if lives(pid)]:
         assert time.monotonic() < deadline, f"{left} live on"
         time.sleep(0.002)
 
