@@ -35,10 +35,12 @@ from checkpoint.engines import files_of_several, restore_checks, restore_memory,
 from checkpoint.engines.copy_hindrances import require_covered
 from checkpoint.engines.copy_mappings import MADV_REMOVE, held_of_objects
 from checkpoint.engines.forked_memory import Legacy
-from checkpoint.engines.ptrace_restore import Estate, RestoredProgram, look_at_vessel
+from checkpoint.engines.ptrace_restore import RestoredProgram
 from checkpoint.engines.ready_copy import ReadyCopy, ended_on_error, paths_open_in
 from checkpoint.engines.restore_checks import Brought
 from checkpoint.engines.restore_memory import Object
+from checkpoint.engines.restore_one import Estate
+from checkpoint.engines.restore_process import look_at_vessel
 from checkpoint.engines.restore_tree import TreeRestore, first_told
 from checkpoint.errors import MismatchError, RestoreError
 from checkpoint.linux import procfs

@@ -33,18 +33,11 @@ from checkpoint.engines import restore_checks, restore_memory, restore_process, 
 from checkpoint.engines.copy_hindrances import require_covered, require_room
 from checkpoint.engines.copy_mappings import Change
 from checkpoint.engines.forked_memory import Legacy
-from checkpoint.engines.ptrace_restore import (
-    RSEQ_SECTION_OFFSET,
-    Estate,
-    LaterTables,
-    ProcessRestore,
-    RestoredProgram,
-    held_or_stored,
-    look_at_vessel,
-    options_for,
-)
+from checkpoint.engines.proved_later import held_or_stored
+from checkpoint.engines.ptrace_restore import RestoredProgram
 from checkpoint.engines.restore_checks import Brought
-from checkpoint.engines.restore_process import Vessel
+from checkpoint.engines.restore_one import RSEQ_SECTION_OFFSET, Estate, LaterTables, ProcessRestore, options_for
+from checkpoint.engines.restore_process import Vessel, look_at_vessel
 from checkpoint.errors import ChainError, CheckpointError, MismatchError, RestoreError, UnsupportedError
 from checkpoint.linux import procfs
 from checkpoint.linux.abi import PAGE_SIZE

@@ -1,6 +1,6 @@
 """What belongs to the process besides memory and files, put back by system calls inside the vessel.
 
-Each function adds its calls to a table; `ptrace_restore` says in which order. What the vessel has no right to do becomes a note,
+Each function adds its calls to a table; `restore_one` says in which order. What the vessel has no right to do becomes a note,
 except where the program would go wrong without it.
 
 Sources: prctl(2), rt_sigaction(2), timer_create(2), sched(7), credentials(7), capabilities(7), rseq(2).
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import resource
 import signal
 import struct
 import time
@@ -99,6 +100,17 @@ class Vessel(Struct, frozen=True):
     def may_choose_executable(self) -> bool:
         """Whether it may say what /proc/PID/exe shows."""
         return self.may(CAP_CHECKPOINT_RESTORE) or self.may(CAP_SYS_ADMIN)
+
+
+def look_at_vessel(pid: int) -> Vessel:
+    """What a vessel is and may do."""
+    status = procfs.status(pid)
+    credentials = Credentials(status.uids, status.gids, status.groups, status.capabilities)
+    return Vessel(pid, status.pids[-1], credentials, frozenset(os.sched_getaffinity(pid)), _hard_limits(pid))
+
+
+def _hard_limits(pid: int) -> dict[int, int]:
+    return {number: resource.prlimit(pid, number)[1] for number in range(16)}
 
 
 # --- The address space's marks ---------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@
                  what of their private memory is equal since a fork (`forked_memory`)
     births       processes, sessions, groups, in the order of `births`; they inherit the estate, and are vessels themselves
     ends         zombies end as they had ended, stand-ins without a trace; who was stopped is stopped
-    each         as `ptrace_restore.ProcessRestore` does it, up to the registers
+    each         as `restore_one.ProcessRestore` does it, up to the registers
     registers    of all; nobody runs before everybody is what it was
 
 They are traced from their birth, and end with us (PTRACE_O_EXITKILL) until `RestoredProgram.resume`.
@@ -43,9 +43,9 @@ from checkpoint.engines import (
 )
 from checkpoint.engines.births import Birth, End, Join, NewSession, Reaper, Step
 from checkpoint.engines.forked_memory import Legacy
-from checkpoint.engines.ptrace_restore import REFUGE_SIZE, Estate, ProcessRestore, look_at_vessel, options_for
 from checkpoint.engines.restore_checks import Brought
-from checkpoint.engines.restore_process import Vessel
+from checkpoint.engines.restore_one import REFUGE_SIZE, Estate, ProcessRestore, options_for
+from checkpoint.engines.restore_process import Vessel, look_at_vessel
 from checkpoint.errors import CheckpointError, MismatchError, ProcessGoneError, RestoreError
 from checkpoint.linux import abi, call_table, kinship, procfs
 from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub

@@ -20,7 +20,7 @@ Source: vdso(7); lib/vdso/gettimeofday.c, where a clock mode of 0 (VDSO_CLOCKMOD
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from msgspec.structs import replace
@@ -30,12 +30,13 @@ from checkpoint.arch import stubs as arch
 from checkpoint.capability import Area, preserved
 from checkpoint.engines.description import this_machine
 from checkpoint.engines.restore_memory import KERNEL_KINDS, content_at, kernel_pages_of
+from checkpoint.engines.vdso_calls import VdsoCalls
 from checkpoint.errors import RestoreError
 from checkpoint.linux import abi, vdso
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.tracee import Tracee
 from checkpoint.linux.vdso import Function
-from checkpoint.model import Snapshot, Vma, VmaKind
+from checkpoint.model import Snapshot, ThreadState, Vma, VmaKind
 
 CAPABILITIES: Final = (
     preserved(
@@ -104,6 +105,37 @@ def _as_memory(vma: Vma) -> Vma:
         return vma
     protection = abi.PROT_READ | abi.PROT_EXEC if vma.kind is VmaKind.VDSO else 0
     return Vma(vma.start, vma.end, protection, shared=False, kind=VmaKind.ANONYMOUS)
+
+
+def led_out(tracee: Tracee, calls: VdsoCalls, foreign: Sequence[Vma], threads: Iterable[ThreadState]) -> tuple[ThreadState, ...]:
+    """The threads of a program, none of them in the middle of the old image.
+
+    Args:
+        tracee: of the vessel, stands still, with all signals blocked but SIGTRAP.
+        calls: that it makes.
+        foreign: the old kernel's data, the image last, as `with_own_image` tells.
+
+    Raises:
+        RestoreError: see `run_out`.
+    """
+    *places, image = foreign
+
+    def protect(protection: int, mappings: Sequence[Vma] = places) -> None:
+        for place in mappings:
+            calls.make("mprotect", place.start, place.size, protection)
+
+    def outside(thread: ThreadState) -> ThreadState:
+        if not stands_in(thread.registers["prstatus"], image):
+            return thread
+        registers = run_out(tracee, thread.registers["prstatus"], image, lambda: protect(abi.PROT_READ))
+        protect(abi.PROT_NONE)
+        return replace(thread, registers={**thread.registers, "prstatus": registers}, interrupted="")
+
+    protect(abi.PROT_READ | abi.PROT_EXEC, [image])
+    led = tuple(map(outside, threads))
+    protect(abi.PROT_READ | abi.PROT_WRITE, [image])
+    protect(abi.PROT_READ)
+    return led
 
 
 def run_out(tracee: Tracee, registers: bytes, code: Vma, open_data: Callable[[], None]) -> bytes:

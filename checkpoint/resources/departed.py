@@ -2,7 +2,7 @@
 
 Such a descriptor answers as that of any process does that is gone: who it was nobody can ask any more. So a restore has the
 vessel give birth to a child that never runs, opens what is wanted of it, ends it, and takes note of its end
-(`engines.ptrace_restore`). Nothing is read meanwhile, not even by lseek(2): what that leaves in the kernel's buffer would be
+(`engines.restore_one`). Nothing is read meanwhile, not even by lseek(2): what that leaves in the kernel's buffer would be
 told of somebody else.
 
 Fact of both kinds: ``ended``: a number that pidfds, or files, of the same process have in common.

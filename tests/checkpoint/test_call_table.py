@@ -10,8 +10,8 @@ from collections.abc import Iterator
 import pytest
 
 from checkpoint.arch import aarch64, cpu, stubs
-from checkpoint.engines.ptrace_restore import OPTIONS
 from checkpoint.engines.restore_memory import kernel_pages
+from checkpoint.engines.restore_one import OPTIONS
 from checkpoint.errors import RestoreError
 from checkpoint.linux import abi, call_table, procfs, vessel
 from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub

@@ -19,16 +19,18 @@ from checkpoint.engines import (
     preserved,
     probe,
     ptrace_restore,
+    restore_one,
     restore_process,
     restore_threads,
     restore_tree,
+    vdso_calls,
 )
 from tests import capability_table
 
 RESOURCES = Path(capabilities.__file__).parent / "resources"
 
 SPEAKS_FOR = {
-    preserved: (probe, ptrace_restore, restore_threads, restore_process),
+    preserved: (probe, ptrace_restore, restore_one, restore_threads, restore_process, vdso_calls),
     births: (captured_tree, restore_tree),
 }
 """Rows that stand in one file for sentences in others."""

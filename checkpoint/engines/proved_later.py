@@ -1,0 +1,42 @@
+"""Which bases may go into their vessel before all of their pages were proved.
+
+A base that lies in files is written into its vessel frame by frame (`checkpoint.stored_base`), and only the last frame tells
+whether all were what was captured. A vessel that got others is given up: nothing may be left of it then.
+"""
+
+from __future__ import annotations
+
+from checkpoint import carried, side_by_side
+from checkpoint.engines import restore_checks, restore_memory, restore_vdso
+from checkpoint.linux import abi
+from checkpoint.linux.vm_flags import MAY_WRITE
+from checkpoint.model import Snapshot, Vma
+from checkpoint.resources import system_v_memory
+from checkpoint.stored_base import StoredBase
+
+
+def held_or_stored(base: Snapshot | StoredBase) -> tuple[Snapshot, StoredBase | None]:
+    """A base with its pages, or without them and where they are."""
+    if isinstance(base, Snapshot):
+        return base, None
+    if _may_be_proved_later(base.outline):
+        return base.outline, base
+    return base.whole(side_by_side.thread_count()), None
+
+
+def _may_be_proved_later(outline: Snapshot) -> bool:
+    """Whether the pages of a base may go into the vessel before all of them were proved, and none is wanted before.
+
+    Not where something outlives a vessel that is given up: files that travel with the program, a directory that is made for it,
+    memory that others see, a file that is written to by being mapped. A program of another kernel needs the old vdso early.
+    """
+    leaves_nothing = not any(map(_outlives, outline.vmas)) and not restore_checks.missing_directories(outline)
+    is_of_this_kernel = restore_vdso.fits(outline, restore_checks.own_kernel_pages())
+    return not outline.is_tree and leaves_nothing and is_of_this_kernel and carried.without(outline) is outline
+
+
+def _outlives(vma: Vma) -> bool:
+    """Whether what is written to a mapping is seen beyond the process that writes it."""
+    if system_v_memory.is_segment(vma):
+        return True
+    return vma.shared and restore_memory.is_file_mapping(vma) and bool(vma.protection & abi.PROT_WRITE or MAY_WRITE in vma.flags)
