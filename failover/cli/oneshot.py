@@ -9,7 +9,7 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, TypeVar
@@ -111,26 +111,43 @@ def _at_last(ask: Callable[[], A]) -> A:
 def _ended(pid: int) -> Iterator[None]:
     """Kill a program that stands still, its children first, so that none runs on without it; after the body all are dead."""
     with contextlib.ExitStack() as held:
-        dying = select.poll()
-        count = 0
+        dying: dict[int, int] = {}
         for one in (*reversed(kinship.component(pid)), pid):
             with contextlib.suppress(ProcessLookupError):
                 end = os.pidfd_open(one)
                 held.callback(os.close, end)
                 signal.pidfd_send_signal(end, signal.SIGKILL)
-                dying.register(end, select.POLLIN)
-                count += 1
+                dying[end] = one
         yield
-        _wait_for_ends(dying, count)
+        _wait_for_ends(dying)
 
 
-def _wait_for_ends(dying: select.poll, count: int) -> None:
-    """Wait, for a while, until all pidfds of a poll have told of an end: who restores at once finds files and PIDs free."""
+def _wait_for_ends(dying: Mapping[int, int]) -> None:
+    """Wait, for a while, until these have ended, and their parents can be told: who restores at once finds files and PIDs free.
+
+    The end of who is traced is told to its tracer first, and to its parent when that has taken note, or has ended itself.
+
+    Args:
+        dying: process ids by their pidfds.
+    """
     deadline = time.monotonic() + END_TIMEOUT_S
-    while count and (left := deadline - time.monotonic()) > 0:
-        for descriptor, _ in dying.poll(left * 1000):
-            dying.unregister(descriptor)
-            count -= 1
+    waiting, left = select.poll(), len(dying)
+    for end in dying:
+        waiting.register(end, select.POLLIN)
+    while left and (left_s := deadline - time.monotonic()) > 0:
+        for end, _ in waiting.poll(left_s * 1000):
+            waiting.unregister(end)
+            left -= 1
+    for pid in dying.values():
+        while _is_traced(pid) and time.monotonic() < deadline:
+            time.sleep(0.001)
+
+
+def _is_traced(pid: int) -> bool:
+    try:
+        return procfs.status(pid).tracer != 0
+    except ProcessGoneError:
+        return False
 
 
 def _tell_capture(arguments: argparse.Namespace, captured: Captured, notes: tuple[str, ...]) -> int:

@@ -11,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -236,6 +237,34 @@ def test_who_was_captured_is_dead_when_the_command_returns(tmp_path: Path) -> No
         assert captured.returncode == 0, captured.stderr
         assert os.waitpid(process.pid, os.WNOHANG) == (process.pid, signal.SIGKILL)
         process.returncode = -signal.SIGKILL
+
+
+TRACER = """
+import sys
+from checkpoint.linux.tracee import Tracee
+tracee = Tracee(int(sys.argv[1]))
+tracee.seize()
+tracee.freeze()
+print("ready", flush=True)
+sys.stdin.read()
+"""
+"""Takes no note of its tracee's end, and goes when its standard input does."""
+
+
+def test_an_end_of_which_the_tracer_has_taken_no_note_yet_is_waited_for() -> None:
+    """Its parent is told when the tracer has, or has gone."""
+    with subprocess.Popen([PYTHON, "-c", "import time; time.sleep(600)"]) as process:
+        argv = [sys.executable, "-c", TRACER, str(process.pid)]
+        with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as tracer:
+            assert tracer.stdin is not None
+            assert tracer.stdout is not None
+            assert tracer.stdout.readline() == b"ready\n"
+            goes = threading.Timer(0.3, tracer.stdin.close)
+            with oneshot._ended(process.pid):
+                goes.start()
+            assert os.waitpid(process.pid, os.WNOHANG) == (process.pid, signal.SIGKILL)
+            process.returncode = -signal.SIGKILL
+            goes.join()
 
 
 def test_a_program_left_running_writes_what_an_undisturbed_one_writes(tmp_path: Path) -> None:
