@@ -211,21 +211,22 @@ def zero_pages(contents: Buffer, page_size: int) -> Flags:
     return zero
 
 
-def digest_pages(contents: Buffer, addresses: Words, page_size: int) -> Words:
+def digest_pages(contents: Buffer, addresses: Words, page_size: int, places: NDArray[np.intp] | None = None) -> Words:
     """The digest of each page: two little-endian lanes of xxh3_128 with the page's address as the seed.
 
     Args:
-        contents: ``len(addresses) × page_size`` bytes.
+        contents: ``len(addresses) × page_size`` bytes, unless there are ``places``.
+        places: of each page among those of ``contents``, of which several may have one.
 
     Returns:
         Lanes of shape ``(count, 2)``.
     """
     rows = _rows(contents, page_size)
-    assert len(rows) == len(addresses), "one address for every page"
+    assert len(addresses) == len(rows if places is None else places), "one address for every page"
     seeds = addresses.tolist()
+    some = (slice(first, first + DIGESTED) for first in range(0, len(seeds), DIGESTED))
     packed = b"".join(
-        b"".join(map(xxhash.xxh3_128_digest, rows[first : first + DIGESTED], seeds[first : first + DIGESTED]))
-        for first in range(0, len(seeds), DIGESTED)
+        b"".join(map(xxhash.xxh3_128_digest, rows[part if places is None else places[part]], seeds[part])) for part in some
     )
     return np.frombuffer(packed, dtype=_LANE).astype(np.uint64, copy=False).reshape(-1, 2)
 
@@ -348,8 +349,7 @@ class PageTable(Struct, frozen=True, eq=False):
         digests = digest_pages(contents, addresses, self.page_size)
         if copies:
             copied, places = copied_pages(copies, addresses, self.page_size)
-            rows = np.frombuffer(contents, dtype=np.uint8).reshape(-1, self.page_size)[places]
-            digests = np.concatenate((digests, digest_pages(rows.tobytes(), copied, self.page_size)))
+            digests = np.concatenate((digests, digest_pages(contents, copied, self.page_size, places)))
             addresses = np.concatenate((addresses, copied))
             order = np.argsort(addresses)
             addresses, digests = addresses[order], digests[order]

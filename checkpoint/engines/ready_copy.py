@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Final
 from msgspec import Struct
 from msgspec.structs import replace
 
-from checkpoint import chain, differences, pages
+from checkpoint import chain, differences, pages, tree
 from checkpoint.differences import Rows
 from checkpoint.engine import Copy, RestoreOptions, pid_taken
 from checkpoint.engines import restore_checks, restore_memory, restore_process, restore_vdso
@@ -85,7 +85,7 @@ def _copy_of(vessel_pid: int, state: Snapshot, options: RestoreOptions, stored: 
     from checkpoint.engines.family_copy import FamilyCopy
 
     if state.is_tree:
-        return FamilyCopy(vessel_pid, state, options)
+        return FamilyCopy(vessel_pid, tree.expanded(state), options)
     return ReadyCopy(Tracee(vessel_pid), state, options, stored=stored)
 
 
