@@ -5,6 +5,8 @@ from __future__ import annotations
 import mmap
 import os
 
+import pytest
+
 from checkpoint.engines.identities import Identities
 from checkpoint.linux import procfs
 from checkpoint.linux.tracking import NONE
@@ -27,6 +29,7 @@ def test_a_result_lasts_as_long_as_the_things_are_the_very_same() -> None:
     assert memo.of(alike, make=make) == 3
 
 
+@pytest.mark.root  # an ordinary user is told which memory file it is, not how large
 def test_mappings_that_have_not_changed_are_told_as_before_but_for_a_size_that_they_do_not_tell() -> None:
     pid = os.getpid()
     file = os.memfd_create("grows")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import random
@@ -128,20 +129,24 @@ def a_life_cut_short(root: Path, cut_at: int) -> tuple[CuttingDisk, int] | None:
     disk = CuttingDisk(cut_at)
     disk.now[root.parent] = disk.safe[root.parent] = None
     voyage, safe = Voyage(), 0
-    try:
-        file = StateFile(root, "voyage", disk)
-        state = KeptState(schema_of("voyage"))
-        session: CooperativeSession | None = None
-        for _ in range(5):
-            voyage.sail()
-            state.commit(voyage)
-            session = session or CooperativeSession(state.open_reader(), os.getpid(), "voyage")
-            file.write(session)
-            safe = voyage.number
-            file.tidy()
-        file.close()
-    except PowerCutError:
-        return disk, safe
+    with contextlib.ExitStack() as after_death:  # what the kernel gives back of a process that dies
+        try:
+            file = StateFile(root, "voyage", disk)
+            after_death.callback(file.close)
+            state = KeptState(schema_of("voyage"))
+            after_death.callback(state.live.close)
+            session: CooperativeSession | None = None
+            for _ in range(5):
+                voyage.sail()
+                state.commit(voyage)
+                session = session or after_death.enter_context(
+                    contextlib.closing(CooperativeSession(state.open_reader(), os.getpid(), "voyage"))
+                )
+                file.write(session)
+                safe = voyage.number
+                file.tidy()
+        except PowerCutError:
+            return disk, safe
     return None
 
 
@@ -150,6 +155,7 @@ def test_power_may_be_cut_at_any_write_of_the_state_file(tmp_path: Path, monkeyp
     monkeypatch.setattr("failover.client.task_file.SMALL_PAGES", 1)  # deltas, so that folding is cut, too
     monkeypatch.setattr("failover.client.task_file.TIDY_S", 0.0)
     monkeypatch.setattr("checkpoint.store.CHEAP_DELTA_COUNT", 2)
+    resumed = KeptState(schema_of("voyage"))
     for cut_at in itertools.count():
         old = tmp_path / f"old{cut_at}"
         old.mkdir()
@@ -168,6 +174,6 @@ def test_power_may_be_cut_at_any_write_of_the_state_file(tmp_path: Path, monkeyp
             if snapshot is None:
                 assert safe == 0, where
                 continue
-            decoded = KeptState(schema_of("voyage")).decode({region.name: content for region, content in regions_of(snapshot)})
+            decoded = resumed.decode({region.name: content for region, content in regions_of(snapshot)})
             assert decoded.value.check() >= safe, where
     assert cut_at > 30
