@@ -240,14 +240,7 @@ def read_pages(source: Source, wanted: Words) -> tuple[Snapshot, Flags, Rows]:
 
 def _places_of(outline: Snapshot, wanted: Words) -> tuple[Flags, NDArray[np.intp]]:
     """Which of the wanted pages a snapshot tells, and the places of their bytes among the carried pages."""
-    page_size = outline.machine.page_size
-    addresses = pages.addresses_of(pages.extents(outline.runs), page_size)
-    places = np.arange(len(addresses))
-    if outline.copies:
-        copied, sources = pages.copied_pages(outline.copies, addresses, page_size)
-        addresses, places = np.concatenate((addresses, copied)), np.concatenate((places, sources))
-        order = np.argsort(addresses)
-        addresses, places = addresses[order], places[order]
+    addresses, places = pages.with_copied(outline.runs, outline.copies, outline.machine.page_size)
     found, at = pages.found_among(addresses, wanted)
     return found, places[at]
 

@@ -172,6 +172,17 @@ def copied_pages(copies: Sequence[PageCopy], carried: Words, page_size: int) -> 
     return targets, np.searchsorted(carried, addresses_of(pairs, page_size))
 
 
+def with_copied(runs: Iterable[PageRun], copies: Sequence[PageCopy], page_size: int) -> tuple[Words, NDArray[np.intp]]:
+    """The addresses of all pages that are told, in order, and the place of each one's bytes among those that are carried."""
+    carried = addresses_of(extents(runs), page_size)
+    if not copies:
+        return carried, np.arange(len(carried))
+    copied, places = copied_pages(copies, carried, page_size)
+    addresses = np.concatenate((carried, copied))
+    order = np.argsort(addresses)
+    return addresses[order], np.concatenate((np.arange(len(carried)), places))[order]
+
+
 def copies_of(targets: Words, sources: Words, page_size: int) -> tuple[PageCopy, ...]:
     """Pages and those whose content they have, as few copies as there can be.
 

@@ -9,7 +9,7 @@ the last one: whoever takes pieces undoes everything where that fails.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
@@ -25,18 +25,16 @@ from checkpoint.frames import ROW, DecodedFrames, Frame
 from checkpoint.layout import FRAME_SIZE
 from checkpoint.model import Snapshot
 from checkpoint.origins import Origins
+from checkpoint.page_source import Taker
 from checkpoint.pages import Buffer, PageMap, Words
 from checkpoint.side_by_side import OwnBuffers
-
-Taker = Callable[[Words, Buffer], None]
-"""Does something with a set of pages and their bytes; several threads call it at once."""
 
 KEPT: Final = 4
 """Frames of which single bytes were asked, that stay decompressed: threads keep things of the same kind beside each other."""
 
 
 class StoredBase:
-    """What a chain's files amount to, of which the first one, the base's, stays open.
+    """What a chain's files amount to, of which the first one, the base's, stays open; a `checkpoint.page_source.PageSource`.
 
     Attributes:
         outline: what they amount to, without its bytes.
@@ -48,6 +46,9 @@ class StoredBase:
         FormatError: as ``checkpoint.format.decode``, but for what the base's pages would tell.
         ChainError: it is no chain, or not the state that its position names.
     """
+
+    tells_zeros = True
+    """A base that went straight to its file has them (`checkpoint.unread_base`)."""
 
     def __init__(self, source: Source, reader: Reader, deltas: Sequence[Snapshot] = ()) -> None:
         self._source = source

@@ -62,13 +62,9 @@ def expanded(snapshot: Snapshot) -> Snapshot:
     if not snapshot.copies or not len(snapshot.contents):
         return replace(snapshot, copies=())
     page_size = snapshot.machine.page_size
-    carried = pages.addresses_of(pages.extents(snapshot.runs), page_size)
-    copied, places = pages.copied_pages(snapshot.copies, carried, page_size)
-    addresses = np.concatenate((carried, copied))
-    rows = np.frombuffer(snapshot.contents, dtype=np.uint8).reshape(-1, page_size)
-    order = np.argsort(addresses)
-    contents = rows[np.concatenate((np.arange(len(carried)), places))[order]]
-    runs = pages.page_runs(pages.extents_of_addresses(addresses[order], page_size))
+    addresses, places = pages.with_copied(snapshot.runs, snapshot.copies, page_size)
+    contents = np.frombuffer(snapshot.contents, dtype=np.uint8).reshape(-1, page_size)[places]
+    runs = pages.page_runs(pages.extents_of_addresses(addresses, page_size))
     return replace(snapshot, runs=runs, contents=contents.reshape(-1).data, copies=())
 
 

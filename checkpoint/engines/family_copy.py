@@ -47,6 +47,7 @@ from checkpoint.linux import procfs
 from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.tracee import Tracee
 from checkpoint.model import Position, Snapshot, Vma
+from checkpoint.page_source import PageSource
 from checkpoint.pages import Words
 from checkpoint.resources import carried_connections, joint
 
@@ -63,8 +64,16 @@ class MemberCopy(ReadyCopy):
 
     _room = AREA_SIZE
 
-    def __init__(self, tracee: Tracee, view: Snapshot, options: RestoreOptions, estate: Estate, legacy: Legacy) -> None:
-        super().__init__(tracee, view, options, estate, legacy)
+    def __init__(
+        self,
+        tracee: Tracee,
+        view: Snapshot,
+        options: RestoreOptions,
+        estate: Estate,
+        legacy: Legacy,
+        source: PageSource | None,
+    ) -> None:
+        super().__init__(tracee, view, options, estate, legacy, source)
         self._descriptors = {*STANDARD, *estate.objects.values()}
 
     @property
@@ -161,8 +170,8 @@ class FamilyCopy(TreeRestore):
         self._estate = self._make_estate(vessel, {})
         self._bear_all(self._estate.base)
         self._copies = [
-            MemberCopy(self._born[view.process.pid], view, self._options, self._estate, legacy)
-            for view, legacy in zip(self._views, self._legacies, strict=True)
+            MemberCopy(self._born[view.process.pid], view, self._options, self._estate, legacy, source)
+            for view, legacy, source in zip(self._views, self._legacies, self._sources, strict=True)
         ]
         self._restoring = [*self._copies]
         self._descriptors = self._copies[0].descriptors
@@ -300,7 +309,7 @@ class FamilyCopy(TreeRestore):
     def _forget_pages(self, snapshot: Snapshot) -> None:
         """Remember a snapshot without its pages, which are in the vessels now."""
         told = replace(snapshot, parent=None, cleared=(), runs=(), copies=(), differences=(), contents=b"", output=())
-        self._state, self._views, self._legacies = told, (), ()
+        self._state, self._views, self._sources, self._legacies = told, (), (), ()
         self.position = snapshot.position
 
 

@@ -25,6 +25,7 @@ from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.tracking import MEMORY_PLACE
+from checkpoint.member_pages import MemberPages
 from checkpoint.model import Snapshot, Vma, VmaKind
 from checkpoint.pages import Words
 
@@ -62,19 +63,33 @@ class Legacy(Struct, frozen=True):
             table.call(f"empty {(end - start) >> 10} KiB at {start:#x}", "madvise", start, end - start, MADV_DONTNEED)
 
 
+class Told(Struct, frozen=True):
+    """A process as its snapshot tells of it, the addresses of its pages, and where their bytes are, if they are not there."""
+
+    view: Snapshot
+    addresses: Words
+    source: MemberPages | None
+
+    def rows_at(self, some: NDArray[np.intp]) -> NDArray[np.uint8]:
+        """The bytes of some of the pages, by their number."""
+        if self.source is not None:
+            return self.source.rows_at(some)
+        return np.frombuffer(self.view.contents, np.uint8).reshape(-1, abi.PAGE_SIZE)[some]
+
+
 class Inheritance(Struct, frozen=True):
     """What all of them are born with.
 
     Attributes:
         regions: where the vessel has it mapped, as far as it is anonymous.
         of_files: the same of files.
-        sources: of whom the pages are: their places in his contents, and in memory.
+        sources: of whom the pages are: their numbers among his, and their addresses.
         legacies: of each process.
     """
 
     regions: Words
     of_files: tuple[tuple[FilePlace, Words], ...]
-    sources: tuple[tuple[Snapshot, NDArray[np.intp], Words], ...]
+    sources: tuple[tuple[Told, NDArray[np.intp], Words], ...]
     legacies: tuple[Legacy, ...]
 
     def leave(self, table: CallTable) -> None:
@@ -98,13 +113,12 @@ class Inheritance(Struct, frozen=True):
 
     def put_in(self, memory: Memory) -> None:
         """Write the pages to the vessel."""
-        for view, rows, addresses in self.sources:
-            contents = _rows(view)
+        for one, rows, addresses in self.sources:
             for first in range(0, len(rows), COMPARED_AT_ONCE):
                 some = slice(first, first + COMPARED_AT_ONCE)
                 ranges = pages.extents_of_addresses(addresses[some], abi.PAGE_SIZE)
                 ranges[:, 1] -= ranges[:, 0]
-                memory.write_from(ranges, np.ascontiguousarray(contents[rows[some]]).reshape(-1))
+                memory.write_from(ranges, np.ascontiguousarray(one.rows_at(rows[some])).reshape(-1))
 
 
 class _Known(Struct):
@@ -116,27 +130,27 @@ class _Known(Struct):
     is_common: NDArray[np.bool_]
 
 
-class _Told(Struct, frozen=True):
-    """A process as its snapshot tells of it, and the addresses of the pages that are carried."""
-
-    view: Snapshot
-    addresses: Words
-
-
 FilePlace = tuple[str, int, int, int]
 """Path, device and inode of a file, and the address at which its first byte would lie."""
 Mapped = Mapping[int, Sequence[Vma]]
 """Mappings of one sort, by the process, in the order of these."""
 
 
-def of(views: Sequence[Snapshot], taken: Words, elsewhere: Collection[str] = ()) -> Inheritance:
+def of(
+    views: Sequence[Snapshot],
+    taken: Words,
+    elsewhere: Collection[str] = (),
+    sources: Sequence[MemberPages | None] = (),
+) -> Inheritance:
     """What these processes have in common.
 
     Args:
         taken: where the vessel has something mapped.
         elsewhere: paths of files that are not this machine's own.
+        sources: of their pages, where the views do not hold them.
     """
-    told = [_Told(view, pages.addresses_of(pages.extents(view.runs), abi.PAGE_SIZE)) for view in views]
+    each = zip(views, sources or (None,) * len(views), strict=True)
+    told = [Told(view, pages.addresses_of(pages.extents(view.runs), abi.PAGE_SIZE), source) for view, source in each]
     anonymous = _alike(told, taken, {index: list(filter(_is_plain, view.vmas)) for index, view in enumerate(views)})
     taken = pages.union(taken, anonymous.regions)
     parts, of_files = [anonymous], []
@@ -154,7 +168,7 @@ def of(views: Sequence[Snapshot], taken: Words, elsewhere: Collection[str] = ())
     )
 
 
-def _files_of_several(told: Sequence[_Told]) -> Iterator[tuple[FilePlace, Mapped]]:
+def _files_of_several(told: Sequence[Told]) -> Iterator[tuple[FilePlace, Mapped]]:
     """Where several processes have the same file mapped, and pages of their own in it."""
     found: dict[FilePlace, dict[int, list[Vma]]] = {}
     for index, one in enumerate(told):
@@ -191,11 +205,11 @@ class _Part(Struct, frozen=True):
     """Of one sort of memory: see `Inheritance`; legacies by the process."""
 
     regions: Words
-    sources: tuple[tuple[Snapshot, NDArray[np.intp], Words], ...]
+    sources: tuple[tuple[Told, NDArray[np.intp], Words], ...]
     legacies: Mapping[int, Legacy]
 
 
-def _alike(told: Sequence[_Told], taken: Words, mapped: Mapped) -> _Part:
+def _alike(told: Sequence[Told], taken: Words, mapped: Mapped) -> _Part:
     """What is common in mappings of one sort."""
     known = _Known(np.empty(0, np.uint64), np.empty(0, np.intp), np.empty(0, np.intp), np.empty(0, np.bool_))
     plain = {index: pages.difference(pages.extents(vmas), taken) for index, vmas in mapped.items()}
@@ -210,7 +224,7 @@ def _alike(told: Sequence[_Told], taken: Words, mapped: Mapped) -> _Part:
     for index in mapped:
         mine = known.is_common & (known.views == index)
         if mine.any():
-            sources.append((told[index].view, known.rows[mine], known.addresses[mine]))
+            sources.append((told[index], known.rows[mine], known.addresses[mine]))
     return _Part(regions, tuple(sources), legacies)
 
 
@@ -219,17 +233,13 @@ def _is_plain(vma: Vma) -> bool:
     return is_private and vma.protection == abi.PROT_READ | abi.PROT_WRITE and PLAIN_FLAGS.issuperset(vma.flags)
 
 
-def _rows(view: Snapshot) -> NDArray[np.uint8]:
-    return np.frombuffer(view.contents, np.uint8).reshape(-1, abi.PAGE_SIZE)
-
-
-def _within(one: _Told, some: Words) -> NDArray[np.intp]:
+def _within(one: Told, some: Words) -> NDArray[np.intp]:
     """The places of the pages that lie in a set, among all that are carried."""
     bounds = np.searchsorted(one.addresses, some).tolist()
     return np.concatenate([np.arange(first, last, dtype=np.intp) for first, last in bounds] or [np.empty(0, np.intp)])
 
 
-def _compared(known: _Known, told: Sequence[_Told], index: int, plain: Words) -> Words:
+def _compared(known: _Known, told: Sequence[Told], index: int, plain: Words) -> Words:
     """Where a process has what is known, by address; what nobody has had before is known from then on."""
     rows = _within(told[index], plain)
     addresses = told[index].addresses[rows]
@@ -239,8 +249,8 @@ def _compared(known: _Known, told: Sequence[_Told], index: int, plain: Words) ->
         of_view = np.flatnonzero(known.views[theirs] == view)
         for first in range(0, len(of_view), COMPARED_AT_ONCE):
             some = of_view[first : first + COMPARED_AT_ONCE]
-            left = _rows(told[view].view)[known.rows[theirs[some]]]
-            is_equal[some] = (left == _rows(told[index].view)[rows[ours[some]]]).all(axis=1)
+            left, right = told[view].rows_at(known.rows[theirs[some]]), told[index].rows_at(rows[ours[some]])
+            is_equal[some] = (left == right).all(axis=1)
     known.is_common[theirs[is_equal]] = True
     fresh = np.ones(len(addresses), np.bool_)
     fresh[ours] = False
@@ -271,7 +281,7 @@ def _regions(plain: Mapping[int, Words], known: _Known, mapped: Mapped) -> Words
     return found
 
 
-def _legacy(one: _Told, kept: Words, equal: Words, known: _Known, common: Words, index: int) -> Legacy:
+def _legacy(one: Told, kept: Words, equal: Words, known: _Known, common: Words, index: int) -> Legacy:
     mine = known.addresses[known.is_common & (known.views == index)]
     there = pages.extents_of_addresses(np.union1d(equal, mine), abi.PAGE_SIZE)
     inside = common[pages.covered(kept, common)]

@@ -15,7 +15,7 @@ from __future__ import annotations
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from checkpoint import carried, room, tree
+from checkpoint import carried, room
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import restore_checks
 from checkpoint.engines.proved_later import held_or_stored
@@ -74,7 +74,6 @@ def restore(vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOption
     program = carried.without(state)
     if program is not state:
         options = replace(options, accept_changed=(*options.accept_changed, *carried.every_path(state)))
-    program = tree.expanded(program)  # once for all who look at its processes one by one
     brought = restore_checks.require(program, options, vessel_pid)
     laid = laying.lay_down_for(state, vessel_pid, own_eyes=options.own_eyes)
     program, _ = remembered.renewed(program, laid.identities)
@@ -103,7 +102,7 @@ def _run_one(
     arriving: Arriving,
     stored: StoredBase | None,
 ) -> RestoredProgram:
-    restoring = ProcessRestore(Tracee(vessel_pid), state, options, brought, stored=stored)
+    restoring = ProcessRestore(Tracee(vessel_pid), state, options, brought, source=stored)
     try:
         restoring.prepare()
         restoring.build()

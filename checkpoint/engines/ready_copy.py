@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Final
 from msgspec import Struct
 from msgspec.structs import replace
 
-from checkpoint import chain, differences, pages, tree
+from checkpoint import chain, differences, pages
 from checkpoint.differences import Rows
 from checkpoint.engine import Copy, RestoreOptions, pid_taken
 from checkpoint.engines import restore_checks, restore_memory, restore_process, restore_vdso
@@ -44,6 +44,7 @@ from checkpoint.linux.abi import PAGE_SIZE
 from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.tracee import Tracee
 from checkpoint.model import Fact, Position, Snapshot, ThreadState
+from checkpoint.page_source import PageSource
 from checkpoint.pages import Words
 from checkpoint.resources import carried_connections, seccomp
 from checkpoint.resources.rebuilding import number_of
@@ -85,8 +86,8 @@ def _copy_of(vessel_pid: int, state: Snapshot, options: RestoreOptions, stored: 
     from checkpoint.engines.family_copy import FamilyCopy
 
     if state.is_tree:
-        return FamilyCopy(vessel_pid, tree.expanded(state), options)
-    return ReadyCopy(Tracee(vessel_pid), state, options, stored=stored)
+        return FamilyCopy(vessel_pid, state, options)
+    return ReadyCopy(Tracee(vessel_pid), state, options, source=stored)
 
 
 @contextmanager
@@ -140,9 +141,9 @@ class ReadyCopy(ProcessRestore):
         options: RestoreOptions,
         estate: Estate | None = None,
         legacy: Legacy = restore_memory.NOTHING,
-        stored: StoredBase | None = None,
+        source: PageSource | None = None,
     ) -> None:
-        super().__init__(tracee, base, options, Brought(), estate, legacy, stored)
+        super().__init__(tracee, base, options, Brought(), estate, legacy, source)
         self.position: Position = base.position
         self.torn = False
         self._extents, self._stiff = pages.extents(base.runs), legacy.kept
@@ -199,7 +200,7 @@ class ReadyCopy(ProcessRestore):
         self._check_room(first)
         self._lay_stub(base, mappings, self._room)
         self._lay_out(first)
-        self._stored = None
+        self._source = None
         self._descriptors = first.descriptors
         self._forget_pages(self._state)
 

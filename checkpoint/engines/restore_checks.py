@@ -16,17 +16,18 @@ from typing import Final
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from checkpoint import carried, portable, tree
+from checkpoint import carried, member_pages, portable, tree
 from checkpoint.arch import cpu, extended
 from checkpoint.capability import Area, by_rule, refused
 from checkpoint.contents import DIGEST_SIZE, digest_of_file, path_in
 from checkpoint.digests_of_files import DigestOf
 from checkpoint.engine import RestoreOptions
-from checkpoint.engines import restore_kinds, restore_vdso
+from checkpoint.engines import restore_kinds, restore_memory, restore_vdso
 from checkpoint.engines.description import this_machine
 from checkpoint.engines.identities import build_id
 from checkpoint.engines.restore_memory import is_file_mapping, kernel_pages, makes_shared_memory
 from checkpoint.engines.restore_process import CAP_SYS_CHROOT, may_not_enter
+from checkpoint.engines.restore_vdso import ContentAt
 from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux import abi, processor, procfs
 from checkpoint.model import FileIdentity, Resource, Snapshot
@@ -125,8 +126,9 @@ def require(state: Snapshot, options: RestoreOptions, *vessel_pids: int) -> tupl
     reasons: list[str] = []
     brought = []
     ours = frozenset[int]().union(*(writers.family(pid) for pid in (os.getpid(), *vessel_pids)))
-    for view in tree.views(state):
-        differing, one = _compare(view, options)
+    for view, source in zip(*member_pages.apart(state), strict=True):
+        content_at = functools.partial(restore_memory.content_at, view) if source is None else source.content_at
+        differing, one = _compare(view, options, content_at=content_at if len(state.contents) else None)
         reasons += (*differing, *_of_writers(view, options, ours))
         brought.append(one)
     if reasons:
@@ -135,8 +137,17 @@ def require(state: Snapshot, options: RestoreOptions, *vessel_pids: int) -> tupl
     return tuple(brought)
 
 
-def _compare(state: Snapshot, options: RestoreOptions, digest_of: DigestOf = digest_of_file) -> tuple[tuple[str, ...], Brought]:
-    """Everything in which this machine differs from what the snapshot needs, one sentence each; and what was brought for it."""
+def _compare(
+    state: Snapshot,
+    options: RestoreOptions,
+    digest_of: DigestOf = digest_of_file,
+    content_at: ContentAt | None = None,
+) -> tuple[tuple[str, ...], Brought]:
+    """Everything in which this machine differs from what the snapshot needs, one sentence each; and what was brought for it.
+
+    Args:
+        content_at: None: its memory is not known, nor whether the vdso that it was born with can be led to ours.
+    """
     architecture = os.uname().machine
     if state.machine.architecture != architecture:
         reason = f"it was taken on {state.machine.architecture}, this machine is {architecture}: restore it on such a machine"
@@ -147,7 +158,7 @@ def _compare(state: Snapshot, options: RestoreOptions, digest_of: DigestOf = dig
     run: dict[str, str] = {}
     opened: dict[str, str] = {}
     of_files = (*_of_files(state, options, run, digest_of), *_of_descriptors(state, options, opened, digest_of))
-    return (*_of_machine(state, options), *of_files), Brought(run, opened)
+    return (*_of_machine(state, options, content_at), *of_files), Brought(run, opened)
 
 
 def lacks(outline: Snapshot, options: RestoreOptions, digest_of: DigestOf) -> tuple[str, ...]:
@@ -187,13 +198,13 @@ def _in_flux(state: Snapshot) -> Iterator[str]:
             yield vma.file.path
 
 
-def _of_machine(state: Snapshot, options: RestoreOptions) -> Iterator[str]:
+def _of_machine(state: Snapshot, options: RestoreOptions, content_at: ContentAt | None) -> Iterator[str]:
     machine, here = state.machine, this_machine()
     if machine.page_size != abi.PAGE_SIZE:
         yield f"its pages are {machine.page_size} bytes, this kernel's {abi.PAGE_SIZE}: boot a kernel with the same"
     yield from _of_threads(state)
-    if state.contents and not restore_vdso.fits(state, own_kernel_pages()):
-        yield from restore_vdso.refuse(state)
+    if content_at is not None and not restore_vdso.fits(state, own_kernel_pages()):
+        yield from restore_vdso.refuse(state, content_at)
     if listed := ", ".join(portable.lacking(machine.features, here.features)):
         cure = "use one that has them, or start it with failover run --portable"
         yield f"this processor lacks {listed}, by which the program may have chosen its code: {cure}"

@@ -28,9 +28,9 @@ from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.tracking import MEMORY_PLACE, NONE
 from checkpoint.model import PageRun, Snapshot, Vma, VmaKind
+from checkpoint.page_source import PageSource
 from checkpoint.pages import Buffer, Words
 from checkpoint.resources import aio_rings, memory_files, nameless, system_v_memory
-from checkpoint.stored_base import StoredBase
 
 OWNERS_ALONE: Final = 0o600
 MREMAP_MAYMOVE_FIXED: Final = 1 | 2
@@ -319,25 +319,34 @@ def fill(memory: Memory, snapshot: Snapshot, legacy: Legacy = NOTHING, untouched
     _write(memory, pages.extents(snapshot.runs), snapshot.contents, _filled(snapshot, legacy, untouched), threads)
 
 
-def fill_from(memory: Memory, base: StoredBase, untouched: Words = NONE, threads: int = 1) -> None:
-    """The same from a base that lies in a file: each page is still in a processor's cache when it is written.
+def fill_from(
+    memory: Memory,
+    outline: Snapshot,
+    source: PageSource,
+    legacy: Legacy = NOTHING,
+    untouched: Words = NONE,
+    threads: int = 1,
+) -> None:
+    """The same of pages that are elsewhere: each is still in a processor's cache when it is written.
 
-    Memory without a file is zero by itself: its pages of zeros, which such a base carries, are left as they are.
+    Memory without a file is zero by itself: pages of zeros are left out there.
 
     Raises:
         FormatError, ChainError: its pages are not what they were; some were written.
     """
-    filled = _filled(base.outline, NOTHING, untouched)
-    zero = pages.extents(vma for vma in base.outline.vmas if vma.file is None)
+    filled = _filled(outline, legacy, untouched)
+    zero = pages.extents(vma for vma in outline.vmas if vma.file is None) if source.tells_zeros else NONE
 
     def written(row: Words, content: Buffer) -> None:
         _write(Memory(memory.pid), *_without_zeros(row, content, zero), filled)
 
-    base.each(written, threads)
+    source.each(written, threads)
 
 
 def _without_zeros(row: Words, content: Buffer, zero: Words) -> tuple[Words, Buffer]:
     """What is left of pages and their bytes without pages of zeros where there are zeros already."""
+    if not len(zero):
+        return row, content
     is_zero = pages.zero_pages(content, abi.PAGE_SIZE)
     if not is_zero.any():
         return row, content

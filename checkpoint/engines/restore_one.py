@@ -49,6 +49,7 @@ from checkpoint.linux.call_table import AREA_SIZE, CallTable, Stub
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.tracee import Tracee
 from checkpoint.model import Credentials, PageRun, Snapshot, ThreadState, Vma
+from checkpoint.page_source import PageSource
 from checkpoint.pages import Words
 from checkpoint.resources import (
     aio_rings,
@@ -71,7 +72,6 @@ from checkpoint.resources.departed import Departed
 from checkpoint.resources.rebuild import deleted_directory, open_here, rebuild_all, rebuild_last
 from checkpoint.resources.rebuilding import number_of
 from checkpoint.resources.system_v_memory import Segments
-from checkpoint.stored_base import StoredBase
 
 OPTIONS: Final = abi.PTRACE_O_EXITKILL | abi.PTRACE_O_TRACESYSGOOD | abi.PTRACE_O_TRACEEXEC | abi.PTRACE_O_TRACECLONE
 
@@ -131,7 +131,7 @@ class ProcessRestore:
         state: of this process alone.
         estate: None for a component of one process.
         legacy: what it has in common with others.
-        stored: the same base, where ``state`` has no pages.
+        source: of its pages, where ``state`` has them without their bytes.
     """
 
     def __init__(
@@ -142,9 +142,9 @@ class ProcessRestore:
         brought: Brought,
         estate: Estate | None = None,
         legacy: Legacy = restore_memory.NOTHING,
-        stored: StoredBase | None = None,
+        source: PageSource | None = None,
     ) -> None:
-        self._stored = stored
+        self._source = source
         self.has_table_of_parent = bool(joint.flags_of(state.resources) & joint.CLONE_FILES)
         self._state = joint.without_descriptors(state) if self.has_table_of_parent else state
         self._legacy = legacy
@@ -309,17 +309,18 @@ class ProcessRestore:
             self._make_rings(self._stub, self._rings, first.descriptors)
         restore_threads.open_what_is_left(self._tracee, self._start_registers, self._stub, self._ended, first.descriptors)
         threads = side_by_side.thread_count()
-        if self._stored is not None:
-            restore_memory.fill_from(self._tracee.memory, self._stored, self._untouched, threads)
+        memory, state = self._tracee.memory, self._state
+        if self._source is not None:
+            restore_memory.fill_from(memory, state, self._source, self._legacy, self._untouched, threads)
         else:
-            restore_memory.fill(self._tracee.memory, self._state, self._legacy, self._untouched, threads)
+            restore_memory.fill(memory, state, self._legacy, self._untouched, threads)
 
     def _complete(self, later: LaterTables) -> None:
         """Everything but mappings and pages, which are there."""
         tracee, state = self._tracee, self._state
         if self._own_functions:
             self._leave_old_vdso()
-            tracee.memory.write_each(restore_vdso.jumps(state, self._vdso, self._own_functions))
+            tracee.memory.write_each(restore_vdso.jumps(state, self._content_at, self._vdso, self._own_functions))
         if self._options.epoch:
             _renew_token(tracee, state, self._options.epoch)
         self.notes += self._stub.run(later.state)
@@ -533,8 +534,8 @@ class ProcessRestore:
 
     def _content_at(self, address: int, size: int) -> bytes | None:
         """Bytes of the program's memory as it was captured; None where no page is carried."""
-        if self._stored is not None:
-            return self._stored.content_at(address, size)
+        if self._source is not None:
+            return self._source.content_at(address, size)
         return restore_memory.content_at(self._state, address, size)
 
 

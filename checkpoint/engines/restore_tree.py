@@ -29,7 +29,7 @@ from typing import Final
 
 from msgspec.structs import replace
 
-from checkpoint import pages, tree
+from checkpoint import member_pages, pages
 from checkpoint.arch import cpu, stubs
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import (
@@ -69,7 +69,8 @@ class TreeRestore:
 
     def __init__(self, vessel_pid: int, state: Snapshot, options: RestoreOptions, brought: tuple[Brought, ...]) -> None:
         self._state = state
-        self._views, self._nameless = files_of_several.made_once(tree.views(state))
+        views, self._sources = member_pages.apart(state)
+        self._views, self._nameless = files_of_several.made_once(views)
         self._brought = brought
         self._options = options
         self._first = Tracee(vessel_pid)
@@ -112,8 +113,8 @@ class TreeRestore:
         estate = self._make_estate(vessel, first_told(self._views))
         self._bear_all(estate.base)
         self._restoring = [
-            ProcessRestore(self._born[view.process.pid], view, self._options, brought, estate, legacy)
-            for view, brought, legacy in zip(self._views, self._brought, self._legacies, strict=True)
+            ProcessRestore(self._born[view.process.pid], view, self._options, brought, estate, legacy, source)
+            for view, brought, legacy, source in zip(self._views, self._brought, self._legacies, self._sources, strict=True)
         ]
         for restoring in sorted(self._restoring, key=lambda one: not one.has_table_of_parent):  # which that fills last
             restoring.build()
@@ -197,7 +198,7 @@ class TreeRestore:
         image = restore_memory.kernel_pages(mappings)[-1]
         stub.install(image.start + cpu.call_in(self._first.memory.read(image.start, image.size)), AREA_SIZE)
         taken_by_vessel = pages.extents(PageRun(line.start, line.end) for line in mappings)
-        inheritance = forked_memory.of(views, taken_by_vessel, {path for one in self._brought for path in one.run})
+        inheritance = forked_memory.of(views, taken_by_vessel, {path for one in self._brought for path in one.run}, self._sources)
         self._legacies = inheritance.legacies
         ended = departed.of([_at(held, estate.descriptions[n]) for n, held in resources.items() if held.kind == pidfds.KIND], "")
         opened, left = restore_threads.open_what_is_left(self._first, self._registers, stub, ended, streams.STANDARD)

@@ -29,7 +29,7 @@ from checkpoint.arch import cpu
 from checkpoint.arch import stubs as arch
 from checkpoint.capability import Area, preserved
 from checkpoint.engines.description import this_machine
-from checkpoint.engines.restore_memory import KERNEL_KINDS, content_at, kernel_pages_of
+from checkpoint.engines.restore_memory import KERNEL_KINDS, kernel_pages_of
 from checkpoint.engines.vdso_calls import VdsoCalls
 from checkpoint.errors import RestoreError
 from checkpoint.linux import abi, vdso
@@ -49,6 +49,8 @@ CAPABILITIES: Final = (
 )
 IMAGE_LIMIT: Final = 1 << 20
 """Bytes of an image that are looked at: those of today's kernels have 8 KiB."""
+ContentAt = Callable[[int, int], bytes | None]
+"""Bytes of a program's memory at an address, of a size; None where they are not carried."""
 STEP_LIMIT: Final = 1000
 """Instructions that a thread is followed: a function of the vdso has some two hundred."""
 
@@ -70,14 +72,14 @@ def entry_address(state: Snapshot) -> int:
     return told or (own[-1].start if own else 0)
 
 
-def refuse(state: Snapshot) -> Iterator[str]:
+def refuse(state: Snapshot, content_at: ContentAt) -> Iterator[str]:
     """Why a program of another kernel cannot be led to this one's vdso."""
     image = _image_mapping(state)
     named = f"the vdso of its kernel ({state.machine.kernel}) differs from ours ({this_machine().kernel})"
     if image is None:
         yield f"{named}, and the program has moved or unmapped it: boot the same kernel"
         return
-    content = content_at(state, image.start, image.size) if image.size <= IMAGE_LIMIT else None
+    content = content_at(image.start, image.size) if image.size <= IMAGE_LIMIT else None
     if not content or not vdso.functions(content):
         yield f"{named}, and the snapshot does not hold the old one: capture it again, or boot the same kernel"
 
@@ -180,7 +182,7 @@ def stands_in(registers: bytes, image: Vma) -> bool:
     return image.start <= cpu.decode_registers(registers)[cpu.INSTRUCTION_POINTER] < image.end
 
 
-def jumps(state: Snapshot, own: int, functions: Sequence[Function]) -> list[tuple[int, bytes]]:
+def jumps(state: Snapshot, content_at: ContentAt, own: int, functions: Sequence[Function]) -> list[tuple[int, bytes]]:
     """What to write where in the image that the program was born with: to each function, how this kernel does the same.
 
     Args:
@@ -188,7 +190,7 @@ def jumps(state: Snapshot, own: int, functions: Sequence[Function]) -> list[tupl
         functions: of this kernel's.
     """
     image = _image_mapping(state)
-    content = content_at(state, image.start, image.size) if image is not None else None
+    content = content_at(image.start, image.size) if image is not None else None
     if image is None or content is None:
         return []
     known = {function.name: own + function.offset for function in functions}

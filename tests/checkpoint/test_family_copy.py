@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import random
 import signal
@@ -28,6 +29,7 @@ from checkpoint.linux import procfs
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.vessel import Born, discard
+from checkpoint.member_pages import MemberPages
 from checkpoint.model import Member, PageRun, Snapshot
 from tests.checkpoint import test_tree_states as states
 from tests.checkpoint.round_trip import (
@@ -115,6 +117,16 @@ def test_a_copy_of_a_family_that_follows_the_deltas_is_the_family(seed: int, tmp
                 assert standby.copy.position == delta.position
             program.kill()
             goes_on_to_its_end(standby.becomes_the_program())
+
+
+def test_a_copy_that_is_laid_holds_no_other_copy_of_the_pages(tmp_path: Path) -> None:
+    with ended(mutable(tmp_path)) as program, protected(program) as session:
+        base = base_of(session)
+        program.kill()
+    assert base.copies
+    with laid(base, tmp_path) as standby:
+        assert standby.copy.position == base.position
+        assert not [one for one in gc.get_objects() if isinstance(one, MemberPages)]
 
 
 def everything_of(restored: RestoredProgram) -> list[dict[int, bytes]]:
