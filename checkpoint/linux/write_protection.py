@@ -208,7 +208,7 @@ class PagemapTracker:
             copied = pages.union(copied, appeared)
         if len(doubtful):
             cleared = pages.union(cleared, doubtful)
-            copied = pages.union(copied, self._scanner.existing(doubtful))
+            copied = pages.union(copied, self._own(doubtful))
         written, emptied = self._sift(written, copied, everywhere=everywhere)
         return Scan(written, pages.union(cleared, emptied))
 
@@ -229,7 +229,7 @@ class PagemapTracker:
         before = self._open
         self._protect_windows(lines, appeared)
         self._learn(lines)
-        return self._scanner.existing(before) if is_running else appeared
+        return self._own(before) if is_running else appeared
 
     def existing(self, lines: Sequence[MapsLine]) -> Words:
         """See `Tracker.existing`."""
@@ -269,7 +269,7 @@ class PagemapTracker:
         everywhere = extents_of(lines)
         existing = self._scanner.existing(everywhere)
         self._protect_windows([line for line in lines if (line.start, line.end) not in self._stubborn], existing)
-        return self._scanner.existing(everywhere) if is_running else existing
+        return self._own(everywhere) if is_running else existing
 
     def _protect_windows(self, lines: Sequence[MapsLine], existing: Words) -> None:
         """Protect what is worth it and is not protected yet: what was written there since the scan began must stay known.
@@ -339,6 +339,11 @@ class PagemapTracker:
         found = self._scanner.private(around)
         real = pages.union(found.present, pages.difference(swapped, away))
         return real, pages.union(copied, pages.intersection(found.swapped, readable))
+
+    def _own(self, extents: Words) -> Words:
+        """What exists where holes may be protected by now, which look as if they were swapped out."""
+        real, looked_at = self._existing(extents, NONE)
+        return pages.union(real, looked_at)
 
     def _surroundings_of(self, doubtful: Words) -> Words:
         """Of the same pages from scan to scan, as a rule: one set while the process runs, and one while it stands still."""

@@ -81,6 +81,10 @@ for order in sys.stdin:
         file = os.open(large, os.O_RDONLY)
         assert os.fstat(file).st_size > count * PAGE
         assert libc.mmap(place, count * PAGE, 3 if verb == "file" else 0, 0x12, file, 0) == place
+    elif verb == "short":
+        file = os.memfd_create("short")
+        os.ftruncate(file, first * PAGE)
+        assert libc.mmap(place, count * PAGE, 3, 0x12, file, 0) == place
     elif verb == "seal":
         libc.mprotect(place, count * PAGE, 1)
     elif verb == "shut":
@@ -272,6 +276,24 @@ def test_a_files_mapping_that_nobody_may_look_into_has_no_pages_until_it_is_open
 
 
 # Scans of a process that runs
+
+
+@pytest.mark.parametrize("are_there", [True, False])
+def test_what_lies_behind_the_end_of_a_file_is_never_to_be_read(child: Child, are_there: bool) -> None:
+    """Nobody can read it: the kernel has no page to give. A loader maps libraries so for a moment, to put other memory there."""
+    if not child.tracker.scans_running:
+        pytest.skip(f"{child.tracker.name} does not scan a process that runs")
+    size = COUNT - 6
+    child.order(f"short {size}")
+    if are_there:
+        child.order(f"look 0 {size}")
+    told = [child.catch_up(), child.catch_up(), child.scan()]
+    assert all(number < size for found in told for number in child.numbers(found.written))
+    child.order("write 3 2")
+    assert child.numbers(child.catch_up().written) == {3, 4}
+    assert child.numbers(child.tracker.existing(child.lines())) >= {3, 4}
+    child.order("write 5")
+    assert child.numbers(child.scan().written) == {5}
 
 
 def test_a_running_scan_reports_once_and_the_next_scan_only_what_came_later(child: Child) -> None:
