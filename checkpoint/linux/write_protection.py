@@ -343,7 +343,7 @@ class PagemapTracker:
     def _own(self, extents: Words) -> Words:
         """What exists where holes may be protected by now, which look as if they were swapped out."""
         real, looked_at = self._existing(extents, NONE)
-        return pages.union(real, looked_at)
+        return pages.intersection(pages.union(real, looked_at), extents)  # it is also told of small gaps between them
 
     def _surroundings_of(self, doubtful: Words) -> Words:
         """Of the same pages from scan to scan, as a rule: one set while the process runs, and one while it stands still."""

@@ -305,6 +305,16 @@ def test_a_running_scan_reports_once_and_the_next_scan_only_what_came_later(chil
     assert child.numbers(child.catch_up().written) == set()
 
 
+def test_what_lies_between_two_fresh_mappings_is_told_as_little_as_before(child: Child) -> None:
+    if not child.tracker.scans_running:
+        pytest.skip(f"{child.tracker.name} does not scan a process that runs")
+    child.catch_up()
+    for place in (1, 6):
+        child.order(f"replace {place} 1")
+        child.order(f"write {place}")
+    assert child.numbers(child.catch_up().written) == {1, 6}
+
+
 def test_the_backlog_is_what_a_scan_would_find_and_takes_nothing_away(child: Child) -> None:
     if not child.tracker.scans_running:
         pytest.skip(f"{child.tracker.name} does not scan a process that runs")
