@@ -22,10 +22,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+import numpy as np
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from checkpoint import epoch_variable, rights, side_by_side
+from checkpoint import epoch_variable, pages, rights, side_by_side
 from checkpoint.arch import extended, stubs
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import (
@@ -484,9 +485,18 @@ class ProcessRestore:
         tracee.memory.write(place, restore_process.packed_action(action))
         calls.make("rt_sigaction", signal.SIGTRAP, place, 0, abi.SIGSET_SIZE)
         self._queue_traps(calls, place)
-        calls.make("munmap", self._stub.base, -(-self._area_size // abi.PAGE_SIZE) * abi.PAGE_SIZE)
+        for start, end in self._ours().tolist():
+            calls.make("munmap", start, end - start)
         for one, thread in ((tracee, self._thread), *self._others):
             self._take_place(one, thread)
+
+    def _ours(self) -> Words:
+        """What is to be unmapped at the end: not this kernel's vdso, where that stays in the refuge beside the area."""
+        base, size = self._stub.base, -(-self._area_size // abi.PAGE_SIZE) * abi.PAGE_SIZE
+        all_of_it = np.array([[base, base + size]], np.uint64)
+        if not self._own_functions:
+            return all_of_it
+        return pages.difference(all_of_it, np.array([[base + AREA_SIZE, base + AREA_SIZE + REFUGE_SIZE]], np.uint64))
 
     def _calls_of_vdso(self) -> VdsoCalls:
         return VdsoCalls(self._tracee, self._start_registers, self._vdso, self._vdso_size)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -28,8 +29,10 @@ from tests.checkpoint.round_trip import (
     expect_ok,
     protected,
     restored,
+    start,
     start_tracee,
 )
+from tests.checkpoint.test_trees import captured_and_ended
 from tests.conftest import children
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
@@ -44,6 +47,20 @@ READ_CLOCK = next(name for name in stubs.VDSO_CALLS if name.endswith("_clock_get
 """What the C library's clock_gettime(2) calls."""
 ATTEMPTS = 400
 """Captures after which a program that reads clocks all the time has been met while it does."""
+
+
+FAMILY = """
+import os, time
+from pathlib import Path
+child = os.fork()
+print("child" if child == 0 else "parent", flush=True)
+while not Path("go").exists():
+    assert time.monotonic() <= time.monotonic()
+    time.sleep(0.01)
+if child:
+    assert os.waitpid(child, 0)[1] == 0
+    print("ok", flush=True)
+"""
 
 
 def image_of(snapshot: Snapshot) -> Vma:
@@ -229,3 +246,14 @@ def test_a_torn_image_has_no_functions_and_raises_nothing(seed: int) -> None:
             torn[dice.randrange(1024)] = dice.randrange(256)
         for function in vdso.functions(bytes(torn)):
             assert 0 <= function.offset <= function.offset + function.size <= len(torn)
+
+
+def test_several_processes_of_another_kernel_go_on_by_this_ones_vdso(tmp_path: Path) -> None:
+    program = start([sys.executable, "-c", FAMILY], tmp_path, isolate=True)
+    with ended(program):
+        program.wait_until(lambda: len(program.output.splitlines()) == 2, "both")
+        snapshot = captured_and_ended(program)
+    assert snapshot.is_tree
+    with ended(restored(of_another_kernel(snapshot), tmp_path)) as back:
+        back.tell()
+        expect_ok(back)
