@@ -1,4 +1,4 @@
-"""The pages of each of several processes, in a snapshot that tells each content once: only what is being written is copied.
+"""The pages of each of several processes, in a snapshot that tells each content once: put together piece by piece.
 
 Processes that have forked have most of their memory in common. To give each its own copy of it, only to write that into a vessel,
 would take as much memory besides as all of them will have.

@@ -329,7 +329,7 @@ def fill_from(
 ) -> None:
     """The same of pages that are elsewhere: each is still in a processor's cache when it is written.
 
-    Memory without a file is zero by itself: pages of zeros are left out there.
+    Memory without a file is zero by itself: pages of zeros are left out there, where the source may tell some.
 
     Raises:
         FormatError, ChainError: its pages are not what they were; some were written.

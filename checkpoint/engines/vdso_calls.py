@@ -1,4 +1,4 @@
-"""System calls by the vdso's own instruction: made inside a vessel while nothing of ours is mapped there yet, or no more.
+"""System calls by the vdso's own instruction: made inside a vessel without anything of ours mapped there.
 
 Source: vdso(7), execve(2); ptrace(2), PTRACE_O_TRACEEXEC, PTRACE_O_TRACESYSGOOD.
 """
