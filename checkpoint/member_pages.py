@@ -39,6 +39,14 @@ class MemberPages:
         self._rows = rows
         self._places = places
 
+    def within(self, wanted: Words) -> MemberPages:
+        """Those of its pages that are in a set."""
+        addresses = pages.addresses_of(self._carried, self._page_size)
+        kept = pages.covered(wanted, addresses)
+        if kept.all():
+            return self
+        return MemberPages(pages.extents_of_addresses(addresses[kept], self._page_size), self._rows, self._places[kept])
+
     def each(self, take: Taker, threads: int) -> None:
         """Have all pages taken, a piece at a time."""
         buffers = OwnBuffers(PIECE_SIZE)
@@ -50,7 +58,8 @@ class MemberPages:
             np.take(self._rows, places, axis=0, out=into, mode="clip")  # it would fill a copy first to be able to raise
             take(extents, content)
 
-        for _ in side_by_side.in_order(taken, self._pieces(), threads):
+        is_little = len(self._places) * self._page_size <= PIECE_SIZE
+        for _ in side_by_side.in_order(taken, self._pieces(), 1 if is_little else threads):
             pass
 
     def _pieces(self) -> Iterator[tuple[Words, NDArray[np.intp]]]:

@@ -20,6 +20,9 @@ class PageSource(Protocol):
 
     tells_zeros: bool
 
+    def within(self, wanted: Words) -> PageSource:
+        """The same, which may leave out pages that are not in a set."""
+
     def each(self, take: Taker, threads: int) -> None:
         """Have all pages taken, some at a time.
 

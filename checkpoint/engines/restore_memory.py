@@ -340,7 +340,7 @@ def fill_from(
     def written(row: Words, content: Buffer) -> None:
         _write(Memory(memory.pid), *_without_zeros(row, content, zero), filled)
 
-    source.each(written, threads)
+    source.within(filled).each(written, threads)
 
 
 def _without_zeros(row: Words, content: Buffer, zero: Words) -> tuple[Words, Buffer]:

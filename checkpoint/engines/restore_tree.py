@@ -40,6 +40,7 @@ from checkpoint.engines import (
     restore_process,
     restore_stops,
     restore_threads,
+    vdso_calls,
 )
 from checkpoint.engines.births import Birth, End, Join, NewSession, Reaper, Step
 from checkpoint.engines.forked_memory import Legacy
@@ -196,7 +197,7 @@ class TreeRestore:
         self._terminals = terminals.controlling({estate.descriptions[number]: held for number, held in resources.items()})
         stub = Stub(self._first, base)
         image = restore_memory.kernel_pages(mappings)[-1]
-        stub.install(image.start + cpu.call_in(self._first.memory.read(image.start, image.size)), AREA_SIZE)
+        stub.install(vdso_calls.instruction_in(self._first.memory, image.start, image.size), AREA_SIZE)
         taken_by_vessel = pages.extents(PageRun(line.start, line.end) for line in mappings)
         inheritance = forked_memory.of(views, taken_by_vessel, {path for one in self._brought for path in one.run}, self._sources)
         self._legacies = inheritance.legacies

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from checkpoint import chain, member_pages, pages, tree
 from checkpoint.member_pages import MemberPages
-from checkpoint.model import Snapshot
+from checkpoint.model import PageRun, Snapshot
 from checkpoint.pages import Buffer, Words
 from tests.checkpoint.snapshots import PAGE, START, family, page, pages_of, runs_of, snapshot, vma
 
@@ -71,6 +71,20 @@ def test_each_process_is_given_its_own_pages(seed: int, threads: int) -> None:
         assert (view.runs, bytes(view.contents)) == (told.runs, b"")
         assert view.vmas == told.vmas
         assert taken(source, threads) == wanted(told)
+
+
+@pytest.mark.usefixtures("small_pieces")
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_not_wanted_is_not_put_together(seed: int, threads: int) -> None:
+    whole, chance = common(100, seed), random.Random(seed)
+    runs = [PageRun(START + number * PAGE, START + (number + 1) * PAGE) for number in range(200) if chance.random() < 0.5]
+    some = pages.extents(runs)
+    for source, told in zip(member_pages.apart(whole)[1], tree.views(whole), strict=True):
+        assert source is not None
+        kept = {at: content for at, content in wanted(told).items() if any(run.start <= at < run.end for run in runs)}
+        assert taken(source.within(some), threads) == kept
+        assert taken(source.within(some[:0]), threads) == {}
+        assert taken(source.within(pages.extents([PageRun(0, START * 2)])), threads) == wanted(told)
 
 
 def test_bytes_and_rows_of_a_process_are_its_own() -> None:
