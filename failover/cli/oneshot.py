@@ -146,7 +146,7 @@ def _wait_for_ends(dying: Mapping[int, int]) -> None:
 def _is_traced(pid: int) -> bool:
     try:
         return procfs.status(pid).tracer != 0
-    except ProcessGoneError:
+    except (ProbeError, ProcessGoneError):  # or one that we are not shown
         return False
 
 
