@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import deque
 from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Final
+
+from msgspec import Struct
 
 from agent.config import ComponentConfig
 from agent.places import Places, complete_logs, log_directory
@@ -14,14 +19,25 @@ from checkpoint import carried, foreign, format
 from checkpoint.channel import close_all
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import ChainError, CheckpointError, FormatError, StoreError
-from checkpoint.model import Snapshot
+from checkpoint.model import OutputPiece, Position, Snapshot
 from checkpoint.store import Store
-from failover.core.acts import Admit
+from failover.core.acts import Accept, Admit, Discard, Show
 from failover.core.events import Event, Stored, StoreFailed
 from failover.core.messages import Offer
 from failover.core.types import COMMITTED
 
 log = logging.getLogger("failover.deposit")
+
+UNSHOWN_MAX: Final = 64
+"""Accepted snapshots of a component whose output is remembered until readers may see it; older ones are read from their files."""
+
+
+class Unshown(Struct, frozen=True):
+    """The output of one accepted snapshot that readers do not see yet."""
+
+    position: Position
+    output: tuple[OutputPiece, ...]
+    is_held: bool
 
 
 class Deposit:
@@ -39,7 +55,7 @@ class Deposit:
     ) -> None:
         """
         Args:
-            kept: called with what was offered, and that snapshot without its pages, for the status.
+            kept: called with what was offered, and that snapshot without its pages, once the core has accepted it.
             runs: this member runs components: what it keeps it may have to lay down.
             here: what this robot's operator wants for a component.
         """
@@ -52,6 +68,8 @@ class Deposit:
         self._admitted: dict[str, Admit] = {}
         self._senders: dict[str, str] = {}
         self._turns: dict[str, asyncio.Lock] = {}
+        self._stored: dict[tuple[str, Position], tuple[Offer, Snapshot]] = {}
+        self._unshown: dict[str, deque[Unshown]] = {}
 
     def admit(self, act: Admit) -> None:
         """From now on take this component's snapshots from this sender alone."""
@@ -94,7 +112,7 @@ class Deposit:
         self._tell(StoreFailed(offer.component, offer.epoch, peer, why, needs_base=False))
 
     async def take(self, peer: str, offer: Offer, descriptor: int) -> None:
-        """Verify, store durably, extend the output streams; then the core hears of it. One at a time for each component."""
+        """Verify, store durably; then the core hears of it, and decides. One at a time for each component."""
         async with self._turns.setdefault(offer.component, asyncio.Lock()):
             try:
                 self.admits(peer, offer)
@@ -112,9 +130,62 @@ class Deposit:
                 log.warning("%s", why, exc_info=error)
                 self._tell(StoreFailed(offer.component, offer.epoch, peer, why, needs_base=False))
                 return
-        self._kept(offer, snapshot)
+        self._stored[offer.component, snapshot.position] = offer, snapshot
         keeps_state = snapshot.engine == COOPERATIVE
-        self._tell(Stored(offer.component, offer.epoch, snapshot.position, peer, offer.spec, keeps_state))
+        told = offer.acknowledged
+        self._tell(Stored(offer.component, offer.epoch, snapshot.position, peer, offer.spec, keeps_state, told))
+
+    def accept(self, act: Accept) -> None:
+        """It counts as held here: the ready copy and the status follow; its output waits for `show`."""
+        offer, snapshot = self._stored.pop((act.component, act.position), (None, None))
+        if offer is None or snapshot is None:  # stored by an earlier life of these lanes
+            return
+        unshown = self._unshown.setdefault(act.component, deque(maxlen=UNSHOWN_MAX))
+        unshown.append(Unshown(snapshot.position, snapshot.output, offer.spec.launch.output == COMMITTED))
+        self._kept(offer, snapshot)
+
+    async def discard(self, act: Discard) -> None:
+        """It came too late: neither is it shown, nor does this robot ever go on from it."""
+        self._stored.pop((act.component, act.position), None)
+        async with self._turns.setdefault(act.component, asyncio.Lock()):
+            try:
+                await asyncio.to_thread(self._store.discard, act.component, act.position)
+            except StoreError as error:
+                log.warning("%s", error)
+        log.info("%s: snapshot %d came too late and is forgotten again", act.component, act.position.sequence)
+
+    async def show(self, act: Show) -> None:
+        """Extend the output streams that readers see up to an accepted position."""
+        async with self._turns.setdefault(act.component, asyncio.Lock()):
+            try:
+                await asyncio.to_thread(self._show, act.component, act.position)
+            except (CheckpointError, OSError) as error:
+                log.warning("the output of %s up to snapshot %d cannot be shown: %s", act.component, act.position.sequence, error)
+
+    def _show(self, component: str, position: Position) -> None:
+        unshown = self._unshown.get(component, deque())
+        directory = log_directory(component, self._places)
+        if not any(one.position == position for one in unshown):
+            self._complete(component, directory, position)
+            return
+        logs = OutputLogs(directory)
+        try:
+            while True:
+                one = unshown.popleft()
+                logs.hold(one.is_held)
+                logs.apply(one.output, is_safe=True)
+                if one.position == position:
+                    return
+        finally:
+            logs.close()
+
+    def _complete(self, component: str, directory: Path, position: Position) -> None:
+        """An earlier life of these lanes took it in, or too many wait: read it from the files."""
+        descriptors = self._store.open_chain(component, position)
+        try:
+            complete_logs(directory, descriptors, is_safe=True)
+        finally:
+            close_all(tuple(descriptors))
 
     async def settled(self, component: str) -> None:
         """Return once no snapshot of it is being stored: from then on a guard writes its output here.
@@ -135,9 +206,10 @@ class Deposit:
                 self._mend_logs_of(name)
 
     def _mend_logs_of(self, name: str) -> None:
+        """What the newest snapshot continues was acknowledged; whether that one was, the core will say (`show`)."""
         descriptors = self._store.open_chain(name)
         try:
-            if complete_logs(log_directory(name, self._places), descriptors):
+            if len(descriptors) > 1 and complete_logs(log_directory(name, self._places), descriptors[:-1]):
                 log.info("%s: its output was completed from its checkpoints", name)
         finally:
             close_all(tuple(descriptors))
@@ -153,11 +225,4 @@ class Deposit:
             raise FormatError(f"a snapshot of {offer.component} is not the one that was offered: it names {header.component}")
         if self._runs and offer.spec.launch.carry and (lack := self._lack_of_room(offer.component, descriptor)):
             raise StoreError(f"a checkpoint of {offer.component} is of no use here: {lack}")
-        snapshot = self._store.put(descriptor)
-        logs = OutputLogs(log_directory(offer.component, self._places))
-        try:
-            logs.hold(offer.spec.launch.output == COMMITTED)
-            logs.apply(snapshot.output, is_safe=True)
-        finally:
-            logs.close()
-        return snapshot
+        return self._store.put(descriptor)

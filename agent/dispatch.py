@@ -94,7 +94,9 @@ class Dispatch:
                 outline = await asyncio.to_thread(self._store.outline, act.component, entry, descriptor)
                 await self._bringing.bring(act.to, act.component, needs(outline, opened=self._brings_data(act.component)))
             digest = await asyncio.to_thread(digest_of, descriptor, entry.size)
-            offer = Offer(0, act.component, entry.epoch, entry.position, entry.parent, entry.size, digest, act.spec)
+            offer = Offer(
+                0, act.component, entry.epoch, entry.position, entry.parent, entry.size, digest, act.spec, act.acknowledged
+            )
             await self._shipper.ship(act.to, offer, descriptor)
         finally:
             os.close(descriptor)

@@ -102,7 +102,7 @@ class Lanes(Switchboard):
         store = self._store = await self._open_store()
         records = Records(self._runtime / "running")
         hooks, here = Hooks(self._starter), self.settings.component
-        self._deposit = Deposit(store, self.places, self.tell, self._stored, runs=self.settings.me.role == "robot", here=here)
+        self._deposit = Deposit(store, self.places, self.tell, self._accepted, runs=self.settings.me.role == "robot", here=here)
         settled = self._deposit.settled
         self._around = Surroundings(self.places, store, records, self.tell, self._silence_ns, settled, here, hooks)
         self._sources = Sources(store, self._from_program)
@@ -158,6 +158,12 @@ class Lanes(Switchboard):
                 self.answered(act)
             case acts.Admit():
                 self._deposit.admit(act)
+            case acts.Accept():
+                self._deposit.accept(act)
+            case acts.Discard():
+                self._task(self._deposit.discard(act))
+            case acts.Show():
+                self._task(self._deposit.show(act))
             case acts.Ship():
                 self._dispatch.ship(act)
             case acts.CancelShip():
@@ -297,12 +303,12 @@ class Lanes(Switchboard):
         task.add_done_callback(self._tasks.discard)
         task.add_done_callback(end_lanes_on_mistake)
 
-    def _stored(self, offer: Offer, snapshot: Snapshot) -> None:
+    def _accepted(self, offer: Offer, snapshot: Snapshot) -> None:
         figures = self.charge(offer.component).figures
         if figures.spec is None:
             self._new_here.set()  # the first one of it: look at once whether it could go on here
         figures.stored(snapshot, offer.size, offer.spec)
-        self.charge(offer.component).copy.stored()
+        self.charge(offer.component).copy.accepted(snapshot.position)
 
     async def _look_what_is_lacking(self) -> None:
         """Now and then, and when this robot becomes a standby: what it lacks of what it stands by for."""

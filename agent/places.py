@@ -45,13 +45,14 @@ def log_directory(name: str, places: Places) -> Path:
     return places.logs / folder_name(name)
 
 
-def complete_logs(directory: Path, chain: Sequence[int]) -> bool:
+def complete_logs(directory: Path, chain: Sequence[int], *, is_safe: bool = False) -> bool:
     """Bring output logs as far as the newest snapshot of a chain says; returns whether they were shorter.
 
     They are where a robot died, or was killed, between storing a snapshot and extending its logs.
 
     Args:
         chain: descriptors of encoded snapshots, oldest first.
+        is_safe: another robot holds the newest of them, too.
     """
     logs = OutputLogs(directory)
     try:
@@ -60,6 +61,8 @@ def complete_logs(directory: Path, chain: Sequence[int]) -> bool:
         if short:
             for descriptor in chain:
                 logs.apply(format.read_outline(descriptor).output)
+        if is_safe:
+            logs.commit(told, is_safe=True)
         return short
     finally:
         logs.close()

@@ -56,6 +56,7 @@ class ReadyCopy:
         self._around = around
         self._figures = figures
         self._ready: Ready | None = None
+        self._accepted: Position | None = None
         self._news = asyncio.Event()
         self._turn = asyncio.Lock()
         self._work: asyncio.Task[None] | None = None
@@ -70,8 +71,9 @@ class ReadyCopy:
         self.drop()
         self._work = self._task(self._follow(spec, tell))
 
-    def stored(self) -> None:
-        """Another checkpoint has come."""
+    def accepted(self, position: Position) -> None:
+        """The core counts another checkpoint as held here. The copy goes no further: the rest of the store may be forgotten."""
+        self._accepted = position
         self._news.set()
 
     def drop(self) -> None:
@@ -129,7 +131,7 @@ class ReadyCopy:
             try:
                 async with self._turn:
                     if self._ready is not None:
-                        await self._bring_on()
+                        await self._bring_on(self._newest())
                     else:
                         await self._lay(spec)
                         laid_s = time.monotonic()
@@ -162,7 +164,7 @@ class ReadyCopy:
 
     async def _lay(self, spec: ComponentSpec) -> None:
         terms = terms_here(spec.launch, self._around.here(self._name))
-        chain = await asyncio.to_thread(self._around.store.open_chain, self._name)
+        chain = await asyncio.to_thread(self._around.store.open_chain, self._name, self._newest())
         try:
             age_ns, outline = clock.age_ns(chain[-1]), await asyncio.to_thread(format.read_outline, chain[-1])
             started = program_of(spec.launch).inheritance
@@ -178,6 +180,11 @@ class ReadyCopy:
         finally:
             close_all(tuple(chain))
         self._stands(Ready(component, outline), laid)
+
+    def _newest(self) -> Position | None:
+        """How far the copy may go; None: as far as the store does, which an earlier life of the agent filled."""
+        wanted = self._accepted
+        return wanted if wanted is not None and wanted in self._around.store.positions(self._name) else None
 
     async def _bring_on(self, position: Position | None = None) -> None:
         """Apply what the store holds beyond it, up to a position; lay it again where that does not continue it."""

@@ -311,6 +311,18 @@ class Store:
             needed = sum(entry.size for shelf in self._shelves.values() for entry in shelf.entries)
         self._history.shrink(needed)
 
+    def discard(self, component: str, position: Position) -> None:
+        """Forget one position that nothing else here continues; one that is not held, or is continued, stays as it is.
+
+        Raises:
+            StoreError: the disk cannot remove it.
+        """
+        with self._change_of(component):
+            entries = self._shelf(component).entries
+            if all(entry.parent != position for entry in entries):
+                self._remove(component, tuple(entry for entry in entries if entry.position == position))
+                self._proofs.forget(component)
+
     def keep_newest(self, component: str, positions: int) -> None:
         """Forget all but the newest positions; as ``prune``."""
         held = self.positions(component)[-positions:]

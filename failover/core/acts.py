@@ -71,6 +71,7 @@ class Ship(Struct, frozen=True):
     Attributes:
         parent: the standby's present position; None for a base.
         whole: the store's chain up to ``position`` folded into one base (a checkpoint that is given back).
+        acknowledged: the newest position of its line that counts as acknowledged; None: not known.
     """
 
     component: str
@@ -80,6 +81,7 @@ class Ship(Struct, frozen=True):
     to: str
     spec: ComponentSpec
     whole: bool = False
+    acknowledged: Position | None = None
 
 
 class CancelShip(Struct, frozen=True):
@@ -89,6 +91,33 @@ class CancelShip(Struct, frozen=True):
     epoch: int
     position: Position
     to: str
+
+
+class Accept(Struct, frozen=True):
+    """The snapshot at ``position``, of which `Stored` told, counts from now on as held here. No answer.
+
+    Until then the agent does nothing with it: no ready copy follows it, no reader sees its output.
+    """
+
+    component: str
+    epoch: int
+    position: Position
+
+
+class Discard(Struct, frozen=True):
+    """The snapshot at ``position``, of which `Stored` told, came too late: the store forgets it. No answer."""
+
+    component: str
+    epoch: int
+    position: Position
+
+
+class Show(Struct, frozen=True):
+    """What the component had written by ``position``, which is held here, is acknowledged: readers may see it. No answer."""
+
+    component: str
+    epoch: int
+    position: Position
 
 
 class Acknowledge(Struct, frozen=True):
@@ -254,6 +283,9 @@ Act = (
     | Capture
     | Ship
     | CancelShip
+    | Accept
+    | Discard
+    | Show
     | Acknowledge
     | Admit
     | Freeze

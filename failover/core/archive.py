@@ -62,7 +62,9 @@ def _send(component: Component, turn: Turn, server: str, has: Position | None) -
         component.archived_ns = turn.now_ns + turn.config.archive_ms * MS
     component.archives[server] = Flight(turn.now_ns, turn.now_ns + turn.config.ship_ms * MS, whole, server, position, has)
     parent = None if whole else has
-    turn.order(acts.Ship(component.name, component.epoch, position, parent, server, component.spec, whole))
+    turn.order(
+        acts.Ship(component.name, component.epoch, position, parent, server, component.spec, whole, acknowledged=component.safe)
+    )
 
 
 # The way back
@@ -78,7 +80,9 @@ def give_back(component: Component, turn: Turn) -> None:
     heir = _heir(component, turn)
     if heir and turn.alive(heir) and _lacks(component, turn.team.peers[heir], mine):
         component.flight = Flight(turn.now_ns, turn.now_ns + turn.config.ship_ms * MS, True, heir, mine)
-        turn.order(acts.Ship(component.name, component.epoch, mine, None, heir, component.spec, whole=True))
+        turn.order(
+            acts.Ship(component.name, component.epoch, mine, None, heir, component.spec, whole=True, acknowledged=component.shown)
+        )
         turn.say(component, f"{turn.me} gives its checkpoint back to {heir}")
 
 

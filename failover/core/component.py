@@ -133,6 +133,8 @@ class Component(Struct):
         generation, sequence: of the next snapshot; ``parent``: newest position that the keeper may count from.
         born: epoch under which the present process was started or restored.
         crashed: wait status of a program that died while it was held still; it is resumed when it may act.
+        safe: on a primary, the newest position that counts as acknowledged and is not here alone. vouched: on any other member,
+            the newest position of which it was told so; ``shown``: the one up to which it lets readers see the output.
         took_ns: from the order of the last delta until it was a checkpoint, 0 if that was none; no other is taken meanwhile.
         freeze_us: how long it stood still for the last snapshot; ``still_us``: the shorter of the last two times.
         due_ns: next capture; ``until_ns``: when the present claim, start or restore is overdue.
@@ -186,6 +188,9 @@ class Component(Struct):
     base_wanted: bool = False
     acked: Position | None = None
     acked_ns: int = -1
+    safe: Position | None = None
+    vouched: Position | None = None
+    shown: Position | None = None
     took_ns: int = 0
     freeze_us: int = 0
     still_us: int = 0

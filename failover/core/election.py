@@ -16,7 +16,7 @@ from failover.core import acts, lease
 from failover.core.component import LOST_MAX, Cause, Component, Turn
 from failover.core.consent import grants, state_of
 from failover.core.membership import Peer
-from failover.core.messages import HOLDS, UNPROTECTED, Entry
+from failover.core.messages import HOLDS, SAFE, UNPROTECTED, Entry
 from failover.core.names import Weight, weight
 from failover.core.types import ENDED, HOLDING, MS, PEERS_MAX, Resumption, State
 
@@ -91,6 +91,7 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     component.degraded = component.awaited = ""
     component.undelivered = component.unstored = ""
     component.resumed_ns = component.resumed_age_ns = -1
+    component.safe = component.vouched = component.shown = None
     component.handing, component.ending, component.reported = None, False, False
     component.ordered = False
     component.crashed, component.reason = 0, ""
@@ -278,6 +279,8 @@ def follow(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
         component.move(Cause.FOLLOW)
     component.trusted = entry.standby == turn.me and turn.config.runs(turn.me)
     admit(component, turn, sender)
+    if entry.flags & SAFE and entry.position is not None:
+        component.vouched = entry.position
     if entry.flags & UNPROTECTED:
         drop(component, turn, f"{sender} protects it no longer")
     if entry.yields_to == turn.me and component.state is State.STANDBY and component.newest == entry.position:
@@ -398,6 +401,7 @@ def drop(component: Component, turn: Turn, why: str) -> None:
     if not component.held:
         return
     component.held.clear()
+    component.vouched = component.shown = None
     turn.order(acts.Drop(component.name, component.epoch))
     turn.say(component, f"{turn.me} forgets its checkpoints: {why}")
 

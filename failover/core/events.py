@@ -116,6 +116,7 @@ class Stored(Struct, frozen=True):
 
     Attributes:
         keeps_state: to go on from it is to start the program again, which keeps its state itself.
+        acknowledged: what the sender said of its line, see `acts.Ship`.
     """
 
     component: str
@@ -124,6 +125,7 @@ class Stored(Struct, frozen=True):
     sender: str
     spec: ComponentSpec
     keeps_state: bool = False
+    acknowledged: Position | None = None
 
 
 class StoreFailed(Struct, frozen=True):

@@ -39,7 +39,7 @@ class Entry(msgspec.Struct, frozen=True, array_like=True):
         yields_to: (primary, handing over) the robot that may claim now.
         flags: ``NEEDS_BASE`` (standby), ``UNPROTECTED`` (primary has stopped protecting), ``HOLDS`` (on_loss is hold),
             ``WARM`` (standby: its program waits there, started already); ``WANTS`` (a checkpoint, to run it);
-            ``FREE``, ``OPEN``, ``STARTS``, ``ORDERED`` (majority).
+            ``SAFE`` (primary: its newest position is acknowledged); ``FREE``, ``OPEN``, ``STARTS``, ``ORDERED`` (majority).
         status: of a finished component, waitpid's.
     """
 
@@ -79,6 +79,10 @@ ORDERED = 128
 
 WANTS = 256
 """An operator wants the sender to run it, and it has no checkpoint: whoever keeps one sends it."""
+
+
+SAFE = 512
+"""The position that the sender, a primary, tells of counts as acknowledged: every robot that holds it may show its output."""
 
 
 class Beat(msgspec.Struct, frozen=True, array_like=True):
@@ -154,6 +158,7 @@ class Offer(msgspec.Struct, frozen=True, tag="offer"):
         transfer: chosen by the sender, never used twice in one life of it.
         size: bytes of the encoded snapshot (``checkpoint/FORMAT.md``); ``digest``: blake3 of them, 32 bytes.
         parent: what it continues; None for a base.
+        acknowledged: the newest position of its line that counts as acknowledged; None: not known, or an older agent.
     """
 
     transfer: int
@@ -164,6 +169,7 @@ class Offer(msgspec.Struct, frozen=True, tag="offer"):
     size: int
     digest: bytes
     spec: ComponentSpec
+    acknowledged: Position | None = None
 
 
 class Belonging(msgspec.Struct, frozen=True, array_like=True):

@@ -188,6 +188,7 @@ class Node:
                 component = self._components[one.component]
                 component.keeps_state = one.keeps_state
                 component.held = [position for position in one.positions if position.generation not in component.lost]
+                replication.remember(component, self._config)
 
     def _begin(self, turn: Turn) -> None:
         """The first step of this life: take over what the last one left running, clear away what it should not have left."""
@@ -384,6 +385,7 @@ def _review(component: Component, turn: Turn) -> None:
         majority.look(component, turn)
     if component.state in (State.ABSENT, State.STANDBY):
         _review_idle(component, turn)
+    replication.show(component, turn)
     if component.state is State.CLAIMING:
         (contest if turn.config.by_majority else election).advance(component, turn)
     if component.holding and component.state is not State.CLAIMING:

@@ -15,9 +15,12 @@ from failover.core.events import Captured, CaptureFailed, Committed, NothingToCa
 from failover.core.membership import Peer
 from failover.core.messages import NEEDS_BASE, Entry
 from failover.core.names import weight
-from failover.core.types import HISTORY_MAX, MS, OnUnsupported
+from failover.core.types import ENDED, HISTORY_MAX, MS, PEERS_MAX, Config, OnUnsupported, State
 
 NS_PER_US = 1_000
+
+_SHOWS = frozenset({State.ABSENT, State.STANDBY, *ENDED})
+"""States in which no guard of this robot writes the component's output."""
 
 STILL_SHARE = 10
 """One part in so many of its time is what a program stands still at most for its snapshots: where nobody tells which pages were
@@ -92,7 +95,9 @@ def captured(component: Component, turn: Turn, event: Captured) -> None:
         _give_up(component, turn)
         return
     flight.to = to
-    turn.order(acts.Ship(component.name, component.epoch, event.position, event.parent, to, component.spec))
+    turn.order(
+        acts.Ship(component.name, component.epoch, event.position, event.parent, to, component.spec, acknowledged=component.safe)
+    )
 
 
 def unchanged(component: Component, turn: Turn, event: Unchanged) -> None:
@@ -208,6 +213,8 @@ def _checkpoint(component: Component, turn: Turn, position: Position, *, is_safe
     turn.order(acts.Acknowledge(component.name, component.epoch, position, is_safe))
     component.undelivered, component.tries = "", 0
     component.parent = component.acked = position
+    if is_safe:
+        component.safe = position
     component.trail.append((position, flight.parent))
     component.acked_ns = flight.state_ns
     component.took_ns = turn.now_ns - flight.started_ns if flight.parent is not None else 0
@@ -264,11 +271,15 @@ def _tell_prune(component: Component, turn: Turn) -> None:
 
 
 def stored(component: Component, turn: Turn, event: Stored) -> None:
-    """A snapshot of the primary's is durable here: our next beat acknowledges it."""
+    """A snapshot of the primary's is durable here: our next beat acknowledges it. One that came too late is forgotten again."""
     if (event.sender, event.epoch) != component.admitted or component.holding:
+        if event.position not in component.held:
+            turn.order(acts.Discard(component.name, component.epoch, event.position))
         return
     supersede(component, turn, event.position)
     component.hold(event.position)
+    turn.order(acts.Accept(component.name, component.epoch, event.position))
+    component.vouched = (event.acknowledged or component.vouched) if turn.config.by_majority else event.position
     component.bare &= event.sender != component.primary
     component.spec, component.keeps_state, component.stored_ns = event.spec, event.keeps_state, turn.now_ns
     component.needs_base, component.unable, component.tries, component.unstored = False, "", 0, ""
@@ -283,3 +294,31 @@ def store_failed(component: Component, turn: Turn, event: StoreFailed) -> None:
     component.needs_base = component.needs_base or event.needs_base
     component.unstored = event.message
     turn.say(component, f"a snapshot from {event.sender} was not stored: {event.message}")
+
+
+def remember(component: Component, config: Config) -> None:
+    """After a restart: two alone, what a standby holds of the present primacy it had accepted, or accepts now."""
+    newest = component.held[-1] if component.held else None
+    follows = not config.by_majority and component.primary not in ("", config.robot)
+    if newest is not None and follows and newest.generation // (PEERS_MAX + 1) == component.epoch:
+        component.vouched = newest
+
+
+def show(component: Component, turn: Turn) -> None:
+    """Let readers here see the output up to the newest position that is held here and counts as acknowledged.
+
+    Two alone: what a standby has accepted. Under majority the primary says it: members may be about to elect a robot that
+    holds less than this one does, and it is the primary that knows when they are not.
+    """
+    told = component.vouched
+    if told is None or told == component.shown or component.state not in _SHOWS:
+        return
+    due = next((held for held in reversed(component.held) if _is_of_line(held, told)), None)
+    if due is not None and due != component.shown:
+        component.shown = due
+        turn.order(acts.Show(component.name, component.epoch, due))
+
+
+def _is_of_line(position: Position, told: Position) -> bool:
+    """Whether a position is as far as another one of its generation, or earlier."""
+    return position.generation == told.generation and position.sequence <= told.sequence

@@ -11,6 +11,7 @@ from failover.core.messages import (
     OPEN,
     ORDERED,
     RULES,
+    SAFE,
     STARTS,
     UNPROTECTED,
     WANTS,
@@ -37,6 +38,7 @@ def entry_of(component: Component, me: str) -> Entry:
     flags |= HOLDS * component.waits | WARM * component.warm
     flags |= FREE * component.free | OPEN * component.open | ORDERED * component.ordered
     flags |= WANTS * (component.wanted is not None)
+    flags |= SAFE * (component.holding and newest is not None and component.safe == newest)
     flags |= STARTS * (component.autostart and not component.held and not component.entrusted)
     return Entry(
         component.name,

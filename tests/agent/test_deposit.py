@@ -8,13 +8,17 @@ from pathlib import Path
 from typing import Any, cast
 
 from agent.deposit import Deposit
-from agent.places import Places
+from agent.places import Places, log_directory
+from agent.streams import OutputLogs
 from checkpoint.errors import StoreError
-from checkpoint.model import Position
-from failover.core.acts import Admit
+from checkpoint.format import encode_bytes
+from checkpoint.model import Position, Snapshot
+from checkpoint.store import open_store
+from failover.core.acts import Accept, Admit, Discard, Show
 from failover.core.events import StoreFailed
 from failover.core.messages import Offer
 from failover.core.types import ComponentSpec
+from tests.checkpoint.snapshots import COMPONENT, history
 
 NAME = "/lab/mapper"
 
@@ -90,3 +94,105 @@ def test_a_snapshot_whose_facts_are_no_facts_is_refused_by_name(tmp_path: Path) 
     assert isinstance(failed, StoreFailed)
     assert failed.sender == "robot1"
     assert f"cannot keep a snapshot of {NAME} from robot1: its snapshot says something" in failed.message
+
+
+class Standing:
+    """A standby's deposit over a real store, and what the core would hear of it."""
+
+    def __init__(self, directory: Path) -> None:
+        self.told: list[Any] = []
+        self.accepted: list[int] = []
+        self.store = open_store(directory / "store")
+        self._directory = directory
+        self._places = Places(directory, directory / "logs", cast(Any, Nursery()))
+        self.deposit = Deposit(self.store, self._places, self.told.append, self._accept)
+        self.deposit.admit(Admit(COMPONENT, 1, "robot1"))
+
+    def _accept(self, offer: Offer, snapshot: Snapshot) -> None:
+        self.accepted.append(snapshot.position.sequence)
+
+    async def take(self, made: Snapshot) -> None:
+        """It arrives from the primary."""
+        path = self._directory / "arrived"
+        path.write_bytes(encode_bytes(made))
+        offer = Offer(1, COMPONENT, 1, made.position, made.parent, path.stat().st_size, b"", ComponentSpec(COMPONENT))
+        with path.open("rb") as file:
+            await self.deposit.take("robot1", offer, file.fileno())
+
+    def seen(self) -> bytes:
+        """What a reader of its output sees here."""
+        logs = OutputLogs(log_directory(COMPONENT, self._places))
+        try:
+            return logs.read(1, 0).content
+        finally:
+            logs.close()
+
+
+def test_readers_see_what_counts_as_acknowledged_and_not_what_is_merely_stored(tmp_path: Path) -> None:
+    first, second, third = history(3)
+
+    async def story() -> None:
+        standing = Standing(tmp_path)
+        for made in (first, second, third):
+            await standing.take(made)
+        assert [event.position.sequence for event in standing.told] == [1, 2, 3], "the core hears of each"
+        assert standing.seen() == b"", "the core has said nothing yet"
+        assert standing.accepted == []
+        for made in (first, second):
+            standing.deposit.accept(Accept(COMPONENT, 1, made.position))
+        assert standing.accepted == [1, 2]
+        assert standing.seen() == b""
+        await standing.deposit.show(Show(COMPONENT, 1, first.position))
+        assert standing.seen() == b"ready\n"
+        await standing.deposit.show(Show(COMPONENT, 1, second.position))
+        assert standing.seen() == b"ready\nline 2\n"
+
+    asyncio.run(story())
+
+
+def test_a_snapshot_that_the_core_does_not_accept_leaves_nothing(tmp_path: Path) -> None:
+    """The robot had claimed the component while it was being stored: it goes on from the one before."""
+    first, second = history(2)
+
+    async def story() -> None:
+        standing = Standing(tmp_path)
+        await standing.take(first)
+        standing.deposit.accept(Accept(COMPONENT, 1, first.position))
+        await standing.deposit.show(Show(COMPONENT, 1, first.position))
+        await standing.take(second)
+        await standing.deposit.discard(Discard(COMPONENT, 1, second.position))
+        assert standing.store.positions(COMPONENT) == (first.position,)
+        assert standing.seen() == b"ready\n"
+        assert standing.accepted == [1]
+
+    asyncio.run(story())
+
+
+def test_a_position_that_others_continue_is_not_forgotten(tmp_path: Path) -> None:
+    first, second = history(2)
+
+    async def story() -> None:
+        standing = Standing(tmp_path)
+        await standing.take(first)
+        await standing.take(second)
+        await standing.deposit.discard(Discard(COMPONENT, 1, first.position))
+        assert standing.store.positions(COMPONENT) == (first.position, second.position)
+
+    asyncio.run(story())
+
+
+def test_after_a_restart_only_what_the_newest_snapshot_continues_is_shown_until_the_core_says_more(tmp_path: Path) -> None:
+    made = history(3)
+
+    async def story() -> None:
+        standing = Standing(tmp_path)
+        for one in made:
+            await standing.take(one)
+        standing.store.close()
+        again = Standing(tmp_path)
+        again.deposit.mend_logs(())
+        assert again.seen() == b"ready\nline 2\n"
+        await again.deposit.show(Show(COMPONENT, 1, made[-1].position))
+        assert again.seen() == b"ready\nline 2\nline 3\n"
+
+    asyncio.run(story())

@@ -51,7 +51,7 @@ class Fickle(ReadyCopy):
         component = Slow()
         component.allowed.set()
         self._ready = Ready(cast(Any, component), cast(Any, None))
-        self.stored()
+        self._news.set()
 
     async def _bring_on(self, position: Any = None) -> None:
         raise RestoreError("its processes are others by now")

@@ -63,6 +63,9 @@ class Deeds:
                 self._ship(robot, act)
             case acts.Acknowledge():
                 robot.keeper[act.component] = act.position
+            case acts.Discard():
+                kept = robot.store.get(act.component, [])
+                robot.store[act.component] = [position for position in kept if position != act.position]
             case acts.Admit():
                 robot.admitted[act.component] = (act.sender, act.epoch)
             case acts.Forget():
@@ -259,7 +262,8 @@ class Deeds:
                 )
             else:
                 keeps = act.spec.launch.engine == KEEPS_STATE
-                stored = Stored(act.component, epoch_of(act.position), act.position, sender, act.spec, keeps)
+                told = act.acknowledged
+                stored = Stored(act.component, epoch_of(act.position), act.position, sender, act.spec, keeps, told)
                 self._write(robot, act.component, act.position, stored)
 
         self._world.after(self._world.soon(1, 10) * robot.slow, done)

@@ -8,6 +8,7 @@ from checkpoint.model import Position
 from failover.core import acts
 from failover.core.messages import ORDERED, Beat
 from failover.core.types import ENDED, Ballot, ComponentView, OnLoss, State, WhenAlone
+from tests.simulation.deeds import epoch_of
 from tests.simulation.robots import NewDisk, ballot_of
 from tests.simulation.world import World
 
@@ -27,6 +28,8 @@ class Invariants:
         gone: positions that were on a disk that was lost.
         split: components that computed in two places at once (allowed under ``run``, after a cut).
         acknowledged: newest position that each component's primaries acknowledged while a standby held it.
+        seen: how far readers have seen each component, by the epoch of what they saw.
+        begun: where the copy of each epoch began.
         ordered: components and the epochs that an operator's order claimed: it may cost what was acknowledged.
         last: components whose end was reported as acknowledged.
     """
@@ -42,6 +45,8 @@ class Invariants:
     shipped: dict[str, Position] = field(default_factory=dict)
     owners: dict[tuple[str, int], str] = field(default_factory=dict)
     ordered: set[tuple[str, int]] = field(default_factory=set)
+    seen: dict[str, dict[int, Position]] = field(default_factory=dict)
+    begun: dict[str, dict[int, int]] = field(default_factory=dict)
     last: set[str] = field(default_factory=set)
     crashing: set[tuple[str, str]] = field(default_factory=set)
 
@@ -64,12 +69,16 @@ class Invariants:
                 self.shipped[what.component] = what.position
             case acts.Acknowledge():
                 self._acknowledged(world, robot, what)
+            case acts.Show():
+                self._shown(world, robot, what)
             case acts.Start():
                 self._one_primary(world, robot, what)
                 self._nothing_is_held(world, robot, what)
+                self._after_what_was_seen(world, robot, what, 0 if what.component in self.acknowledged else -1)
             case acts.Restore():
                 self._one_primary(world, robot, what)
                 self._not_older(world, robot, what)
+                self._after_what_was_seen(world, robot, what, world.values[what.position])
             case acts.Warm():
                 if what.component in world.robots[robot].programs:
                     raise _broken(world, f"{robot}: {what.component} is to wait where it runs")
@@ -145,6 +154,32 @@ class Invariants:
         if elsewhere:
             before = self.acknowledged.get(act.component)
             self.acknowledged[act.component] = act.position if before is None else max(before, act.position)
+
+    def _shown(self, world: World, robot: str, act: acts.Show) -> None:
+        """Readers see what was written up to there: it is in the past of every later copy, and of every copy that there is."""
+        if act.position not in world.robots[robot].store.get(act.component, []):
+            raise _broken(world, f"{robot} shows what {act.component} wrote up to {act.position}, which it does not hold")
+        epoch, value = epoch_of(act.position), world.values[act.position]
+        for later, begin in self.begun.get(act.component, {}).items():
+            if later > epoch and value > begin and act.component not in self.split:
+                raise _broken(
+                    world, f"{robot} shows {act.position} of {act.component}, which is not in the past of epoch {later}"
+                )
+        seen = self.seen.setdefault(act.component, {})
+        seen[epoch] = max(act.position, seen.get(epoch, act.position), key=world.values.__getitem__)
+
+    def _after_what_was_seen(self, world: World, robot: str, act: acts.Start | acts.Restore, begin: int) -> None:
+        """No copy begins before what readers have seen of earlier ones."""
+        is_lost = (act.component, act.epoch) in self.ordered or act.component in self.split or begin < 0
+        if is_lost:
+            self.seen.pop(act.component, None)
+            self.begun.pop(act.component, None)
+            return
+        for epoch, position in self.seen.get(act.component, {}).items():
+            is_before = epoch < act.epoch and world.values[position] > begin
+            if is_before and self._is_held(world, act.component, position):
+                raise _broken(world, f"{robot} begins {act.component} before {position}, of which readers have seen the output")
+        self.begun.setdefault(act.component, {}).setdefault(act.epoch, begin)
 
     def _is_held(self, world: World, component: str, position: Position) -> bool:
         """Whether any disk still has as much as that."""

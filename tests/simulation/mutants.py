@@ -85,6 +85,29 @@ def early_acknowledgement() -> Any:
     return patch.object(replication, "captured", hasty)
 
 
+def shown_when_stored() -> Any:
+    """Readers see the output of a snapshot as soon as it is stored, whether or not the rules have accepted it."""
+    honest = replication.stored
+
+    def hasty(component: Component, turn: Turn, event: Any) -> None:
+        turn.order(acts.Show(component.name, component.epoch, event.position))
+        honest(component, turn, event)
+
+    return patch.object(replication, "stored", hasty)
+
+
+def shown_when_accepted() -> Any:
+    """Under majority readers see what their robot has accepted, though the primary has not acknowledged it."""
+    honest = replication.stored
+
+    def hasty(component: Component, turn: Turn, event: Any) -> None:
+        honest(component, turn, event)
+        if event.position in component.held:
+            component.vouched = event.position
+
+    return patch.object(replication, "stored", hasty)
+
+
 def no_base_for_the_lost() -> Any:
     """A delta is sent although the standby does not have its parent."""
     honest = replication._standby_entry
@@ -358,6 +381,7 @@ MUTANTS: tuple[Mutant, ...] = (
     no_grace,
     waits_for_ever,
     waits_where_it_may_not_run,
+    shown_when_stored,
 )
 
 
@@ -382,6 +406,8 @@ ELECTIVE_MUTANTS: tuple[Mutant, ...] = (
     oldest_checkpoint,
     same_epoch_again,
     runs_the_finished,
+    shown_when_stored,
+    shown_when_accepted,
 )
 """Mistakes that lives of voting teams catch."""
 

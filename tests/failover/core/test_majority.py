@@ -10,8 +10,8 @@ from failover.core import acts
 from failover.core.component import Component
 from failover.core.consent import STATES
 from failover.core.election import placing
-from failover.core.events import Captured, Handover, Received, Run, Started, Tick
-from failover.core.messages import FREE, Beat, Echo, Entry
+from failover.core.events import Captured, Handover, Received, Run, Started, Stored, Tick
+from failover.core.messages import FREE, SAFE, Beat, Echo, Entry
 from failover.core.node import Node
 from failover.core.types import MS, Ballot, ComponentSpec, Config, Held, Launch, Record, Rule, Rules, State, WhenAlone
 from failover.errors import RulesError
@@ -310,3 +310,22 @@ def test_of_robots_with_the_same_checkpoint_the_preferred_one_then_the_least_loa
 def test_roles_that_contradict_each_other_are_refused(settings: dict[str, object]) -> None:
     with pytest.raises(RulesError):
         Config("robot1", ("robot2",), **settings)  # type: ignore[arg-type]
+
+
+def test_a_voters_standby_shows_output_only_as_far_as_its_primary_says_that_it_is_acknowledged() -> None:
+    """A robot that holds less may be elected as long as a majority has not noted who holds this."""
+    config = Config("robot1", ("robot2", "robot3"), rule=Rule.MAJORITY, grace_ms=300)
+    talk, first, second = Talk(config), Position(65, 1, b"d"), Position(65, 2, b"e")
+    talk.tick(1_000)
+    talk.hear("robot2", entry(State.PRIMARY, 1, "robot2", first))
+    assert shown(talk.node.step(Stored(NAME, 1, first, "robot2", SPEC), talk.now_ns)) == []
+    told = Stored(NAME, 1, second, "robot2", SPEC, acknowledged=first)
+    assert shown(talk.node.step(told, talk.now_ns)) == [first]
+    assert shown(talk.hear("robot2", entry(State.PRIMARY, 1, "robot2", second))) == []
+    assert shown(talk.hear("robot2", entry(State.PRIMARY, 1, "robot2", second, flags=SAFE))) == [second]
+    assert shown(talk.hear("robot2", entry(State.PRIMARY, 1, "robot2", second, flags=SAFE))) == []
+
+
+def shown(ready: acts.Ready) -> list[Position]:
+    """How far readers may see from now on."""
+    return [act.position for act in ready.act if isinstance(act, acts.Show)]

@@ -217,6 +217,27 @@ def test_who_takes_a_component_over_takes_no_more_snapshots_of_it() -> None:
     assert acts.Admit(SPEC.name, 2, "") in ordered
 
 
+def test_a_snapshot_that_comes_after_the_claim_is_neither_accepted_nor_shown() -> None:
+    """It was being stored when the standby claimed; the claim goes on from the one before."""
+    node, first, late = Node(PAIR, 1, Ballot(), 0), Position(65, 1, b"d"), Position(65, 2, b"e")
+    entry = Entry(SPEC.name, STATES.index(State.PRIMARY), 1, "robot2", standby="robot1")
+    node.step(Received(Beat("robot2", 1, 1, 1, 0, 1, (Echo("robot1", 1, 1),), (entry,)), "wire"), 10 * MS)
+    taken = node.step(Stored(SPEC.name, 1, first, "robot2", SPEC), 20 * MS).act
+    assert acts.Accept(SPEC.name, 1, first) in taken
+    assert acts.Show(SPEC.name, 1, first) in taken
+    ordered = [act for at in range(30, 2_000, 10) for act in node.step(Tick(), at * MS).act]
+    assert [act.position for act in ordered if isinstance(act, acts.Restore)] == [first]
+    assert node.step(Stored(SPEC.name, 1, late, "robot2", SPEC), 2_000 * MS).act == (acts.Discard(SPEC.name, 2, late),)
+
+
+def test_after_a_restart_a_standby_shows_what_it_holds_of_the_present_primacy_and_no_earlier_copy_of_its_own() -> None:
+    ours, theirs = Position(64, 9, b"d"), Position(64 * 2 + 1, 3, b"e")
+    record = Record(SPEC.name, 2, "robot2", State.STANDBY, spec=SPEC)
+    for held, shown in (((ours,), []), ((ours, theirs), [theirs])):
+        node = Node(PAIR, 2, Ballot((record,)), 0, (Held(SPEC.name, held),))
+        assert [act.position for act in only(node.step(Tick(), 1 * MS), acts.Show)] == shown
+
+
 def test_an_entry_from_before_the_last_change_is_not_acted_on() -> None:
     peer = Peer("robot2", 0)
     own = ("robot1", 1)
