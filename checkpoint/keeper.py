@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 import checkpoint
-from checkpoint import carried, chain, channel, engine, foreign, format, side_by_side
+from checkpoint import carried, chain, channel, engine, foreign, format, lean, side_by_side
 from checkpoint.channel import Channel, ChannelClosedError, ChannelError, Failed, Reply, Request
 from checkpoint.digests_of_files import DigestsOfFiles
 from checkpoint.engine import CaptureOrder, Copy, Engine, ProtectOrder, Restored, RestoreOptions, Session, Streams
@@ -373,6 +373,7 @@ def _become(owner: Owner) -> None:
 
     All of us is loaded before: that user may have no right to read where we are installed.
     """
+    lean.load_seldom_used()
     for module in pkgutil.walk_packages(checkpoint.__path__, "checkpoint."):
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
