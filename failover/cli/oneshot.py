@@ -25,6 +25,7 @@ from checkpoint.engine import Terms
 from checkpoint.errors import (
     CaptureError,
     ChainError,
+    CheckpointError,
     FormatError,
     NothingCommittedError,
     ProbeError,
@@ -250,7 +251,12 @@ def _restored(arguments: argparse.Namespace, file: int, author: Author | None) -
     birth = birth_of(state, elapsed_ns, own_session=not arguments.wait)
     owner = author.owner if author is not None else None
     reduced = _reduced(arguments.file, state, author) if author is not None else ()
-    with contextlib.ExitStack() as opened, Keeper.spawn() as keeper, _born(_owned(birth, state, owner, opened)) as born:
+    with (
+        _told_of(reduced),
+        contextlib.ExitStack() as opened,
+        Keeper.spawn() as keeper,
+        _born(_owned(birth, state, owner, opened)) as born,
+    ):
         order = Restore(
             born.pid, state.component, elapsed_ns, terms=terms, stood_still=terms.connections, follow=False, bound=owner
         )
@@ -270,6 +276,16 @@ def _reduced(path: str, state: State, author: Author) -> tuple[str, ...]:
         return ()
     cure = f"if {author.name} may run that as root: failover restore --trust {shlex.quote(path)}"
     return (f"{author.why}: the program has the rights of {author.name} and no more. It asks for {', '.join(asked)}; {cure}",)
+
+
+@contextmanager
+def _told_of(reduced: tuple[str, ...]) -> Iterator[None]:
+    """Add to what comes to nothing that it was tried with less than was asked for."""
+    try:
+        yield
+    except CheckpointError as error:
+        error.args = ("; ".join((str(error), *reduced)),)
+        raise
 
 
 def _owned(birth: Birth, state: State, owner: Owner | None, opened: contextlib.ExitStack) -> Birth:
