@@ -23,13 +23,18 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
+from agent.bounds import check_rights
 from checkpoint import authors, format, rights
 from checkpoint.chain import position_of
-from checkpoint.errors import AuthorError, CheckpointError
+from checkpoint.channel import Restore, Restored, Resume, Resumed
+from checkpoint.errors import AuthorError, CheckpointError, MismatchError
 from checkpoint.linux import kinship, procfs
+from checkpoint.linux.inheritance import Inheritance
+from checkpoint.linux.vessel import Birth, discard, spawn_vessel
 from checkpoint.model import Credentials, Fact, Member, Resource, Snapshot
 from checkpoint.rights import Owner
 from checkpoint.state import decode_state, encode_state
+from failover.cli.keeper import Keeper
 from tests.failover.cli.test_oneshot import has_ended, wait_for
 from tests.failover.cli.test_verbs import failover
 
@@ -148,6 +153,8 @@ def more_than(uid: int, pid: int) -> Iterator[str]:
             int(procfs.parse_fields((descriptor.parents[1] / "fdinfo" / descriptor.name).read_text())["flags"], 8),
         )
         wanted = {os.O_RDONLY: 0o4, os.O_WRONLY: 0o2, os.O_RDWR: 0o6}[flags & os.O_ACCMODE]
+        if os.readlink(descriptor).startswith(f"/proc/{os.getpid()}/"):
+            yield f"{os.readlink(descriptor)} is open"
         if about.st_uid != uid and about.st_mode & wanted != wanted and stat.S_IFMT(about.st_mode):
             yield f"{os.readlink(descriptor)} is open, which is of uid {about.st_uid}, mode {about.st_mode:o}"
 
@@ -259,6 +266,10 @@ ASKED: Mapping[str, tuple[Craft, str]] = {
         lambda one: with_file(ordinary(one), "/proc/sys/kernel/core_pattern", os.O_WRONLY, "kernel_files"),
         "core_pattern",
     ),
+    "a view of another process": (
+        lambda one: with_file(ordinary(one), f"/proc/{os.getpid()}/maps", os.O_RDONLY, "kernel_files"),
+        "Permission denied",
+    ),
     "memory of another process": (lambda one: with_file(ordinary(one), "/proc/1/mem", os.O_RDWR, "kernel_files"), "/proc/1/mem"),
     "executable": (
         lambda one: with_process(
@@ -300,6 +311,33 @@ def test_an_ordinary_user_gets_by_no_file_more_than_he_has(field: str, honest: S
         assert back.pid or back.ran.returncode == 1
         found = [one for pid in back.pids for one in more_than(OWNER, pid)]
         assert [one for one in found if not one.startswith("the login")] == [], "who belongs to no login may choose one"
+
+
+ROOTS_TO_GIVE = ("nice", "policy", "an OOM score", "Max ", "the login")
+"""What root gives to ordinary programs while they run, and what an agent therefore gives back (`agent.bounds`)."""
+
+
+@pytest.mark.parametrize("field", ASKED)
+def test_an_agent_of_root_gives_an_ordinary_owners_component_nothing_above_him(field: str, honest: Snapshot, place: Path) -> None:
+    """What a standby was sent is refused (`check_rights`), or comes back with its owner's rights."""
+    crafted = ASKED[field][0](honest)
+    try:
+        check_rights("/lab/r1/mapper", crafted, OWNER, Inheritance(OWNER, NO_GROUP))
+    except MismatchError:
+        return
+    null = os.open(os.devnull, os.O_RDWR)
+    file = os.open(written(crafted, place / "file", 0), os.O_RDONLY)
+    isolate = crafted.process.isolated
+    born = spawn_vessel(Birth(crafted.process.pid, isolate, crafted.clocks if isolate else None, stdio=(null, null, null)))
+    try:
+        with Keeper.spawn() as keeper, contextlib.suppress(CheckpointError):
+            keeper.ask(Restore(born.pid, "/lab/r1/mapper", own_eyes=True, follow=False), Restored, (file,))
+            keeper.ask(Resume(), Resumed)
+            assert [one for one in more_than(OWNER, born.pid) if not one.startswith(ROOTS_TO_GIVE)] == []
+    finally:
+        discard(born)
+        os.close(file)
+        os.close(null)
 
 
 @pytest.mark.parametrize("words", [("--trust",), ()])
