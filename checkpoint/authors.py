@@ -22,7 +22,6 @@ from msgspec import Struct
 
 from checkpoint.errors import AuthorError
 from checkpoint.linux import mounts
-from checkpoint.resources import writers
 from checkpoint.rights import Owner
 
 ROOT: Final = 0
@@ -69,8 +68,8 @@ def author_of(file: int, path: str) -> Author:
         raise _unknown(
             path, f"others than its owner may write to it (mode {stat.S_IMODE(about.st_mode):o})", f"chmod go-w {path}"
         )
-    if who := _writer_of(file):
-        raise _unknown(path, f"{who} has it open for writing", "end that process first")
+    if _is_being_written(file):
+        raise _unknown(path, "a process has it open for writing", f"end that process first (fuser -v {path} shows it)")
     if about.st_uid != ROOT:
         return _author(about.st_uid, f"{path} belongs to {named(about.st_uid)}")
     if not _tells_true_owners(file, path):
@@ -106,16 +105,18 @@ def _unknown(path: str, why: str, cure: str = "") -> AuthorError:
     return AuthorError(f"whose rights {path} may have cannot be told: {why}; {first}trust it with all rights of root (--trust)")
 
 
-def _writer_of(file: int) -> str:
-    """Who has the file open, or mapped, for writing: a change of owner or mode does not take that back."""
+def _is_being_written(file: int) -> bool:
+    """Whether a process has the file open, or mapped, for writing: a change of owner or mode does not take that back.
+
+    The kernel grants a lease to read only where none has. Of a file system without leases that is not known.
+    """
     try:
         fcntl.fcntl(file, fcntl.F_SETSIG, signal.SIGURG)  # who opens it meanwhile waits for us; SIGIO would kill us
         fcntl.fcntl(file, fcntl.F_SETLEASE, fcntl.F_RDLCK)
         fcntl.fcntl(file, fcntl.F_SETLEASE, fcntl.F_UNLCK)
-        return ""
     except OSError as error:
-        pid = writers.writer_of(f"/proc/self/fd/{file}", frozenset())
-        return f"pid {pid}" if pid else "a process" if error.errno == errno.EAGAIN else ""
+        return error.errno == errno.EAGAIN
+    return False
 
 
 def _tells_true_owners(file: int, path: str) -> bool:

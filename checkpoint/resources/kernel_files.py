@@ -165,7 +165,7 @@ def mismatches(held: Resource) -> Iterator[str]:
     """Why it is not here."""
     path, flags = str(held.facts["path"]), number_of(held.facts["flags"])
     if not (path.startswith((OWN, ENDED)) or _only_reads(flags)):  # none is captured so: `refuse`
-        yield f"{path}, open as {held.name} for writing, acts on this machine's kernel: a program opens such a file itself"
+        yield f"{path}, {held.name}, is open for writing, by which it acts on this machine's kernel: let it be opened only to write"
     if not (path.startswith((OWN, ENDED)) or _OF_A_PROCESS.fullmatch(path) or os.path.exists(path)):
         yield f"{path}, open as {held.name}, is not offered by this kernel: boot the same one, or attach what it shows"
 
@@ -180,7 +180,7 @@ def refuse_user(held: Resource, known: Container[int], *, isolated: bool) -> Ite
     path = os.path.normpath(str(held.facts.get("path", "")))
     is_opened = held.kind == ON_DISK and not number_of(held.facts.get("flags", 0)) & O_PATH
     if is_opened and any(f"{path}/".startswith(f"{place}/") for place in PLACES):
-        yield f"{path}, open as {held.name}, is told to be a file on a disk: capture it again"
+        yield f"{path}, open as {held.name}, is a part of this machine's kernel that cannot be opened again as a file on a disk"
     match = _OF_A_PROCESS.fullmatch(path)
     if match and int(match[1]) not in known and not (isolated and int(match[1]) == INIT):
         yield f"{path}, open as {held.name}, is a view of another process: let the program close it after reading"
