@@ -165,7 +165,7 @@ def mismatches(held: Resource) -> Iterator[str]:
     """Why it is not here."""
     path, flags = str(held.facts["path"]), number_of(held.facts["flags"])
     if not (path.startswith((OWN, ENDED)) or _only_reads(flags)):  # none is captured so: `refuse`
-        yield f"{path}, {held.name}, is open for writing, by which it acts on this machine's kernel: let it be opened only to write"
+        yield f"{path}, {held.name}, is open for writing, by which it acts on this machine's kernel: open it only to write"
     if not (path.startswith((OWN, ENDED)) or _OF_A_PROCESS.fullmatch(path) or os.path.exists(path)):
         yield f"{path}, open as {held.name}, is not offered by this kernel: boot the same one, or attach what it shows"
 
