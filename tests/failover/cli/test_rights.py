@@ -25,6 +25,7 @@ from msgspec.structs import replace
 
 from agent.bounds import check_rights
 from checkpoint import authors, format, rights
+from checkpoint.carried import Entry, Tree
 from checkpoint.chain import position_of
 from checkpoint.channel import Restore, Restored, Resume, Resumed
 from checkpoint.errors import AuthorError, CheckpointError, MismatchError
@@ -379,6 +380,36 @@ def test_each_process_of_several_and_each_thread_has_its_owners_rights_at_most(t
         assert len(set(back.pids)) == 3
         assert {procfs.status(pid).uids[1] for pid in back.pids} == {0 if trusted else OWNER}
         assert trusted or [one for pid in back.pids for one in more_than(OWNER, pid)] == []
+
+
+def carrying(honest: Snapshot, path: Path) -> Snapshot:
+    """With a program of root's, set-user-ID, that is to be laid down at a path."""
+    mark = b"\1\0\0\2" + bytes.fromhex("ffffffff") + bytes(12)
+    entry = Entry(
+        b"", stat.S_IFREG | 0o4755, 0, 0, 1, place=0, attributes=(("security.capability", mark), ("user.colour", b"red"))
+    )
+    crafted = ordinary(honest)
+    return replace(crafted, resources=(*crafted.resources, Tree(str(path), (entry,)).resource()))
+
+
+def test_files_that_travel_with_it_are_laid_down_with_the_owners_rights_and_through_no_link(
+    honest: Snapshot, place: Path
+) -> None:
+    theirs, ours = place / "theirs", place / "ours"
+    for folder in (theirs, ours):
+        folder.mkdir()
+    (theirs / "link").symlink_to(ours)
+    os.chown(theirs, OWNER, OWNER)
+    for path in (ours / "program", theirs / "link" / "program", Path("/etc/cron.d/crafted")):
+        with restored(written(carrying(honest, path), place / "file")) as back:
+            assert (back.pid, back.ran.returncode) == (0, 1)
+            assert "Permission denied" in back.error, back.error
+            assert not path.exists()
+    with restored(written(carrying(honest, theirs / "program"), place / "file")) as back:
+        assert back.pid, back.error
+        about = (theirs / "program").stat()
+        assert (about.st_uid, about.st_gid) == (OWNER, NO_GROUP)
+        assert "security.capability" not in os.listxattr(theirs / "program")
 
 
 def test_inspect_says_with_which_rights_it_comes_back(honest: Snapshot, place: Path) -> None:
