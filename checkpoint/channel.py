@@ -311,13 +311,14 @@ class Compare(msgspec.Struct, frozen=True, tag=True):
     """Look whether the program of a snapshot could go on here; with a descriptor: its newest snapshot. Answer: `Compared`.
 
     Attributes:
-        contents, terms: see `checkpoint.engine.RestoreOptions`.
+        contents, terms, own_eyes: see `checkpoint.engine.RestoreOptions`.
         known: what the last `Compared` told, so that only files that have changed are read again.
     """
 
     contents: str = ""
     terms: Terms = NO_TERMS
     known: tuple[KnownDigest, ...] = ()
+    own_eyes: bool = False
 
 
 class OpenFile(msgspec.Struct, frozen=True, tag=True):

@@ -313,7 +313,8 @@ class Keeper:
         chosen = self._tracer if outline.engine == self._tracer.name else engine.engine_named(outline.engine)
         digests = DigestsOfFiles(request.known)
         with foreign.facts(f"compare {outline.component} with what is here"):
-            found = chosen.lacks(outline, RestoreOptions(contents=request.contents, terms=request.terms), digests.of)
+            options = RestoreOptions(own_eyes=request.own_eyes, contents=request.contents, terms=request.terms)
+            found = chosen.lacks(outline, options, digests.of)
         return channel.Compared(found, tuple(digests.used.values())), ()
 
     def _open_file(self, request: channel.OpenFile, _: Descriptors) -> Answer:

@@ -65,7 +65,7 @@ class Birth(Struct, frozen=True):
         clocks: the reading its monotonic and boot time are to go on from; None: this machine's clocks are right for it.
         elapsed_ns: time since that reading, as it was at ``counted_ns`` on CLOCK_BOOTTIME; 0: as it is now.
         stdio: our descriptors that become its 0, 1 and 2; all others are closed.
-        own_session: make it the leader of a session, with standard input as its terminal if that is one.
+        own_session: make it the leader of a session, with standard input as its terminal if that is one and nobody's yet.
         die_with_parent: SIGKILL it when the calling thread ends.
         inheritance: whose rights, limits and priorities it gets; None: ours. A vessel keeps the right that a restore takes.
         brought: files of the program that are to be there; they are shown to it where its own are missing.
@@ -328,7 +328,8 @@ def _grow_up(
         os.setsid()
     _take_stdio(birth.stdio)
     if birth.own_session and os.isatty(0):
-        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+        with contextlib.suppress(PermissionError):  # it is that of the session of whoever restores by hand, and stays so
+            fcntl.ioctl(0, termios.TIOCSCTTY, 0)
     _forget_signals()
     namespaces.close_others_on_exec(3)
     if birth.inheritance is not None:

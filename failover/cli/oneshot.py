@@ -298,17 +298,16 @@ def _owned(birth: Birth, state: State, owner: Owner | None, opened: contextlib.E
 
 
 def _without_terminal(opened: contextlib.ExitStack) -> tuple[int, int, int]:
-    """Our standard streams for who is not to read what is typed: terminals open for writing alone, no standard input."""
+    """Our standard streams for who is not to read what is typed: a terminal is open for writing alone."""
 
-    def again(stream: int, path: str, flags: int) -> int:
+    def unread(stream: int) -> int:
         if not os.isatty(stream):
             return stream
-        descriptor = os.open(path, flags | os.O_NOCTTY | os.O_CLOEXEC)
+        descriptor = os.open(f"/proc/self/fd/{stream}", os.O_WRONLY | os.O_NOCTTY | os.O_CLOEXEC)
         opened.callback(os.close, descriptor)
         return descriptor
 
-    outputs = [again(stream, f"/proc/self/fd/{stream}", os.O_WRONLY) for stream in (1, 2)]
-    return again(0, os.devnull, os.O_RDONLY), outputs[0], outputs[1]
+    return unread(0), unread(1), unread(2)
 
 
 def birth_of(state: State, elapsed_ns: int, own_session: bool) -> Birth:

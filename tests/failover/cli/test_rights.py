@@ -6,8 +6,10 @@ Each field of a snapshot that carries authority is changed by the project's own 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
+import pty
 import random
 import resource
 import shutil
@@ -15,6 +17,7 @@ import signal
 import stat
 import subprocess
 import sys
+import termios
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -410,6 +413,51 @@ def test_files_that_travel_with_it_are_laid_down_with_the_owners_rights_and_thro
         about = (theirs / "program").stat()
         assert (about.st_uid, about.st_gid) == (OWNER, NO_GROUP)
         assert "security.capability" not in os.listxattr(theirs / "program")
+
+
+def at_a_terminal(words: list[str]) -> tuple[int, str]:
+    """Run the command in a session of its own at a new terminal: our end of that, and what the command has written there."""
+    ours, theirs = pty.openpty()
+
+    def sit_down() -> None:
+        os.setsid()
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+    command = [sys.executable, "-m", "failover", *words]
+    with subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs, preexec_fn=sit_down) as ran:
+        os.close(theirs)
+        said = ""
+        while not said.strip().partition("\n")[0].strip().isdigit() and ran.poll() is None:
+            said += os.read(ours, 4096).decode()
+    return ours, said
+
+
+@pytest.mark.parametrize("trusted", [False, True])
+def test_a_users_program_that_root_brings_back_reads_nothing_that_is_typed_at_roots_terminal(trusted: bool, place: Path) -> None:
+    seen, terminal = pty.openpty()
+
+    def sit_down() -> None:
+        os.setsid()
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+    words = ["sleep", "1000"]
+    with subprocess.Popen(words, cwd="/", stdin=terminal, stdout=terminal, stderr=terminal, preexec_fn=sit_down) as program:
+        ran = failover("capture", str(program.pid), "-o", str(place / "file"))
+        program.kill()
+    assert ran.returncode == 0, ran.stderr
+    os.chown(place / "file", OWNER, OWNER)
+    ours, said = at_a_terminal(["restore", *(["--trust"] if trusted else []), str(place / "file")])
+    pid = int(said.split()[0])
+    try:
+        fields = procfs.parse_fields(Path(f"/proc/{pid}/fdinfo/0").read_text())
+        assert int(fields["flags"], 8) & os.O_ACCMODE == (os.O_RDWR if trusted else os.O_WRONLY)
+        assert os.readlink(f"/proc/{pid}/fd/1").startswith("/dev/pts/")
+        assert procfs.status(pid).uids[1] == (0 if trusted else OWNER)
+    finally:
+        os.kill(pid, signal.SIGKILL)
+        wait_for("its end", lambda: has_ended(pid))
+        for descriptor in (ours, seen, terminal):
+            os.close(descriptor)
 
 
 def test_inspect_says_with_which_rights_it_comes_back(honest: Snapshot, place: Path) -> None:
