@@ -31,7 +31,7 @@ from checkpoint import authors, format, rights
 from checkpoint.carried import Entry, Tree
 from checkpoint.chain import position_of
 from checkpoint.channel import Restore, Restored, Resume, Resumed
-from checkpoint.errors import AuthorError, CheckpointError, MismatchError
+from checkpoint.errors import AuthorError, CheckpointError
 from checkpoint.linux import kinship, procfs
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.linux.vessel import Birth, discard, spawn_vessel
@@ -321,27 +321,32 @@ ROOTS_TO_GIVE = ("nice", "policy", "an OOM score", "Max ", "the login")
 """What root gives to ordinary programs while they run, and what an agent therefore gives back (`agent.bounds`)."""
 
 
+def given_by_an_agent(crafted: Snapshot, file: Path) -> list[str]:
+    """What an agent of root gives an ordinary owner's component above what that owner, or root while it ran, could give it."""
+    try:
+        check_rights("/lab/r1/mapper", crafted, OWNER, Inheritance(OWNER, NO_GROUP))
+    except CheckpointError:
+        return []
+    null = os.open(os.devnull, os.O_RDWR)
+    source = os.open(written(crafted, file, 0), os.O_RDONLY)
+    isolate = crafted.process.isolated
+    with contextlib.ExitStack() as held:
+        held.callback(os.close, null)
+        held.callback(os.close, source)
+        held.enter_context(contextlib.suppress(CheckpointError))
+        born = spawn_vessel(Birth(crafted.process.pid, isolate, crafted.clocks if isolate else None, stdio=(null, null, null)))
+        held.callback(discard, born)
+        with Keeper.spawn() as keeper:
+            keeper.ask(Restore(born.pid, "/lab/r1/mapper", own_eyes=True, follow=False), Restored, (source,))
+            keeper.ask(Resume(), Resumed)
+            return [one for one in more_than(OWNER, born.pid) if not one.startswith(ROOTS_TO_GIVE)]
+    return []
+
+
 @pytest.mark.parametrize("field", ASKED)
 def test_an_agent_of_root_gives_an_ordinary_owners_component_nothing_above_him(field: str, honest: Snapshot, place: Path) -> None:
     """What a standby was sent is refused (`check_rights`), or comes back with its owner's rights."""
-    crafted = ASKED[field][0](honest)
-    try:
-        check_rights("/lab/r1/mapper", crafted, OWNER, Inheritance(OWNER, NO_GROUP))
-    except MismatchError:
-        return
-    null = os.open(os.devnull, os.O_RDWR)
-    file = os.open(written(crafted, place / "file", 0), os.O_RDONLY)
-    isolate = crafted.process.isolated
-    born = spawn_vessel(Birth(crafted.process.pid, isolate, crafted.clocks if isolate else None, stdio=(null, null, null)))
-    try:
-        with Keeper.spawn() as keeper, contextlib.suppress(CheckpointError):
-            keeper.ask(Restore(born.pid, "/lab/r1/mapper", own_eyes=True, follow=False), Restored, (file,))
-            keeper.ask(Resume(), Resumed)
-            assert [one for one in more_than(OWNER, born.pid) if not one.startswith(ROOTS_TO_GIVE)] == []
-    finally:
-        discard(born)
-        os.close(file)
-        os.close(null)
+    assert given_by_an_agent(ASKED[field][0](honest), place / "file") == []
 
 
 @pytest.mark.parametrize("words", [("--trust",), ()])
@@ -657,6 +662,15 @@ def test_whatever_a_file_says_no_more_rights_come_of_it_and_no_traceback(seed: i
             assert back.pid or back.error, back.ran
             more = [one for pid in back.pids for one in more_than(OWNER, pid) if not (uid and one.startswith("the login"))]
             assert more == [], (seed, found)
+
+
+@pytest.mark.parametrize("seed", range(SEEDS // 2))
+def test_whatever_a_peer_sends_an_agent_gives_no_more_than_the_owner_has(seed: int, honest: Snapshot, place: Path) -> None:
+    chance = random.Random(-1 - seed)
+    told = with_file(ordinary(honest), "/proc/self/status", os.O_RDONLY, "kernel_files")
+    for found in range(CRAFTED_A_SEED):
+        if crafted := crafted_by_chance(told, chance):
+            assert given_by_an_agent(crafted, place / f"file-{found}") == [], (seed, found)
 
 
 def with_sample_resources(honest: Snapshot) -> Snapshot:
