@@ -152,11 +152,8 @@ def more_than(uid: int, pid: int) -> Iterator[str]:
         if hard > (0 if "priority" in name else ceilings[name]):
             yield f"{name} {hard}"
     for descriptor in Path(f"/proc/{pid}/fd").iterdir():
-        about, flags = (
-            descriptor.stat(),
-            int(procfs.parse_fields((descriptor.parents[1] / "fdinfo" / descriptor.name).read_text())["flags"], 8),
-        )
-        wanted = {os.O_RDONLY: 0o4, os.O_WRONLY: 0o2, os.O_RDWR: 0o6}[flags & os.O_ACCMODE]
+        about, told = descriptor.stat(), Path(f"/proc/{pid}/fdinfo/{descriptor.name}").read_text()
+        wanted = {os.O_RDONLY: 0o4, os.O_WRONLY: 0o2}.get(int(procfs.parse_fields(told)["flags"], 8) & os.O_ACCMODE, 0o6)
         if os.readlink(descriptor).startswith(f"/proc/{os.getpid()}/"):
             yield f"{os.readlink(descriptor)} is open"
         if about.st_uid != uid and about.st_mode & wanted != wanted and stat.S_IFMT(about.st_mode):
