@@ -68,7 +68,7 @@ def author_of(file: int, path: str) -> Author:
         raise _unknown(
             path, f"others than its owner may write to it (mode {stat.S_IMODE(about.st_mode):o})", f"chmod go-w {path}"
         )
-    if _is_being_written(file):
+    if _is_being_written(file, path):
         raise _unknown(path, "a process has it open for writing", f"end that process first (fuser -v {path} shows it)")
     if about.st_uid != ROOT:
         return _author(about.st_uid, f"{path} belongs to {named(about.st_uid)}")
@@ -105,17 +105,17 @@ def _unknown(path: str, why: str, cure: str = "") -> AuthorError:
     return AuthorError(f"whose rights {path} may have cannot be told: {why}; {first}trust it with all rights of root (--trust)")
 
 
-def _is_being_written(file: int) -> bool:
+def _is_being_written(file: int, path: str) -> bool:
     """Whether a process has the file open, or mapped, for writing: a change of owner or mode does not take that back.
 
-    The kernel grants a lease to read only where none has. Of a file system without leases that is not known.
+    The kernel grants a lease to read only where none has. Of a file system without leases, or of a network, that is not known.
     """
     try:
         fcntl.fcntl(file, fcntl.F_SETSIG, signal.SIGURG)  # who opens it meanwhile waits for us; SIGIO would kill us
         fcntl.fcntl(file, fcntl.F_SETLEASE, fcntl.F_RDLCK)
         fcntl.fcntl(file, fcntl.F_SETLEASE, fcntl.F_UNLCK)
     except OSError as error:
-        return error.errno == errno.EAGAIN
+        return error.errno == errno.EAGAIN and not mounts.network_mount(os.getpid(), os.path.realpath(path))
     return False
 
 
