@@ -1,24 +1,19 @@
-"""With whose rights a snapshot may come back: those of its owner, and no more.
+"""With whose rights a snapshot may come back: those of its owner, and no more (`checkpoint.rights`).
 
 An agent of root restores with root's rights; what a snapshot asks for is set. Priorities and limits come back as they were: root
 gives them to ordinary programs while they run (chrt, prlimit, RealtimeKit), and who hands snapshots in counts as root.
-
-Source: capabilities(7), on securebits.
 """
 
 from __future__ import annotations
 
 import os
-from typing import Final
 
 from agent.caller import ROOT
 from checkpoint import rights
 from checkpoint.errors import MismatchError
 from checkpoint.linux.inheritance import Inheritance
-from checkpoint.model import Credentials, Snapshot
-
-SECBIT_KEEP_CAPS: Final = 1 << 4
-"""The one of the securebits that anybody may set; execve(2) takes it back."""
+from checkpoint.model import Snapshot
+from checkpoint.rights import Owner
 
 
 def check_rights(name: str, outline: Snapshot, owner: int, started: Inheritance | None) -> None:
@@ -35,23 +30,10 @@ def check_rights(name: str, outline: Snapshot, owner: int, started: Inheritance 
     """
     if owner == ROOT or os.geteuid() != ROOT:
         return  # root may; where we are not root, there is nothing to be gained
-    groups = frozenset((started.gid, *started.groups)) if started is not None else None
-    if not all(_are_no_more(one, owner, groups) for one in rights.everybodys(outline)):
-        reason = f"it runs with other rights than those of its owner, uid {owner}"
-    elif rights.could_gain(outline):
-        reason = "it is under a seccomp filter, but may gain rights by what it executes (no_new_privs is off)"
-    elif {one.process.root_directory for one in outline.processes} != {"/"}:
-        reason = "it has a root directory of its own (chroot), by whose files it may gain rights"
-    elif any(one.securebits & ~SECBIT_KEEP_CAPS for one in rights.everybodys(outline)):
-        reason = "it has securebits, under which a set-user-id program may keep rights that it gives up"
-    else:
+    groups = (started.gid, *started.groups) if started is not None else None
+    theirs = Owner(owner, started.gid if started is not None else -1, groups)
+    if not (asked := tuple(dict.fromkeys(rights.beyond(outline, theirs)))):
         return
+    reason = f"it runs with other rights than those of its owner, uid {owner}: it has {', '.join(asked)}"
     reason += ": only a program of root may; start it as root"
     raise MismatchError(f"cannot restore {name}: {reason}", (reason,))
-
-
-def _are_no_more(theirs: Credentials, owner: int, groups: frozenset[int] | None) -> bool:
-    _, permitted, effective, _, ambient = theirs.capabilities
-    if set(theirs.uids) != {owner} or permitted | effective | ambient:
-        return False
-    return len(set(theirs.gids)) == 1 if groups is None else groups.issuperset((*theirs.gids, *theirs.groups))

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from typing import Final
 
 from agent.bounds import check_rights
+from agent.caller import ROOT
 from agent.charge import Charge
 from agent.errands import Errands
 from agent.errors import TROUBLE, RefusedError
@@ -75,7 +76,8 @@ async def _compared(around: Surroundings, charge: Charge, keeper: KeeperLink) ->
         if outline.engine == COOPERATIVE and around.here(name).command:
             return ()  # it is started by that
         terms = terms_here(spec.launch if spec is not None else None, around.here(name))
-        order = channel.Compare(around.places.contents, terms, charge.figures.digests)
+        is_ordinary = spec is not None and spec.owner != ROOT
+        order = channel.Compare(around.places.contents, terms, charge.figures.digests, own_eyes=is_ordinary)
         reply, _ = await keeper.dialogue.ask(order, (chain[-1],))
     finally:
         close_all(tuple(chain))

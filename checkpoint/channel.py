@@ -22,6 +22,7 @@ from checkpoint.digests_of_files import KnownDigest
 from checkpoint.engine import NO_TERMS, PTRACE, Report, Terms
 from checkpoint.errors import UNDECODABLE, CheckpointError
 from checkpoint.model import Position
+from checkpoint.rights import Owner
 
 INLINE: Final = b"\x00"
 IN_MEMFD: Final = b"\x01"
@@ -251,6 +252,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
         own_eyes, epoch, contents, stood_still: see `checkpoint.engine.RestoreOptions`.
         terms: those under which it is restored, and followed from then on.
         follow: protect it again as soon as it runs.
+        bound: see `checkpoint.engine.RestoreOptions`; the keeper becomes that user for good, before it looks at the snapshot.
     """
 
     pid: int
@@ -265,6 +267,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
     terms: Terms = NO_TERMS
     stood_still: bool = False
     follow: bool = True
+    bound: Owner | None = None
 
 
 class Lay(msgspec.Struct, frozen=True, tag=True):
@@ -308,13 +311,14 @@ class Compare(msgspec.Struct, frozen=True, tag=True):
     """Look whether the program of a snapshot could go on here; with a descriptor: its newest snapshot. Answer: `Compared`.
 
     Attributes:
-        contents, terms: see `checkpoint.engine.RestoreOptions`.
+        contents, terms, own_eyes: see `checkpoint.engine.RestoreOptions`.
         known: what the last `Compared` told, so that only files that have changed are read again.
     """
 
     contents: str = ""
     terms: Terms = NO_TERMS
     known: tuple[KnownDigest, ...] = ()
+    own_eyes: bool = False
 
 
 class OpenFile(msgspec.Struct, frozen=True, tag=True):

@@ -16,6 +16,7 @@ from checkpoint.device_rules import DeviceRule
 from checkpoint.digests_of_files import DigestOf
 from checkpoint.errors import ProbeError, RestoreError
 from checkpoint.model import Position, Snapshot
+from checkpoint.rights import Owner
 
 if TYPE_CHECKING:
     from checkpoint.stored_base import StoredBase
@@ -192,6 +193,8 @@ class RestoreOptions(Struct, frozen=True):
         contents: directory of files that were brought along (`checkpoint.contents`), for what this machine lacks or has in
             another version; "": there are none.
         stood_still: nothing of it has run since the capture, so that TCP connections that were taken along can be taken up.
+        bound: whose rights it gets at most, whatever it asks for (`checkpoint.rights.bounded`); None: what it asks for.
+            The vessel is that user's already, so that the kernel keeps to it, too.
     """
 
     elapsed_ns: int = 0
@@ -201,6 +204,7 @@ class RestoreOptions(Struct, frozen=True):
     contents: str = ""
     terms: Terms = NO_TERMS
     stood_still: bool = False
+    bound: Owner | None = None
 
 
 COPY_CLOCKS_AHEAD_NS: Final = 250_000_000

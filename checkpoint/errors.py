@@ -59,6 +59,10 @@ class MismatchError(RestoreError):
         self.reasons = reasons
 
 
+class AuthorError(CheckpointError):
+    """Whose word a snapshot's file is cannot be told; nothing of it was restored."""
+
+
 class FormatError(CheckpointError):
     """Bytes that are not a whole, unaltered snapshot of a version that we read."""
 

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import importlib
 import os
+import pkgutil
 import resource
 import signal
 import socket
@@ -20,16 +22,19 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from checkpoint import carried, chain, channel, engine, foreign, format, side_by_side
+import checkpoint
+from checkpoint import carried, chain, channel, engine, foreign, format, lean, side_by_side
 from checkpoint.channel import Channel, ChannelClosedError, ChannelError, Failed, Reply, Request
 from checkpoint.digests_of_files import DigestsOfFiles
 from checkpoint.engine import CaptureOrder, Copy, Engine, ProtectOrder, Restored, RestoreOptions, Session, Streams
 from checkpoint.errors import CaptureError, CheckpointError, FormatError, ProcessGoneError, RestoreError, StoreError
 from checkpoint.hot_pages import Sender
+from checkpoint.linux import namespaces
 from checkpoint.linux.address import address_of
 from checkpoint.linux.waking import waking
 from checkpoint.model import Position, Snapshot
 from checkpoint.needs import names_of_contents, needs
+from checkpoint.rights import Owner
 from checkpoint.stored_base import stored_base
 from checkpoint.unread_base import UnreadBase
 
@@ -209,6 +214,8 @@ class Keeper:
         try:
             if self._is_busy:
                 raise RestoreError(f"cannot restore into pid {request.pid}: this keeper follows a process already")
+            if request.bound is not None:
+                _become(request.bound)
             with foreign.facts(f"restore {request.component}"):
                 self._restored, names = self._restored_from(files, request)
         finally:
@@ -306,7 +313,8 @@ class Keeper:
         chosen = self._tracer if outline.engine == self._tracer.name else engine.engine_named(outline.engine)
         digests = DigestsOfFiles(request.known)
         with foreign.facts(f"compare {outline.component} with what is here"):
-            found = chosen.lacks(outline, RestoreOptions(contents=request.contents, terms=request.terms), digests.of)
+            options = RestoreOptions(own_eyes=request.own_eyes, contents=request.contents, terms=request.terms)
+            found = chosen.lacks(outline, options, digests.of)
         return channel.Compared(found, tuple(digests.used.values())), ()
 
     def _open_file(self, request: channel.OpenFile, _: Descriptors) -> Answer:
@@ -361,6 +369,23 @@ class Keeper:
             session.close()
 
 
+def _become(owner: Owner) -> None:
+    """Be an ordinary user from now on: what a snapshot names is opened, asked and made with that user's rights, by the kernel.
+
+    All of us is loaded before: that user may have no right to read where we are installed.
+    """
+    lean.load_seldom_used()
+    for module in pkgutil.walk_packages(checkpoint.__path__, "checkpoint."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+    try:
+        namespaces.become(owner.uid, owner.gid, owner.groups or ())
+    except OSError as error:
+        raise RestoreError(
+            f"cannot restore with the rights of uid {owner.uid}: {error.strerror}; restore it as that user"
+        ) from error
+
+
 def _names_of(state: Snapshot, request: channel.Restore) -> dict[str, str] | None:
     return names_of_contents(needs(state), request.contents) if request.robot else None
 
@@ -374,6 +399,7 @@ def _options(order: channel.Restore) -> RestoreOptions:
         order.contents,
         terms=order.terms,
         stood_still=order.stood_still,
+        bound=order.bound,
     )
 
 

@@ -71,6 +71,13 @@ def load_numpy() -> None:
             os.environ[NUMPYS_THREADS] = threads
 
 
+def load_seldom_used() -> None:
+    """Import what was left for when it is used: soon this process may have no right to read it."""
+    for name in SELDOM_USED:
+        if isinstance(stand_in := sys.modules.get(name), _Seldom):
+            vars(stand_in).update(vars(stand_in.loaded()))
+
+
 class _Seldom(ModuleType):
     """A module until something in it is wanted, besides what is given here: then it is loaded, and this one shows what is in it.
 
@@ -84,12 +91,16 @@ class _Seldom(ModuleType):
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)  # the import system's questions want nothing of the module
+        real = self.loaded()
+        vars(self).update(vars(real))
+        return getattr(real, name)
+
+    def loaded(self) -> ModuleType:
+        """The module itself."""
         with _standing_in:
             if sys.modules.get(self.__name__) is self:
                 del sys.modules[self.__name__]
-        real = import_module(self.__name__)  # whoever comes meanwhile waits for it here
-        vars(self).update(vars(real))
-        return getattr(real, name)
+        return import_module(self.__name__)  # whoever comes meanwhile waits for it here
 
 
 _standing_in: Final = Lock()

@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import stat
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -150,7 +151,11 @@ class Store:
         try:
             with self._lock, disk_trouble(f"open the chain of {component}"):
                 for entry in self.chain_of(component, position):
-                    opened.append(os.open(entry.path, os.O_RDONLY | os.O_CLOEXEC))
+                    opened.append(os.open(entry.path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW))
+                    if why := why_not_ours(os.fstat(opened[-1])):
+                        raise StoreError(
+                            f"cannot use {entry.path}: {why}; remove it, and see who may write to the store {self._root}"
+                        )
         except StoreError:
             for descriptor in opened:
                 os.close(descriptor)
@@ -522,6 +527,9 @@ class Store:
                 self._read_file(path)
 
     def _read_file(self, path: Path) -> None:
+        if why := why_not_ours(path.lstat()):
+            self._notice(f"{path}: {why}; it is not used")
+            return
         try:
             header = format.verify(path)
         except FormatError as error:
@@ -552,6 +560,8 @@ def open_store(root: Path, disk: Disk | None = None, retention: Retention = NOTH
             root.parent.mkdir(parents=True, exist_ok=True)
             disk.make_folder(root)
             disk.sync_folder(root.parent)
+        if why := why_not_ours(root.stat()):
+            raise StoreError(f"cannot open the store {root}: {why}; give it to this user alone (chown, chmod go-w)")
         lock = lock_exclusively(root / LOCK_NAME)
     except OSError as error:
         raise StoreError(f"cannot open the store {root}: {error.strerror}; it must be a folder that we may write") from error
@@ -564,6 +574,18 @@ def open_store(root: Path, disk: Disk | None = None, retention: Retention = NOTH
         store.close()
         raise
     return store
+
+
+def why_not_ours(about: os.stat_result) -> str:
+    """Why a file or folder of a store may be another user's word; "" if it is ours or root's alone.
+
+    A restore gives a program the rights that its snapshot says.
+    """
+    if about.st_uid not in (os.geteuid(), 0):
+        return f"it belongs to uid {about.st_uid}"
+    if stat.S_ISLNK(about.st_mode):
+        return "it is a symbolic link"
+    return f"others may write to it (mode {stat.S_IMODE(about.st_mode):o})" if about.st_mode & 0o022 else ""
 
 
 def _entry_of(path: Path, snapshot: Snapshot, size: int) -> Entry:

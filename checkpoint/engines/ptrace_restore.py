@@ -15,7 +15,7 @@ from __future__ import annotations
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from checkpoint import carried, room
+from checkpoint import carried, rights, room
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import restore_checks
 from checkpoint.engines.proved_later import held_or_stored
@@ -67,6 +67,8 @@ class RestoredProgram(Struct):
 def restore(vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -> RestoredProgram:
     """See ``checkpoint.engine.Engine.restore``."""
     state, stored = held_or_stored(base)
+    if options.bound is not None:
+        state = rights.bounded(state, options.bound)
     if not state.is_base:
         raise RestoreError("cannot restore a delta by itself: fold its chain first")
     if reasons := room.refuse_restore(state):

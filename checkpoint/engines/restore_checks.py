@@ -31,7 +31,7 @@ from checkpoint.engines.restore_vdso import ContentAt
 from checkpoint.errors import CheckpointError, MismatchError
 from checkpoint.linux import abi, processor, procfs
 from checkpoint.model import FileIdentity, Resource, Snapshot
-from checkpoint.resources import aio_rings, attached_devices, covered_files, rebuild, writers
+from checkpoint.resources import aio_rings, attached_devices, covered_files, kernel_files, rebuild, writers
 from checkpoint.resources.rebuilding import number_of
 
 CAPABILITIES: Final = (
@@ -126,6 +126,7 @@ def require(state: Snapshot, options: RestoreOptions, *vessel_pids: int) -> tupl
     reasons: list[str] = []
     brought = []
     ours = frozenset[int]().union(*(writers.family(pid) for pid in (os.getpid(), *vessel_pids)))
+    reasons += _of_views(state, options)
     for view, source in zip(*member_pages.apart(state), strict=True):
         content_at = functools.partial(restore_memory.content_at, view) if source is None else source.content_at
         differing, one = _compare(view, options, content_at=content_at if len(state.contents) else None)
@@ -170,11 +171,20 @@ def lacks(outline: Snapshot, options: RestoreOptions, digest_of: DigestOf) -> tu
     Args:
         outline: of its newest snapshot, which may be a delta.
     """
-    found: list[str] = []
+    found = list(_of_views(outline, options))
     for view in tree.views(carried.without(outline)):
         expected = (*options.accept_changed, *carried.every_path(outline), *_in_flux(view))
         found += (*_of_root(view), *_compare(view, replace(options, accept_changed=expected), digest_of)[0])
     return tuple(dict.fromkeys(found))
+
+
+def _of_views(state: Snapshot, options: RestoreOptions) -> tuple[str, ...]:
+    """Views of the kernel that a program of an ordinary user cannot have, of all processes of a component."""
+    if not options.own_eyes:
+        return ()
+    known = frozenset(one.process.pid for one in state.processes)
+    held = (resource for one in state.processes for resource in one.resources)
+    return tuple(text for one in held for text in kernel_files.refuse_user(one, known, isolated=state.process.isolated))
 
 
 def _of_root(state: Snapshot) -> Iterator[str]:

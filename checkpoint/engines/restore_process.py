@@ -62,10 +62,17 @@ RAISED_LIMITS: Final = (1, 2, 7, 8, 9)
 CAP_SETGID: Final = 6
 CAP_SETUID: Final = 7
 CAP_SETPCAP: Final = 8
+CAP_SYS_RAWIO: Final = 17
 CAP_SYS_CHROOT: Final = 18
+CAP_SYS_PTRACE: Final = 19
 CAP_SYS_ADMIN: Final = 21
 CAP_SYS_RESOURCE: Final = 24
+CAP_SYSLOG: Final = 34
+CAP_PERFMON: Final = 38
+CAP_BPF: Final = 39
 CAP_CHECKPOINT_RESTORE: Final = 40
+OPENING: Final = sum(1 << one for one in (CAP_SYS_RAWIO, CAP_SYS_PTRACE, CAP_SYSLOG, CAP_PERFMON, CAP_BPF))
+"""Capabilities that open what a file system uid alone would not."""
 
 PR_CAPBSET_DROP: Final = 24
 PR_CAP_AMBIENT: Final = 47
@@ -425,11 +432,15 @@ def limits(table: CallTable, process: ProcessState, vessel: Vessel) -> tuple[str
 def own_eyes(table: CallTable, process: ProcessState, vessel: Vessel) -> None:
     """From here on open files as the program's user, who may have put other ones in their place: see `RestoreOptions`.
 
-    Source: capabilities(7), "Effect of user ID changes on capabilities": those for files go with a file system uid other than 0.
+    Other rights by which views of the kernel and of other processes open are laid down until `rights`, too.
+
+    Sources: capabilities(7), "Effect of user ID changes on capabilities": those for files go with a file system uid other than 0;
+    ptrace(2), "Ptrace access mode checking".
     """
     if not (vessel.may(CAP_SETUID) and vessel.may(CAP_SETGID)):
         return
-    theirs = process.credentials
+    theirs, (inheritable, permitted, effective, _, _) = process.credentials, vessel.credentials.capabilities
+    _set_capabilities(table, effective & ~OPENING, permitted, inheritable)
     groups = table.place(struct.pack(f"<{len(theirs.groups)}I", *theirs.groups))
     table.call("set the groups", "setgroups", len(theirs.groups), groups)
     table.call("set the filesystem's gid", "setfsgid", theirs.gids[3])
@@ -452,13 +463,19 @@ def our_eyes(table: CallTable, process: ProcessState, vessel: Vessel, options: R
         _see_as(table, process)
 
 
-def rights(table: CallTable, process: ProcessState, vessel: Vessel) -> tuple[str, ...]:
+def rights(table: CallTable, process: ProcessState, vessel: Vessel, *, ordinary: bool = False) -> tuple[str, ...]:
     """Become the user that the program ran as, with its capabilities: notes for what the vessel has no right to become.
 
     Everything that needs rights must stand before this in the table.
+
+    Args:
+        ordinary: it is not root's, and gets no inheritable capability: files may turn one into a right (capabilities(7)).
     """
     theirs, ours = process.credentials, vessel.credentials
     notes: list[str] = []
+    if ordinary and (inheritable := theirs.capabilities[0]):
+        theirs = replace(theirs, capabilities=(0, *theirs.capabilities[1:]))
+        notes.append(f"inheritable capabilities {inheritable:#x} are not kept: only a program of root gets them")
     same_user = (theirs.uids, theirs.gids, set(theirs.groups)) == (ours.uids, ours.gids, set(ours.groups))
     if not same_user and vessel.may(CAP_SETUID) and vessel.may(CAP_SETGID):
         _bounding_set(table, theirs, vessel)

@@ -54,10 +54,25 @@ class Inheritance(Struct, frozen=True):
         return replace(self, uid=uid, gid=gid, groups=groups)
 
 
-def take_on(inheritance: Inheritance) -> None:
+def of_owner(uid: int, gid: int, groups: tuple[int, ...]) -> Inheritance:
+    """What a program of another user gets where root starts it by hand: none of root's priorities, nor a right to any."""
+    return Inheritance(
+        uid,
+        gid,
+        groups,
+        limits={resource.RLIMIT_NICE: (0, 0), resource.RLIMIT_RTPRIO: (0, 0)},
+        nice=max(os.getpriority(os.PRIO_PROCESS, 0), 0),
+        oom_score_adj=max(int(Path("/proc/self/oom_score_adj").read_text()), 0),
+    )
+
+
+def take_on(inheritance: Inheritance, *, restorable: bool = False) -> None:
     """Become what it says, for good: in a child, just before its execve.
 
     Without rights of our own we stay the user that we are, and limits stay below our own hard ones.
+
+    Args:
+        restorable: keep the one right that a restore takes, see `namespaces.become`.
 
     Raises:
         OSError: it names what could not be taken on.
@@ -68,7 +83,10 @@ def take_on(inheritance: Inheritance) -> None:
         _set_limit(number, soft, hard)
     if os.geteuid() == 0:
         _drop_capabilities(inheritance.bounding)
-        _become(inheritance)
+        if restorable:
+            namespaces.become(inheritance.uid, inheritance.gid, inheritance.groups)
+        else:
+            _become(inheritance)
     if inheritance.no_new_privs:
         namespaces.prctl(PR_SET_NO_NEW_PRIVS, 1)
 

@@ -12,6 +12,7 @@ import ctypes
 import errno
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -26,6 +27,7 @@ CLONE_NEWUSER: Final = 0x10000000
 CLONE_NEWPID: Final = 0x20000000
 
 PR_SET_PDEATHSIG: Final = 1
+PR_SET_KEEPCAPS: Final = 8
 PR_CAP_AMBIENT: Final = 47
 PR_CAP_AMBIENT_RAISE: Final = 2
 PR_SET_PTRACER: Final = 0x59616D61
@@ -226,11 +228,37 @@ def keep_restore_right() -> None:
     prctl(PR_CAP_AMBIENT, PR_CAP_AMBIENT_RAISE, CAP_CHECKPOINT_RESTORE)
 
 
+def become(uid: int, gid: int, groups: Sequence[int]) -> None:
+    """Become an ordinary user for good, in each of the four ids; of root's rights CAP_CHECKPOINT_RESTORE is left, if it is ours.
+
+    By that one threads get their ids again. It opens no file and reaches no process of another user.
+
+    Raises:
+        OSError: we may not.
+    """
+    keeps = bool(_effective() & 1 << CAP_CHECKPOINT_RESTORE)
+    prctl(PR_SET_KEEPCAPS, 1)
+    os.setgroups(groups)
+    os.setresgid(gid, gid, gid)
+    os.setresuid(uid, uid, uid)
+    header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
+    kept = 1 << (CAP_CHECKPOINT_RESTORE - 32) if keeps else 0
+    sets = (ctypes.c_uint32 * 6)(0, 0, 0, kept, kept, kept)  # effective, permitted, inheritable: see `keep_restore_right`
+    _checked(_libc.capset(header, sets), "capset")
+    prctl(PR_SET_KEEPCAPS, 0)
+    if keeps:
+        prctl(PR_CAP_AMBIENT, PR_CAP_AMBIENT_RAISE, CAP_CHECKPOINT_RESTORE)
+
+
 def may_choose_pids() -> bool:
     """Whether we have a right by which a new process gets the PID that we want. Source: clone3(2), set_tid."""
+    return bool(_effective() & (1 << CAP_CHECKPOINT_RESTORE | 1 << CAP_SYS_ADMIN))
+
+
+def _effective() -> int:
+    """Our capabilities."""
     status = Path("/proc/self/status").read_text()
-    effective = int(status.partition("CapEff:")[2].split()[0], 16)
-    return bool(effective & (1 << CAP_CHECKPOINT_RESTORE | 1 << CAP_SYS_ADMIN))
+    return int(status.partition("CapEff:")[2].split()[0], 16)
 
 
 def prctl(option: int, *arguments: int) -> int:

@@ -65,9 +65,9 @@ class Birth(Struct, frozen=True):
         clocks: the reading its monotonic and boot time are to go on from; None: this machine's clocks are right for it.
         elapsed_ns: time since that reading, as it was at ``counted_ns`` on CLOCK_BOOTTIME; 0: as it is now.
         stdio: our descriptors that become its 0, 1 and 2; all others are closed.
-        own_session: make it the leader of a session, with standard input as its terminal if that is one.
+        own_session: make it the leader of a session, with standard input as its terminal if that is one and nobody's yet.
         die_with_parent: SIGKILL it when the calling thread ends.
-        inheritance: whose rights, limits and priorities it gets; None: ours.
+        inheritance: whose rights, limits and priorities it gets; None: ours. A vessel keeps the right that a restore takes.
         brought: files of the program that are to be there; they are shown to it where its own are missing.
     """
 
@@ -239,7 +239,7 @@ def _attend(lines: _Lines, birth: Birth, become: Callable[[], NoReturn], keep_ri
         notes += json.loads(os.read(ready_read, _REPORT_LIMIT) or b"[]")
     pid, note = _sibling_with_pid(birth.inner_pid)
     if pid == 0:
-        _end_after(_grow_up, lines, birth, watch_write, become, keep_right and entered.user, entered.pids)
+        _end_after(_grow_up, lines, birth, watch_write, become, keep_right, entered)
     lines.say(pid=pid, isolated=entered.pids, own_clocks=entered.clocks, notes=notes + note)
 
 
@@ -314,25 +314,26 @@ def _keep_only(kept: tuple[int, ...], null: int) -> None:
 
 
 def _grow_up(
-    lines: _Lines, birth: Birth, watch_write: int, become: Callable[[], NoReturn], keep_right: bool, own_mounts: bool
+    lines: _Lines, birth: Birth, watch_write: int, become: Callable[[], NoReturn], keep_right: bool, entered: namespaces.Entered
 ) -> None:
     """The child's own part, up to the execve that ends it."""
     kept = birth.inheritance
     user = User(kept.uid, kept.gid, kept.groups) if kept else User(os.geteuid(), os.getegid())
-    show(birth.brought, user, own_mounts=own_mounts)
+    show(birth.brought, user, own_mounts=entered.pids)
     with contextlib.suppress(OSError):  # only kernels with Yama know this; the others let our keeper in anyway
         namespaces.prctl(namespaces.PR_SET_PTRACER, -1)
-    if keep_right:
+    if keep_right and entered.user:
         namespaces.keep_restore_right()
     if birth.own_session:
         os.setsid()
     _take_stdio(birth.stdio)
     if birth.own_session and os.isatty(0):
-        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+        with contextlib.suppress(PermissionError):  # it is that of the session of whoever restores by hand, and stays so
+            fcntl.ioctl(0, termios.TIOCSCTTY, 0)
     _forget_signals()
     namespaces.close_others_on_exec(3)
     if birth.inheritance is not None:
-        take_on(birth.inheritance)
+        take_on(birth.inheritance, restorable=keep_right)
     if birth.die_with_parent:
         namespaces.prctl(namespaces.PR_SET_PDEATHSIG, signal.SIGKILL)  # after a change of user, which takes it back
     lines.say(inner_pid=os.getpid())  # race 1

@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from typing import Final
 
 from checkpoint.capability import Area, preserved, refused
@@ -61,6 +61,8 @@ CAPABILITIES: Final = (
 )
 
 PLACES: Final = ("/proc", "/sys")
+ON_DISK: Final = "files"
+"""The kind of `checkpoint.resources.files`."""
 UNREADABLE: Final = ("/proc/kmsg", "/sys/kernel/debug", "/sys/kernel/tracing", "/sys/fs/bpf", "/proc/sys/fs/binfmt_misc")
 """What is used up by being read, or is no view at all."""
 OWN: Final = "/proc/{pid}"
@@ -152,14 +154,36 @@ def of_ended(path: str, pid: int) -> str:
 
 
 def _is_only_read(held: OpenFile) -> bool:
-    return held.first.flags & os.O_ACCMODE == os.O_RDONLY or bool(held.first.flags & O_PATH)
+    return _only_reads(held.first.flags)
+
+
+def _only_reads(flags: int) -> bool:
+    return flags & os.O_ACCMODE == os.O_RDONLY or bool(flags & O_PATH)
 
 
 def mismatches(held: Resource) -> Iterator[str]:
     """Why it is not here."""
-    path = str(held.facts["path"])
+    path, flags = str(held.facts["path"]), number_of(held.facts["flags"])
+    if not (path.startswith((OWN, ENDED)) or _only_reads(flags)):  # none is captured so: `refuse`
+        yield f"{path}, {held.name}, is open for writing, by which it acts on this machine's kernel: open it only to write"
     if not (path.startswith((OWN, ENDED)) or _OF_A_PROCESS.fullmatch(path) or os.path.exists(path)):
         yield f"{path}, open as {held.name}, is not offered by this kernel: boot the same one, or attach what it shows"
+
+
+def refuse_user(held: Resource, known: Container[int], *, isolated: bool) -> Iterator[str]:
+    """Why a program of an ordinary user cannot have it, where we have more rights than that user: they would open it, too.
+
+    Args:
+        known: numbers of the processes of its component.
+        isolated: number 1 is of its own PIDs.
+    """
+    path = os.path.normpath(str(held.facts.get("path", "")))
+    is_opened = held.kind == ON_DISK and not number_of(held.facts.get("flags", 0)) & O_PATH
+    if is_opened and any(f"{path}/".startswith(f"{place}/") for place in PLACES):
+        yield f"{path}, open as {held.name}, is a part of this machine's kernel that cannot be opened again as a file on a disk"
+    match = _OF_A_PROCESS.fullmatch(path)
+    if match and int(match[1]) not in known and not (isolated and int(match[1]) == INIT):
+        yield f"{path}, open as {held.name}, is a view of another process: let the program close it after reading"
 
 
 def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:

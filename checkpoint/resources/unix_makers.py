@@ -76,6 +76,10 @@ class Disguise(Struct, frozen=True):
         """Make calls for the body as who made a socket; as the program's user where nobody knows, never as ourselves."""
         maker = one.facts.get("maker")
         if isinstance(maker, list) and maker:
+            if self._is_foreign(number_of(maker[1]), number_of(maker[2])):
+                with self.as_program(table):
+                    yield
+                return
             lost = f"{one.name} tells another user as its peer (SO_PEERCRED): it was uid {maker[1]!r}, gid {maker[2]!r}"
             with self._as(table, number_of(maker[1]), number_of(maker[2]), lost):
                 yield
@@ -93,7 +97,7 @@ class Disguise(Struct, frozen=True):
     def as_owner(self, table: CallTable, one: Resource) -> Iterator[None]:
         """Make calls for the body as whom a socket belongs to; as the program's user where nobody knows."""
         owner = one.facts.get("user")
-        if isinstance(owner, list) and owner:
+        if isinstance(owner, list) and owner and not self._is_foreign(number_of(owner[0]), number_of(owner[1])):
             with self._as(table, number_of(owner[0]), number_of(owner[1]), ""):
                 yield
         else:
@@ -101,12 +105,24 @@ class Disguise(Struct, frozen=True):
                 yield
 
     def notes(self, held: Iterable[Resource]) -> tuple[str, ...]:
-        """Which sockets tell another process than before."""
-        return tuple(
-            f"{one.name} tells another process as its peer (SO_PEERCRED): it was pid {maker[0]!r}"
-            for one in held
-            if isinstance(maker := one.facts.get("maker"), list) and maker and maker[0] != self.inner_pid
-        )
+        """Which sockets tell another process, or another user, than before."""
+        found = []
+        for one in held:
+            maker = one.facts.get("maker")
+            if not (isinstance(maker, list) and maker):
+                continue
+            if maker[0] != self.inner_pid:
+                found.append(f"{one.name} tells another process as its peer (SO_PEERCRED): it was pid {maker[0]!r}")
+            if self._is_foreign(number_of(maker[1]), number_of(maker[2])):
+                found.append(
+                    f"{one.name} tells another user as its peer (SO_PEERCRED): it was uid {maker[1]!r}, gid {maker[2]!r}"
+                )
+        return tuple(found)
+
+    def _is_foreign(self, uid: int, gid: int) -> bool:
+        """Whether a program of an ordinary user's says that it was another user, or of another group: that is not made so."""
+        theirs = self.program.credentials
+        return self.eyes and 0 not in theirs.uids and (uid not in theirs.uids or gid not in {*theirs.gids, *theirs.groups})
 
     def _is(self, uid: int, gid: int) -> bool:
         return (uid, gid) == (self.vessel.uids[1], self.vessel.gids[1])

@@ -255,6 +255,11 @@ def restore(room: argparse.ArgumentParser) -> None:
     """Of ``failover restore``."""
     room.add_argument("file", metavar="FILE", help="a snapshot made by failover capture")
     room.add_argument("--wait", action="store_true", help="stay until the program ends, and pass on its exit status")
+    room.add_argument(
+        "--trust",
+        action="store_true",
+        help="give the program all rights that FILE asks for, also if FILE is not root's (default: its owner's at most)",
+    )
     _devices(room)
     _connections(room, "reset: do not take up TCP connections that the capture took along (default: carry)", "carry")
     _json(room)

@@ -10,8 +10,8 @@ from typing import Any
 
 import msgspec
 
-from checkpoint import format
-from checkpoint.errors import FormatError
+from checkpoint import authors, format, rights
+from checkpoint.errors import AuthorError, FormatError
 from checkpoint.model import Position, Snapshot, Vma
 from failover.cli import picture, render
 
@@ -25,14 +25,50 @@ def inspect(arguments: argparse.Namespace) -> int:
     try:
         format.verify(arguments.file)
         snapshot = format.read_outline(arguments.file)
-        size = os.stat(arguments.file).st_size
+        with open(arguments.file, "rb") as file:
+            size, back = os.fstat(file.fileno()).st_size, rights_of(snapshot, file.fileno(), arguments.file)
     except OSError as error:
         raise FormatError(f"cannot read {arguments.file}: {error.strerror}") from error
     if arguments.json:
-        render.as_json(as_builtins(snapshot, size))
+        render.as_json(as_builtins(snapshot, size) | {"rights": msgspec.to_builtins(back)})
         return 0
-    _show(snapshot, size, arguments.vmas)
+    _show(snapshot, size, arguments.vmas, back)
     return 0
+
+
+class Rights(msgspec.Struct, frozen=True):
+    """With whose rights a snapshot comes back if root restores it.
+
+    Attributes:
+        author: uid of whose word it is; None: that cannot be told, and root is refused without --trust.
+        why: what shows that.
+        reduced: what it asks for and does not get, each with its figure.
+    """
+
+    author: int | None
+    why: str
+    reduced: tuple[str, ...] = ()
+
+    @property
+    def line(self) -> str:
+        """In one line."""
+        if self.author is None:
+            return "refused: " + self.why
+        if not self.author:
+            return f"all that it asks for ({self.why})"
+        lost = f"; not {', '.join(self.reduced)}" if self.reduced else "; it asks for no more"
+        return f"those of {authors.named(self.author)} at most ({self.why}){lost}"
+
+
+def rights_of(snapshot: Snapshot, file: int, path: str) -> Rights:
+    """What `failover restore` would give it where root calls it."""
+    try:
+        author = authors.author_of(file, path)
+    except AuthorError as error:
+        return Rights(None, str(error))
+    if author.owner is None:
+        return Rights(authors.ROOT, author.why)
+    return Rights(author.owner.uid, author.why, rights.excess(snapshot, author.owner))
 
 
 def as_builtins(snapshot: Snapshot, size: int) -> dict[str, Any]:
@@ -45,8 +81,8 @@ def as_builtins(snapshot: Snapshot, size: int) -> dict[str, Any]:
     return found
 
 
-def _show(snapshot: Snapshot, size: int, with_vmas: bool) -> None:
-    render.table(("", ""), facts(snapshot, size), "Snapshot")
+def _show(snapshot: Snapshot, size: int, with_vmas: bool, back: Rights) -> None:
+    render.table(("", ""), [*facts(snapshot, size), ("rights, if root restores it", back.line)], "Snapshot")
     print()
     render.table(("memory", "mappings", "size"), memory(snapshot.vmas), "Memory")
     if snapshot.resources:

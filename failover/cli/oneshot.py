@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import os
 import select
+import shlex
 import signal
 import sys
 import time
@@ -14,13 +15,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, TypeVar
 
-from checkpoint import channel, format
+import msgspec
+
+from checkpoint import channel, format, rights
+from checkpoint.authors import Author, author_of
 from checkpoint.channel import Capture, Captured, Protect, Protected, Restore, Restored, Resume, Resumed
 from checkpoint.device_rules import DeviceRule, rule_from
 from checkpoint.engine import Terms
 from checkpoint.errors import (
     CaptureError,
     ChainError,
+    CheckpointError,
     FormatError,
     NothingCommittedError,
     ProbeError,
@@ -29,7 +34,9 @@ from checkpoint.errors import (
     UnsupportedError,
 )
 from checkpoint.linux import kinship, namespaces, procfs, vessel
+from checkpoint.linux.inheritance import of_owner
 from checkpoint.linux.vessel import Birth, Born
+from checkpoint.rights import Owner
 from checkpoint.state import State
 from failover.cli import picture, render
 from failover.cli.components import exit_like
@@ -48,6 +55,8 @@ IDS_TIMEOUT_S: Final = 2.0
 IDS_PAUSE_S: Final = 0.01
 """How long the ids of a program that has just been ended may take to be free, and how often that is looked at."""
 OWN_PIDS: Final = "it goes on in PIDs of its own, in which it has its old ones: here they are taken, or not ours to choose"
+
+ROOT: Final = 0
 
 A = TypeVar("A")
 
@@ -215,28 +224,90 @@ def device_rules(arguments: argparse.Namespace) -> tuple[DeviceRule, ...]:
 def restore(arguments: argparse.Namespace) -> int:
     """Start the program of a snapshot where it stood; print its PID and return, or stay until it ends."""
     try:
-        file = os.open(arguments.file, os.O_RDONLY | os.O_CLOEXEC)
+        file = os.open(arguments.file, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # what is no file is told, not waited for
     except OSError as error:
         raise FailoverError(f"cannot read {arguments.file}: {error.strerror}") from error
     try:
-        return _restored(arguments, file)
+        return _restored(arguments, file, whose_rights(arguments, file))
     except (FormatError, ChainError) as error:
         raise FailoverError(f"cannot restore {arguments.file}: {error}") from error
 
 
-def _restored(arguments: argparse.Namespace, file: int) -> int:
+def whose_rights(arguments: argparse.Namespace, file: int) -> Author | None:
+    """Whose word a snapshot is, and so whose rights it gets at most; None: it gets what it asks for, as far as we have it.
+
+    Raises:
+        AuthorError: that cannot be told.
+    """
+    if os.geteuid() != ROOT or arguments.trust:
+        return None
+    author = author_of(file, arguments.file)
+    return author if author.owner is not None else None
+
+
+def _restored(arguments: argparse.Namespace, file: int, author: Author | None) -> int:
     state = format.read_state(file)
     elapsed_ns, terms = vessel.elapsed_since(state.clocks), terms_of(arguments)
     birth = birth_of(state, elapsed_ns, own_session=not arguments.wait)
-    with Keeper.spawn() as keeper, _born(birth) as born:
-        order = Restore(born.pid, state.component, elapsed_ns, terms=terms, stood_still=terms.connections, follow=False)
+    owner = author.owner if author is not None else None
+    reduced = _reduced(arguments.file, state, author) if author is not None else ()
+    with (
+        _told_of(reduced),
+        contextlib.ExitStack() as opened,
+        Keeper.spawn() as keeper,
+        _born(_owned(birth, state, owner, opened)) as born,
+    ):
+        order = Restore(
+            born.pid, state.component, elapsed_ns, terms=terms, stood_still=terms.connections, follow=False, bound=owner
+        )
         restored, _ = keeper.ask(order, Restored, (file,))
         resumed, _ = keeper.ask(Resume(), Resumed)
         if not arguments.wait:
             keeper.release()
     moved = (OWN_PIDS,) if born.isolated and not state.process.isolated else ()
-    _tell_restore(arguments, restored.pid, born.notes + moved + restored.notes + resumed.notes)
+    _tell_restore(arguments, restored.pid, reduced + born.notes + moved + restored.notes + resumed.notes)
     return _wait_for(born) if arguments.wait else 0
+
+
+def _reduced(path: str, state: State, author: Author) -> tuple[str, ...]:
+    """What a snapshot asks for and does not get, as a note; none where it asks for no more than its owner has."""
+    assert author.owner is not None
+    if not (asked := rights.excess(state, author.owner)):
+        return ()
+    cure = f"if {author.name} may run that as root: failover restore --trust {shlex.quote(path)}"
+    return (f"{author.why}: the program has the rights of {author.name} and no more. It asks for {', '.join(asked)}; {cure}",)
+
+
+@contextmanager
+def _told_of(reduced: tuple[str, ...]) -> Iterator[None]:
+    """Add to what comes to nothing that it was tried with less than was asked for."""
+    try:
+        yield
+    except CheckpointError as error:
+        error.args = ("; ".join((str(error), *reduced)),)
+        raise
+
+
+def _owned(birth: Birth, state: State, owner: Owner | None, opened: contextlib.ExitStack) -> Birth:
+    """The same for an owner who is not root: with nothing of root's, also not root's terminal to read from."""
+    if owner is None:
+        return birth
+    theirs = rights.at_most(state.process.credentials, owner)
+    stdio = _without_terminal(opened) if birth.own_session else birth.stdio
+    return msgspec.structs.replace(birth, inheritance=of_owner(owner.uid, theirs.gids[0], theirs.groups), stdio=stdio)
+
+
+def _without_terminal(opened: contextlib.ExitStack) -> tuple[int, int, int]:
+    """Our standard streams for who is not to read what is typed: a terminal is open for writing alone."""
+
+    def unread(stream: int) -> int:
+        if not os.isatty(stream):
+            return stream
+        descriptor = os.open(f"/proc/self/fd/{stream}", os.O_WRONLY | os.O_NOCTTY | os.O_CLOEXEC)
+        opened.callback(os.close, descriptor)
+        return descriptor
+
+    return unread(0), unread(1), unread(2)
 
 
 def birth_of(state: State, elapsed_ns: int, own_session: bool) -> Birth:
@@ -321,8 +392,6 @@ def check(arguments: argparse.Namespace) -> int:
     with Keeper.spawn() as keeper:
         report = keeper.ask(channel.Probe(arguments.pid), channel.Probed)[0].report
     if arguments.json:
-        import msgspec
-
         render.as_json(msgspec.to_builtins(report) | {"supported": report.supported})
         return 0 if report.supported else 1
     print(f"pid {report.pid}: {report.command}")

@@ -318,6 +318,10 @@ VERBS: Final = (
         Start the program of FILE where it stood. Prints its PID on a line of its own and returns while it runs on.
         The old PID is kept where this user may choose it and it is free.
 
+        FILE says as which user it ran, and it is FILE's owner who wrote that. So root's restore gives the program the
+        rights of FILE's owner at most, and says what FILE asks for beyond those. --trust gives it all that it asks for:
+        for a file whose content you would run as root. failover inspect shows beforehand what comes back.
+
           failover restore mapper.snapshot
           failover restore --wait mapper.snapshot && echo it ended well
         """,

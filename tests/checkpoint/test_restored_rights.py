@@ -87,6 +87,20 @@ def test_nothing_is_made_as_root_for_somebody_else(facts: dict[str, Fact]) -> No
         assert (stubs.SYSTEM_CALLS["setresuid"], (1000, 1000)) in before
 
 
+@pytest.mark.parametrize(("uid", "gid"), [(0, 0), (0, 1000), (1000, 0), (1001, 1000)])
+def test_an_ordinary_users_socket_is_made_as_nobody_else_whatever_it_says(uid: int, gid: int) -> None:
+    held = Resource("unix_sockets", "fd 3", {"maker": [1, uid, gid], "user": [uid, gid]})
+    for as_whom in (disguise(1000).as_maker, disguise(1000).as_owner):
+        table = CallTable(0x10000)
+        with as_whom(table, held):
+            before = [(call.number, call.arguments[:2]) for call in table.calls]
+        assert before[-2:] == [
+            (stubs.SYSTEM_CALLS["setresgid"], (1000, 1000)),
+            (stubs.SYSTEM_CALLS["setresuid"], (1000, 1000)),
+        ]
+    assert any("another user" in note for note in disguise(1000).notes([held]))
+
+
 def by_node(table: CallTable, path: str) -> None:
     nameless.make_node(table, path, stat.S_IFIFO | 0o640)
 

@@ -397,3 +397,35 @@ def test_a_full_disk_is_said_and_costs_nothing_that_was_held(tmp_path: Path) -> 
     with opened(tmp_path / "store") as store:
         assert store.newest(COMPONENT) == made[0].position
         assert not store.notices
+
+
+@pytest.mark.root
+@pytest.mark.parametrize("spoil", ["owner", "mode", "link"])
+def test_a_file_that_another_user_may_have_written_is_not_used(spoil: str, tmp_path: Path) -> None:
+    """Of a chain whose base and delta belong to different users nothing is restored."""
+    with opened(tmp_path / "store") as store:
+        for one in history(2):
+            put(store, one)
+        file = store.chain_of(COMPONENT)[1].path
+        if spoil == "owner":
+            os.chown(file, 1234, 1234)
+        elif spoil == "mode":
+            file.chmod(0o622)
+        else:
+            file.rename(tmp_path / "aside")
+            file.symlink_to(tmp_path / "aside")
+        with pytest.raises(StoreError, match=r"belongs to uid 1234|mode 622|cannot open the chain"):
+            store.open_chain(COMPONENT)
+    with opened(tmp_path / "store") as store:
+        assert len(store.positions(COMPONENT)) == 1, "the base is ours"
+
+
+@pytest.mark.root
+@pytest.mark.parametrize(("owner", "mode"), [(1234, 0o700), (0, 0o777), (0, 0o770)])
+def test_a_store_that_another_user_may_write_to_is_not_opened(owner: int, mode: int, tmp_path: Path) -> None:
+    root = tmp_path / "store"
+    root.mkdir()
+    os.chown(root, owner, owner)
+    root.chmod(mode)
+    with pytest.raises(StoreError, match="give it to this user alone"):
+        open_store(root)
