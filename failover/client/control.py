@@ -113,6 +113,9 @@ story: [{at, doubt_ms, robot, component, did, life, number, repeats, epoch_befor
 MESSAGE_LIMIT: Final = 16 << 20
 """Bytes of one message either way: a status of thousands of components fits, a runaway peer does not fill the memory."""
 
+REQUEST_LIMIT: Final = 4 << 20
+"""Bytes of one request: the kernel takes no program with more arguments and environment than 6 MB, and by default with 2 MB."""
+
 LENGTH: Final = struct.Struct(">I")
 SOCKET_NAME: Final = "control.sock"
 SYSTEM_SOCKET: Final = Path("/run/failover") / SOCKET_NAME
@@ -224,7 +227,7 @@ class Control:
             AgentRefusedError, LostAgentError: as for `ask`.
             RequestError: it cannot be said.
         """
-        self._send(_encoded(Request(verb, arguments)))
+        self._send(_encoded(Request(verb, arguments)), verb)
         while True:
             reply = self._receive(verb)
             if isinstance(reply, Refused):
@@ -248,10 +251,18 @@ class Control:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _send(self, body: bytes) -> None:
+    def _send(self, body: bytes, verb: str) -> None:
+        """Send a request; an agent that has hung up has perhaps said why.
+
+        Raises:
+            AgentRefusedError, LostAgentError: as for `ask`.
+        """
         try:
             self._link.sendall(LENGTH.pack(len(body)) + body)
         except OSError as error:
+            with contextlib.suppress(LostAgentError):
+                if isinstance(last := self._receive(verb), Refused):
+                    raise AgentRefusedError(last.message, last.kind, last.reasons) from error
             raise LostAgentError(f"cannot send to the agent at {self._path}: {error.strerror}; is it still running?") from error
 
     def _receive(self, verb: str) -> Reply:
@@ -282,8 +293,8 @@ def _encoded(request: Request) -> bytes:
     except (UnicodeEncodeError, OverflowError) as error:
         odd = error.object[:ODD_SHOWN] if isinstance(error, UnicodeEncodeError) else "so large a number"
         raise RequestError(f"cannot ask for {request.verb}: {odd!r} is not UTF-8 text, so it cannot be sent") from error
-    if len(body) > MESSAGE_LIMIT:
-        raise RequestError(f"cannot ask for {request.verb}: {len(body)} bytes of arguments are over the limit of {MESSAGE_LIMIT}")
+    if len(body) > REQUEST_LIMIT:
+        raise RequestError(f"cannot ask for {request.verb}: {len(body)} bytes of arguments are over the limit of {REQUEST_LIMIT}")
     return body
 
 
