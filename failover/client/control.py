@@ -53,7 +53,8 @@ insecure: links are neither authenticated nor encrypted
 realtime: the heart runs at real-time priority with its memory locked
 rule, promise: by which rule the team decides, and one sentence: what holds if this robot dies now
 fencing: one sentence: what freezes a program that may not act, and what this robot does not have for the worst case
-healthy: nothing is degraded, nothing has failed, nobody is silent, as far as this robot knows
+healthy: nothing is degraded, nothing has failed, nobody is silent, as far as this robot knows; with ``team`` as far as any robot
+    that answered knows, which is what the exit status of ``failover status`` says, too (`failover.client.verdict`)
 notes: [sentence, …]: what is missing or degraded on this robot
 beats: {sent, heard, unsent, refused, late_us_max, gap_us_max, gaps}: of this life; refused: {reason: count}
 links: [{name, medium, because, carrier, addresses, snapshots, bytes_in, bytes_out}]: interfaces with an address of this robot
@@ -62,6 +63,7 @@ links: [{name, medium, because, carrier, addresses, snapshots, bytes_in, bytes_o
 peers: [{name, role, state, last_heard_ms, hears_us, load, beats_lost, links, lane, notes}]
     role: robot | server | witness; state: unknown | live | suspect | dead; links: ours, over which it was heard lately
     lane: connected | connecting | refused | down
+peers_elsewhere: {robot: {peer: state}}: with ``team``, the same as the others see it
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
     freeze_us_max, freeze_budget_missed, snapshot_size, dirty_bytes, xor_hit_rate, snapshots, restores, crashes, outage_ms,

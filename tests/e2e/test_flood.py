@@ -16,7 +16,7 @@ from tests.e2e.robots import RobotMachine
 Pair = tuple[RobotMachine, RobotMachine]
 
 BUSY = 24
-"""Programs beside it: the kernel leaves a part of the processors to what is not at real-time priority, and they share that part."""
+"""Programs beside it: the kernel leaves a part of the processors to ordinary programs, and they share that part."""
 
 FLOOD_S = 10.0
 """Longer than the lanes may be silent, and than any lease."""
