@@ -122,7 +122,9 @@ LENGTH: Final = struct.Struct(">I")
 SOCKET_NAME: Final = "control.sock"
 SYSTEM_SOCKET: Final = Path("/run/failover") / SOCKET_NAME
 SOCKET_VARIABLE: Final = "FAILOVER_SOCKET"
-CONNECT_TIMEOUT_S: Final = 5.0
+CONNECT_TIMEOUT_S: Final = 5
+_TIMEVAL: Final = struct.Struct("@ll")
+"""Source: socket(7), SO_SNDTIMEO; unix(7)."""
 
 
 class Request(msgspec.Struct, frozen=True):
@@ -200,14 +202,15 @@ class Control:
         """
         path = path or socket_path()
         link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
-        link.settimeout(CONNECT_TIMEOUT_S)
+        # Of the kernel, which has us wait for our turn: with Python's own, a socket refuses at once while too many others wait.
+        link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(CONNECT_TIMEOUT_S, 0))
         try:
             with address_of(path) as address:
                 link.connect(address)
         except OSError as error:
             link.close()
             raise NoAgentError(_why_not(path, error)) from error
-        link.settimeout(None)
+        link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(0, 0))
         return cls(link, path)
 
     def ask(self, verb: str, **arguments: Any) -> dict[str, Any]:
@@ -308,6 +311,7 @@ def _why_not(path: Path, error: OSError) -> str:
     cure = {
         FileNotFoundError: f"no agent has been started there; start failover-agent, or set {SOCKET_VARIABLE}",
         ConnectionRefusedError: "the socket is a left-over of an agent that ended; start failover-agent again",
+        BlockingIOError: f"it has taken no connection for {CONNECT_TIMEOUT_S} s; too many others wait, or it hangs: see its log",
         PermissionError: "this user may not; use sudo, or join the group that owns the socket",
     }.get(type(error), error.strerror or str(error))
     return f"cannot reach the agent at {path}: {cure}"

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import socket
 import tempfile
 from collections.abc import AsyncIterator, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, asynccontextmanager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -235,3 +237,22 @@ def test_a_client_that_was_hung_up_on_hears_why_at_its_next_request(monkeypatch:
             assert "nothing was asked on this connection" in await asyncio.to_thread(late, path)
 
     asyncio.run(body())
+
+
+def test_a_client_waits_for_its_turn_while_many_others_wait(tmp_path: Path) -> None:
+    path = tmp_path / "control.sock"
+    with ExitStack() as held, socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen(4)
+        full = 0
+        while not full:
+            waiting = held.enter_context(socket.socket(socket.AF_UNIX))
+            waiting.setblocking(False)
+            full = waiting.connect_ex(str(path))
+        assert full == errno.EAGAIN
+        with ThreadPoolExecutor() as threads:
+            asking = threads.submit(Control.open, path)
+            with pytest.raises(TimeoutError):
+                asking.result(0.2)
+            held.enter_context(listener.accept()[0])
+            asking.result(PATIENCE_S).close()

@@ -11,8 +11,10 @@ import pytest
 
 from agent import stalls
 from failover.cli import picture
+from failover.client.control import Control
 from tests.e2e import robots
 from tests.e2e.robots import NO_ANSWER, RobotMachine
+from tests.e2e.test_deaths import kill, parts
 from tests.e2e.test_stale import parts_of_it
 
 Pair = tuple[RobotMachine, RobotMachine]
@@ -36,7 +38,7 @@ def answer(robot: RobotMachine) -> Answer:
     """The exit status, and each component's row."""
     shown = robots.failover(robot, "status")
     try:
-        with robot.control() as agent:
+        with Control.open(robot.socket) as agent:
             status = agent.ask("status", team=True)
     except NO_ANSWER:
         return shown.returncode, ()
@@ -85,7 +87,8 @@ def test_both_robots_answer_the_same_after_a_part_was_killed(pair: Pair, part: s
 
 def test_a_program_whose_agent_is_killed_is_healthy_at_no_robot(pair: Pair) -> None:
     first, second = pair
-    robots.stop_agent(first)
+    kill(first, ("heart",))
+    robots.until(lambda: not parts(first, "heart") and not parts(first, "lanes"), "the agent to be gone")
     robots.until(lambda: answer(second)[0] == 1, "robot2 to say that not all is well")
     robots.until_taken_over(second)
     assert answer(second)[0] == 1, "it has no standby"
