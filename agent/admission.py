@@ -23,7 +23,7 @@ OTHERS_CONNECTIONS_MAX: Final = 128
 """Of all those users together: the agent keeps its descriptors for what it protects."""
 
 USER_BYTES_MAX: Final = 8 << 20
-"""Of requests of one user that have arrived and are not answered."""
+"""Of requests of one user that have arrived and are not answered, without the first 32 KB of each: a small one is heard."""
 
 OTHERS_BYTES_MAX: Final = 32 << 20
 """The same of all users together who are neither root nor the agent's own."""

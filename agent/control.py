@@ -154,7 +154,7 @@ class ControlServer:
             await self._serve(_request(body), conversation, reader)
             return True
         finally:
-            self._admission.let_go(uid, len(body))
+            self._admission.let_go(uid, _counted(len(body)))
 
     async def _receive(self, reader: asyncio.StreamReader, uid: int, body: bytearray) -> bool:
         """Add the bytes of the next request to ``body`` as they arrive; False when the client has closed instead.
@@ -178,7 +178,7 @@ class ControlServer:
                     piece = await reader.read(min(size - len(body), PIECE_SIZE))
                     if not piece:
                         raise asyncio.IncompleteReadError(b"", size)
-                    self._admission.hold(uid, len(piece))
+                    self._admission.hold(uid, _counted(len(body) + len(piece)) - _counted(len(body)))
                     body += piece
         except TimeoutError:
             raise RefusedError(
@@ -213,6 +213,11 @@ class ControlServer:
             return Refused(refusal.kind, str(refusal), refusal.reasons)
         except (AgentError, CheckpointError, FailoverError) as error:
             return Refused(type(error).__name__, str(error), tuple(getattr(error, "reasons", ())))
+
+
+def _counted(size: int) -> int:
+    """How many bytes of a request of this size are counted: a small one is always heard."""
+    return max(size - PIECE_SIZE, 0)
 
 
 def _request(body: bytearray) -> Request:
