@@ -1,12 +1,15 @@
 """The beat lane: plain UDP datagrams, one socket a link, never queued behind anything.
 
 Nothing here blocks and nothing raises for the network's sake: a datagram that cannot leave is a beat that a peer misses, which
-is exactly what beats are there to show. Authentication is `failover.core.wire`'s.
+is exactly what beats are there to show. Authentication is `failover.core.wire`'s. What does not begin as a beat is dropped by the
+kernel, before it takes room in a socket's buffer or wakes this process. Source: Documentation/networking/filter.rst.
 """
 
 from __future__ import annotations
 
+import array
 import contextlib
+import ctypes
 import select
 import socket
 import struct
@@ -16,6 +19,7 @@ from typing import Final
 from agent.errors import LaneError
 from agent.rtnetlink import ANCILLARY_SIZE, allow_absent, interface_index, tell_interfaces
 from failover.client.team import Robot, for_lookup, split_address
+from failover.core.wire import FRAME_SIZE_MAX, MAGIC
 
 FRAME_LIMIT: Final = 1_472
 """Bytes of one datagram: an Ethernet frame's worth, so that no beat is lost with half a fragment."""
@@ -29,6 +33,18 @@ RECEIVE_BUFFER: Final = 256 << 10
 EXPEDITED: Final = 0xB8
 """IP type of service: DSCP EF, so that switches and the wireless card send beats first. Source: RFC 3246, RFC 8325."""
 
+
+SO_ATTACH_FILTER: Final = 26
+UDP_HEADER_SIZE: Final = 8
+"""A filter of a UDP socket sees the datagram from its header on."""
+
+_INSTRUCTION: Final = struct.Struct("=HBBI")
+_LOAD_LENGTH, _LOAD_HALF, _IS_ABOVE, _IS_EQUAL, _RETURN = 0x80, 0x28, 0x25, 0x15, 0x06
+"""BPF_LD|BPF_W|BPF_LEN, BPF_LD|BPF_H|BPF_ABS, BPF_JMP|BPF_JGT|BPF_K, BPF_JMP|BPF_JEQ|BPF_K, BPF_RET|BPF_K: linux/bpf_common.h."""
+
+SO_MEMINFO: Final = 55
+_DROPS: Final = 8
+"""Index of SK_MEMINFO_DROPS: what the filter refused, and what found no room. Source: linux/sock_diag.h."""
 
 SO_TIMESTAMPNS: Final = 35
 _ARRIVAL: Final = struct.Struct("@ll")
@@ -83,6 +99,10 @@ class BeatLane:
                     continue  # an ICMP error of an earlier datagram; the next call has the next datagram
                 yield frame, self._interface(ancillary), _arrival_ns(ancillary)
 
+    def dropped(self) -> int:
+        """Datagrams that the kernel dropped since these sockets were bound: no beats, or beats without room."""
+        return sum(map(_drops, self._sockets.values()))
+
     def _interface(self, ancillary: Iterable[tuple[int, int, bytes]]) -> str:
         index = interface_index(ancillary)
         if index and index not in self._names:
@@ -109,12 +129,41 @@ def _bound(address: str) -> socket.socket:
         allow_absent(link)
         tell_interfaces(link)
         link.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        with contextlib.suppress(OSError):  # an emulated kernel has no filters; the receiver refuses the same, more dearly
+            _let_only_beats_in(link)
         link.bind(where)
     except OSError as error:
         raise LaneError(
             f"cannot listen for beats at {address}: {error.strerror}; is another agent running, or is it another robot's?"
         ) from error
     return link
+
+
+def _let_only_beats_in(link: socket.socket) -> None:
+    """Have the kernel drop what is longer than a beat, or does not begin like one."""
+    program = b"".join(
+        _INSTRUCTION.pack(*instruction)
+        for instruction in (
+            (_LOAD_LENGTH, 0, 0, 0),
+            (_IS_ABOVE, 3, 0, UDP_HEADER_SIZE + FRAME_SIZE_MAX),
+            (_LOAD_HALF, 0, 0, UDP_HEADER_SIZE),  # of a datagram that has none: dropped
+            (_IS_EQUAL, 0, 1, int.from_bytes(MAGIC, "big")),
+            (_RETURN, 0, 0, 0xFFFF_FFFF),
+            (_RETURN, 0, 0, 0),
+        )
+    )
+    held = ctypes.create_string_buffer(program, len(program))
+    count = len(program) // _INSTRUCTION.size
+    link.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, struct.pack("@HP", count, ctypes.addressof(held)))
+
+
+def _drops(link: socket.socket) -> int:
+    counts = array.array("I")
+    try:
+        counts.frombytes(link.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, counts.itemsize * (_DROPS + 1)))
+    except OSError:
+        return 0
+    return counts[_DROPS] if len(counts) > _DROPS else 0
 
 
 def _arrival_ns(ancillary: Iterable[tuple[int, int, bytes]]) -> int:

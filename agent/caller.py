@@ -70,6 +70,11 @@ def check_right(uid: int, component: str, owner: int | None) -> None:
         raise RefusedError(f"{component} {whose}; its owner and root may give orders and read its output", "PermissionError")
 
 
+def uid_of(connection: socket.socket) -> int:
+    """Whose the client is."""
+    return int(_CREDENTIALS.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))[1])
+
+
 def caller_of(connection: socket.socket) -> Caller:
     """Ask the kernel who connected."""
     pid, uid, gid = _CREDENTIALS.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))

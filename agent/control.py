@@ -13,19 +13,26 @@ from typing import Any, Final
 
 import msgspec
 
-from agent.caller import Caller, caller_of
+from agent.admission import Admission
+from agent.caller import Caller, caller_of, uid_of
 from agent.errors import AgentError, RefusedError
 from agent.mistake import end_lanes_on_mistake
 from checkpoint.errors import UNDECODABLE, CheckpointError
 from checkpoint.linux.address import address_of
-from failover.client.control import LENGTH, MESSAGE_LIMIT, Output, Refused, Reply, Request, Result, Update
+from failover.client.control import LENGTH, REQUEST_LIMIT, Output, Refused, Reply, Request, Result, Update
 from failover.errors import FailoverError
 
 OWNER_ONLY: Final = 0o600
 OWNER_AND_GROUP: Final = 0o660
 
-CLIENTS_LIMIT: Final = 256
-"""Connections at a time; a script that forgets to close them is told, and the agent keeps its descriptors."""
+IDLE_S: Final = 60.0
+"""How long a connection may stay open without a request. One whose request is being answered may take any time."""
+
+REQUEST_S: Final = 30.0
+"""How long a request may take from its first byte to its last: a client writes it at once, however busy the machine is."""
+
+PIECE_SIZE: Final = 32 << 10
+"""Bytes read ahead of a client (asyncio reads twice as many and one more piece); a request takes memory as it arrives."""
 
 log = logging.getLogger("failover.control")
 
@@ -50,9 +57,7 @@ class Conversation:
 
     async def reply(self, reply: Reply) -> None:
         """One message; waits while the client does not read."""
-        body = _encoder.encode(reply)
-        self._writer.write(LENGTH.pack(len(body)) + body)
-        await self._writer.drain()
+        await _say(self._writer, reply)
 
 
 Verb = Callable[[Conversation, dict[str, Any]], Awaitable[dict[str, Any]]]
@@ -68,6 +73,7 @@ class ControlServer:
         self._verbs = verbs
         self._server: asyncio.Server | None = None
         self._clients: set[asyncio.Task[None]] = set()
+        self._admission = Admission()
 
     async def open(self) -> None:
         """Listen; only the owner, and the group if there is one, may connect.
@@ -81,7 +87,7 @@ class ControlServer:
             before = os.umask(0o177)
             try:
                 with address_of(self._path) as address:
-                    self._server = await asyncio.start_unix_server(self._connected, address)
+                    self._server = await asyncio.start_unix_server(self._connected, address, limit=PIECE_SIZE)
             finally:
                 os.umask(before)
             if self._group:
@@ -111,37 +117,91 @@ class ControlServer:
         task.add_done_callback(self._clients.discard)
         task.add_done_callback(end_lanes_on_mistake)
         try:
-            caller = caller_of(writer.get_extra_info("socket"))
-            await self._converse(reader, Conversation(writer, caller))
+            await self._converse(reader, writer)
         except (ConnectionError, asyncio.IncompleteReadError, asyncio.CancelledError):
             pass  # the client has gone, or the agent ends; the request goes with it, the component does not
         finally:
             writer.close()
 
-    async def _converse(self, reader: asyncio.StreamReader, conversation: Conversation) -> None:
-        """Request after request, until the client closes or says what is none."""
+    async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Request after request, until the client closes, or says what is none, or says nothing."""
+        connection = writer.get_extra_info("socket")
+        uid = uid_of(connection)
         try:
-            if len(self._clients) > CLIENTS_LIMIT:
-                raise RefusedError(f"{CLIENTS_LIMIT} clients are connected; close some")
-            while (request := await _request(reader)) is not None:
-                await self._serve(request, conversation, reader)
+            self._admission.enter(uid)
         except RefusedError as refusal:
-            await conversation.reply(Refused(refusal.kind, str(refusal)))
+            await _say(writer, Refused(refusal.kind, str(refusal)))
+            return
+        try:
+            conversation = Conversation(writer, caller_of(connection))
+            while await self._served(reader, conversation):
+                pass
+        except RefusedError as refusal:
+            await _say(writer, Refused(refusal.kind, str(refusal)))
+        finally:
+            self._admission.leave(uid)
+
+    async def _served(self, reader: asyncio.StreamReader, conversation: Conversation) -> bool:
+        """Take one request, and answer it; whether there was one. What it takes is counted until then.
+
+        Raises:
+            RefusedError: it was none, it did not come in time, or it is one too many.
+        """
+        uid, body = conversation.caller.uid, bytearray()
+        try:
+            if not await self._receive(reader, uid, body):
+                return False
+            await self._serve(_request(body), conversation, reader)
+            return True
+        finally:
+            self._admission.let_go(uid, _counted(len(body)))
+
+    async def _receive(self, reader: asyncio.StreamReader, uid: int, body: bytearray) -> bool:
+        """Add the bytes of the next request to ``body`` as they arrive; False when the client has closed instead.
+
+        Raises:
+            RefusedError: as for `_served`.
+        """
+        try:
+            async with asyncio.timeout(IDLE_S):
+                first = await reader.read(1)
+        except TimeoutError:
+            raise RefusedError(f"nothing was asked on this connection for {IDLE_S:.0f} s; connect again") from None
+        if not first:
+            return False
+        try:
+            async with asyncio.timeout(REQUEST_S):
+                (size,) = LENGTH.unpack(first + await reader.readexactly(LENGTH.size - 1))
+                if size > REQUEST_LIMIT:
+                    raise RefusedError(f"a request of {size} bytes is over the limit of {REQUEST_LIMIT}")
+                while len(body) < size:
+                    piece = await reader.read(min(size - len(body), PIECE_SIZE))
+                    if not piece:
+                        raise asyncio.IncompleteReadError(b"", size)
+                    self._admission.hold(uid, _counted(len(body) + len(piece)) - _counted(len(body)))
+                    body += piece
+        except TimeoutError:
+            raise RefusedError(
+                f"a request was begun and {len(body)} bytes of it came in {REQUEST_S:.0f} s; connect again and send it whole"
+            ) from None
+        return True
 
     async def _serve(self, request: Request, conversation: Conversation, reader: asyncio.StreamReader) -> None:
-        """Work on one request; a client that hangs up in the middle ends it."""
+        """Work on one request; a client that hangs up in the middle, or asks for more before the answer, ends it."""
         work = asyncio.ensure_future(self._answer(request, conversation))
-        gone = asyncio.ensure_future(_hung_up(reader))
+        more = asyncio.ensure_future(reader.read(1))
         try:
-            await asyncio.wait({work, gone}, return_when=asyncio.FIRST_COMPLETED)
-            if work.done():
-                await conversation.reply(work.result())
-            else:
-                raise ConnectionResetError
+            await asyncio.wait({work, more}, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            for future in (work, gone):
+            for future in (work, more):
                 future.cancel()
-            await asyncio.gather(work, gone, return_exceptions=True)
+            await asyncio.gather(work, more, return_exceptions=True)
+        if work.cancelled() and not more.result():
+            raise ConnectionResetError
+        if not work.cancelled():
+            await conversation.reply(work.result())
+        if not more.cancelled() and more.result():
+            raise RefusedError("another request came before the answer; wait for it, or use another connection")
 
     async def _answer(self, request: Request, conversation: Conversation) -> Reply:
         verb = self._verbs.get(request.verb)
@@ -155,27 +215,20 @@ class ControlServer:
             return Refused(type(error).__name__, str(error), tuple(getattr(error, "reasons", ())))
 
 
-async def _request(reader: asyncio.StreamReader) -> Request | None:
-    """The next request; None when the client has closed."""
+def _counted(size: int) -> int:
+    """How many bytes of a request of this size are counted: a small one is always heard."""
+    return max(size - PIECE_SIZE, 0)
+
+
+def _request(body: bytearray) -> Request:
     try:
-        (size,) = LENGTH.unpack(await reader.readexactly(LENGTH.size))
-    except asyncio.IncompleteReadError as error:
-        if not error.partial:
-            return None
-        raise
-    if size > MESSAGE_LIMIT:
-        raise RefusedError(f"a request of {size} bytes is over the limit of {MESSAGE_LIMIT}")
-    try:
-        return _decoder.decode(await reader.readexactly(size))
+        return _decoder.decode(body)
     except UNDECODABLE as error:
         raise RefusedError(f"a request was not understood: {error}; client and agent are of different versions") from error
 
 
-async def _hung_up(reader: asyncio.StreamReader) -> None:
-    """Return when the client has closed its end. It says nothing while it waits: one request at a time."""
-    while not reader.at_eof() and reader.exception() is None:
-        await asyncio.sleep(HANGUP_POLL_S)
-
-
-HANGUP_POLL_S: Final = 0.1
-"""How soon a client that went away is noticed; asyncio's reader has no way to wait for the end without reading."""
+async def _say(writer: asyncio.StreamWriter, reply: Reply) -> None:
+    """One message; waits while the client does not read."""
+    body = _encoder.encode(reply)
+    writer.write(LENGTH.pack(len(body)) + body)
+    await writer.drain()

@@ -61,6 +61,12 @@ class LanesProcess:
         self._ready = False
         self._early: deque[Act] = deque(maxlen=WAITING_LIMIT)
 
+    @property
+    def pid(self) -> int:
+        """Of the process, or of the one before it as long as no other could be started."""
+        assert self._child is not None, "start comes first"
+        return self._child.pid
+
     def start(self) -> None:
         """Start the process; it begins by sending its inventory.
 

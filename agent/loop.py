@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Final
 
 from agent import ballot as ballot_file
-from agent import clock, door, kernel
-from agent.beats import BeatLane
+from agent import clock, door, kernel, turns
+from agent.beats import TURN_LIMIT, BeatLane
 from agent.config import Settings
 from agent.copies import Copies
 from agent.door import Alive, BeatCounts, Farewell, Happened, HearKey, Inventory, Life, SpeakKey, ToHeart, ToLanes, Told
@@ -55,6 +55,9 @@ REST_SHARE: Final = 3
 
 LANES_SILENCE_NS: Final = 4 * NANOSECONDS_A_SECOND
 """How long the lanes may say nothing; then another process takes their place. Meanwhile nobody renews the guards' leases."""
+
+LANES_LOOK_NS: Final = NANOSECONDS_A_SECOND
+"""Between two looks at lanes that say nothing: longer than between their signs of life, so that others are not looked at."""
 
 LANES_BIRTH_NS: Final = 30 * NANOSECONDS_A_SECOND
 """The same before their first word: an interpreter starts."""
@@ -99,11 +102,14 @@ class Heart:
             socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
         )
         self._ending = self._rests = False
+        self._listens = True
+        self._deaf_until_ns = 0
         self._read_ns, self._rest_ns = 0, settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000 // REST_SHARE
         self._lanes_deaths = 0
         self._turned_ns = clock.now_ns()
-        self._lanes_silent_ns = 0
+        self._lanes_silent_ns = self._lanes_unseen_ns = 0
         self._lanes_allowed_ns = LANES_BIRTH_NS
+        self._lanes_turns: turns.Turns | None = None
         self._refused: Counter[str] = Counter()
         self._sent = self._heard = self._late_us_max = self._gap_us_max = self._gaps = 0
         self._heard_at: dict[str, int] = {}
@@ -158,10 +164,7 @@ class Heart:
         self._expect_lanes()
 
     def _expect_lanes(self) -> None:
-        self._lanes_silent_ns, self._lanes_allowed_ns = (
-            0,
-            LANES_BIRTH_NS << self._lanes_deaths,
-        )  # a machine so busy gets no busier
+        self._lanes_spoke(LANES_BIRTH_NS << self._lanes_deaths)  # a machine so busy gets no busier
         self._poll.register(self._lanes.fileno(), select.EPOLLIN | select.EPOLLHUP)
         self._lanes.send(Life(self._ballot.record.boot, os.getpid(), self._notes))
 
@@ -189,24 +192,48 @@ class Heart:
                 self._step(Tick())
 
     def _rest(self) -> None:
-        """While there is no component anywhere, what peers say is read a few times a lease only: half the turns, less in each."""
-        rests = self._node is not None and self._node.rests(clock.now_ns())
-        if rests != self._rests:
-            self._rests = rests
-            self._poll.modify(self._beats.fileno(), 0 if rests else select.EPOLLIN)
+        """While there is no component anywhere, what peers say is read a few times a lease only: half the turns, less in each.
+
+        In a flood of what is refused the heart leaves half of the time to others: it runs before all ordinary processes.
+        """
+        now_ns = clock.now_ns()
+        self._rests = self._node is not None and self._node.rests(now_ns)
+        listens = not self._rests and now_ns >= self._deaf_until_ns
+        if listens != self._listens:
+            self._listens = listens
+            self._poll.modify(self._beats.fileno(), select.EPOLLIN if listens else 0)
 
     def _watch_lanes(self) -> None:
-        """Count how long the lanes say nothing; a turn of our own that took long proves nothing about them."""
+        """Count how long the lanes say nothing.
+
+        A turn of our own that took long proves nothing about them, and neither does a time in which the kernel kept them from
+        running: the ones in their place would say as little.
+        """
         now_ns = clock.now_ns()
-        self._lanes_silent_ns += min(now_ns - self._turned_ns, int(SLEEP_LIMIT_S * NANOSECONDS_A_SECOND))
+        self._lanes_unseen_ns += min(now_ns - self._turned_ns, int(SLEEP_LIMIT_S * NANOSECONDS_A_SECOND))
         self._turned_ns = now_ns
+        if self._lanes_unseen_ns < LANES_LOOK_NS:
+            return
+        before, self._lanes_turns = self._lanes_turns, turns.look(self._lanes.pid)
+        self._lanes_silent_ns += turns.had_ns(before, self._lanes_turns, self._lanes_unseen_ns)
+        self._lanes_unseen_ns = 0
         if self._lanes_silent_ns > self._lanes_allowed_ns:
-            self._replace_lanes(f"it said nothing for {self._lanes_silent_ns / NANOSECONDS_A_SECOND:.0f} s")
+            self._replace_lanes(
+                f"it said nothing for {self._lanes_silent_ns / NANOSECONDS_A_SECOND:.0f} s in which it could have"
+            )
+
+    def _lanes_spoke(self, allowed_ns: int) -> None:
+        """Their silence counts from now on, and may last so long."""
+        self._lanes_silent_ns = self._lanes_unseen_ns = 0
+        self._lanes_turns, self._lanes_allowed_ns = None, allowed_ns
 
     def _pause_s(self) -> float:
         if self._node is None:
             return SLEEP_LIMIT_S
-        left_ns = self._node.next_deadline_ns() - clock.now_ns()
+        now_ns = clock.now_ns()
+        left_ns = self._node.next_deadline_ns() - now_ns
+        if not self._listens and not self._rests:
+            left_ns = min(left_ns, self._deaf_until_ns - now_ns)
         return min(max(left_ns / NANOSECONDS_A_SECOND, 0.0), SLEEP_LIMIT_S)
 
     # --- events in ---
@@ -221,7 +248,9 @@ class Heart:
 
     def _hear(self) -> None:
         self._read_ns = clock.now_ns()
+        taken = refused = 0
         for frame, link, wall_ns in self._beats.receive():
+            taken += 1
             opened = self._hearing.open(frame)
             if isinstance(opened, Beat):
                 came_ns = self._came_ns(wall_ns)
@@ -231,6 +260,9 @@ class Heart:
                 self._step(Received(opened, link, self._copies.take(opened.sender), came_ns))
             elif not self._copies.admit(opened, link, clock.now_ns()):
                 self._refused[str(opened.reason)] += 1
+                refused += 1
+        if taken >= TURN_LIMIT and refused > taken // 2:
+            self._deaf_until_ns = 2 * clock.now_ns() - self._read_ns
 
     def _came_ns(self, wall_ns: int) -> int:
         """When a beat came that waited because this heart rests: its sender was not late. 0: now, or a stall of ours."""
@@ -268,7 +300,7 @@ class Heart:
     def _listen_to_lanes(self) -> None:
         try:
             for message in self._lanes.receive():
-                self._lanes_silent_ns, self._lanes_allowed_ns = 0, LANES_SILENCE_NS
+                self._lanes_spoke(LANES_SILENCE_NS)
                 self._heed(message)
         except (ChannelClosedError, ChannelError) as error:
             self._replace_lanes(str(error))
@@ -337,11 +369,13 @@ class Heart:
 
     def _told(self, question: door.Ask) -> ToLanes:
         now_ns = clock.now_ns()
+        refused = Counter(self._refused)
+        refused[str(wire.Reason.NOT_OURS)] += self._beats.dropped()
         counts = BeatCounts(
             self._sent,
             self._heard,
             self._beats.unsent,
-            dict(self._refused),
+            dict(+refused),
             self._late_us_max,
             self._gap_us_max,
             self._gaps,

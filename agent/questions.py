@@ -18,11 +18,12 @@ from agent.errands import Errands, Order
 from agent.errors import RefusedError
 from agent.telling import Telling
 from agent.view import version
+from failover.client.verdict import is_healthy
 from failover.core import acts, events
 from failover.core.types import State
 
-SIGHT_PATIENCE_S: Final = 0.5
-"""How long a status waits for the other robots' own."""
+SIGHT_PATIENCE_S: Final = 2.0
+"""How long a status waits for the other robots' own: where no answer came from counts as not known, and busy robots are late."""
 
 LIVING: Final = ("live", "suspect")
 """States of peers that are asked: on a busy machine three beats may be late at any time."""
@@ -32,6 +33,19 @@ WORK: Final = ("run", "protect", "logs", "handover", "failback", "prefer", "prom
 
 QUESTIONS: Final = ("standing", "picture", "story")
 """What any member may ask of another one. The rest are orders, and a witness's are refused: it may be anybody's process."""
+
+
+NOT_HERE: Final[dict[str, Any]] = {
+    "state": "absent",
+    "role": "none",
+    "epoch": 0,
+    "lacks": None,
+    "cold": "",
+    "unstored": "",
+    "notes": [],
+    "reasons": [],
+}
+"""Of a component that this robot has not heard of, in place of what another one says of itself."""
 
 
 class Lines(Protocol):
@@ -92,12 +106,9 @@ class Questions:
             component["elsewhere"] = {}
         if team:
             living = await self._reachable()
-            theirs = await asyncio.gather(*(self._asked(peer, "picture", {}) for peer in living))
-            for robot, picture in zip(living, theirs, strict=True):
-                known = {one["name"]: one for one in picture.get("components", ())}
-                for component in mine["components"]:
-                    if component["name"] in known:
-                        component["elsewhere"][robot] = known[component["name"]]
+            answers = await asyncio.gather(*(self._asked(peer, "picture", {}) for peer in living))
+            _join(mine, {robot: picture for robot, picture in zip(living, answers, strict=True) if picture})
+            mine["healthy"] = is_healthy(mine)
         return mine
 
     async def _reachable(self) -> list[str]:
@@ -154,3 +165,18 @@ class Questions:
             raise RefusedError(f"{wanted!r} could be {', '.join(sorted(fitting))}; give the whole name", "UnknownComponentError")
         known = ", ".join(sorted(name for name, state in names.items() if state is not State.RELEASED)) or "nothing"
         raise RefusedError(f"no component is called {wanted!r}; this team protects {known}", "UnknownComponentError")
+
+
+def _join(mine: dict[str, Any], theirs: dict[str, dict[str, Any]]) -> None:
+    """Add to a robot's picture what the others say: of its components, of those that it does not know, and of their peers."""
+    known = {one["name"]: one for one in mine["components"]}
+    for robot, picture in theirs.items():
+        for one in picture.get("components", ()):
+            if one["name"] not in known:
+                known[one["name"]] = {**one, **NOT_HERE, "elsewhere": {}}
+                mine["components"].append(known[one["name"]])
+            known[one["name"]]["elsewhere"][robot] = one
+    mine["components"].sort(key=lambda one: str(one["name"]))
+    mine["peers_elsewhere"] = {
+        robot: {peer["name"]: peer["state"] for peer in picture.get("peers", ())} for robot, picture in theirs.items()
+    }

@@ -25,6 +25,8 @@ LATE_S: Final = 0.5
 
 UNKNOWN: Final = ""
 WAITS_FOR_DISK: Final = "D"
+WAITS_FOR_PROCESSOR: Final = "R"
+"""Of one that has used none meanwhile: others kept it from running, and would keep the one in its place."""
 
 log = logging.getLogger("failover.component")
 
@@ -70,7 +72,7 @@ class Watchman:
         if owed is None:
             return
         is_late = asyncio.get_running_loop().time() - planned > LATE_S
-        is_idle = before == self._seen and state not in (UNKNOWN, WAITS_FOR_DISK)
+        is_idle = before == self._seen and state not in (UNKNOWN, WAITS_FOR_DISK, WAITS_FOR_PROCESSOR)
         self._steps = self._steps + 1 if is_idle and not is_late else 0
         if self._steps < STEPS_MAX:
             self._plan()

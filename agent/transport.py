@@ -24,6 +24,7 @@ from msgspec import Struct
 from zmq.utils import z85
 from zmq.utils.monitor import parse_monitor_message
 
+from agent.arrivals import Arrivals
 from agent.errors import LaneError
 from agent.links import Device
 from agent.mistake import end_lanes_on_mistake
@@ -295,6 +296,7 @@ class BulkLane:
         self.strangers = 0
         self._stranger = ""
         self._misunderstood: Counter[str] = Counter()
+        self._arrivals = Arrivals(split_address(bind, "bulk address")[1], self._hosts())
 
     def open(self) -> None:
         """Listen, and begin to connect to everybody.
@@ -314,12 +316,16 @@ class BulkLane:
             router.curve_secretkey = self._keys.secret.encode()
             router.zap_domain = ZAP_DOMAIN
         self._router = router
+        monitor = router.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
         try:
             self._listen(router)
         except LaneError:
+            router.disable_monitor()
+            monitor.close(0)
             router.close(0)
             raise
         self._tasks.append(asyncio.create_task(self._hear(router)))
+        self._tasks.append(asyncio.create_task(self._watch(monitor)))
         for task in self._tasks:
             task.add_done_callback(end_lanes_on_mistake)
         for peer in self._peers:
@@ -394,6 +400,8 @@ class BulkLane:
             f"{peer} sent {count} messages on the bulk lane that this robot does not understand; install the same release on both"
             for peer, count in self._misunderstood.items()
         ]
+        if trouble := self._arrivals.trouble():
+            told.append(trouble)
         if self.strangers:
             told.append(
                 f"a key that is not in this robot's team.toml was refused on the bulk lane, {self.strangers} times, last from "
@@ -425,6 +433,18 @@ class BulkLane:
         finally:
             router.close(0)
 
+    async def _watch(self, monitor: zmq.asyncio.Socket) -> None:
+        """Follow which connections come and go; what is too much is ended before it has said a word."""
+        try:
+            while True:
+                event = parse_monitor_message(await monitor.recv_multipart())
+                if event["event"] == zmq.EVENT_ACCEPTED:
+                    self._arrivals.accepted(event["value"])
+                else:
+                    self._arrivals.ended(event["value"])
+        finally:
+            monitor.close(0)
+
     def _speaker(self, frames: list[Any]) -> str:
         """The peer whose message this is, by its key; "" for a stranger or a peer under another's name."""
         claimed = bytes(frames[0].bytes).decode(errors="replace")
@@ -443,6 +463,8 @@ class BulkLane:
                 owner = owners.get(credentials[0]) if mechanism == b"CURVE" and len(credentials) == 1 else None
                 if owner is None:
                     self._refused(address.decode(errors="replace"))
+                else:
+                    self._arrivals.is_of_member(address.decode(errors="replace"))
                 status = (b"200", b"OK", owner.encode()) if owner else (b"400", b"not in the team", b"")
                 await gate.send_multipart([version, request, *status, b""])
         finally:

@@ -10,13 +10,14 @@ from typing import Any, Final, Literal
 
 from msgspec import Struct
 
+from failover.client.verdict import BAD_STATES as BAD_STATES
+from failover.client.verdict import OVER_STATES, is_lacking, is_unknown, is_unprotected, sight
+from failover.client.verdict import is_healthy as is_healthy
+
 Mood = Literal["good", "warning", "bad", "quiet"]
 
 COLUMNS: Final = ("", "role", "state", "engine", "epoch", "lag", "freeze", "standby", "links")
 
-BAD_STATES: Final = frozenset({"degraded", "failed"})
-OVER_STATES: Final = frozenset({"ended", "released"})
-"""Nobody expects anything of these any more."""
 UNSETTLED_STATES: Final = frozenset({"starting", "restoring", "held", "frozen"})
 
 
@@ -71,29 +72,6 @@ def rows(status: Mapping[str, Any]) -> tuple[Row, ...]:
         found.append(Row(("nobody", *[""] * (len(COLUMNS) - 1)), "bad"))
         found += _branch(orphans, "")
     return tuple(found)
-
-
-def sight(component: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The component as the robot sees it that runs or ran it, where that one was asked; otherwise as the asked robot does.
-
-    With what its standby lacks, as that one says.
-    """
-    primary, elsewhere = component.get("primary"), component.get("elsewhere") or {}
-    seen: Mapping[str, Any] = elsewhere.get(primary, {})
-    seen = seen if seen.get("primary") == primary else component
-    standing_by = elsewhere.get(seen.get("standby"), component)
-    return {**seen, "lacks": standing_by.get("lacks"), "prepared_first": standing_by.get("prepared_first")}
-
-
-def is_unprotected(component: Mapping[str, Any]) -> bool:
-    """It runs, and nobody could go on with what it does now."""
-    checkpointed = component.get("protection") not in ("none", "stopped")
-    return component.get("role") == "primary" and (not checkpointed or _is_lacking(component))
-
-
-def _is_lacking(component: Mapping[str, Any]) -> bool:
-    """Its standby would refuse it, and no hook brings what is lacking."""
-    return bool(component.get("lacks")) and not component.get("prepared_first")
 
 
 def _robot_row(status: Mapping[str, Any], name: str, peer: Mapping[str, Any] | None) -> Row:
@@ -238,10 +216,20 @@ def _remarks_on(component: Mapping[str, Any]) -> list[str]:
         lines += [f"{robot}: {line}" if robot else line for line in notes if line not in lines]
         lines += [line for line in reasons[:REASONS_SHOWN] if not any(line in other for other in said)]
     seen = sight(component)
+    if is_unknown(seen) and component.get("elsewhere") is not None:
+        lines.append(_unknown(seen))
     wanting = seen.get("state") == "degraded" or is_unprotected(seen)
-    if seen.get("promise") and not seen.get("promise_differs") and wanting and not _is_lacking(seen):
+    if seen.get("promise") and not seen.get("promise_differs") and wanting and not is_lacking(seen):
         lines.append(str(seen["promise"]))
     return [f"{component['name']}: {line}" for line in lines]
+
+
+def _unknown(seen: Mapping[str, Any]) -> str:
+    """Where it should run, and that no answer came from there."""
+    primary = seen.get("primary")
+    if primary:
+        return f"{primary}, where it runs, has not answered: whether it is protected now is not known; ask there, or look again"
+    return "no robot that answered runs it; failover why tells what was decided"
 
 
 PASSING: Final = frozenset({"unknown key", "seen before, or too old", "from an earlier life of its sender"})
@@ -249,16 +237,3 @@ PASSING: Final = frozenset({"unknown key", "seen before, or too old", "from an e
 
 REASONS_SHOWN: Final = 8
 """Of a component that cannot be captured; ``--json`` has them all."""
-
-
-def is_healthy(status: Mapping[str, Any]) -> bool:
-    """Whether all that should be protected is: no component degraded, failed, unprotected or without a standby that can run it,
-    no peer dead."""
-    living = [sight(component) for component in status["components"] if component.get("state") not in OVER_STATES]
-    unwell = any(one.get("state") in BAD_STATES or not one.get("standby") or is_unprotected(one) for one in living)
-    unwell |= any(
-        seen.get("cold") or seen.get("unstored") or _is_lacking(seen)
-        for one in status["components"]
-        for seen in (one, *(one.get("elsewhere") or {}).values())
-    )
-    return not unwell and all(peer["state"] != "dead" for peer in status["peers"])

@@ -53,7 +53,8 @@ insecure: links are neither authenticated nor encrypted
 realtime: the heart runs at real-time priority with its memory locked
 rule, promise: by which rule the team decides, and one sentence: what holds if this robot dies now
 fencing: one sentence: what freezes a program that may not act, and what this robot does not have for the worst case
-healthy: nothing is degraded, nothing has failed, nobody is silent, as far as this robot knows
+healthy: nothing is degraded, nothing has failed, nobody is silent, as far as this robot knows; with ``team`` as far as any robot
+    that answered knows, which is what the exit status of ``failover status`` says, too (`failover.client.verdict`)
 notes: [sentence, …]: what is missing or degraded on this robot
 beats: {sent, heard, unsent, refused, late_us_max, gap_us_max, gaps}: of this life; refused: {reason: count}
 links: [{name, medium, because, carrier, addresses, snapshots, bytes_in, bytes_out}]: interfaces with an address of this robot
@@ -62,6 +63,7 @@ links: [{name, medium, because, carrier, addresses, snapshots, bytes_in, bytes_o
 peers: [{name, role, state, last_heard_ms, hears_us, load, beats_lost, links, lane, notes}]
     role: robot | server | witness; state: unknown | live | suspect | dead; links: ours, over which it was heard lately
     lane: connected | connecting | refused | down
+peers_elsewhere: {robot: {peer: state}}: with ``team``, the same as the others see it
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
     freeze_us_max, freeze_budget_missed, snapshot_size, dirty_bytes, xor_hit_rate, snapshots, restores, crashes, outage_ms,
@@ -113,11 +115,16 @@ story: [{at, doubt_ms, robot, component, did, life, number, repeats, epoch_befor
 MESSAGE_LIMIT: Final = 16 << 20
 """Bytes of one message either way: a status of thousands of components fits, a runaway peer does not fill the memory."""
 
+REQUEST_LIMIT: Final = 4 << 20
+"""Bytes of one request: the kernel takes no program with more arguments and environment than 6 MB, and by default with 2 MB."""
+
 LENGTH: Final = struct.Struct(">I")
 SOCKET_NAME: Final = "control.sock"
 SYSTEM_SOCKET: Final = Path("/run/failover") / SOCKET_NAME
 SOCKET_VARIABLE: Final = "FAILOVER_SOCKET"
-CONNECT_TIMEOUT_S: Final = 5.0
+CONNECT_TIMEOUT_S: Final = 5
+_TIMEVAL: Final = struct.Struct("@ll")
+"""Source: socket(7), SO_SNDTIMEO; unix(7)."""
 
 
 class Request(msgspec.Struct, frozen=True):
@@ -195,14 +202,15 @@ class Control:
         """
         path = path or socket_path()
         link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
-        link.settimeout(CONNECT_TIMEOUT_S)
+        # Of the kernel, which has us wait for our turn: with Python's own, a socket refuses at once while too many others wait.
+        link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(CONNECT_TIMEOUT_S, 0))
         try:
             with address_of(path) as address:
                 link.connect(address)
         except OSError as error:
             link.close()
             raise NoAgentError(_why_not(path, error)) from error
-        link.settimeout(None)
+        link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(0, 0))
         return cls(link, path)
 
     def ask(self, verb: str, **arguments: Any) -> dict[str, Any]:
@@ -224,7 +232,7 @@ class Control:
             AgentRefusedError, LostAgentError: as for `ask`.
             RequestError: it cannot be said.
         """
-        self._send(_encoded(Request(verb, arguments)))
+        self._send(_encoded(Request(verb, arguments)), verb)
         while True:
             reply = self._receive(verb)
             if isinstance(reply, Refused):
@@ -248,10 +256,18 @@ class Control:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _send(self, body: bytes) -> None:
+    def _send(self, body: bytes, verb: str) -> None:
+        """Send a request; an agent that has hung up has perhaps said why.
+
+        Raises:
+            AgentRefusedError, LostAgentError: as for `ask`.
+        """
         try:
             self._link.sendall(LENGTH.pack(len(body)) + body)
         except OSError as error:
+            with contextlib.suppress(LostAgentError):
+                if isinstance(last := self._receive(verb), Refused):
+                    raise AgentRefusedError(last.message, last.kind, last.reasons) from error
             raise LostAgentError(f"cannot send to the agent at {self._path}: {error.strerror}; is it still running?") from error
 
     def _receive(self, verb: str) -> Reply:
@@ -282,8 +298,8 @@ def _encoded(request: Request) -> bytes:
     except (UnicodeEncodeError, OverflowError) as error:
         odd = error.object[:ODD_SHOWN] if isinstance(error, UnicodeEncodeError) else "so large a number"
         raise RequestError(f"cannot ask for {request.verb}: {odd!r} is not UTF-8 text, so it cannot be sent") from error
-    if len(body) > MESSAGE_LIMIT:
-        raise RequestError(f"cannot ask for {request.verb}: {len(body)} bytes of arguments are over the limit of {MESSAGE_LIMIT}")
+    if len(body) > REQUEST_LIMIT:
+        raise RequestError(f"cannot ask for {request.verb}: {len(body)} bytes of arguments are over the limit of {REQUEST_LIMIT}")
     return body
 
 
@@ -295,6 +311,7 @@ def _why_not(path: Path, error: OSError) -> str:
     cure = {
         FileNotFoundError: f"no agent has been started there; start failover-agent, or set {SOCKET_VARIABLE}",
         ConnectionRefusedError: "the socket is a left-over of an agent that ended; start failover-agent again",
+        BlockingIOError: f"it has taken no connection for {CONNECT_TIMEOUT_S} s; too many others wait, or it hangs: see its log",
         PermissionError: "this user may not; use sudo, or join the group that owns the socket",
     }.get(type(error), error.strerror or str(error))
     return f"cannot reach the agent at {path}: {cure}"

@@ -39,7 +39,9 @@ NUMBER_MAX = 1 << 62
 DIGEST_SIZE_MAX = 32
 """Beyond these a number is somebody's mistake; believing it would leave no room to count on."""
 
-_MAGIC = b"fB"
+MAGIC = b"fB"
+"""Of a beat, its first two bytes."""
+
 _HEADER = struct.Struct("<2sBxI8s")
 _CODE_SIZE = 16
 _BODY = _HEADER.size + _CODE_SIZE
@@ -83,7 +85,7 @@ class Refused:
 
 def seal(beat: Beat, team: str, key: bytes) -> bytes:
     """The datagram for one beat. ``Speaker`` keeps beats small enough; at most ``FRAME_SIZE_MAX`` bytes."""
-    header = _HEADER.pack(_MAGIC, VERSION, key_number(key), team_tag(team))
+    header = _HEADER.pack(MAGIC, VERSION, key_number(key), team_tag(team))
     body = _encoder.encode(beat)
     assert len(body) <= BODY_SIZE_MAX, f"a beat of {len(body)} bytes does not fit a frame"
     return header + _code(key, header, body) + body
@@ -186,7 +188,7 @@ class Receiver:
         if len(frame) > FRAME_SIZE_MAX or len(frame) <= _BODY:
             return Refused(Reason.NOT_OURS)
         magic, version, number, tag = _HEADER.unpack_from(frame)
-        if magic != _MAGIC:
+        if magic != MAGIC:
             return Refused(Reason.NOT_OURS)
         if version != VERSION:
             return Refused(Reason.VERSION)

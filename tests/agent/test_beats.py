@@ -13,8 +13,10 @@ import pytest
 from agent import clock
 from agent.beats import TURN_LIMIT, BeatLane
 from failover.client.team import Robot
+from failover.core.wire import FRAME_SIZE_MAX, MAGIC
 
 PATIENCE_MS = 10_000
+BEAT = MAGIC + b" and so on"
 
 
 def robot(links: int) -> Robot:
@@ -47,12 +49,12 @@ def waits(lane: BeatLane) -> bool:
 def test_a_beat_comes_over_every_link_and_says_when(lanes: tuple[BeatLane, BeatLane]) -> None:
     ours, theirs = lanes
     before_ns = clock.now_ns()
-    ours.send("robot2", b"beat")
+    ours.send("robot2", BEAT)
     sent_ns = clock.now_ns()
     assert waits(theirs)
     time.sleep(0.05)  # it waits for us, and that does not count
     came = list(theirs.receive())
-    assert [(frame, link) for frame, link, _ in came] == [(b"beat", "lo")] * 2
+    assert [(frame, link) for frame, link, _ in came] == [(BEAT, "lo")] * 2
     for _, _, wall_ns in came:
         assert before_ns - 1_000_000 < clock.of_wall_ns(wall_ns) < sent_ns + 1_000_000
 
@@ -64,8 +66,20 @@ def test_where_nothing_waits_nothing_comes(lanes: tuple[BeatLane, BeatLane]) -> 
 def test_a_flood_is_taken_in_parts_and_none_of_it_is_lost(lanes: tuple[BeatLane, BeatLane]) -> None:
     ours, theirs = lanes
     for number in range(TURN_LIMIT):
-        ours.send("robot2", b"%d" % number)
+        ours.send("robot2", MAGIC + b"%d" % number)
     assert waits(theirs)
     parts = [[frame for frame, _, _ in theirs.receive()] for _ in range(3)]
     assert [len(part) for part in parts] == [TURN_LIMIT, TURN_LIMIT, 0]
-    assert sorted(int(frame) for part in parts for frame in part) == sorted([*range(TURN_LIMIT)] * 2)
+    assert sorted(int(frame[2:]) for part in parts for frame in part) == sorted([*range(TURN_LIMIT)] * 2)
+
+
+def test_what_does_not_begin_as_a_beat_is_dropped_by_the_kernel_and_counted(lanes: tuple[BeatLane, BeatLane]) -> None:
+    ours, theirs = lanes
+    longest = MAGIC + bytes(FRAME_SIZE_MAX - len(MAGIC))
+    for frame in (b"", b"f", b"GET / HTTP/1.1", longest + b"\0", *[bytes(1_000)] * 5_000):
+        ours.send("robot2", frame)
+    ours.send("robot2", longest)
+    assert waits(theirs)
+    assert [frame for frame, _, _ in theirs.receive()] == [longest] * 2
+    assert theirs.dropped() == 2 * 5_004
+    assert ours.dropped() == 0

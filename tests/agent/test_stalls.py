@@ -69,6 +69,10 @@ def test_who_waits_for_a_disk_or_is_not_to_be_seen_is_not(monkeypatch: pytest.Mo
     assert not is_ended(monkeypatch, [("", 0)] * LOOKS)
 
 
+def test_who_is_kept_from_running_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not is_ended(monkeypatch, [("R", 7)] * LOOKS)
+
+
 def test_who_answers_one_question_after_the_other_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     questions = itertools.count()
     assert not is_ended(monkeypatch, STANDING, lambda: next(questions))

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from agent import arrivals
 from agent.errors import LaneError
 from agent.transport import BulkLane, Keys, LinkState, new_keys
 from failover.core.messages import CHUNK_SIZE_MAX, Bulk, Cancel, Chunk
@@ -136,5 +137,62 @@ def test_a_link_that_is_lost_says_so_and_comes_back() -> None:
         await until(pair.connected)
         pair.lanes["robot1"].say("robot2", Cancel(2))
         await until(lambda: ("robot1", Cancel(2)) in pair.heard["robot2"])
+
+    run(keys1, keys2, body)
+
+
+def hangs_up(connection: socket.socket) -> bool:
+    """Whether the other end has hung up by now."""
+    try:
+        while connection.recv(1 << 16):
+            pass  # ZeroMQ greets everybody
+    except BlockingIOError:
+        return False
+    except ConnectionError:
+        pass
+    return True
+
+
+def test_connections_of_strangers_are_limited_and_a_member_comes_in_beside_them() -> None:
+    keys1, keys2 = team_keys()
+    many = arrivals.OTHERS_MAX + 40
+
+    async def body(pair: Pair) -> None:
+        port, strangers = pair.ports["robot1"], []
+        await until(pair.connected)
+        await pair.lanes["robot2"].close()
+        try:
+            for number in range(many):
+                stranger = socket.create_connection(("127.0.0.1", port), source_address=(f"127.0.1.{number % 60 + 1}", 0))
+                stranger.setblocking(False)
+                strangers.append(stranger)
+                await asyncio.sleep(0)
+            await until(lambda: sum(map(hangs_up, strangers)) >= many - arrivals.OTHERS_MAX)
+            pair.lanes["robot2"] = pair.lane("robot2", keys2)
+            pair.lanes["robot2"].open()
+            await until(pair.connected)
+            (told,) = pair.lanes["robot1"].troubles()
+            assert "connections to port" in told
+            assert "were turned away, last from 127.0.1." in told
+        finally:
+            for stranger in strangers:
+                stranger.close()
+
+    run(keys1, keys2, body)
+
+
+def test_one_address_holds_no_more_than_its_share() -> None:
+    keys1, keys2 = team_keys()
+
+    async def body(pair: Pair) -> None:
+        await until(pair.connected)
+        crowd = [socket.create_connection(("127.0.0.1", pair.ports["robot1"])) for _ in range(3 * arrivals.ADDRESS_MAX)]
+        for one in crowd:
+            one.setblocking(False)
+        await until(lambda: sum(map(hangs_up, crowd)) >= 2 * arrivals.ADDRESS_MAX)
+        assert pair.connected()
+        assert any("were turned away" in told for told in pair.lanes["robot1"].troubles())
+        for one in crowd:
+            one.close()
 
     run(keys1, keys2, body)

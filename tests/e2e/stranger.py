@@ -35,6 +35,28 @@ with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.sendto(bytes.fromhex(line), (sys.argv[1], int(sys.argv[2])))
 """
 
+FLOOD = """
+import os, socket, sys, time
+host, port, frame, seconds = sys.argv[1], int(sys.argv[2]), bytes.fromhex(sys.argv[3]), float(sys.argv[4])
+os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
+end, sent = time.monotonic() + seconds, 0
+children = []
+for _ in range(len(os.sched_getaffinity(0)) - 1):
+    children.append(os.fork())
+    if not children[-1]:
+        break
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+    link.connect((host, port))
+    while time.monotonic() < end:
+        for _ in range(100):
+            link.send(frame)
+        sent += 100
+if 0 not in children:
+    for child in children:
+        os.waitpid(child, 0)
+    print(sent)
+"""
+
 KNOCK = """
 import asyncio, sys
 from agent.transport import BulkLane, Keys, LinkState, new_keys
@@ -75,6 +97,16 @@ def send(robot: RobotMachine, frames: Sequence[bytes]) -> None:
     """Send datagrams to where the robot hears beats."""
     host, port = _beat_address(robot)
     _inside(robot, SEND, host, str(port), said="\n".join(frame.hex() for frame in frames))
+
+
+def flood(robot: RobotMachine, frame: bytes, seconds: float) -> int:
+    """Send one datagram to where the robot hears beats, again and again, from each processor at real-time priority. Needs root.
+
+    Returns:
+        how often one of the senders sent it.
+    """
+    host, port = _beat_address(robot)
+    return int(_inside(robot, FLOOD, host, str(port), frame.hex(), str(seconds)))
 
 
 def knock(robot: RobotMachine, claimed: str) -> str:

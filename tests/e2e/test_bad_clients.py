@@ -6,20 +6,26 @@ import os
 import random
 import socket
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 
-from failover.client.control import LENGTH, MESSAGE_LIMIT, Control, Refused, Request
+from checkpoint.linux import procfs
+from failover.client.control import LENGTH, MESSAGE_LIMIT, REQUEST_LIMIT, Control, Refused, Request
 from failover.errors import AgentRefusedError, RequestError
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
+from tests.e2e.test_deaths import parts
 
 SEED = int(os.environ.get("FAILOVER_FUZZ_SEED", random.randrange(1 << 30)))
 TURNS = int(os.environ.get("FAILOVER_FUZZ_TURNS", "300"))
+
+CONNECTIONS = 100
+GROWTH_MAX = 100 << 20
+"""Bytes: a quarter of what so many half requests are together."""
 
 VERBS = (
     "ping",
@@ -146,6 +152,19 @@ def test_a_client_that_hangs_up_midway_leaves_nothing(pair: Pair, sent: bytes) -
     for _ in range(20):
         with connect(pair[0].socket) as link:
             link.sendall(sent)
+
+
+def test_half_requests_on_many_connections_take_a_bounded_memory_and_no_place(pair: Pair) -> None:
+    (lanes,) = parts(pair[0], "lanes")
+    half = LENGTH.pack(REQUEST_LIMIT) + bytes(REQUEST_LIMIT - 1)
+    before = procfs.status(lanes).resident_size
+    with ExitStack() as held:
+        for _ in range(CONNECTIONS):
+            link = held.enter_context(connect(pair[0].socket))
+            with suppress(ConnectionError):  # told that it is too much, and hung up on
+                link.sendall(half)
+        assert pair[0].status()["robot"] == "robot1"
+        assert procfs.status(lanes).resident_size - before < GROWTH_MAX
 
 
 def test_a_client_that_reads_nothing_holds_nobody_up(pair: Pair) -> None:

@@ -1,0 +1,75 @@
+"""How a component stands, and whether all is well: from what every robot of the team says, so that all answer the same.
+
+Pure: `failover.client.control.STATUS` in, words out. Whichever robot was asked, the same sights lie before this, its own and
+those of the others (``elsewhere``), so nothing here may depend on which of them is its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+BAD_STATES: Final = frozenset({"degraded", "failed"})
+OVER_STATES: Final = frozenset({"ended", "released"})
+"""Nobody expects anything of these any more."""
+
+Sight = Mapping[str, Any]
+"""One component, as one robot sees it."""
+
+
+def sights(component: Sight) -> Iterator[Sight]:
+    """The component as each robot sees it that was asked and answered."""
+    yield component
+    yield from (component.get("elsewhere") or {}).values()
+
+
+def sight(component: Sight) -> Sight:
+    """The component as the robot sees it that runs or ran it, where that one was asked; otherwise as the asked robot does.
+
+    With what its standby lacks, as that one says.
+    """
+    elsewhere = component.get("elsewhere") or {}
+    seen = max(sights(component), key=lambda one: (one.get("epoch") or 0, one.get("role") == "primary"))
+    seen = seen if seen.get("role") == "primary" else _of_primary(seen, elsewhere)
+    standing_by = elsewhere.get(seen.get("standby"), component)
+    return {**seen, "lacks": standing_by.get("lacks"), "prepared_first": standing_by.get("prepared_first")}
+
+
+def _of_primary(seen: Sight, elsewhere: Mapping[str, Sight]) -> Sight:
+    """What the robot says of it that others take for its primary, where that one agrees."""
+    primary = seen.get("primary")
+    theirs: Sight = elsewhere.get(primary, {}) if primary else {}
+    return theirs if theirs.get("primary") == primary else seen
+
+
+def is_lacking(component: Sight) -> bool:
+    """Its standby would refuse it, and no hook brings what is lacking."""
+    return bool(component.get("lacks")) and not component.get("prepared_first")
+
+
+def is_unprotected(component: Sight) -> bool:
+    """It runs, and nobody could go on with what it does now."""
+    checkpointed = component.get("protection") not in ("none", "stopped")
+    return component.get("role") == "primary" and (not checkpointed or is_lacking(component))
+
+
+def is_unknown(component: Sight) -> bool:
+    """No robot that answered runs it: it runs nowhere, or where no answer came from."""
+    return component.get("role") != "primary" and component.get("state") not in OVER_STATES | BAD_STATES
+
+
+def is_healthy(status: Mapping[str, Any]) -> bool:
+    """Whether all that should be protected is, as far as any robot that answered knows.
+
+    No component is degraded, failed, unprotected, without a standby that can run it, or where no answer came from; no robot
+    counts a peer as dead.
+    """
+    living = [one for one in map(sight, status["components"]) if one.get("state") not in OVER_STATES]
+    unwell = any(
+        one.get("state") in BAD_STATES or not one.get("standby") or is_unprotected(one) or is_unknown(one) for one in living
+    )
+    unwell |= any(
+        seen.get("cold") or seen.get("unstored") or is_lacking(seen) for one in status["components"] for seen in sights(one)
+    )
+    peers = {peer["name"]: peer["state"] for peer in status["peers"]}
+    return not unwell and all("dead" not in seen.values() for seen in (peers, *(status.get("peers_elsewhere") or {}).values()))
