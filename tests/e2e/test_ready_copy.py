@@ -39,8 +39,9 @@ def count_goes_on(robot: RobotMachine) -> None:
 def test_a_takeover_lets_the_ready_copy_go(tmp_path: Path) -> None:
     with robots.two_robots(tmp_path) as (first, second):
         start_counting(first, 1_000_000)
-        shown = until_ready(second)
-        assert shown["size"] > 1_000_000, "an interpreter has some megabytes"
+        until_ready(second)
+        robots.until(lambda: copy_at(second).get("size", 0) > 1_000_000, "the copy to have an interpreter's megabytes")
+        shown = copy_at(second)
         robots.until(lambda: copy_at(second)["position"] != shown["position"], "the copy to be brought on")
         robots.until(lambda: "robot2, ready" in robots.failover(first, "status").stdout, "the primary to know")
         assert "ready copy at robot2" in robots.failover(second, "status").stdout
