@@ -331,7 +331,12 @@ async def begin_again(
         if waiting is not None:
             await waiting.undo()
         raise
-    await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
+    try:
+        await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
+    except (CheckpointError, OSError):
+        if waiting is not None:
+            await waiting.undo()
+        raise
     component = waiting or Component(name, await places.nursery.guard(), places)
     component.engine_wanted = COOPERATIVE  # what another engine took before it says Hello would be older than its state
     component.keeper.terms = terms_of(outline, terms)

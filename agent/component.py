@@ -187,7 +187,8 @@ class Component:
         try:
             _, streams = await self.ask_guard(self.commit)
             untold = await self._tell(*told) if told else ""
-            self.streams = streams or self.streams
+            if streams:
+                self._take_streams(streams)
             resumed, _ = await self.keeper.ask(channel.Resume(bool(streams)), streams)
         except (CheckpointError, GuardError, KeeperLostError):
             await self.undo()
@@ -332,7 +333,7 @@ class Component:
         A program that keeps its state makes no checkpoint while it waits in a write: it is bounded only while nobody stands by,
         for then its checkpoints would not help.
         """
-        if self.logs.is_held and limited != self._output_limited and self._guard.dialogue.open:
+        if self._guard.dialogue.open and self.logs.is_held and limited != self._output_limited:
             self._output_limited = limited
             self._guard.dialogue.tell(guard_messages.LimitOutput(HOLD_LIMIT if limited else 0))
 
@@ -417,25 +418,30 @@ class Component:
         self.close()
 
     def close(self) -> None:
-        """Let go of guard and keeper without changing anything for the program: what a stopping agent does."""
+        """Let go of guard, keeper and logs without changing anything for the program: what a stopping agent does."""
         self._drop_keeper()
         self._guard.dialogue.close()
         if self.prepared is not None:
             os.close(self.prepared.segment)
             self.prepared = None
-        close_all(self.streams)
-        self.streams = ()
+        self._take_streams(())
         self._forget_guest()
+        self.logs.close()
 
     # --- guard and keeper ---
 
     def take(self, born: Started | VesselReady | Described, streams: tuple[int, ...]) -> None:
         """Note what the guard said of it."""
         self.pid, self.inner_pid, self.isolated, self.notes = born.pid, born.inner_pid, born.isolated, born.notes
-        self.streams = streams
+        self._take_streams(streams)
         self.limit_output(self.engine == PTRACE)
         if isinstance(born, Described):
             self.engine_wanted, self.task_pid, self.keeps = born.engine, born.task_pid, born.keeps
+
+    def _take_streams(self, streams: tuple[int, ...]) -> None:
+        """These are its streams' descriptors from now on; those before are closed."""
+        before, self.streams = self.streams, streams
+        close_all(before)
 
     async def ask_guard(self, request: Any, descriptors: tuple[int, ...] = ()) -> Any:
         """The guard's reply, and descriptors that are ours now.

@@ -42,6 +42,9 @@ TRIM_STEP: Final = 16 << 20
 READ_LIMIT: Final = 1 << 20
 """Most bytes that one `OutputLogs.read` returns."""
 
+CLOSED: Final = -1
+"""In place of the descriptor of a log that was closed: its number may be another file's by then."""
+
 START: Final = 0
 COMMITTED: Final = 1
 SAFE: Final = 4
@@ -79,9 +82,12 @@ class OutputLogs:
         """Whether old bytes can be given back here; otherwise the logs grow until the disk is full."""
 
     def close(self) -> None:
-        """Let the files go; what was written stays."""
-        for descriptor in (self._offsets, *self._logs.values()):
-            os.close(descriptor)
+        """Let the files go; what was written stays. Closing twice is closing once; other calls fail with EBADF from then on."""
+        opened = (self._offsets, *self._logs.values())
+        self._offsets, self._logs = CLOSED, dict.fromkeys(self._logs, CLOSED)
+        for descriptor in opened:
+            if descriptor != CLOSED:
+                os.close(descriptor)
 
     def descriptor(self, stream: int) -> int:
         """The log's file descriptor; it stays this object's."""

@@ -7,6 +7,7 @@ import contextlib
 import os
 import signal
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -21,7 +22,9 @@ from agent.component import Captured, Component
 from agent.errors import GuardError, GuardLostError, KeeperLostError
 from agent.nursery import Nursery
 from agent.places import Places, guard_sockets
+from agent.streams import OutputLogs
 from checkpoint import format
+from checkpoint.engine import NO_TERMS
 from checkpoint.errors import CaptureError, CheckpointError, FormatError, NothingCommittedError, ProcessGoneError
 from checkpoint.model import OutputPiece
 from checkpoint.stream_counts import StreamCounts
@@ -406,3 +409,78 @@ def test_a_program_that_was_released_runs_on_unprotected(tmp_path: Path) -> None
         await until(lambda: not lives(pid), "it to end with its guard")
 
     live(tmp_path, story)
+
+
+# Descriptors
+
+
+def opened() -> list[str]:
+    """What this process has open: log files, guards' and keepers' sockets, and whatever else."""
+    found = []
+    for entry in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):
+            found.append(os.readlink(entry).partition(":[")[0])
+    return sorted(found)
+
+
+async def closed_again(before: list[str]) -> None:
+    """Wait until no more is open than before; a keeper that was let go may need a moment."""
+    for _ in range(int(PATIENCE_S / POLL_S)):
+        if (now := opened()) == before:
+            return
+        await asyncio.sleep(POLL_S)
+    raise AssertionError(
+        f"{len(now) - len(before)} descriptors more than before: {sorted((Counter(now) - Counter(before)).items())}"
+    )
+
+
+def test_a_ready_copy_that_is_laid_again_and_again_leaves_no_descriptor(tmp_path: Path) -> None:
+    """A standby's agent lays one a minute, for months, of a program whose children come and go."""
+
+    async def story(places: Places) -> None:
+        async with started(places, COUNT) as first:
+            captures = Captures(first)
+            await captures.take()
+
+            async def laid_and_ended() -> None:
+                copy, _ = await births.lay(
+                    NAME, captures.chain, places, age_ns=0, owner=os.geteuid(), started=None, terms=NO_TERMS
+                )
+                await copy.undo()
+
+            await laid_and_ended()  # what is opened once for all of them is open by now
+            before = opened()
+            for _ in range(3):
+                await laid_and_ended()
+            await closed_again(before)
+            captures.close()
+
+    live(tmp_path, story)
+
+
+def test_a_program_that_has_ended_or_was_let_go_leaves_no_descriptor(tmp_path: Path) -> None:
+    async def story(places: Places) -> None:
+        async def lived(*, let_go: bool) -> None:
+            async with started(places, COUNT) as component:
+                await component.protect()
+                if let_go:
+                    pid = component.pid
+                    await component.release()
+                    os.kill(pid, signal.SIGKILL)
+
+        await lived(let_go=False)
+        before = opened()
+        for let_go in (False, True, False, True):
+            await lived(let_go=let_go)
+        await closed_again(before)
+
+    live(tmp_path, story)
+
+
+def test_logs_that_were_closed_write_into_no_other_file(tmp_path: Path) -> None:
+    """The number of a closed descriptor may be another file's by then."""
+    logs = OutputLogs(tmp_path)
+    logs.close()
+    logs.close()
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        logs.commit((1, 1))
