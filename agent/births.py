@@ -25,7 +25,7 @@ from agent.errors import GuardError, GuardLostError, KeeperLostError
 from agent.guest import Guest
 from agent.nursery import KeeperLink, connect
 from agent.places import Places, complete_logs, log_directory
-from agent.streams import discard, total_of
+from agent.streams import total_of
 from checkpoint import channel, epoch_variable, format
 from checkpoint.carried import paths_of
 from checkpoint.channel import Laid
@@ -56,19 +56,21 @@ class Program(Struct, frozen=True):
     brought: tuple[tuple[str, str, int], ...] = ()
 
 
-async def start(name: str, program: Program, places: Places, epoch: int = 0) -> Component:
+async def start(name: str, program: Program, places: Places, epoch: int = 0, owner: int | None = None) -> Component:
     """Start a guard and under it the program. It runs, and is not protected yet.
+
+    Args:
+        owner: user id of whose component it is; None: of the agent's own user.
 
     Raises:
         GuardError: it could not be started; nothing is left of it.
     """
-    guard = await places.nursery.guard()
+    component = Component(name, await places.nursery.guard(), places)
     try:
-        discard(log_directory(name, places))  # a namesake that was let go may still write to its own
+        component.begin_output(os.geteuid() if owner is None else owner)
     except OSError as error:
-        guard.dialogue.close()
+        component.close()
         raise GuardError(f"{name}: cannot begin its output anew in {error.filename}: {error.strerror}") from error
-    component = Component(name, guard, places)
     component.engine_wanted = program.engine
     task = guard_messages.Task(epoch, engine=program.engine) if program.engine != PTRACE else None
     component.logs.hold(program.holds_output)
@@ -149,7 +151,7 @@ async def restore(
     theirs = outline.process.credentials
     owner = theirs.uids[0] if owner is None else owner
     check_rights(name, outline, owner, started)
-    await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
+    await asyncio.to_thread(complete_logs, log_directory(name, places), chain, owner=owner)
     laps.lap("reading the newest")
     component = Component(name, await places.nursery.guard(), places)
     request = _vessel_for(name, outline, places, outage_ns, total_of(outline.output), task)
@@ -332,7 +334,7 @@ async def begin_again(
             await waiting.undo()
         raise
     try:
-        await asyncio.to_thread(complete_logs, log_directory(name, places), chain)
+        await asyncio.to_thread(complete_logs, log_directory(name, places), chain, owner=owner)
     except (CheckpointError, OSError):
         if waiting is not None:
             await waiting.undo()

@@ -31,7 +31,7 @@ from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CheckpointError, NothingCommittedError, UnsupportedError
 from failover.core import acts, events
 from failover.core.acts import Act
-from failover.core.types import Launch, Resumption
+from failover.core.types import ComponentSpec, Resumption
 
 KILLED: Final = 9
 """The wait status of a program whose guard was lost: as of one that was killed."""
@@ -297,19 +297,21 @@ class Charge:
             await self.around.settled(self.name)
             if not act.spec.launch.pid:
                 await self._occasions.before_start(act)
-            self.component = await self._begun(act.spec.launch, act.epoch)
+            self.component = await self._begun(act.spec, act.epoch)
         self.component.keeper.terms = terms
         await self.component.lease(self._lease_until_ns)
         await self._protect(refuse=act.spec.launch.pid != 0)
+        if act.spec.launch.pid and not adopted:
+            self.component.begin_output(act.spec.owner)  # not before: one that is refused leaves a namesake's output as it is
         self.started.set()
         self.around.tell(events.Started(self.name, act.epoch))
         if not adopted:
             self._watch_the_end()
 
-    async def _begun(self, launch: Launch, epoch: int) -> Component:
-        if launch.pid:
-            return await births.watch(self.name, launch.pid, self.around.places)
-        return await births.start(self.name, program_of(launch), self.around.places, epoch)
+    async def _begun(self, spec: ComponentSpec, epoch: int) -> Component:
+        if spec.launch.pid:
+            return await births.watch(self.name, spec.launch.pid, self.around.places)
+        return await births.start(self.name, program_of(spec.launch), self.around.places, epoch, spec.owner)
 
     async def _protect(self, *, refuse: bool) -> None:
         """Give it a keeper. A program that was started here runs on unprotected where it cannot have one; a guest is refused."""

@@ -35,7 +35,7 @@ from agent.guest import Guest
 from agent.nursery import GuardLink
 from agent.places import Places, log_directory
 from agent.pump import HOLD_LIMIT
-from agent.streams import STREAMS, OutputLogs
+from agent.streams import STREAMS, OutputLogs, discard, logs_of
 from checkpoint import channel
 from checkpoint.channel import close_all
 from checkpoint.engine import AUTO, COOPERATIVE, PTRACE
@@ -151,6 +151,17 @@ class Component:
         self.guest: Guest | None = None
         guard.dialogue.heard = self._heard
         guard.dialogue.ended = self._guard_lost
+
+    def begin_output(self, owner: int) -> None:
+        """Its output begins anew, and is this owner's. A namesake that was let go may still write: to files without a name.
+
+        Raises:
+            OSError: its logs cannot be written.
+        """
+        directory = self.logs.directory
+        self.logs.close()
+        discard(directory)
+        self.logs = logs_of(directory, owner)
 
     @property
     def engine(self) -> str:

@@ -14,7 +14,7 @@ from msgspec import Struct
 from agent.config import ComponentConfig
 from agent.places import Places, complete_logs, log_directory
 from agent.shipping import Refusal
-from agent.streams import OutputLogs
+from agent.streams import logs_of
 from checkpoint import carried, foreign, format
 from checkpoint.channel import close_all
 from checkpoint.engine import COOPERATIVE
@@ -38,6 +38,7 @@ class Unshown(Struct, frozen=True):
     position: Position
     output: tuple[OutputPiece, ...]
     is_held: bool
+    owner: int
 
 
 class Deposit:
@@ -141,7 +142,7 @@ class Deposit:
         if offer is None or snapshot is None:  # stored by an earlier life of these lanes
             return
         unshown = self._unshown.setdefault(act.component, deque(maxlen=UNSHOWN_MAX))
-        unshown.append(Unshown(snapshot.position, snapshot.output, offer.spec.launch.output == COMMITTED))
+        unshown.append(Unshown(snapshot.position, snapshot.output, offer.spec.launch.output == COMMITTED, offer.spec.owner))
         self._kept(offer, snapshot)
 
     async def discard(self, act: Discard) -> None:
@@ -168,7 +169,7 @@ class Deposit:
         if not any(one.position == position for one in unshown):
             self._complete(component, directory, position)
             return
-        logs = OutputLogs(directory)
+        logs = logs_of(directory, next(one.owner for one in unshown if one.position == position))
         try:
             while True:
                 one = unshown.popleft()

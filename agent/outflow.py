@@ -82,18 +82,21 @@ class Outflow:
             raise RefusedError(f"piece: {wanted.stream} is no stream; 1 is standard output, 2 standard error")
         view, _ = await self._view(wanted.name)
         check_right(by, wanted.name, view.owner if view is not None else None)
-        piece = self._read_here(wanted.name, wanted.stream, wanted.offset, not await self._has_ended(wanted.name))
+        piece = self._read_here(wanted.name, wanted.stream, wanted.offset, not await self._has_ended(wanted.name), by)
         return {"offset": piece.offset, "content": piece.content}
 
     async def _read(self, name: str, robot: str, stream: int, offset: int, committed: bool, by: int) -> OutputPiece:
         if not robot:
-            return self._read_here(name, stream, offset, committed)
+            return self._read_here(name, stream, offset, committed, by)
         told = await self._lanes.errands.send(robot, "piece", {"name": name, "stream": stream, "offset": offset}, by)
         return OutputPiece(stream, told["offset"], told["content"])
 
-    def _read_here(self, name: str, stream: int, offset: int, committed: bool) -> OutputPiece:
+    def _read_here(self, name: str, stream: int, offset: int, committed: bool, by: int) -> OutputPiece:
+        """Raises RefusedError: these are still the logs of another user's component, which had the name before."""
         logs = OutputLogs(log_directory(name, self._lanes.places))
         try:
+            if logs.owner is not None:
+                check_right(by, f"the output of {name} that is kept here", logs.owner)
             return logs.read(stream, offset, PIECE_SIZE, committed=committed)
         finally:
             logs.close()

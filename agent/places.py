@@ -8,7 +8,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from agent.nursery import Nursery
-from agent.streams import OutputLogs, total_of
+from agent.streams import OutputLogs, logs_of, total_of
 from checkpoint import format
 from checkpoint.shelf import folder_name
 
@@ -45,7 +45,7 @@ def log_directory(name: str, places: Places) -> Path:
     return places.logs / folder_name(name)
 
 
-def complete_logs(directory: Path, chain: Sequence[int], *, is_safe: bool = False) -> bool:
+def complete_logs(directory: Path, chain: Sequence[int], *, is_safe: bool = False, owner: int | None = None) -> bool:
     """Bring output logs as far as the newest snapshot of a chain says; returns whether they were shorter.
 
     They are where a robot died, or was killed, between storing a snapshot and extending its logs.
@@ -53,8 +53,9 @@ def complete_logs(directory: Path, chain: Sequence[int], *, is_safe: bool = Fals
     Args:
         chain: descriptors of encoded snapshots, oldest first.
         is_safe: another robot holds the newest of them, too.
+        owner: user id of whose component it is, see `agent.streams.logs_of`; None: not known here.
     """
-    logs = OutputLogs(directory)
+    logs = OutputLogs(directory) if owner is None else logs_of(directory, owner)
     try:
         told = total_of(format.read_outline(chain[-1]).output)
         short = any(has < total for has, total in zip(logs.totals(), told, strict=True))

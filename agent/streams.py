@@ -9,7 +9,9 @@ Four numbers bound a stream: ``start <= committed <= size``, and ``safe <= commi
   shows these alone: not even a robot that is lost for good, while it was alone, takes back what was seen.
 * Bytes up to ``size`` were written by a program whose newest state is not acknowledged yet; a restore cuts them off.
 
-They stand in the file ``offsets`` (seven little-endian u64: start 1, committed 1, start 2, committed 2, safe 1, safe 2, held).
+They stand in the file ``offsets`` (eight little-endian u64: start 1, committed 1, start 2, committed 2, safe 1, safe 2, held,
+owner). The owner is the user id, plus one, of whose component wrote it: users use a name again, and what one user's component
+wrote is never shown to the next one.
 None needs to survive a power cut by itself: a restore gets its totals from the snapshot, and what is not known to be safe waits.
 """
 
@@ -50,6 +52,7 @@ COMMITTED: Final = 1
 SAFE: Final = 4
 """Places in the file ``offsets``, for the first stream."""
 HELD: Final = 6
+OWNER: Final = 7
 _OFFSET: Final = struct.Struct("<Q")
 FAR_AWAY: Final = 1 << 40
 """An offset, a multiple of `TRIM_STEP`, to try out whether holes can be made."""
@@ -112,6 +115,16 @@ class OutputLogs:
         """Note, on this robot, what the component's record says of its output."""
         if held != self.is_held:
             self._set_word(HELD, int(held))
+
+    @property
+    def owner(self) -> int | None:
+        """User id of whose component wrote it; None: an earlier version of the agent began these logs, and did not note it."""
+        return self._word(OWNER) - 1 if self._word(OWNER) else None
+
+    def belong(self, owner: int) -> None:
+        """Note whose component writes it."""
+        if owner != self.owner:
+            self._set_word(OWNER, owner + 1)
 
     def waiting(self) -> int:
         """Bytes of both streams that wait for another robot to hold them."""
@@ -215,6 +228,21 @@ def discard(directory: Path) -> None:
     """
     for name in (OFFSETS_NAME, *LOG_NAMES.values()):
         (directory / name).unlink(missing_ok=True)
+
+
+def logs_of(directory: Path, owner: int) -> OutputLogs:
+    """The logs of a component of this owner's; another owner's, of the same name, are given up first.
+
+    Raises:
+        OSError: the directory cannot be written.
+    """
+    logs = OutputLogs(directory)
+    if logs.owner not in (None, owner):
+        logs.close()
+        discard(directory)
+        logs = OutputLogs(directory)
+    logs.belong(owner)
+    return logs
 
 
 def total_of(pieces: Iterable[OutputPiece]) -> tuple[int, int]:

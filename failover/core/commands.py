@@ -41,6 +41,7 @@ def _run(component: Component, turn: Turn, command: Run) -> None:
         turn.order(acts.Answer(command.request, False, refusal))
         return
     drop(component, turn, "an operator runs it anew")
+    component.former = component.spec
     component.spec = replace(command.spec, home=command.spec.home or turn.me)
     component.request, component.acked, component.acked_ns = command.request, None, -1
     component.crashes.clear()

@@ -144,6 +144,7 @@ class Component(Struct):
         stored_ns: on a standby, when its newest checkpoint was stored, -1 if it was before this life of the agent.
         elects: primaries are elected. free, open: then, what this robot would vote for (``majority.py``).
         ordered: the claim was, by an operator.
+        former: what was known of its namesake before an operator had it started.
         wanted: an operator promoted this robot, and a checkpoint is on its way here.
         seen: highest epoch that anybody told of; a claim goes above it. contested_ns: when this copy, which stands still, last
             met another that does.
@@ -224,6 +225,7 @@ class Component(Struct):
     free: bool = False
     open: bool = False
     ordered: bool = False
+    former: ComponentSpec | None = None
     wanted: Wanted | None = None
     elects: bool = False
     seen: int = 0

@@ -64,7 +64,8 @@ def failed(component: Component, turn: Turn, event: ActFailed) -> None:
     if event.epoch != component.epoch:
         return
     if component.state is State.STARTING:
-        told = bool(component.request)  # whoever asked for it is told; then nothing of it needs to be remembered
+        told = bool(component.request)  # the operator is told; then nothing of it is remembered: its name is whose it was before
+        component.spec = component.former if told else component.spec
         refuse_request(component, turn, event.message)
         _end(component, turn, Cause.RELEASE if told else Cause.FAIL, 0, event.message)
     elif component.state is State.RECOVERING:

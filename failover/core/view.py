@@ -20,15 +20,18 @@ STALE_NS = 2 * NS_PER_S
 
 def status(components: dict[str, Component], turn: Turn, boot: int) -> StatusView:
     """Everything, as this robot sees it."""
-    views = tuple(
-        _component(component, turn) for _, component in sorted(components.items()) if component.state is not State.ABSENT
-    )
+    views = tuple(_component(component, turn) for _, component in sorted(components.items()) if not _is_nothing(component))
     peers = turn.team.views(turn.now_ns)
     bad = any(view.protection is Protection.DEGRADED or view.state is State.FAILED for view in views)
     bad = bad or any(view.cold or view.unstored for view in views)
     bad = bad or bool(turn.team.at_odds(turn.now_ns))
     lost = any(peer.state == "dead" for peer in peers)
     return StatusView(turn.me, boot, str(turn.config.rule), promise.team(turn), not bad and not lost, peers, views)
+
+
+def _is_nothing(component: Component) -> bool:
+    """Whether it is a name alone: heard of only, or of a start that was refused, whose epoch must not be forgotten."""
+    return component.state is State.ABSENT or (component.state is State.RELEASED and component.spec is None)
 
 
 def _component(component: Component, turn: Turn) -> ComponentView:

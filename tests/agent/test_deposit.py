@@ -7,12 +7,15 @@ import threading
 from pathlib import Path
 from typing import Any, cast
 
+from msgspec.structs import replace
+
 from agent.deposit import Deposit
 from agent.places import Places, log_directory
-from agent.streams import OutputLogs
+from agent.streams import OutputLogs, logs_of
 from checkpoint.errors import StoreError
 from checkpoint.format import encode_bytes
 from checkpoint.model import Position, Snapshot
+from checkpoint.shelf import folder_name
 from checkpoint.store import open_store
 from failover.core.acts import Accept, Admit, Discard, Show
 from failover.core.events import StoreFailed
@@ -194,5 +197,25 @@ def test_after_a_restart_only_what_the_newest_snapshot_continues_is_shown_until_
         assert again.seen() == b"ready\nline 2\n"
         await again.deposit.show(Show(COMPONENT, 1, made[-1].position))
         assert again.seen() == b"ready\nline 2\nline 3\n"
+
+    asyncio.run(story())
+
+
+def test_a_component_of_another_user_takes_nothing_over_from_its_namesake(tmp_path: Path) -> None:
+    first, _ = history(2)
+
+    async def story() -> None:
+        standing = Standing(tmp_path)
+        place = tmp_path / "logs" / folder_name(COMPONENT)
+        theirs = logs_of(place, 7002)
+        theirs.write(1, 0, b"a secret, and longer than what comes now\n")
+        theirs.close()
+        await standing.take(replace(first, output=()))
+        standing.deposit.accept(Accept(COMPONENT, 1, standing.told[0].position))
+        await standing.deposit.show(Show(COMPONENT, 1, standing.told[0].position))
+        ours = OutputLogs(place)
+        assert ours.owner == 0
+        assert ours.totals() == (0, 0)
+        ours.close()
 
     asyncio.run(story())

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from agent.errors import RefusedError
 from agent.outflow import Outflow
 from agent.places import Places, log_directory
 from agent.streams import OutputLogs
@@ -64,3 +65,19 @@ def test_logs_show_all_of_it_as_soon_as_status_says_that_it_has_ended(places: Pl
     outflow = Outflow(Lanes(places, state))
     asyncio.run(outflow.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
     assert listener.heard == heard
+
+
+def test_a_robot_shows_no_user_what_another_users_component_of_the_same_name_wrote(places: Places) -> None:
+    """That one was released; what it wrote lies here until the new one has written something."""
+    logs = OutputLogs(log_directory(NAME, places))
+    logs.belong(7002)
+    logs.close()
+    listener: Any = Listener()
+    listener.caller = SimpleNamespace(uid=7001)
+    outflow = Outflow(Lanes(places, State.PRIMARY))
+    with pytest.raises(RefusedError, match="belongs to uid 7002"):
+        asyncio.run(outflow.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
+    assert listener.heard == b""
+    listener.caller = SimpleNamespace(uid=7002)
+    asyncio.run(outflow.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
+    assert listener.heard == WRITTEN[:COMMITTED]

@@ -181,3 +181,52 @@ def test_a_program_that_comes_back_opens_no_file_that_its_user_may_not(machine: 
 def test_the_owner_gives_orders(machine: Machine, alices: str) -> None:
     status, said = as_user(machine, "alice", f"failover release {alices}")
     assert status == 0, said
+
+
+REFUSED = """
+rm -f /tmp/connected
+python3 -Sc 'import socket, time
+one = socket.socket(socket.AF_UNIX)
+one.connect("/run/systemd/journal/stdout")
+open("/tmp/connected", "w").close()
+time.sleep(1000)' >/dev/null &
+until [ -e /tmp/connected ]; do :; done
+failover protect $! --name {}; status=$?; kill $!; exit $status
+"""
+"""A process with a unix socket that is connected to another one."""
+
+
+def test_a_name_that_was_released_gives_its_next_user_nothing_of_what_its_last_user_wrote(machine: Machine) -> None:
+    secret = "echo a secret of bob; exec sleep 1000"
+    status, said = as_user(machine, "bob", f"failover run --name reused --detach -- sh -c '{secret}'")
+    assert status == 0, said
+    robots.until(lambda: "secret" in as_user(machine, "bob", "failover logs reused")[1], "its output")
+    assert as_user(machine, "bob", "failover release reused")[0] == 0
+    assert "secret" in as_user(machine, "bob", "failover logs reused")[1], "it is his, released or not"
+
+    status, said = as_user(machine, "alice", REFUSED.format("reused"))
+    assert status == 1, said
+    status, said = as_user(machine, "alice", "failover logs reused")
+    assert status == 1 and "belongs to uid 7002" in said and "secret" not in said, said
+    assert "secret" in as_user(machine, "bob", "failover logs reused")[1], "a start that is refused takes nothing"
+
+    status, said = as_user(machine, "alice", "sleep 1000 >/dev/null 2>&1 & failover protect $! --name reused")
+    assert status == 0, said
+    status, said = as_user(machine, "alice", "failover logs reused")
+    assert status == 0 and "secret" not in said, said
+    status, said = as_user(machine, "bob", "failover logs reused")
+    assert status == 1 and "belongs to uid 7001" in said, said
+    assert as_user(machine, "alice", "failover stop reused")[0] == 0
+
+
+def test_a_start_that_is_refused_leaves_nothing_under_its_name(machine: Machine) -> None:
+    for attempt in (
+        REFUSED.format("nonexist"),
+        "failover run --name nonexist -- /no/such/program",
+        "failover run -- /no/such/nonexist",
+    ):
+        status, said = as_user(machine, "alice", attempt)
+        assert status == 1, said
+    assert "nonexist" not in as_user(machine, "alice", "failover status --json")[1]
+    status, said = as_user(machine, "bob", "failover run --name nonexist -- id -u")
+    assert (status, said) == (0, "7002\n"), "another user may have the name"
