@@ -148,6 +148,7 @@ class Config:
         beat_ms: period of beats to each peer.
         lease_ms: how long a primary acts without being heard, and how long a standby stays loyal to a silent one.
         patience_s: under the majority rule: how long the robots that hold the newest checkpoint are waited for.
+        boot_patience_s: under the pair rule: how long a robot that starts waits for the robots that may run a component.
         rule: who decides that a silent robot is replaced: pair, majority, or auto: a majority wherever more than two belong.
         when_alone: under the pair rule: when no other robot is heard, what is started here runs on, or is held still.
         snapshot_period_ms: between two snapshots of a component; grows by itself when link or standby is slower.
@@ -176,6 +177,7 @@ class Config:
     rule: Literal["auto", "pair", "majority"] = "auto"
     when_alone: Literal["run", "freeze"] = "run"
     patience_s: int = 30
+    boot_patience_s: int = 60
     snapshot_period_ms: int = 100
     realtime: bool = True
     link_mbit_s: int = 0
@@ -216,6 +218,8 @@ class Config:
             )
         if not 1 <= self.patience_s <= PATIENCE_S_MAX:
             raise ValueError(f"patience_s is {self.patience_s}; it must be at least 1 and at most {PATIENCE_S_MAX}")
+        if not 0 <= self.boot_patience_s <= PATIENCE_S_MAX:
+            raise ValueError(f"boot_patience_s is {self.boot_patience_s}; it must be at least 0 and at most {PATIENCE_S_MAX}")
         if not 0 <= self.keep_checkpoints <= KEEP_MAX:
             raise ValueError(f"keep_checkpoints is {self.keep_checkpoints}; at most {KEEP_MAX}, and 0 keeps none")
         _check_quantity("keep_for", span_ms, self.keep_for)

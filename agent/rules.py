@@ -35,6 +35,7 @@ def node_config(settings: Settings) -> types.Config:
         servers=_members(settings, "server"),
         witnesses=_members(settings, "witness"),
         patience_ms=config.patience_s * 1_000,
+        boot_patience_ms=config.boot_patience_s * 1_000,
     )
 
 

@@ -132,6 +132,8 @@ class Component(Struct):
         claim_counter: beat of ours that first carried the present epoch.
         generation, sequence: of the next snapshot; ``parent``: newest position that the keeper may count from.
         born: epoch under which the present process was started or restored.
+        stood: this copy stood still, or began without a word of the robots that ran it before, since all peers last agreed to it.
+        rival_ns: when this copy, which never stopped acting, first heard of the present rival.
         crashed: wait status of a program that died while it was held still; it is resumed when it may act.
         safe: on a primary, the newest position that counts as acknowledged and is not here alone. vouched: on any other member,
             the newest position of which it was told so; ``shown``: the one up to which it lets readers see the output.
@@ -180,6 +182,8 @@ class Component(Struct):
     request: int = 0
     until_ns: int = 0
     born: int = 0
+    stood: bool = False
+    rival_ns: int = 0
     generation: int = 0
     sequence: int = 0
     parent: Position | None = None

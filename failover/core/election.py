@@ -16,7 +16,7 @@ from failover.core import acts, lease
 from failover.core.component import LOST_MAX, Cause, Component, Turn
 from failover.core.consent import grants, state_of
 from failover.core.membership import Peer
-from failover.core.messages import HOLDS, SAFE, UNPROTECTED, Entry
+from failover.core.messages import HOLDS, ORDERED, SAFE, STOOD, UNPROTECTED, Entry
 from failover.core.names import Weight, weight
 from failover.core.types import ENDED, HOLDING, MS, PEERS_MAX, Resumption, State
 
@@ -35,7 +35,7 @@ def consider(component: Component, turn: Turn) -> None:
     """Claim the component if it is vacant and this robot is the one to run it."""
     if component.state not in (State.ABSENT, State.STANDBY) or turn.now_ns < component.retry_ns or not vacant(component, turn):
         return
-    if not turn.config.runs(turn.me):
+    if not turn.config.runs(turn.me) or waits_after_boot_ns(component, turn):
         return
     entries = living_entries(component, turn)
     best = max((position for _, entry in entries if (position := entry.position)), default=None)
@@ -48,6 +48,23 @@ def consider(component: Component, turn: Turn) -> None:
         chosen = best is None or best < mine or (best == mine and first_of_equals(component, turn, entries, mine))
     if chosen and _may_go_on(component, turn):
         claim(component, turn, mine, "nobody runs it")
+
+
+def unheard(component: Component, turn: Turn) -> tuple[str, ...]:
+    """Under pair: the robots that ran it last, or may have taken it over since, of which there was no word in this life of ours.
+
+    They may be well: the network of a robot that boots often comes later than its agent.
+    """
+    if turn.config.by_majority:
+        return ()
+    theirs = dict.fromkeys((component.primary, *component.entrusted))
+    return tuple(robot for robot in theirs if robot != turn.me and turn.team.unheard(robot))
+
+
+def waits_after_boot_ns(component: Component, turn: Turn) -> int:
+    """For how long this robot waits for them still before it claims the component; 0: not any more."""
+    left_ns = turn.config.boot_patience_ms * MS - turn.team.lived_ns(turn.now_ns)
+    return max(left_ns, 0) if unheard(component, turn) else 0
 
 
 def vacant(component: Component, turn: Turn) -> bool:
@@ -79,6 +96,7 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     component.alone_right = not component.freezes or _right_to_act_alone(component, turn)
     component.claimed = not component.alone_right
     component.begun, component.bare = component.has_begun, False
+    component.stood, component.rival_ns = bool(unheard(component, turn)), 0
     component.move(Cause.CLAIM)
     component.epoch = max(component.epoch, component.seen) + 1
     component.resumption = _resumption(component, turn, is_planned=is_planned)
@@ -259,7 +277,9 @@ def _is_taken(component: Component, sender: str, entry: Entry) -> bool:
 
 def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
     if component.holding:
-        if stronger(component, turn, sender, entry, theirs):
+        if _never_stopped(component, entry):
+            _outlast(component, turn, sender, entry, theirs)
+        elif stronger(component, turn, sender, entry, theirs):
             lose(component, turn, sender, entry)
         return
     if entry.epoch < component.epoch or (component.state in ENDED and entry.epoch == component.epoch):
@@ -292,6 +312,31 @@ def stronger(component: Component, turn: Turn, sender: str, entry: Entry, theirs
     their_claim = (entry.epoch, _ACTS.get(theirs, ACTS_FULLY))
     our_claim = (component.epoch, _ACTS.get(component.state, ACTS_FULLY))
     return their_claim > our_claim or (their_claim == our_claim and weight(sender) < weight(turn.me))
+
+
+def _never_stopped(component: Component, entry: Entry) -> bool:
+    """Of two copies that met again: whether ours acted all the time, and the other one began from a checkpoint of it meanwhile.
+
+    An operator's order stands: the copy that was promoted stays.
+    """
+    acts_on = component.state is State.PRIMARY and not component.stood and not component.ordered
+    return acts_on and not entry.flags & ORDERED and (bool(entry.flags & STOOD) or 0 < component.born < entry.born)
+
+
+def _outlast(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
+    """Go on above the other's epoch, so that the least work is lost; where that robot does not hear us, give up to it as ever."""
+    if entry.epoch < component.epoch:
+        return  # it will hear of ours
+    if turn.team.lease_ns(sender) > turn.now_ns:
+        component.rival_ns = 0
+        turn.say(
+            component, f"{turn.me} keeps its copy, which never stopped acting; the one of {sender} began in epoch {entry.born}"
+        )
+        renew(component, turn, entry.epoch)
+    elif turn.now_ns >= component.rival_ns + 2 * turn.config.loyalty_ns:
+        component.rival_ns = turn.now_ns
+    elif turn.now_ns >= component.rival_ns + turn.config.loyalty_ns and stronger(component, turn, sender, entry, theirs):
+        lose(component, turn, sender, entry)
 
 
 def _may_switch(component: Component, turn: Turn, sender: str, entry: Entry) -> bool:
@@ -335,9 +380,21 @@ def lose(component: Component, turn: Turn, winner: str, entry: Entry) -> None:
     component.handing = component.flight = None
     component.standby, component.lease_ns, component.told_ns = "", 0, 0
     component.crashed = 0
+    _forget_lines_since(component, turn, entry)
     accept(component, turn, winner, entry.epoch)
     component.trusted = entry.standby == turn.me
     admit(component, turn, winner)
+
+
+def _forget_lines_since(component: Component, turn: Turn, entry: Entry) -> None:
+    """The winner's copy was there before ours: what our primacy captured is not in its past, and is never resumed from."""
+    if turn.config.by_majority or not 0 < entry.born < component.epoch < entry.epoch:
+        return
+    beaten = tuple(sorted({held.generation for held in component.held if held.generation // (PEERS_MAX + 1) > entry.born}))
+    if beaten:
+        component.held = [held for held in component.held if held.generation not in beaten]
+        component.lost = (*component.lost, *beaten)[-LOST_MAX:]
+        turn.order(acts.Forget(component.name, entry.epoch, beaten))
 
 
 def refuse_request(component: Component, turn: Turn, sentence: str) -> None:

@@ -65,6 +65,7 @@ def _call_off(component: Component, turn: Turn, handing: Handing) -> None:
     if handing.yielded:
         renew(component, turn, component.epoch + 1)
     component.move(Cause.CALL_OFF)
+    component.stood = True
     component.handing = None
     if component.flight is not None and component.flight.position is None:
         component.flight.final = False  # it is being taken still, and no second one may be at once

@@ -27,6 +27,7 @@ def watch(component: Component, turn: Turn) -> None:
     over = on_lease(component, turn) and (ran_out or turn.now_ns >= component.lease_ns)
     if component.state is State.PRIMARY and over:
         component.move(Cause.LEASE_OVER)
+        component.stood = True
         turn.order(acts.Freeze(component.name, component.epoch))
         turn.say(component, f"{turn.me} {Cause.LEASE_OVER}")
     if component.state is State.FROZEN and _may_thaw(component, turn):
@@ -37,6 +38,8 @@ def watch(component: Component, turn: Turn) -> None:
         turn.say(component, f"{turn.me} lets it run: it may act")
     elif component.state in ACTING and not _has_given_way(component):
         _tell(component, turn)
+    if component.stood and component.state is State.PRIMARY and _all_agree(component, turn):
+        component.stood = False
 
 
 def entrust(component: Component, turn: Turn, robot: str) -> bool:
@@ -76,6 +79,11 @@ def on_lease(component: Component, turn: Turn) -> bool:
 def _granted_ns(component: Component, turn: Turn, robot: str) -> int:
     peer = turn.team.peers.get(robot)
     return turn.team.lease_ns(robot) if peer is not None and grants(component, peer, turn.me) else 0
+
+
+def _all_agree(component: Component, turn: Turn) -> bool:
+    """Whether every peer is heard, and consents: none of them runs another copy."""
+    return all(turn.alive(peer.robot) and grants(component, peer, turn.me) for peer in turn.team.peers.values())
 
 
 def _has_given_way(component: Component) -> bool:

@@ -235,6 +235,14 @@ class Membership:
         peer = self.peers[robot]
         return self._deaf(peer, now_ns) and now_ns >= peer.told_ns + self._loyalty_ns
 
+    def unheard(self, robot: str) -> bool:
+        """Whether a peer has said nothing yet in this life of ours."""
+        return robot in self.peers and not self.peers[robot].boot
+
+    def lived_ns(self, now_ns: int) -> int:
+        """How long this life of ours has lasted."""
+        return now_ns - self._born_ns
+
     def rested(self, now_ns: int) -> bool:
         """Whether whatever an earlier life of ours has told anybody is over."""
         return now_ns >= self._born_ns + self._loyalty_ns

@@ -39,8 +39,10 @@ class Entry(msgspec.Struct, frozen=True, array_like=True):
         yields_to: (primary, handing over) the robot that may claim now.
         flags: ``NEEDS_BASE`` (standby), ``UNPROTECTED`` (primary has stopped protecting), ``HOLDS`` (on_loss is hold),
             ``WARM`` (standby: its program waits there, started already); ``WANTS`` (a checkpoint, to run it);
-            ``SAFE`` (primary: its newest position is acknowledged); ``FREE``, ``OPEN``, ``STARTS``, ``ORDERED`` (majority).
+            ``SAFE`` (primary: its newest position is acknowledged); ``STOOD`` (primary of a pair); ``FREE``, ``OPEN``,
+            ``STARTS``, ``ORDERED`` (majority).
         status: of a finished component, waitpid's.
+        born: epoch under which the sender's copy was started or restored; 0 does not tell.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Entry(msgspec.Struct, frozen=True, array_like=True):
     yields_to: str = ""
     flags: int = 0
     status: int = 0
+    born: int = 0
 
     @property
     def position(self) -> Position | None:
@@ -83,6 +86,10 @@ WANTS = 256
 
 SAFE = 512
 """The position that the sender, a primary, tells of counts as acknowledged: every robot that holds it may show its output."""
+
+
+STOOD = 1024
+"""The sender's copy stood still, or began without a word of the robots that ran it, since all its peers last agreed to it."""
 
 
 class Beat(msgspec.Struct, frozen=True, array_like=True):

@@ -311,6 +311,7 @@ def _take_up(component: Component, turn: Turn, found: Found | None) -> None:
         return
     component.born = min(found.epoch, component.epoch)
     component.state = State.FROZEN
+    component.stood = True
     component.standby = component.entrusted[0] if component.entrusted else ""
     election.open_line(component, turn)
     if not found.running:

@@ -13,6 +13,7 @@ from failover.core.messages import (
     RULES,
     SAFE,
     STARTS,
+    STOOD,
     UNPROTECTED,
     WANTS,
     WARM,
@@ -38,6 +39,7 @@ def entry_of(component: Component, me: str) -> Entry:
     flags |= HOLDS * component.waits | WARM * component.warm
     flags |= FREE * component.free | OPEN * component.open | ORDERED * component.ordered
     flags |= WANTS * (component.wanted is not None)
+    flags |= STOOD * (component.holding and component.stood)
     flags |= SAFE * (component.holding and newest is not None and component.safe == newest)
     flags |= STARTS * (component.autostart and not component.held and not component.entrusted)
     return Entry(
@@ -52,6 +54,7 @@ def entry_of(component: Component, me: str) -> Entry:
         handing.to if handing and handing.yielded else "",
         flags,
         component.status,
+        component.epoch if component.state is State.CLAIMING else component.born,
     )
 
 

@@ -233,6 +233,8 @@ class Config(Struct, frozen=True, dict=True):
         patience_ms: under majority, how long the robots that hold what was acknowledged are waited for before another one goes on
             from an older checkpoint.
         archive_ms: between two whole checkpoints for a server that does not keep up with the deltas.
+        boot_patience_ms: under pair, how long after its own start a robot waits for the robots that ran a component last, or that
+            may have taken it over since, before it claims the component without having heard them.
     """
 
     robot: str
@@ -253,6 +255,7 @@ class Config(Struct, frozen=True, dict=True):
     witnesses: tuple[str, ...] = ()
     patience_ms: int = 30_000
     archive_ms: int = 10_000
+    boot_patience_ms: int = 0
 
     def __post_init__(self) -> None:
         if not 1 <= self.beat_ms <= BEAT_MS_MAX:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from failover.core import homecoming, promise, replication
+from failover.core import election, homecoming, promise, replication
 from failover.core.component import Component, Turn
 from failover.core.consent import state_of
 from failover.core.types import MS, ComponentView, Protection, State, StatusView
@@ -141,6 +141,10 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
         notes.append(staying)
     if component.unstored and component.state is State.STANDBY:
         notes.append(f"a snapshot was not stored at {turn.me}: {component.unstored}")
+    if component.state is State.STANDBY and (left_ns := election.waits_after_boot_ns(component, turn)):
+        who = " and ".join(election.unheard(component, turn))
+        claims = f"{turn.me} claims it in {left_ns / NS_PER_S:.0f} s (boot_patience_s); failover promote does not wait"
+        notes.append(f"waiting: {who} may run it and was not heard since {turn.me} started; {claims}")
     if component.unprotected:
         notes.append("protected no longer, as on_unsupported = stop_protecting says; failover release, then protect, begins anew")
     if component.cold:

@@ -232,6 +232,7 @@ def _sound_entry(entry: Entry) -> bool:
         0 < text_size(entry.name) <= COMPONENT_SIZE_MAX
         and all(text_size(robot) <= ROBOT_SIZE_MAX for robot in robots)
         and 0 <= entry.epoch < EPOCH_MAX
+        and 0 <= entry.born < EPOCH_MAX
         and 0 <= entry.generation < EPOCH_MAX * (PEERS_MAX + 1)
         and 0 <= entry.sequence < NUMBER_MAX
         and len(entry.digest) <= DIGEST_SIZE_MAX

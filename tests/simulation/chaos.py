@@ -46,6 +46,10 @@ least, which tends to be the primary, has the slowest clock, and everybody else 
 LONG_LEASE_MS = 600
 DRIFT_MAX = 0.05
 
+CAREFUL = 4
+BOOT_PATIENCE_MS = 1_500
+"""Every so many-th pair waits that long after a start for a word of the robot that ran a component."""
+
 PACES = (1.0, 0.02)
 """How long disks, captures and restores take: as on a robot, or next to nothing, so that no delay hides a mistake."""
 
@@ -60,7 +64,7 @@ def life(seed: int, engines: tuple[str, ...] = ENGINES, team: tuple[int, int, in
     random, engine = Random(seed ^ 0x5EED), Random(seed)
     specs = tuple(_spec(random, index, engine.choice(engines)) for index in range(random.choice((1, 1, 2, 3))))
     robots, servers, witnesses = team or TEAMS[seed // HARSH % len(TEAMS)]
-    configs = pair(specs)
+    configs = pair(specs, boot_patience_ms=0 if seed % CAREFUL else BOOT_PATIENCE_MS)
     if robots + servers + witnesses > 2:
         configs = elective(robots, specs, servers, witnesses, lease_ms=150 if seed % HARSH else LONG_LEASE_MS)
     narrow = NARROW_BODY_SIZE + ECHO_SIZE * (len(configs) - 2)

@@ -149,6 +149,21 @@ def crash_is_the_end() -> Any:
     return patch.object(endings, "_recover", lambda *_: None)
 
 
+def rewinds_at_reunion() -> Any:
+    """Of two copies that met again the one with the higher epoch stays, also where the other one never stopped acting."""
+    return patch.object(election, "_never_stopped", lambda *_: False)
+
+
+def never_stopped_though_it_stood() -> Any:
+    """A copy that stood still meanwhile claims that it never stopped."""
+    return patch.object(lease, "_all_agree", lambda *_: True)
+
+
+def claims_at_boot() -> Any:
+    """A robot that has just started claims what another one ran, though it has not heard that robot yet."""
+    return patch.object(election, "waits_after_boot_ns", lambda *_: 0)
+
+
 def no_grace() -> Any:
     """A robot that has just started takes everybody it has not heard for dead."""
     return patch.object(Config, "grace_ns", property(lambda _: 0))
@@ -358,6 +373,10 @@ SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (forgets_what_it_ran, "an_epoch_that_was_used_is_not_consented_to"),
     (humble_primary, "an_old_copy_that_raises_its_epoch_is_not_believed"),
     (minority_rules, "without_a_majority_nothing_acts"),
+    (rewinds_at_reunion, "after_a_total_cut_the_copy_that_never_stopped_stays"),
+    (rewinds_at_reunion, "a_claim_in_the_dark_gives_up_to_the_copy_that_never_stopped"),
+    (never_stopped_though_it_stood, "a_primary_that_stood_still_gives_up_to_the_copy_that_acted"),
+    (claims_at_boot, "a_standby_that_boots_before_its_network_rewinds_nothing"),
     (tireless_giver, "a_chain_that_is_not_taken_is_offered_again_after_a_pause"),
 )
 """Mistakes that a pair survives, or that cost no promise but the peace: each spoils a scenario."""

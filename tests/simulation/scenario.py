@@ -4,6 +4,7 @@ A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment. ``expect`` 
 
     team robot1 robot2 robot3              who is in the team, if not robot1 and robot2; before everything else
     votes robot1 robot2 witness1           the same, and primaries are elected; servers have their role by their name, too
+    boot-patience 5000                     of robots that start, in ms; before everything but that
     rule when_alone=freeze on_loss=hold    rules of the component, before everything but that
     0    on robot1                         start a robot; off: power cut; agent-dies: guards and programs live on
     100  run robot1                        an operator starts the component there
@@ -55,11 +56,12 @@ class Story:
         lines = [words for line in text.splitlines() if (words := line.split("#")[0].split())]
         kind, *members = lines.pop(0) if lines[0][0] in ("team", "votes") else ("team", "robot1", "robot2")
         names, votes = tuple(members), kind == "votes"
+        boot_patience_ms = int(lines.pop(0)[1]) if lines[0][0] == "boot-patience" else 0
         if lines[0][0] == "rule":
             self.rules = _rules(lines.pop(0)[1:])
         safe = {COMPONENT} if votes or self.rules.when_alone == "freeze" else set()
         self.invariants = Invariants(safe=safe, votes=votes)
-        self.world = World(1, _voters(names) if votes else pair(names=names), (self.invariants, self._count))
+        self.world = World(1, _voters(names) if votes else pair((), names, boot_patience_ms), (self.invariants, self._count))
         for at_ms, verb, *arguments in lines:
             self.world.run(int(at_ms) * MS)
             self._play(verb, arguments)

@@ -7,9 +7,12 @@ from msgspec.structs import replace
 from failover.core.types import ComponentSpec, Config, Rule
 
 
-def pair(components: tuple[ComponentSpec, ...] = (), names: tuple[str, ...] = ("robot1", "robot2")) -> list[Config]:
+def pair(
+    components: tuple[ComponentSpec, ...] = (), names: tuple[str, ...] = ("robot1", "robot2"), boot_patience_ms: int = 0
+) -> list[Config]:
     """Configurations of a small team, with times that make a minute of life cheap to simulate."""
     plain = Config(names[0], (), components, 25, 150, 20, 10, 300, 200, 2_000, 400, 3_000, 2_000)
+    plain = replace(plain, boot_patience_ms=boot_patience_ms)
     return [replace(plain, robot=name, peers=tuple(other for other in names if other != name)) for name in names]
 
 

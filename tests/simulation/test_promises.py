@@ -100,13 +100,14 @@ def test_a_total_cut_between_two_that_live_can_run_a_component_twice() -> None:
     assert two.after(500) == ["robot1", "robot2"]
 
 
-def test_when_they_meet_again_the_higher_epoch_goes_on_and_the_losers_state_is_kept_aside() -> None:
+def test_when_they_meet_again_the_copy_that_never_stopped_goes_on_and_the_other_ones_state_is_kept_aside() -> None:
     two = team()
     two.cut("robot1", "robot2")
     two.after(500)
     two.world.network.cuts.clear()
-    assert two.after(300) == ["robot2"]
-    assert two.aside == ["robot1"] and state_at(two.world, "robot1", PART) is State.STANDBY
+    assert two.after(500) == ["robot1"]
+    assert two.aside == ["robot2"] and state_at(two.world, "robot2", PART) is State.STANDBY
+    assert seen_at(two.world, "robot1", PART).epoch == 3, "above the one that robot2 had opened"
 
 
 def test_of_two_that_claimed_the_same_epoch_the_lesser_name_goes_on_and_the_others_state_is_kept_aside() -> None:

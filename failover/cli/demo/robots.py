@@ -32,6 +32,9 @@ from failover.errors import FailoverError, LostAgentError, NoAgentError
 NAMES: Final = ("robot1", "robot2")
 BEAT_MS: Final = 20
 LEASE_MS: Final = 120
+BOOT_PATIENCE_S: Final = 3
+"""These robots' networks are there when they boot."""
+
 START_S: Final = 60.0
 """How long an agent may take until it answers; a second is usual, a busy machine takes more."""
 
@@ -228,7 +231,7 @@ class Stage:
             cables: as `CABLES`; beats go over all of them, snapshots over the first.
         """
         self._cables = cables
-        self._pace = f"beat_ms = {beat_ms}\nlease_ms = {lease_ms}\n"
+        self._pace = f"beat_ms = {beat_ms}\nlease_ms = {lease_ms}\nboot_patience_s = {BOOT_PATIENCE_S}\n"
         self.directory = directory
         self._settings = settings
         self.means = allowed
