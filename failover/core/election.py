@@ -61,16 +61,35 @@ def unheard(component: Component, turn: Turn) -> tuple[str, ...]:
     return tuple(robot for robot in theirs if robot != turn.me and turn.team.unheard(robot))
 
 
+def _begins_in_the_dark(component: Component, turn: Turn) -> bool:
+    """Whether it is claimed without a word, in this life of ours, of a robot that may run it; of one that nobody is known to have
+    run that is any, but where an operator starts it.
+    """
+    if turn.config.by_majority:
+        return False
+    is_unknown = not component.primary and not component.request
+    return bool(unheard(component, turn)) or (is_unknown and any(map(turn.team.unheard, turn.team.peers)))
+
+
 def waits_after_boot_ns(component: Component, turn: Turn) -> int:
     """For how long this robot waits for them still before it claims the component; 0: not any more."""
+    absent = unheard(component, turn)
+    if not absent:
+        return 0
     left_ns = turn.config.boot_patience_ms * MS - turn.team.lived_ns(turn.now_ns)
-    return max(left_ns, 0) if unheard(component, turn) else 0
+    if any(robot not in turn.team.peers for robot in absent):  # a robot that knocks may be that one: our team file may be old
+        left_ns = max(left_ns, turn.team.strangers_until_ns() - turn.now_ns)
+    return max(left_ns, 0)
 
 
-def vacant(component: Component, turn: Turn) -> bool:
-    """Nobody who lives holds it or knows its end, and everybody is heard or dead."""
+def vacant(component: Component, turn: Turn, *, is_ordered: bool = False) -> bool:
+    """Nobody who lives holds it or knows its end, and everybody is heard or dead.
+
+    Args:
+        is_ordered: an operator says so of robots that send what cannot be authenticated.
+    """
     for robot, peer in turn.team.peers.items():
-        if turn.gone(robot):
+        if turn.gone(robot) or (is_ordered and turn.team.keeps_waiting(robot, turn.now_ns)):
             continue
         if not turn.alive(robot):
             return False
@@ -96,7 +115,7 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     component.alone_right = not component.freezes or _right_to_act_alone(component, turn)
     component.claimed = not component.alone_right
     component.begun, component.bare = component.has_begun, False
-    component.stood, component.rival_ns = bool(unheard(component, turn)), 0
+    component.stood, component.rival_ns = _begins_in_the_dark(component, turn), 0
     component.move(Cause.CLAIM)
     component.epoch = max(component.epoch, component.seen) + 1
     component.resumption = _resumption(component, turn, is_planned=is_planned)
@@ -197,7 +216,7 @@ def renew(component: Component, turn: Turn, above: int) -> None:
 def _consented(component: Component, turn: Turn) -> bool:
     overdue = turn.now_ns >= component.until_ns
     for robot, peer in turn.team.peers.items():
-        if turn.dead(robot):
+        if turn.dead(robot) or (component.ordered and turn.team.keeps_waiting(robot, turn.now_ns)):
             if not component.alone_right:
                 return False
         elif not (peer.echoed >= component.claim_counter and grants(component, peer, turn.me)) and (
@@ -277,7 +296,7 @@ def _is_taken(component: Component, sender: str, entry: Entry) -> bool:
 
 def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
     if component.holding:
-        if _never_stopped(component, entry):
+        if _outlasts(component, entry):
             _outlast(component, turn, sender, entry, theirs)
         elif stronger(component, turn, sender, entry, theirs):
             lose(component, turn, sender, entry)
@@ -314,13 +333,19 @@ def stronger(component: Component, turn: Turn, sender: str, entry: Entry, theirs
     return their_claim > our_claim or (their_claim == our_claim and weight(sender) < weight(turn.me))
 
 
-def _never_stopped(component: Component, entry: Entry) -> bool:
-    """Of two copies that met again: whether ours acted all the time, and the other one began from a checkpoint of it meanwhile.
+def _outlasts(component: Component, entry: Entry) -> bool:
+    """Of two copies that met again: whether ours stays, though the other one's epoch may be later.
 
-    An operator's order stands: the copy that was promoted stays.
+    An operator's order stands: the copy that was promoted stays. Without an order the one does that never stopped acting.
     """
-    acts_on = component.state is State.PRIMARY and not component.stood and not component.ordered
-    return acts_on and not entry.flags & ORDERED and (bool(entry.flags & STOOD) or 0 < component.born < entry.born)
+    if component.state is not State.PRIMARY or entry.flags & ORDERED:
+        return False
+    return component.ordered or _never_stopped(component, entry)
+
+
+def _never_stopped(component: Component, entry: Entry) -> bool:
+    """Whether ours acted all the time, and the other one stood still, or began from a checkpoint of it meanwhile."""
+    return not component.stood and (bool(entry.flags & STOOD) or 0 < component.born < entry.born)
 
 
 def _outlast(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
@@ -329,9 +354,8 @@ def _outlast(component: Component, turn: Turn, sender: str, entry: Entry, theirs
         return  # it will hear of ours
     if turn.team.lease_ns(sender) > turn.now_ns:
         component.rival_ns = 0
-        turn.say(
-            component, f"{turn.me} keeps its copy, which never stopped acting; the one of {sender} began in epoch {entry.born}"
-        )
+        ours = "was promoted by an operator" if component.ordered else "never stopped acting"
+        turn.say(component, f"{turn.me} keeps its copy, which {ours}; the one of {sender} began in epoch {entry.born}")
         renew(component, turn, entry.epoch)
     elif turn.now_ns >= component.rival_ns + 2 * turn.config.loyalty_ns:
         component.rival_ns = turn.now_ns

@@ -29,6 +29,18 @@ class Received(Struct, frozen=True):
     came_ns: int = 0
 
 
+class Unread(Struct, frozen=True):
+    """Something came from a member that proves nothing of whom it is: a beat under an unknown key, a refusal of our own key.
+
+    Attributes:
+        robot: the member whose address it came from; "": an address that is no member's.
+        why: what is wrong, for the status; "": the receiver cannot tell.
+    """
+
+    robot: str
+    why: str = ""
+
+
 class Started(Struct, frozen=True):
     """The act Start is done: the program runs (or, adopted, has been running) and its keeper is ready."""
 
@@ -273,6 +285,7 @@ Command = Run | Release | Stop | Handover | Promote | Failback | Prefer
 Event = (
     Tick
     | Received
+    | Unread
     | Started
     | Captured
     | Unchanged

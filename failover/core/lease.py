@@ -38,8 +38,8 @@ def watch(component: Component, turn: Turn) -> None:
         turn.say(component, f"{turn.me} lets it run: it may act")
     elif component.state in ACTING and not _has_given_way(component):
         _tell(component, turn)
-    if component.stood and component.state is State.PRIMARY and _all_agree(component, turn):
-        component.stood = False
+    if _is_remembered(component, turn) and component.state is State.PRIMARY and _all_agree(component, turn):
+        component.stood = component.ordered = False
 
 
 def entrust(component: Component, turn: Turn, robot: str) -> bool:
@@ -79,6 +79,11 @@ def on_lease(component: Component, turn: Turn) -> bool:
 def _granted_ns(component: Component, turn: Turn, robot: str) -> int:
     peer = turn.team.peers.get(robot)
     return turn.team.lease_ns(robot) if peer is not None and grants(component, peer, turn.me) else 0
+
+
+def _is_remembered(component: Component, turn: Turn) -> bool:
+    """Whether there is something about this copy that counts where two meet again: until all peers have agreed to it."""
+    return component.stood or (component.ordered and not turn.config.by_majority)
 
 
 def _all_agree(component: Component, turn: Turn) -> bool:

@@ -14,7 +14,7 @@ from msgspec import Struct, field
 
 from failover.core.messages import RULES, Beat, Echo, Entry
 from failover.core.story import Sighting
-from failover.core.types import COMPONENTS_MAX, Config, PeerView, State
+from failover.core.types import COMPONENTS_MAX, MS, Config, PeerView, State
 
 ASKED_MAX = 512
 """Beats of ours whose instant of leaving is remembered; ten seconds of them at 20 ms."""
@@ -31,8 +31,15 @@ UNSTEADY_BEATS = 512
 UNSTEADY_FACTOR = 2
 """The margin is so many times the lateness that was seen: the next one may be longer."""
 
+UNREAD_NS = 10_000 * MS
+"""A sign of a member that cannot be authenticated proves for so long that its robot lives: its lanes knock every two seconds."""
+
 SUSPECT_BEATS = 3
 """Beats that may be missing before a peer is called suspect."""
+
+
+UNREAD = "its beats are sealed with a key that this robot was not given"
+"""Why, where nothing else is known."""
 
 
 class _Known(Struct):
@@ -54,6 +61,8 @@ class Peer(Struct):
         settled: see ``messages.Beat``.
         unsteady_ns: how late its beats come at worst, lately: silence beyond a period.
         at_odds: number of its rule, where that is not ours: it is known to live, and nothing else it says counts.
+        unread_ns: when something last came from it that could not be authenticated, 0 for never since its last beat;
+            ``unread_why``: what is wrong.
         loyal_until_ns: `Membership.loyal_until_ns`, counted when something of it changes: it is asked for several times a step.
     """
 
@@ -72,6 +81,8 @@ class Peer(Struct):
     at_odds: int = 0
     total: int = 0
     load: int = 0
+    unread_ns: int = 0
+    unread_why: str = ""
     loyal_until_ns: int = 0
     links: dict[str, int] = field(default_factory=dict)
     entries: dict[str, _Known] = field(default_factory=dict)
@@ -96,6 +107,7 @@ class Peer(Struct):
             self.entries.clear()
             self.since_ns = now_ns
         self.heard_ns = max(self.heard_ns, now_ns)
+        self.unread_ns, self.unread_why = 0, ""
         self.links[link] = now_ns
         self.at_odds = beat.rule if 0 not in (rule, beat.rule) and beat.rule != rule else 0
         if self.at_odds:
@@ -142,6 +154,7 @@ class Membership:
         self._elects = config.by_majority
         self._rule = RULES.index(config.rule)
         self._asked: deque[tuple[int, int]] = deque(maxlen=ASKED_MAX)
+        self._stranger_ns = 0
         self.peers = {robot: Peer(robot, now_ns) for robot in config.peers}
         for peer in self.peers.values():
             self._count_loyalty(peer)
@@ -183,7 +196,9 @@ class Membership:
             peer.told_ns = min(peer.told_ns + late_ns, now_ns)
             peer.heard_us_ns = min(peer.heard_us_ns + late_ns, now_ns)
             peer.since_ns = min(peer.since_ns + late_ns, now_ns)
+            peer.unread_ns = min(peer.unread_ns + late_ns, now_ns) if peer.unread_ns else 0
             self._count_loyalty(peer)
+        self._stranger_ns = min(self._stranger_ns + late_ns, now_ns) if self._stranger_ns else 0
         self._born_ns += late_ns
 
     def loyal_until_ns(self, robot: str) -> int:
@@ -194,7 +209,16 @@ class Membership:
         return self.peers[robot].loyal_until_ns
 
     def _count_loyalty(self, peer: Peer) -> None:
-        peer.loyal_until_ns = peer.heard_ns + (self._loyalty_ns + self._wider_ns(peer) if peer.boot else self._grace_ns)
+        """What cannot be authenticated proves that a robot lives only where that robot was never heard in this life of ours.
+
+        One that was heard and then falls silent is replaced, whatever comes from its address. Under majority votes decide.
+        """
+        if peer.boot:
+            peer.loyal_until_ns = peer.heard_ns + self._loyalty_ns + self._wider_ns(peer)
+            return
+        peer.loyal_until_ns = peer.heard_ns + self._grace_ns
+        if peer.unread_ns and not self._elects:
+            peer.loyal_until_ns = max(peer.loyal_until_ns, peer.unread_ns + UNREAD_NS)
 
     def _wider_ns(self, peer: Peer) -> int:
         """By how much the margin is to be wider than the configured one."""
@@ -236,8 +260,37 @@ class Membership:
         return self._deaf(peer, now_ns) and now_ns >= peer.told_ns + self._loyalty_ns
 
     def unheard(self, robot: str) -> bool:
-        """Whether a peer has said nothing yet in this life of ours."""
-        return robot in self.peers and not self.peers[robot].boot
+        """Whether a robot has said nothing yet in this life of ours: a peer, or one that the team file does not know."""
+        return robot not in self.peers or not self.peers[robot].boot
+
+    def unreadable(self, robot: str, why: str, now_ns: int) -> str:
+        """Note what could not be authenticated; a sentence for the story where it is the first, or says more than before."""
+        peer = self.peers.get(robot)
+        if peer is None:
+            is_news, self._stranger_ns = not self._is_recent(self._stranger_ns, now_ns), now_ns
+            return f"{self._own[0]} receives from a robot that its team.toml does not know{why and f': {why}'}" if is_news else ""
+        is_news = not self._is_recent(peer.unread_ns, now_ns) or (why not in ("", peer.unread_why))
+        peer.unread_ns = now_ns
+        peer.unread_why = why or peer.unread_why or UNREAD
+        self._count_loyalty(peer)
+        return f"{self._own[0]} receives from {robot} and cannot authenticate it: {peer.unread_why}" if is_news else ""
+
+    def unread(self, robot: str, now_ns: int) -> str:
+        """Why what comes from a peer cannot be authenticated; "" where nothing of that kind came lately."""
+        peer = self.peers.get(robot)
+        return peer.unread_why if peer is not None and self._is_recent(peer.unread_ns, now_ns) else ""
+
+    def keeps_waiting(self, robot: str, now_ns: int) -> bool:
+        """Whether a peer would count as dead, but for what comes from it that cannot be authenticated."""
+        peer = self.peers[robot]
+        return not peer.boot and peer.heard_ns + self._grace_ns <= now_ns < peer.loyal_until_ns
+
+    def strangers_until_ns(self) -> int:
+        """For how long a robot that the team file does not know has proved to live: one that belonged to the team, perhaps."""
+        return self._stranger_ns + UNREAD_NS if self._stranger_ns else 0
+
+    def _is_recent(self, at_ns: int, now_ns: int) -> bool:
+        return at_ns > 0 and now_ns < at_ns + UNREAD_NS
 
     def lived_ns(self, now_ns: int) -> int:
         """How long this life of ours has lasted."""
@@ -300,7 +353,7 @@ class Membership:
         state = self._state(peer, now_ns)
         heard = tuple(link for link, at in sorted(peer.links.items()) if now_ns - at < self._loyalty_ns)
         hears_us = self.lease_ns(peer.robot) > now_ns
-        return PeerView(peer.robot, state, peer.boot, silent_ns, hears_us, peer.load, heard)
+        return PeerView(peer.robot, state, peer.boot, silent_ns, hears_us, peer.load, heard, self.unread(peer.robot, now_ns))
 
 
 def _state_name(number: int) -> str:

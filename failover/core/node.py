@@ -52,6 +52,7 @@ from failover.core.events import (
     StoreFailed,
     Tick,
     Unchanged,
+    Unread,
     Warmed,
 )
 from failover.core.membership import Membership
@@ -218,6 +219,9 @@ class Node:
         if isinstance(event, Noticed):
             self._note(event, turn)
             return []
+        if isinstance(event, Unread):
+            self._fail_to_read(event, turn)
+            return []
         name = event.spec.name if isinstance(event, Run) else event.component
         component = self._known(name) if isinstance(event, Run | Stored) else self._components.get(name)
         if component is None:
@@ -233,6 +237,11 @@ class Node:
             turn.say(component, event.sentence, event.output_pending)
         elif not event.component:
             turn.say_of_robot(event.sentence)
+
+    def _fail_to_read(self, event: Unread, turn: Turn) -> None:
+        sentence = self._team.unreadable(event.robot, event.why, turn.now_ns)
+        if sentence:
+            turn.say_of_robot(sentence)
 
     def _hear(self, event: Received, turn: Turn) -> list[Component]:
         beat = event.beat

@@ -73,7 +73,7 @@ def _refusal(component: Component, turn: Turn) -> str:
         return f"here it is {component.state}"
     if component.state not in (State.CLAIMING, State.FROZEN) and _best(component, turn) is None:
         return f"neither {me} nor who is heard holds a checkpoint of it" + (f": {component.unable}" if component.unable else "")
-    if not vacant(component, turn):
+    if not vacant(component, turn, is_ordered=True):
         holder = _holder(component, turn)
         return (
             f"{holder} lives and has it; ask there"
@@ -138,7 +138,7 @@ def _claim(component: Component, turn: Turn, request: int) -> None:
 def _go_on_with_the_claim(component: Component, turn: Turn, request: int) -> None:
     """It waits for the consent of robots that are silent: the operator gives it."""
     component.request = component.request or request
-    component.alone_right, component.claimed = True, False
+    component.alone_right, component.claimed, component.ordered = True, False, True
     turn.say(component, f"{turn.me} goes on with its claim without the others: an operator promoted it")
     if component.request != request:
         turn.order(acts.Answer(request, True, f"{component.name} goes on at {turn.me}"))
@@ -146,7 +146,7 @@ def _go_on_with_the_claim(component: Component, turn: Turn, request: int) -> Non
 
 def _let_it_go_on(component: Component, turn: Turn, request: int) -> None:
     """The copy that stands still here goes on, under an epoch in which nobody else may take it over."""
-    component.entrusted, component.standby = (), ""
+    component.entrusted, component.standby, component.ordered = (), "", True
     renew(component, turn, max(component.epoch, component.seen) + SKIPPED_EPOCHS)
     turn.say(component, f"{turn.me} does not wait for the others: an operator promoted it")
     turn.order(acts.Answer(request, True, f"{component.name} goes on at {turn.me}"))
@@ -165,6 +165,11 @@ def _stands_still(component: Component, robot: str) -> bool:
 
 def _double(turn: Turn, robot: str) -> str:
     silent_s = (turn.now_ns - turn.team.peers[robot].heard_ns) / (1_000 * MS)
+    if unread := turn.team.unread(robot, turn.now_ns):
+        return (
+            f"{robot} lives and cannot be authenticated ({unread}): it may run it too, until they hear each other: then "
+            f"{turn.me} goes on, and what {robot} did is kept aside"
+        )
     return (
         f"{robot} has not been heard for {silent_s:.0f} s; if it lives it may run it too, until they hear each other: then "
         f"{turn.me} goes on, and what {robot} did is kept aside"

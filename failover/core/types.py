@@ -404,7 +404,10 @@ class Found(Struct, frozen=True):
 
 
 class PeerView(Struct, frozen=True):
-    """One peer as this robot sees it: ``state`` is alive, suspect, dead or unheard; ``silent_ns`` since its last beat."""
+    """One peer as this robot sees it: ``state`` is alive, suspect, dead or unheard; ``silent_ns`` since its last beat.
+
+    ``unread``: why what comes from it cannot be authenticated, if something of that kind came lately.
+    """
 
     robot: str
     state: str
@@ -413,6 +416,7 @@ class PeerView(Struct, frozen=True):
     hears_us: bool
     load: int
     links: tuple[str, ...] = ()
+    unread: str = ""
 
 
 class ComponentView(Struct, frozen=True):

@@ -24,7 +24,7 @@ def status(components: dict[str, Component], turn: Turn, boot: int) -> StatusVie
     peers = turn.team.views(turn.now_ns)
     bad = any(view.protection is Protection.DEGRADED or view.state is State.FAILED for view in views)
     bad = bad or any(view.cold or view.unstored for view in views)
-    bad = bad or bool(turn.team.at_odds(turn.now_ns))
+    bad = bad or bool(turn.team.at_odds(turn.now_ns)) or any(peer.unread for peer in peers)
     lost = any(peer.state == "dead" for peer in peers)
     return StatusView(turn.me, boot, str(turn.config.rule), promise.team(turn), not bad and not lost, peers, views)
 
@@ -123,6 +123,13 @@ def _ending(component: Component, turn: Turn) -> list[str]:
     return [robot for robot, entry in entries if entry is not None and state_of(entry) is State.STOPPING]
 
 
+def _unread(turn: Turn) -> str:
+    """Which robots live, and only cannot be authenticated."""
+    waited_for = [robot for robot in turn.team.peers if turn.team.keeps_waiting(robot, turn.now_ns)]
+    told = (f"{robot} lives and cannot be authenticated: {turn.team.unread(robot, turn.now_ns)}" for robot in waited_for)
+    return "; ".join(told)
+
+
 def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
     notes = []
     if component.degraded and component.holding:
@@ -145,6 +152,8 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
         who = " and ".join(election.unheard(component, turn))
         claims = f"{turn.me} claims it in {left_ns / NS_PER_S:.0f} s (boot_patience_s); failover promote does not wait"
         notes.append(f"waiting: {who} may run it and was not heard since {turn.me} started; {claims}")
+    if component.state in (State.STANDBY, State.FROZEN) and (unread := _unread(turn)):
+        notes.append(f"waiting: {unread}; failover promote does not wait")
     if component.unprotected:
         notes.append("protected no longer, as on_unsupported = stop_protecting says; failover release, then protect, begins anew")
     if component.cold:

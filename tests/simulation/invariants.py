@@ -148,7 +148,7 @@ class Invariants:
             act.position in other.store.get(act.component, []) for name, other in world.robots.items() if name != robot
         )
         elsewhere = elsewhere or act.position in self.gone
-        is_told = act.is_safe and len(world.robots) > 1
+        is_told = act.is_safe and bool(world.robots[robot].config.peers)
         if not elsewhere and (is_told or self.shipped.get(act.component) == act.position):
             raise _broken(world, f"{robot} acknowledges {act.position} of {act.component}, which nobody else holds")
         if elsewhere:

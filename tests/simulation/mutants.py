@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from failover.core import acts, archive, contest, election, endings, handover, lease, majority, node, replication, warmth
 from failover.core.component import Component, Turn
-from failover.core.membership import Membership, Peer
+from failover.core.membership import UNREAD_NS, Membership, Peer
 from failover.core.messages import Entry
 from failover.core.types import Config, State
 
@@ -162,6 +162,44 @@ def never_stopped_though_it_stood() -> Any:
 def claims_at_boot() -> Any:
     """A robot that has just started claims what another one ran, though it has not heard that robot yet."""
     return patch.object(election, "waits_after_boot_ns", lambda *_: 0)
+
+
+def takes_the_unreadable_for_silence() -> Any:
+    """What comes from a robot and cannot be authenticated counts as if nothing came."""
+    return patch.object(Membership, "unreadable", lambda *_: "")
+
+
+def believes_garbage() -> Any:
+    """What cannot be authenticated proves that its robot lives, also where that robot was heard before."""
+    honest = Membership._count_loyalty
+
+    def mistaken_loyalty(self: Membership, peer: Any) -> None:
+        honest(self, peer)
+        peer.loyal_until_ns = max(peer.loyal_until_ns, peer.unread_ns + UNREAD_NS)
+
+    return patch.object(Membership, "_count_loyalty", mistaken_loyalty)
+
+
+def waits_in_spite_of_the_order() -> Any:
+    """An operator's order does not help against what cannot be authenticated."""
+    return patch.object(Membership, "keeps_waiting", lambda *_: False)
+
+
+def forgets_the_order() -> Any:
+    """Where two copies meet again, that one of them was promoted counts for nothing."""
+    return patch.object(election, "_outlasts", election._never_stopped)
+
+
+def remembers_the_order_for_ever() -> Any:
+    """A copy that was promoted once is not protected by having acted all the time."""
+    return patch.object(
+        election, "_outlasts", lambda component, entry: not component.ordered and election._never_stopped(component, entry)
+    )
+
+
+def believes_its_team_file() -> Any:
+    """A robot that the team file does not know is dead, though one knocks that may be it."""
+    return patch.object(Membership, "strangers_until_ns", lambda _: 0)
 
 
 def no_grace() -> Any:
@@ -377,6 +415,17 @@ SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (rewinds_at_reunion, "a_claim_in_the_dark_gives_up_to_the_copy_that_never_stopped"),
     (never_stopped_though_it_stood, "a_primary_that_stood_still_gives_up_to_the_copy_that_acted"),
     (claims_at_boot, "a_standby_that_boots_before_its_network_rewinds_nothing"),
+    (claims_at_boot, "a_robot_that_was_taken_out_of_the_team_is_replaced_after_the_patience"),
+    (takes_the_unreadable_for_silence, "a_robot_that_cannot_authenticate_its_neighbour_takes_nothing_over"),
+    (takes_the_unreadable_for_silence, "a_primary_whose_agent_is_back_with_a_wrong_key_stands_still"),
+    (takes_the_unreadable_for_silence, "a_robot_whose_team_file_is_old_rewinds_nothing"),
+    (takes_the_unreadable_for_silence, "a_robot_that_was_never_authenticated_and_falls_silent_is_replaced"),
+    (believes_garbage, "what_anybody_sends_from_a_lost_robots_address_keeps_nobody_from_replacing_it"),
+    (waits_in_spite_of_the_order, "an_operator_need_not_wait_for_what_cannot_be_authenticated"),
+    (waits_in_spite_of_the_order, "a_standby_is_promoted_past_what_cannot_be_authenticated"),
+    (forgets_the_order, "an_operator_need_not_wait_for_what_cannot_be_authenticated"),
+    (remembers_the_order_for_ever, "an_operator_need_not_wait_for_what_cannot_be_authenticated"),
+    (believes_its_team_file, "a_robot_whose_team_file_is_old_rewinds_nothing"),
     (tireless_giver, "a_chain_that_is_not_taken_is_offered_again_after_a_pause"),
 )
 """Mistakes that a pair survives, or that cost no promise but the peace: each spoils a scenario."""

@@ -103,13 +103,20 @@ class Robot:
 
 @dataclass(slots=True)
 class Network:
-    """How messages fare. ``cuts``: directed pairs that nothing passes; ``healed``: for good, whatever storm is still to pass."""
+    """How messages fare.
+
+    Attributes:
+        cuts: directed pairs that nothing passes.
+        sealed: directed pairs between which nothing can be authenticated: one of them has a wrong key, or an old team file.
+        healed: for good, whatever storm is still to pass.
+    """
 
     loss: float = 0.0
     duplicate: float = 0.0
     delay_ns: int = 1 * MS
     spread_ns: int = 1 * MS
     cuts: set[tuple[str, str]] = field(default_factory=set)
+    sealed: set[tuple[str, str]] = field(default_factory=set)
     healed: bool = False
 
     def calm(self, weather: tuple[float, float, int]) -> None:
@@ -120,6 +127,7 @@ class Network:
     def heal(self) -> None:
         """From now on everything arrives, soon."""
         self.cuts.clear()
+        self.sealed.clear()
         self.calm((0, 0, 1 * MS))
         self.healed = True
 

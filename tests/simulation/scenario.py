@@ -9,11 +9,15 @@ A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment. ``expect`` 
     0    on robot1                         start a robot; off: power cut; agent-dies: guards and programs live on
     100  run robot1                        an operator starts the component there
     500  cut robot1 robot2                 nothing passes, both ways;  one-way A B: from A to B;  mend: all cuts end
+    500  sealed robot1 robot2              neither can authenticate the other, until both have been told: read robot1 robot2
+    500  noise robot2 robot1 900           for 900 ms somebody sends robot1 garbage from robot2's address
+    550  old-team robot1 robot2            from its next start on robot1's team file does not know robot2;  new-team robot1 robot2
     600  stall robot1 300                  its loop gets no processor for 300 ms
     600  slow robot1 40                    its disk and its captures take so many times as long
     600  refuses robot1                    a program that is resumed there ends at once: it cannot read its state;  takes: it can
     700  exit robot1 0                     its program ends with this wait status (11: crash)
     800  handover robot1                   an operator moves it to the standby
+    800  promote robot1                    an operator has robot1 run it, without waiting for others
     850  new-disk robot1                   its checkpoints are gone; what it has decided is not
     850  new-robot robot1                  both are gone
     900  expect robot1 primary             its state there
@@ -30,9 +34,10 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 import msgspec
+from msgspec.structs import replace
 
 from failover.core import acts
-from failover.core.events import Handover, Run, Stop
+from failover.core.events import Handover, Promote, Run, Stop
 from failover.core.types import MS, ComponentSpec, Config, Launch, Rules
 from tests.simulation.invariants import Invariants, seen_at, state_at
 from tests.simulation.teams import elective, pair
@@ -85,6 +90,8 @@ class Story:
                 world.command(robot, Run(world.request(), spec))
             case "stop":
                 world.command(robot, Stop(world.request(), COMPONENT))
+            case "promote":
+                world.command(robot, Promote(world.request(), COMPONENT))
             case "handover":
                 world.command(robot, Handover(world.request(), COMPONENT))
             case "exit":
@@ -102,6 +109,16 @@ class Story:
                 world.network.cuts.add((robot, arguments[1]))
             case "mend":
                 world.network.cuts.clear()
+            case "sealed":
+                world.network.sealed |= {(robot, arguments[1]), (arguments[1], robot)}
+            case "read":
+                world.network.sealed -= {(robot, arguments[1]), (arguments[1], robot)}
+            case "noise":
+                world.noise(robot, arguments[1], world.now_ns + int(arguments[2]) * MS)
+            case "old-team" | "new-team":
+                config = world.robots[robot].config
+                others = {*config.peers} - {arguments[1]} if verb == "old-team" else {*config.peers, arguments[1]}
+                world.robots[robot].config = replace(config, peers=tuple(sorted(others)))
             case "new-disk" | "new-robot":
                 world.new_disk(robot, ballot=verb == "new-robot")
             case "epoch":

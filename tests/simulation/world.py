@@ -20,6 +20,7 @@ from failover.core.events import (
     Exited,
     Received,
     Tick,
+    Unread,
 )
 from failover.core.node import Node
 from failover.core.types import MS, Config, Found, Held
@@ -28,6 +29,9 @@ from tests.simulation.robots import KEEPS_STATE, KEY, TEAM, Clock, Network, NewD
 
 QUEUE_MAX = 4_096
 """Events that may wait for one robot; more means that somebody floods."""
+
+NOISE_NS = 100 * MS
+"""Between two datagrams of somebody who sends under another's address."""
 
 TORN = 0.5
 """Of the writes that a crash interrupts: those that got to the disk all the same."""
@@ -286,10 +290,22 @@ class World:
         for _ in range(copies):
             if self.passes(sender, to.name):
                 delay_ns = self.network.delay_ns + int(self.random.random() * self.network.spread_ns)
-                self.after(delay_ns, lambda: self._arrive(to, frame))
+                self.after(delay_ns, lambda: self._arrive(sender, to, frame))
 
-    def _arrive(self, robot: Robot, frame: bytes) -> None:
+    def noise(self, sender: str, receiver: str, until_ns: int) -> None:
+        """Let somebody send from a robot's address what that robot did not seal."""
+        if self.now_ns < until_ns:
+            self.feed(self.robots[receiver], self._unread(sender, self.robots[receiver]))
+            self.after(NOISE_NS, lambda: self.noise(sender, receiver, until_ns))
+
+    def _unread(self, sender: str, robot: Robot) -> Unread:
+        return Unread(sender if sender in robot.config.peers else "", "a wrong key")
+
+    def _arrive(self, sender: str, robot: Robot, frame: bytes) -> None:
         if robot.node is None:
+            return
+        if (sender, robot.name) in self.network.sealed:
+            self.feed(robot, self._unread(sender, robot))
             return
         beat = robot.receiver.open(frame)
         if not isinstance(beat, wire.Refused):
