@@ -38,7 +38,7 @@ class Arrivals:
             team: the hosts of the other members, one for each of them; names are known by address once their member has come.
         """
         self._port = port
-        self._room = Counter(map(_plain, team))
+        self._room = Counter(map(plain, team))
         self._addresses: dict[int, str] = {}
         self._held: Counter[str] = Counter()
         self.turned_away = 0
@@ -46,7 +46,7 @@ class Arrivals:
 
     def is_of_member(self, address: str) -> None:
         """A member has proved itself from there."""
-        address = _plain(address)
+        address = plain(address)
         if address not in self._room and len(self._room) < KNOWN_MAX:
             self._room[address] = 1
 
@@ -56,7 +56,7 @@ class Arrivals:
         with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as connection:
             if connection.family not in (socket.AF_INET, socket.AF_INET6) or connection.getsockname()[1] != self._port:
                 return  # it has ended, and its number is another file's
-            address = _plain(connection.getpeername()[0])
+            address = plain(connection.getpeername()[0])
             if self._has_room(address):
                 self._addresses[descriptor] = address
                 self._held[address] += 1
@@ -88,7 +88,7 @@ class Arrivals:
         return address in self._room or others < OTHERS_MAX
 
 
-def _plain(address: str) -> str:
+def plain(address: str) -> str:
     """An address as text, in one way: of IPv4 that comes over IPv6 too."""
     try:
         found = ipaddress.ip_address(address)

@@ -80,8 +80,8 @@ class BeatLane:
             except OSError:
                 self.unsent += 1  # no route, no buffer, link down: the peer's silence is the message
 
-    def receive(self) -> Iterator[tuple[bytes, str, int]]:
-        """The datagrams that wait, at most `TURN_LIMIT`: each with the interface that it came over ("": not told), and when.
+    def receive(self) -> Iterator[tuple[bytes, str, int, tuple[str, int]]]:
+        """The datagrams that wait, at most `TURN_LIMIT`: each with its interface ("": not told), when it came, and whence.
 
         Which one the kernel chose is not known by the address: where one link is gone, its packets may come over another. The
         instant is by this machine's calendar, in nanoseconds since 1970; 0: not told.
@@ -94,10 +94,10 @@ class BeatLane:
             for fileno, _ in ready:
                 taken += 1
                 try:
-                    frame, ancillary, _, _ = self._sockets[fileno].recvmsg(FRAME_LIMIT + 1, ANCILLARY_SIZE)
+                    frame, ancillary, _, sender = self._sockets[fileno].recvmsg(FRAME_LIMIT + 1, ANCILLARY_SIZE)
                 except OSError:
                     continue  # an ICMP error of an earlier datagram; the next call has the next datagram
-                yield frame, self._interface(ancillary), _arrival_ns(ancillary)
+                yield frame, self._interface(ancillary), _arrival_ns(ancillary), sender[:2]
 
     def dropped(self) -> int:
         """Datagrams that the kernel dropped since these sockets were bound: no beats, or beats without room."""

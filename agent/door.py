@@ -65,6 +65,7 @@ EVENTS: Final[dict[str, Any]] = {
         events.Inquired,
         events.Exited,
         events.Noticed,
+        events.Unread,
         events.Run,
         events.Release,
         events.Stop,

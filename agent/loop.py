@@ -31,6 +31,7 @@ from agent.persister import Persister
 from agent.rules import node_config
 from agent.scribe import Scribe
 from agent.systemd import Notifier, watchdog_period_ns
+from agent.unread import UnreadBeats
 from checkpoint.channel import ChannelClosedError, ChannelError
 from failover.core import ballot as core_ballot
 from failover.core import wire
@@ -90,6 +91,7 @@ class Heart:
         self._notifier = notifier
         self._beats = BeatLane(settings.me, settings.peers)
         self._hearing = wire.Receiver(settings.team.team)
+        self._unread = UnreadBeats({name: robot.beats for name, robot in settings.peers.items()})
         self._keys: dict[str, bytes] = {}
         self._lanes = LanesProcess(settings)
         self._node: Node | None = None
@@ -249,7 +251,7 @@ class Heart:
     def _hear(self) -> None:
         self._read_ns = clock.now_ns()
         taken = refused = 0
-        for frame, link, wall_ns in self._beats.receive():
+        for frame, link, wall_ns, sender in self._beats.receive():
             taken += 1
             opened = self._hearing.open(frame)
             if isinstance(opened, Beat):
@@ -261,6 +263,8 @@ class Heart:
             elif not self._copies.admit(opened, link, clock.now_ns()):
                 self._refused[str(opened.reason)] += 1
                 refused += 1
+                if sign := self._unread.of_beat(opened, sender, clock.now_ns()):
+                    self._step(sign)
         if taken >= TURN_LIMIT and refused > taken // 2:
             self._deaf_until_ns = 2 * clock.now_ns() - self._read_ns
 

@@ -48,6 +48,12 @@ ANSWER_PATIENCE_S: Final = 60.0
 
 MESSAGES_A_TURN: Final = 64
 
+SIGNS_MAX: Final = 256
+"""Kinds of them that are remembered: each names a key, and anybody has many keys."""
+
+SIGN_S: Final = 1.0
+"""Between two signs of one kind from a peer that cannot be authenticated: ZeroMQ tries twenty times a second."""
+
 UNFIT_KEY: Final = (
     "this robot's secret key does not belong to its public key in team.toml: no other robot lets it in; failover team enrol "
     "makes a fresh pair"
@@ -79,6 +85,7 @@ class Switchboard:
         self._end: asyncio.Event = asyncio.Event()
         self._incompatible: dict[str, str] = {}
         self._own_troubles: list[str] = []
+        self._signs: dict[tuple[str, str], float] = {}
         keys = Keys("", "", {})
         if not config.insecure:
             publics = {name: robot.public_key for name, robot in settings.team.robots.items()}
@@ -88,7 +95,7 @@ class Switchboard:
         facts = Facts(frozenset(config.wireless))
         self._links = Links(settings.me, facts, anywhere=config.snapshots_over == "any")
         self._wires = Wires(self._links, self._links_changed)
-        self._ways = Ways(settings, keys, self._hear, self._way_changed, self._links)
+        self._ways = Ways(settings, keys, self._hear, self._way_changed, self._links, self._unread)
         self._lane = self._ways.bulk
 
     def connect(self, verbs: Questions) -> None:
@@ -257,6 +264,16 @@ class Switchboard:
         if had_words:
             self.errands.lost(peer)
 
+    def _unread(self, peer: str, why: str) -> None:
+        """Something came from a peer, or from nobody known (""), that does not prove whose it is."""
+        now_s = asyncio.get_running_loop().time()
+        sign = (peer, why if peer else "")
+        if len(self._signs) > SIGNS_MAX:
+            self._signs.clear()
+        if now_s >= self._signs.get(sign, 0) + SIGN_S:
+            self._signs[sign] = now_s
+            self.tell(events.Unread(peer, why))
+
     async def _links_changed(self, sentences: list[str]) -> None:
         for sentence in sentences:
             log.info("%s", sentence)
@@ -300,6 +317,7 @@ class Switchboard:
             self.lane_is_new(peer)  # a new connection: what was half here stays half
         if reason:
             self._incompatible[peer] = reason
+            self._unread(peer, reason)
             self._ways.answer(way, peer, Goodbye(reason))
             log.warning("%s", reason)
             return

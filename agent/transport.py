@@ -24,7 +24,7 @@ from msgspec import Struct
 from zmq.utils import z85
 from zmq.utils.monitor import parse_monitor_message
 
-from agent.arrivals import Arrivals
+from agent.arrivals import Arrivals, plain
 from agent.errors import LaneError
 from agent.links import Device
 from agent.mistake import end_lanes_on_mistake
@@ -56,6 +56,16 @@ LISTEN_PAUSE_S: Final = 0.02
 
 BACKLOG: Final = 100
 """Connections that wait to be accepted: more than a team has robots."""
+
+KEY_SIZE: Final = 32
+SHOWN: Final = 8
+"""Characters of a public key by which people tell it from another one."""
+
+MEND: Final = "bring the same team.toml to every robot, or enrol the robot whose key is another one again, and restart its agent"
+
+HANDSHAKE_FAILURES: Final = frozenset(
+    {zmq.EVENT_HANDSHAKE_FAILED_AUTH, zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL}
+)
 
 ZAP_ADDRESS: Final = "inproc://zeromq.zap.01"
 ZAP_DOMAIN: Final = b"failover"
@@ -115,6 +125,9 @@ Receive = Callable[[str, Bulk], None]
 Changed = Callable[[str, LinkState, str], None]
 """Called with (peer, state, reason) when a connection changed."""
 
+Unread = Callable[[str, str], None]
+"""Called with (peer, why) whenever something comes from a peer's address that does not prove to be its; "" for no peer's."""
+
 
 def new_keys() -> tuple[str, str]:
     """A fresh (public, secret) pair, Z85."""
@@ -145,6 +158,7 @@ class Link:
         address: str,
         keys: Keys,
         changed: Changed,
+        unread: Unread,
         device: Device | None = None,
     ) -> None:
         """
@@ -156,6 +170,8 @@ class Link:
         self.state = LinkState.CONNECTING
         self.reason = ""
         self._changed = changed
+        self._unread = unread
+        self._own_key, self._their_key = shown(keys.public), shown(keys.peers.get(peer, ""))
         self._words: deque[bytes] = deque(maxlen=QUEUE_LIMIT)
         self._chunk: tuple[bytes, asyncio.Future[None]] | None = None
         self._wake = asyncio.Event()
@@ -173,7 +189,9 @@ class Link:
             self._socket.curve_secretkey = keys.secret.encode()
             self._socket.curve_serverkey = keys.peers[peer].encode()
         self._monitor = self._socket.get_monitor_socket()
-        self._socket.connect(f"tcp://{address}")
+        self._address = f"tcp://{address}"
+        self._loop = asyncio.get_running_loop()
+        self._socket.connect(self._address)
         self._tasks = (asyncio.create_task(self._watch()), asyncio.create_task(self._send()))
         for task in self._tasks:
             task.add_done_callback(end_lanes_on_mistake)
@@ -238,14 +256,23 @@ class Link:
             kind = event["event"]
             if kind == zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 self._enter(LinkState.CONNECTED, "")
-            elif kind in (zmq.EVENT_HANDSHAKE_FAILED_AUTH, zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL):
-                self._enter(LinkState.REFUSED, _refusal(self.peer, kind))
-            elif kind == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL:
-                self._enter(LinkState.REFUSED, f"{self.peer} closed the connection during the handshake: wrong key, or no agent")
+            elif kind in HANDSHAKE_FAILURES:
+                reason = _refusal(self.peer, kind, self._own_key, self._their_key)
+                self._enter(LinkState.REFUSED, reason)
+                self._unread(self.peer, reason)
+                if kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+                    self._loop.call_later(RECONNECT_MOST_MS / 1_000, self._knock_again)
             elif kind == zmq.EVENT_DISCONNECTED and self.state is not LinkState.REFUSED:
                 self._enter(LinkState.CONNECTING, "the connection was lost")
             elif kind == zmq.EVENT_CLOSED and self.state is LinkState.CONNECTING:
                 self._enter(LinkState.CONNECTING, "nobody listens there")
+
+    def _knock_again(self) -> None:
+        """ZeroMQ does not by itself where a key was refused; and both robots are to know that the other one lives."""
+        if self.state is LinkState.REFUSED and not self._socket.closed:
+            with contextlib.suppress(zmq.ZMQError):
+                self._socket.disconnect(self._address)
+            self._socket.connect(self._address)
 
     def _enter(self, state: LinkState, reason: str) -> None:
         if (state, reason) == (self.state, self.reason):
@@ -274,6 +301,7 @@ class BulkLane:
         receive: Receive,
         changed: Changed,
         devices: Devices = ANY_DEVICE,
+        unread: Unread = lambda *_: None,
     ) -> None:
         """
         Args:
@@ -290,11 +318,13 @@ class BulkLane:
         self._keys = keys
         self._receive = receive
         self._changed = changed
+        self._unread = unread
         self._context = zmq.asyncio.Context()
         self._tasks: list[asyncio.Task[None]] = []
         self.links: dict[str, Link] = {}
         self.strangers = 0
         self._stranger = ""
+        self._mismatch: dict[str, str] = {}
         self._misunderstood: Counter[str] = Counter()
         self._arrivals = Arrivals(split_address(bind, "bulk address")[1], self._hosts())
 
@@ -381,7 +411,7 @@ class BulkLane:
 
     def _connect(self, peer: str) -> None:
         address, device = self._peers[peer], self._device_to(peer)
-        self.links[peer] = Link(self._context, self._me, peer, address, self._keys, self._changed, device)
+        self.links[peer] = Link(self._context, self._me, peer, address, self._keys, self._changed, self._unread, device)
 
     def _device_to(self, peer: str) -> Device | None:
         return self._devices.device(split_address(self._peers[peer], "bulk address")[0])
@@ -402,6 +432,7 @@ class BulkLane:
         ]
         if trouble := self._arrivals.trouble():
             told.append(trouble)
+        told.extend(self._mismatch.values())
         if self.strangers:
             told.append(
                 f"a key that is not in this robot's team.toml was refused on the bulk lane, {self.strangers} times, last from "
@@ -462,13 +493,27 @@ class BulkLane:
                 version, request, _domain, address, _identity, mechanism, *credentials = await gate.recv_multipart()
                 owner = owners.get(credentials[0]) if mechanism == b"CURVE" and len(credentials) == 1 else None
                 if owner is None:
-                    self._refused(address.decode(errors="replace"))
+                    self._refuse(address.decode(errors="replace"), credentials)
                 else:
                     self._arrivals.is_of_member(address.decode(errors="replace"))
+                    self._mismatch.pop(owner, None)
                 status = (b"200", b"OK", owner.encode()) if owner else (b"400", b"not in the team", b"")
                 await gate.send_multipart([version, request, *status, b""])
         finally:
             gate.close(0)
+
+    def _refuse(self, address: str, credentials: list[bytes]) -> None:
+        """A key that is not in the team: of a member whose key, or whose entry in our team file, is an old one?"""
+        self._refused(address)
+        host = plain(address)
+        peers = [peer for peer, there in self._peers.items() if plain(split_address(there, "bulk address")[0]) == host]
+        key = shown(z85.encode(credentials[0]).decode()) if len(credentials) == 1 and len(credentials[0]) == KEY_SIZE else "none"
+        for peer in peers:
+            known = shown(self._keys.peers[peer])
+            self._mismatch[peer] = f"{peer} presents the key {key}, and team.toml here has {known} for it: {MEND}"
+            self._unread(peer, self._mismatch[peer])
+        if not peers:
+            self._unread("", f"one at {address} presents the key {key}")
 
     def _refused(self, stranger: str) -> None:
         """Count one that is not in the team; the log hears of it once, for it may knock for ever."""
@@ -506,7 +551,20 @@ def _listener(address: str, device: Device | None) -> int:
         return listener.detach()
 
 
-def _refusal(peer: str, kind: int) -> str:
+def shown(key: str) -> str:
+    """The beginning of a public key, by which a person tells it from another in team.toml."""
+    return f"{key[:SHOWN]}…" if key else "none"
+
+
+def _refusal(peer: str, kind: int, own: str, theirs: str) -> str:
     if kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
-        return f"{peer} does not know this robot's key: bring the same team.toml to every robot"
-    return f"the handshake with {peer} broke off: its key is not the one in team.toml, or one side runs without keys"
+        return f"{peer} does not know this robot's key, {own}: {MEND}"
+    if kind == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
+        return (
+            f"the handshake with {peer} broke off: its key is not {theirs}, which team.toml here has, or one side runs without "
+            f"keys: {MEND}"
+        )
+    return (
+        f"{peer} closed the connection during the handshake: wrong key, or no agent; if its agent runs, its key is not {theirs}, "
+        f"which team.toml here has: {MEND}"
+    )

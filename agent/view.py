@@ -98,7 +98,7 @@ def team_view(
 
 
 def _peer(peer: PeerView, link: Link | None, told: Told, settings: Settings) -> dict[str, Any]:
-    reason = [link.reason] if link is not None and link.reason else []
+    reason = list(dict.fromkeys(filter(None, (link.reason if link is not None else "", peer.unread))))
     return {
         "name": peer.robot,
         "role": settings.team.robots[peer.robot].role,

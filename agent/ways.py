@@ -16,7 +16,7 @@ from typing import Final
 from agent.config import Settings
 from agent.errors import LaneError
 from agent.links import Links
-from agent.transport import BulkLane, Keys, LinkState
+from agent.transport import BulkLane, Keys, LinkState, Unread
 from failover.client.team import Robot, split_address
 from failover.core.messages import Bulk
 
@@ -42,7 +42,9 @@ class Ways:
         troubles: sentences: lanes that could not be had.
     """
 
-    def __init__(self, settings: Settings, keys: Keys, heard: Heard, changed: Changed, links: Links) -> None:
+    def __init__(
+        self, settings: Settings, keys: Keys, heard: Heard, changed: Changed, links: Links, unread: Unread = lambda *_: None
+    ) -> None:
         self.troubles: list[str] = []
         self._connected: set[tuple[int, str]] = set()
         self._beat_keys: dict[str, bytes] = {}
@@ -51,11 +53,11 @@ class Ways:
         name = settings.config.robot
         bulks = {peer: robot.bulk for peer, robot in settings.peers.items()}
         hear, change = functools.partial(heard, BULK), functools.partial(changed, BULK)
-        self.bulk = BulkLane(name, settings.me.bulk, bulks, keys, hear, change, links)
+        self.bulk = BulkLane(name, settings.me.bulk, bulks, keys, hear, change, links, unread)
         self._lanes.append(self.bulk)
         for way, (bind, peers) in enumerate(further_links(settings), start=1):
             hear, change = functools.partial(heard, way), functools.partial(changed, way)
-            self._lanes.append(BulkLane(name, bind, peers, keys, hear, change))
+            self._lanes.append(BulkLane(name, bind, peers, keys, hear, change, unread=unread))
 
     def open(self) -> None:
         """Listen on every link. A further link that cannot be had is done without, and said.

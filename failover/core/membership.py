@@ -264,12 +264,17 @@ class Membership:
         return robot not in self.peers or not self.peers[robot].boot
 
     def unreadable(self, robot: str, why: str, now_ns: int) -> str:
-        """Note what could not be authenticated; a sentence for the story where it is the first, or says more than before."""
+        """Note what could not be authenticated; a sentence for the story where it is the first, or says more than before.
+
+        Of a peer that lives it says nothing: anybody may send from its address.
+        """
         peer = self.peers.get(robot)
         if peer is None:
             is_news, self._stranger_ns = not self._is_recent(self._stranger_ns, now_ns), now_ns
             return f"{self._own[0]} receives from a robot that its team.toml does not know{why and f': {why}'}" if is_news else ""
-        is_news = not self._is_recent(peer.unread_ns, now_ns) or (why not in ("", peer.unread_why))
+        if self.alive(robot, now_ns):
+            return ""
+        is_news = not self._is_recent(peer.unread_ns, now_ns) or (bool(why) and peer.unread_why == UNREAD)
         peer.unread_ns = now_ns
         peer.unread_why = why or peer.unread_why or UNREAD
         self._count_loyalty(peer)

@@ -32,7 +32,8 @@ def team(turn: Turn) -> str:
         return f"{turn.me} hears nobody: what runs here is not protected."
     return (
         f"{turn.me} and {', '.join(living)} protect each other: whoever is silent for {_silence(turn)} is replaced; "
-        "a total cut between two that live can run a component twice, except where when_alone is freeze."
+        "a total cut between two that live can run a component twice until they meet again, except where when_alone is freeze; "
+        "then the copy that never stopped goes on."
     )
 
 
@@ -68,7 +69,8 @@ def one(component: Component, turn: Turn, protection: Protection) -> str:
             f"If {turn.me} is silent for {_silence(turn)} and a majority agrees, {component.standby} runs it; "
             "it stands still here first."
         )
-    alone = "stands still here first" if component.freezes else "may run twice if both live on and cannot hear each other"
+    twice = "may run twice if both live on and cannot hear each other; then the copy that never stopped goes on"
+    alone = "stands still here first" if component.freezes else twice
     return f"If {turn.me} is silent for {_silence(turn)}, {component.standby} runs it; it {alone}."
 
 

@@ -123,6 +123,19 @@ def _ending(component: Component, turn: Turn) -> list[str]:
     return [robot for robot, entry in entries if entry is not None and state_of(entry) is State.STOPPING]
 
 
+def _waits_after_boot(component: Component, turn: Turn, left_ns: int) -> str:
+    silent = election.unheard(component, turn)
+    waiting = f"waiting: {' and '.join(silent)} may run it and was not heard since {turn.me} started"
+    unknown = [robot for robot in silent if robot not in turn.team.peers]
+    claims = f"{turn.me} claims it in {left_ns / NS_PER_S:.0f} s"
+    if unknown and turn.team.strangers_until_ns() > turn.now_ns:
+        waiting += f"; team.toml here does not know {' and '.join(unknown)}, and a robot that it does not know sends to {turn.me}"
+        return f"{waiting}: bring the newest team.toml here; {claims} after the last sign of it; failover promote does not wait"
+    if unknown:
+        waiting += f"; team.toml here does not know {' and '.join(unknown)}: bring the newest one if it is still of the team"
+    return f"{waiting}; {claims} (boot_patience_s); failover promote does not wait"
+
+
 def _unread(turn: Turn) -> str:
     """Which robots live, and only cannot be authenticated."""
     waited_for = [robot for robot in turn.team.peers if turn.team.keeps_waiting(robot, turn.now_ns)]
@@ -149,9 +162,7 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
     if component.unstored and component.state is State.STANDBY:
         notes.append(f"a snapshot was not stored at {turn.me}: {component.unstored}")
     if component.state is State.STANDBY and (left_ns := election.waits_after_boot_ns(component, turn)):
-        who = " and ".join(election.unheard(component, turn))
-        claims = f"{turn.me} claims it in {left_ns / NS_PER_S:.0f} s (boot_patience_s); failover promote does not wait"
-        notes.append(f"waiting: {who} may run it and was not heard since {turn.me} started; {claims}")
+        notes.append(_waits_after_boot(component, turn, left_ns))
     if component.state in (State.STANDBY, State.FROZEN) and (unread := _unread(turn)):
         notes.append(f"waiting: {unread}; failover promote does not wait")
     if component.unprotected:

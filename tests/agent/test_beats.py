@@ -54,8 +54,8 @@ def test_a_beat_comes_over_every_link_and_says_when(lanes: tuple[BeatLane, BeatL
     assert waits(theirs)
     time.sleep(0.05)  # it waits for us, and that does not count
     came = list(theirs.receive())
-    assert [(frame, link) for frame, link, _ in came] == [(BEAT, "lo")] * 2
-    for _, _, wall_ns in came:
+    assert [(frame, link) for frame, link, *_ in came] == [(BEAT, "lo")] * 2
+    for _, _, wall_ns, _ in came:
         assert before_ns - 1_000_000 < clock.of_wall_ns(wall_ns) < sent_ns + 1_000_000
 
 
@@ -68,7 +68,7 @@ def test_a_flood_is_taken_in_parts_and_none_of_it_is_lost(lanes: tuple[BeatLane,
     for number in range(TURN_LIMIT):
         ours.send("robot2", MAGIC + b"%d" % number)
     assert waits(theirs)
-    parts = [[frame for frame, _, _ in theirs.receive()] for _ in range(3)]
+    parts = [[frame for frame, *_ in theirs.receive()] for _ in range(3)]
     assert [len(part) for part in parts] == [TURN_LIMIT, TURN_LIMIT, 0]
     assert sorted(int(frame[2:]) for part in parts for frame in part) == sorted([*range(TURN_LIMIT)] * 2)
 
@@ -80,6 +80,6 @@ def test_what_does_not_begin_as_a_beat_is_dropped_by_the_kernel_and_counted(lane
         ours.send("robot2", frame)
     ours.send("robot2", longest)
     assert waits(theirs)
-    assert [frame for frame, _, _ in theirs.receive()] == [longest] * 2
+    assert [frame for frame, *_ in theirs.receive()] == [longest] * 2
     assert theirs.dropped() == 2 * 5_004
     assert ours.dropped() == 0

@@ -12,7 +12,7 @@ import pytest
 
 from agent import arrivals
 from agent.errors import LaneError
-from agent.transport import BulkLane, Keys, LinkState, new_keys
+from agent.transport import MEND, BulkLane, Keys, LinkState, new_keys, shown
 from failover.core.messages import CHUNK_SIZE_MAX, Bulk, Cancel, Chunk
 
 PATIENCE_S = 20.0
@@ -36,6 +36,7 @@ class Pair:
     def __init__(self, keys1: Keys, keys2: Keys) -> None:
         self.ports = {"robot1": free_port(), "robot2": free_port()}
         self.heard: dict[str, list[tuple[str, Bulk]]] = {"robot1": [], "robot2": []}
+        self.unread: dict[str, list[tuple[str, str]]] = {"robot1": [], "robot2": []}
         self.lanes = {name: self.lane(name, keys) for name, keys in (("robot1", keys1), ("robot2", keys2))}
 
     def lane(self, name: str, keys: Keys) -> BulkLane:
@@ -43,7 +44,12 @@ class Pair:
             self.heard[name].append((peer, message))
 
         peers = {peer: f"127.0.0.1:{port}" for peer, port in self.ports.items() if peer != name}
-        return BulkLane(name, f"127.0.0.1:{self.ports[name]}", peers, keys, receive, lambda *_: None)
+
+        def unread(*sign: str) -> None:
+            self.unread[name].append((sign[0], sign[1]))
+
+        where = f"127.0.0.1:{self.ports[name]}"
+        return BulkLane(name, where, peers, keys, receive, lambda *_: None, unread=unread)
 
     def state(self, name: str) -> LinkState:
         other = next(peer for peer in self.ports if peer != name)
@@ -104,7 +110,11 @@ def test_a_stranger_with_a_key_of_its_own_is_refused_and_both_sides_say_so() -> 
         with pytest.raises(LaneError, match="down"):
             await pair.lanes["robot2"].ship("robot1", Chunk(1, 0, b"let me in"))
         assert pair.heard["robot1"] == []
+        await until(lambda: len(pair.unread["robot1"]) > 1 and len(pair.unread["robot2"]) > 1)  # each is told again and again
+        assert ("robot2", mismatch) in pair.unread["robot1"] and mismatch in pair.lanes["robot1"].troubles()
+        assert any(peer == "robot1" and shown(public) in why for peer, why in pair.unread["robot2"])
 
+    mismatch = f"robot2 presents the key {shown(public)}, and team.toml here has {shown(keys1.peers['robot2'])} for it: {MEND}"
     run(keys1, stranger, body)
 
 

@@ -7,10 +7,13 @@ from dataclasses import dataclass, field
 from checkpoint.model import Position
 from failover.core import acts
 from failover.core.messages import ORDERED, Beat
-from failover.core.types import ENDED, Ballot, ComponentView, OnLoss, State, WhenAlone
+from failover.core.types import ENDED, MS, Ballot, ComponentView, OnLoss, Resumption, State, WhenAlone
 from tests.simulation.deeds import epoch_of
 from tests.simulation.robots import NewDisk, ballot_of
 from tests.simulation.world import World
+
+SURELY_UNREAD_NS = 5_000 * MS
+"""Less than the time for which a sign counts, by any clock, and whatever it leaps."""
 
 
 class Broken(AssertionError):
@@ -77,6 +80,7 @@ class Invariants:
                 self._after_what_was_seen(world, robot, what, 0 if what.component in self.acknowledged else -1)
             case acts.Restore():
                 self._one_primary(world, robot, what)
+                self._silence_is_no_sound(world, robot, what)
                 self._not_older(world, robot, what)
                 self._after_what_was_seen(world, robot, what, world.values[what.position])
             case acts.Warm():
@@ -107,6 +111,15 @@ class Invariants:
         owner = self.owners.setdefault((act.component, act.epoch), robot)
         if owner != robot and act.component in self.safe:
             raise _broken(world, f"epoch {act.epoch} of {act.component} is {owner}'s and {robot}'s")
+
+    def _silence_is_no_sound(self, world: World, robot: str, act: acts.Restore) -> None:
+        """Under pair nothing is taken over beside a robot from which there comes what was never authenticated."""
+        here = world.robots[robot]
+        if self.votes or act.why is not Resumption.TAKEN_OVER:
+            return
+        for other, at_ns in here.unread_ns.items():
+            if other not in here.read and world.now_ns - at_ns < SURELY_UNREAD_NS:
+                raise _broken(world, f"{robot} takes {act.component} over, and receives from {other} what it cannot authenticate")
 
     def _epochs_grow(self, world: World, robot: str, ballot: Ballot) -> None:
         kept = {record.name: record.epoch for record in ballot.records}

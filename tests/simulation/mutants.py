@@ -171,13 +171,13 @@ def takes_the_unreadable_for_silence() -> Any:
 
 def believes_garbage() -> Any:
     """What cannot be authenticated proves that its robot lives, also where that robot was heard before."""
-    honest = Membership._count_loyalty
 
-    def mistaken_loyalty(self: Membership, peer: Any) -> None:
-        honest(self, peer)
-        peer.loyal_until_ns = max(peer.loyal_until_ns, peer.unread_ns + UNREAD_NS)
+    def unreadable(self: Membership, robot: str, _why: str, now_ns: int) -> str:
+        peer = self.peers[robot]
+        peer.loyal_until_ns = max(peer.loyal_until_ns, now_ns + UNREAD_NS)
+        return ""
 
-    return patch.object(Membership, "_count_loyalty", mistaken_loyalty)
+    return patch.object(Membership, "unreadable", unreadable)
 
 
 def waits_in_spite_of_the_order() -> Any:
@@ -447,6 +447,7 @@ MUTANTS: tuple[Mutant, ...] = (
     runs_the_finished,
     crash_is_the_end,
     no_grace,
+    takes_the_unreadable_for_silence,
     waits_for_ever,
     waits_where_it_may_not_run,
     shown_when_stored,
@@ -496,7 +497,7 @@ NEAR: dict[str, int] = {
 }
 """The first seed that catches a mistake, where that is a late one: it is tried first."""
 
-LONG = {"named_in_advance": 37}
+LONG = {"named_in_advance": 37, "takes_the_unreadable_for_silence": 0}
 """The first long life that catches one which hardly any short one does."""
 
 

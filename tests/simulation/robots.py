@@ -70,6 +70,7 @@ class Robot:
 
     Attributes:
         lacks: what it says that it lacks when it is asked; None: something now and then.
+        read: robots whose beats it has authenticated in this life; ``unread_ns``: when it last received what it could not.
     """
 
     name: str
@@ -89,6 +90,8 @@ class Robot:
     warm: dict[str, Launch] = field(default_factory=dict)
     inbox: list[Event] = field(default_factory=list)
     receiver: wire.Receiver = field(default_factory=lambda: wire.Receiver(TEAM))
+    read: set[str] = field(default_factory=set)
+    unread_ns: dict[str, int] = field(default_factory=dict)
     life: int = 0
     busy: bool = False
     stalled_until_ns: int = 0

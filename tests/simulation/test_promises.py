@@ -95,7 +95,9 @@ def test_whoever_is_silent_is_replaced() -> None:
 
 def test_a_total_cut_between_two_that_live_can_run_a_component_twice() -> None:
     two = team()
-    assert "a total cut between two that live can run a component twice" in two.says("robot1")
+    says = two.says("robot1")
+    assert "a total cut between two that live can run a component twice until they meet again" in says
+    assert "then the copy that never stopped goes on" in says
     two.cut("robot1", "robot2")
     assert two.after(500) == ["robot1", "robot2"]
 
@@ -135,7 +137,7 @@ def test_the_team_of_two_says_its_rule_and_its_promise_in_one_sentence_each() ->
     promises = [one.promise for one in status.components]
     assert promises == [
         "If robot1 is silent for 170 ms (up to 300 where beats come late), robot2 runs it; "
-        "it may run twice if both live on and cannot hear each other."
+        "it may run twice if both live on and cannot hear each other; then the copy that never stopped goes on."
     ]
 
 

@@ -18,6 +18,10 @@ PAUSES_MS = (30, 100, 200, 400, 900)
 """Around a lease, and far longer."""
 
 
+SEALED = 0.5
+"""Of the starts in careful teams: those with a wrong key, which is put right so long after the start:"""
+SEALED_MS = 3_000
+
 PROMOTED_MS = 300
 """After the loss, and again after as long, an operator gives his order: with short leases the first one is in time."""
 
@@ -151,7 +155,17 @@ class Trouble:
 
     def _outage(self, stop: Callable[[str], None]) -> None:
         stop(self._name)
+        if self._world.robots[self._name].config.boot_patience_ms and self._random.random() < SEALED:
+            self._seal()
         self._world.after(self._pause_ns, lambda: self._world.power_on(self._name))
+
+    def _seal(self) -> None:
+        """It comes back with a key that its team does not know, and has the right one some time later."""
+        sealed = self._world.network.sealed
+        ways = {*self._ways_out(), *(way[::-1] for way in self._ways_out())}
+        self._world.note(f"{self._name} comes back with a wrong key")
+        sealed.update(ways)
+        self._world.after(self._pause_ns + SEALED_MS * MS, lambda: sealed.difference_update(ways))
 
     def _stall(self) -> None:
         self._world.stall(self._name, self._pause_ns)

@@ -110,6 +110,8 @@ class World:
         robot.boot += 1
         robot.life += 1
         robot.inbox, robot.busy, robot.receiver = [], False, wire.Receiver(TEAM)
+        robot.read.clear()
+        robot.unread_ns.clear()
         robot.admitted.clear()
         robot.capturing.clear()
         robot.keeper.clear()
@@ -305,8 +307,10 @@ class World:
         if robot.node is None:
             return
         if (sender, robot.name) in self.network.sealed:
+            robot.unread_ns[sender] = self.now_ns
             self.feed(robot, self._unread(sender, robot))
             return
         beat = robot.receiver.open(frame)
         if not isinstance(beat, wire.Refused):
+            robot.read.add(sender)
             self.feed(robot, Received(beat, "wire"))

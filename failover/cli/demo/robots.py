@@ -231,7 +231,8 @@ class Stage:
             cables: as `CABLES`; beats go over all of them, snapshots over the first.
         """
         self._cables = cables
-        self._pace = f"beat_ms = {beat_ms}\nlease_ms = {lease_ms}\nboot_patience_s = {BOOT_PATIENCE_S}\n"
+        patience = "" if "boot_patience_s" in settings else f"boot_patience_s = {BOOT_PATIENCE_S}\n"
+        self._pace = f"beat_ms = {beat_ms}\nlease_ms = {lease_ms}\n{patience}"
         self.directory = directory
         self._settings = settings
         self.means = allowed
