@@ -8,7 +8,8 @@ In C, getenv(3) returns the place itself, so it tells the present epoch each tim
 start: `failover.epoch` asks the C library, a shell script reads /proc/$$/environ. A program that writes over its environment, as
 some do to change what ps(1) shows, has no token after that.
 
-A copy that was frozen for a while and thawed again under a later epoch keeps its token: nobody else can have had one in between.
+A copy that goes on under a later epoch without a restore keeps its token. After a total cut under the rule ``pair``
+another copy may have had a later one in between: docs/fencing.md says what that costs.
 """
 
 from __future__ import annotations
