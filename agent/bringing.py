@@ -7,6 +7,7 @@ was there once is not asked again with each delta, only when something else is n
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import logging
 import os
@@ -28,6 +29,9 @@ from failover.core.messages import BELONGINGS_MAX, Belonging, Belongings, Bulk, 
 
 ANSWER_S: Final = 60.0
 """How long a standby may take to look whether it has some files: it reads those that have the right size."""
+
+ASKED_TIMES: Final = 4
+"""In that time: an answer is lost where the standby has not noticed yet that this process is another one."""
 
 SURE_S: Final = 60.0
 """For so long a standby that had all is believed to have it still: its operator may install another release."""
@@ -140,11 +144,12 @@ class Bringing:
         answer: asyncio.Future[Lacking] = asyncio.get_running_loop().create_future()
         self._asked[number] = peer, answer
         try:
-            if not self._say(peer, Belongings(number, component, files)):
-                raise LaneError(f"the bulk lane to {peer} is not connected")
-            return await asyncio.wait_for(answer, ANSWER_S)
-        except TimeoutError:
-            raise LaneError(f"{peer} did not say within {ANSWER_S:.0f} s which files of {component} it lacks") from None
+            for _ in range(ASKED_TIMES):
+                if not self._say(peer, Belongings(number, component, files)):
+                    raise LaneError(f"the bulk lane to {peer} is not connected")
+                with contextlib.suppress(TimeoutError):
+                    return await asyncio.wait_for(asyncio.shield(answer), ANSWER_S / ASKED_TIMES)
+            raise LaneError(f"{peer} did not say within {ANSWER_S:.0f} s which files of {component} it lacks")
         finally:
             del self._asked[number]
 

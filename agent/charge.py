@@ -331,7 +331,7 @@ class Charge:
         began_ns, laps = clock.now_ns(), clock.Laps()
         silent_ns = await self.around.silence_ns(self.name) if act.why is Resumption.TAKEN_OVER else 0
         await self._stop()
-        await self.around.settled(self.name)
+        await self.around.settled(self.name, act.position)
         laps.lap("asking and clearing away")
         descriptors = await asyncio.to_thread(self.around.store.open_chain, self.name, act.position)
         laps.lap(f"opening {len(descriptors)} snapshots")

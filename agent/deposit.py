@@ -14,7 +14,7 @@ from msgspec import Struct
 from agent.config import ComponentConfig
 from agent.places import Places, complete_logs, log_directory
 from agent.shipping import Refusal
-from agent.streams import logs_of
+from agent.streams import STREAMS, logs_of
 from checkpoint import carried, foreign, format
 from checkpoint.channel import close_all
 from checkpoint.engine import COOPERATIVE
@@ -163,38 +163,51 @@ class Deposit:
             except (CheckpointError, OSError) as error:
                 log.warning("the output of %s up to snapshot %d cannot be shown: %s", act.component, act.position.sequence, error)
 
-    def _show(self, component: str, position: Position) -> None:
-        unshown = self._unshown.get(component, deque())
+    def _show(self, component: str, position: Position, *, is_elsewhere: bool = True) -> None:
+        """Have the logs hold all up to a position.
+
+        Args:
+            is_elsewhere: another robot is known to hold it, whoever took it in.
+        """
+        unshown = self._unshown.setdefault(component, deque())
         directory = log_directory(component, self._places)
-        if not any(one.position == position for one in unshown):
-            self._complete(component, directory, position)
+        due = [one for one in tuple(unshown) if one.position.generation == position.generation and one.position <= position]
+        if not due or due[-1].position != position:
+            self._complete(component, directory, position, is_safe=is_elsewhere)
             return
-        logs = logs_of(directory, next(one.owner for one in unshown if one.position == position))
+        logs = logs_of(directory, due[-1].owner)
         try:
-            while True:
-                one = unshown.popleft()
-                logs.hold(one.is_held)
+            sizes = dict(zip(STREAMS, logs.totals(), strict=True))
+            is_gap = any(piece.offset > sizes[piece.stream] for piece in due[0].output)
+            logs.hold(due[-1].is_held)
+            for one in () if is_gap else due:
                 logs.apply(one.output, is_safe=True)
-                if one.position == position:
-                    return
         finally:
             logs.close()
+        if is_gap:  # what came before was taken in by an earlier life of these lanes
+            self._complete(component, directory, position, is_safe=True)
+        while unshown and unshown[0].position <= position:
+            unshown.popleft()
 
-    def _complete(self, component: str, directory: Path, position: Position) -> None:
+    def _complete(self, component: str, directory: Path, position: Position, *, is_safe: bool) -> None:
         """An earlier life of these lanes took it in, or too many wait: read it from the files."""
         descriptors = self._store.open_chain(component, position)
         try:
-            complete_logs(directory, descriptors, is_safe=True)
+            complete_logs(directory, descriptors, is_safe=is_safe)
         finally:
             close_all(tuple(descriptors))
 
-    async def settled(self, component: str) -> None:
+    async def settled(self, component: str, position: Position | None = None) -> None:
         """Return once no snapshot of it is being stored: from then on a guard writes its output here.
 
-        The core has ordered that nobody's are taken any more; what waits for its turn is refused.
+        The core has ordered that no robot's are taken any more; what waits for its turn is refused.
+
+        Args:
+            position: what the component goes on from here: its output is in the logs when this returns, shown before or not.
         """
         async with self._turns.setdefault(component, asyncio.Lock()):
-            pass
+            if position is not None:
+                await asyncio.to_thread(self._show, component, position, is_elsewhere=False)
 
     def mend_logs(self, running: Collection[str]) -> None:
         """Bring each stream as far as the newest checkpoint says: an earlier life, or a power cut, may have come in between.

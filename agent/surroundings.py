@@ -26,7 +26,8 @@ class Surroundings(Struct):
     Attributes:
         tell: passes an event to the core.
         silence_ns: how long the robot that the component is taken over from has been silent, as far as known; for the outage.
-        settled: returns once no snapshot of a component is being stored any more.
+        settled: returns once no snapshot of a component is being stored any more; given a position that it goes on from, with its
+            output in the logs.
         here: what this robot's operator wants for a component.
         hooks: runs his commands.
     """
@@ -36,7 +37,7 @@ class Surroundings(Struct):
     records: Records
     tell: Callable[[Event], None]
     silence_ns: Callable[[str], Coroutine[Any, Any, int]]
-    settled: Callable[[str], Coroutine[Any, Any, None]]
+    settled: Callable[..., Coroutine[Any, Any, None]]
     here: Callable[[str], ComponentConfig]
     hooks: Hooks = field(default_factory=Hooks)
 

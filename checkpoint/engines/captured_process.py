@@ -250,13 +250,14 @@ class CapturedProcess:
             return living
         return (self.ended_first.state(living[0], look.standing.status.tgids[-1], look.taken.lines), *living)
 
-    def mappings(self, look: Look, *, is_kin: bool = False) -> tuple[Vma, ...]:
+    def mappings(self, look: Look, kin: frozenset[int] = frozenset()) -> tuple[Vma, ...]:
         """Its mappings.
 
         Args:
-            is_kin: see `Identities`.
+            kin: see `Identities`.
         """
-        self.identities.is_kin = is_kin
+        if kin != self.identities.kin:
+            self.identities.kin = kin
         return self.identities.vmas(look.taken.lines, self._flags.flags, look.taken.guards)
 
     def reasons(self, look: Look, kin: Collection[int] = ()) -> tuple[str, ...]:

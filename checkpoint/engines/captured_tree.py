@@ -525,7 +525,7 @@ def _told_of(process: CapturedProcess, look: Look, around: Surroundings, stopped
         look=look,
         process=process.process(look),
         threads=process.thread_states(look),
-        vmas=process.mappings(look, is_kin=True),
+        vmas=process.mappings(look, seen.pids),
         held=held,
         unopened=(*unopened, *shared, *stops.describe(stopped_by, look.standing.stat.exit_code)),
         reasons=tuple(f"{named}: {reason}" for reason in reasons),

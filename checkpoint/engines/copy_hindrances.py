@@ -13,8 +13,6 @@ from msgspec.structs import replace
 from checkpoint import carried, pages, room, tree
 from checkpoint.engines import restore_kinds, restore_memory
 from checkpoint.errors import UnsupportedError
-from checkpoint.linux import vm_flags
-from checkpoint.linux.abi import PROT_WRITE
 from checkpoint.linux.tracking import MEMORY_PLACE
 from checkpoint.model import Snapshot, Vma
 from checkpoint.resources import aio_rings, departed, joint, memory_files, stops, system_v_memory, terminals, untouched
@@ -43,7 +41,7 @@ def _of_process(state: Snapshot, *, is_kin: bool) -> Iterator[str]:
             yield "it has System V shared memory"
         elif aio_rings.is_ring(vma):
             yield "it has rings of asynchronous I/O"
-        elif vma.shared and vma.file is not None and not (_is_only_read(vma) or (is_kin and _is_in_memory(vma))):
+        elif vma.shared and vma.file is not None and not (restore_memory.is_only_read(vma) or (is_kin and _is_in_memory(vma))):
             yield f"it maps {named} shared"
         elif restore_kinds.is_special(vma):
             yield f"it has huge or droppable pages ({named})"
@@ -73,11 +71,6 @@ def _is_in_memory(vma: Vma) -> bool:
         return True
     assert vma.file is not None
     return restore_memory.is_object_mapping(vma) and vma.file.path.startswith((memory_files.PREFIX, MEMORY_PLACE))
-
-
-def _is_only_read(vma: Vma) -> bool:
-    """Whether it is a mapping of a file with a name that nobody can write through: the C library has such ones."""
-    return restore_memory.is_file_mapping(vma) and not vma.protection & PROT_WRITE and vm_flags.MAY_WRITE not in vma.flags
 
 
 def require_covered(state: Snapshot) -> None:

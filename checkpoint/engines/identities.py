@@ -13,13 +13,13 @@ from msgspec.structs import replace
 
 from checkpoint import pages
 from checkpoint.errors import CaptureError
-from checkpoint.linux import procfs, vm_flags
+from checkpoint.linux import abi, procfs, vm_flags
 from checkpoint.linux.procfs import DELETED, MapsLine
-from checkpoint.linux.tracking import NOT_CARRIED, is_shared_object
+from checkpoint.linux.tracking import MEMORY_PLACE, NOT_CARRIED, is_shared_object
 from checkpoint.memo import Memo
 from checkpoint.model import FileIdentity, Resource, Vma, VmaKind
 from checkpoint.pages import Words
-from checkpoint.resources import files
+from checkpoint.resources import files, living_names
 from checkpoint.resources.unsupported import HUGE_NAME
 
 _ADVICE: Final = frozenset(("gd", "dc", "dd", "wf", "hg", "nh", "lo", "lf", "nr", "sr", "rr", "mg"))
@@ -42,7 +42,8 @@ class Identities:
     """Identities of one process's files; each file is looked at once while it stays mapped.
 
     Attributes:
-        is_kin: other processes may share its anonymous memory, so that it is told which is which.
+        kin: all processes of its component, where it is one of several: they may share its anonymous memory, so that it is told
+            which is which, and know a file by a name that is left.
     """
 
     def __init__(self, pid: int, names: Mapping[str, str]) -> None:
@@ -52,9 +53,10 @@ class Identities:
         """
         self._pid = pid
         self._names = names
-        self.is_kin = False
+        self.kin: frozenset[int] = frozenset()
         self._mapped_twice: frozenset[int] = frozenset()
         self._known: dict[tuple[int, int, str], FileIdentity] = {}
+        self._without_name: dict[tuple[int, int, str], tuple[int, frozenset[int]]] = {}
         self._found = Memo[tuple[Vma, ...]]()
         self._sees_sizes = False
         """Of a shared object that is mapped nothing tells the size but itself."""
@@ -66,7 +68,7 @@ class Identities:
             flags: VmFlags by start, possibly older than ``lines``.
             guards: guard pages of all of them.
         """
-        found = self._found.of(lines, flags, self.is_kin, make=lambda: self._every(lines, flags))
+        found = self._found.of(lines, flags, self.kin, make=lambda: self._every(lines, flags))
         if self._sees_sizes:
             self._found.forget()
         if not len(guards):
@@ -76,12 +78,14 @@ class Identities:
     def _every(self, lines: Sequence[MapsLine], flags: Mapping[int, tuple[str, ...]]) -> tuple[Vma, ...]:
         mapped = {_key(line) for line in lines}
         self._known = {key: identity for key, identity in self._known.items() if key in mapped}
+        self._without_name = {key: looked for key, looked in self._without_name.items() if key in mapped}
         self._mapped_twice = _mapped_twice(lines)
         self._sees_sizes = any(map(is_shared_object, lines))
         return tuple(self._vma(line, flags.get(line.start, ())) for line in lines if line.name != VSYSCALL)
 
     def _vma(self, line: MapsLine, flags: tuple[str, ...]) -> Vma:
         is_told = self._is_told(line)
+        living = self._living_name(line)
         is_shared_huge = is_told and line.name.startswith(HUGE_NAME)
         is_file = not is_shared_huge and line.has_file and line.name not in NOT_CARRIED and not line.name.startswith("/dev/zero")
         if is_shared_huge:  # by relatives, who can have it as ordinary memory alone
@@ -93,26 +97,59 @@ class Identities:
             shared=line.shared,
             kind=VmaKind.FILE if is_file else KINDS.get(line.name, VmaKind.ANONYMOUS),
             offset=line.offset,
-            name=self._names.get(line.name, line.name),
-            file=self.of_mapping(line) if is_file else _of_shared(line) if is_told else None,
+            name=living or self._names.get(line.name, line.name),
+            file=self.of_mapping(line, living) if is_file else _of_shared(line) if is_told else None,
             flags=tuple(flag for flag in flags if flag in KEPT_FLAGS or (flag == vm_flags.MAY_WRITE and is_file and line.shared)),
         )
 
     def _is_told(self, line: MapsLine) -> bool:
         """Whether it must be told which shared memory without a file this is: it is mapped elsewhere, too."""
-        return line.shared and (self.is_kin or line.inode in self._mapped_twice)
+        return line.shared and (bool(self.kin) or line.inode in self._mapped_twice)
 
-    def of_mapping(self, line: MapsLine) -> FileIdentity:
-        """The file behind a mapping."""
+    def of_mapping(self, line: MapsLine, living: str = "") -> FileIdentity:
+        """The file behind a mapping.
+
+        Args:
+            living: a name that is left of it, in place of the one by which it was mapped.
+        """
         key = _key(line)
         if key not in self._known or is_shared_object(line):  # the size of such a one is told by nothing else
-            deleted = line.name.endswith(DELETED)
-            path = line.name.removesuffix(DELETED) if deleted else line.name
-            identity = self._identity(path, self._place(line), deleted, is_memory=is_shared_object(line))
+            deleted = line.name.endswith(DELETED) and not living
+            path = living or line.name.removesuffix(DELETED)
+            place = f"{procfs.outlook(self._pid)}{living}" if living else self._place(line)
+            is_memory = is_shared_object(line) and bool(line.protection & abi.PROT_WRITE or not living)
+            identity = self._identity(path, place, deleted, is_memory=is_memory)
             if deleted and not identity.inode:  # an ordinary user may not look at it, but is told which it is
                 identity = replace(identity, device=line.device, inode=line.inode)
             self._known[key] = identity
         return self._known[key]
+
+    def _living_name(self, line: MapsLine) -> str:
+        """The name by which shared memory of a file is told, where it is not the one by which it was mapped; "" for all others.
+
+        A private mapping of what was deleted is told by its pages alone.
+        """
+        is_gone = line.name.endswith(DELETED)
+        if not line.shared or not line.name.startswith("/") or not (is_gone or line.name.startswith(MEMORY_PLACE)):
+            return ""
+        path, file, key = line.name.removesuffix(DELETED), (line.device, line.inode), _key(line)
+        try:
+            about = os.stat(f"/proc/{self._pid}/map_files/{line.start:x}-{line.end:x}")
+        except OSError:  # an ordinary user may not look there
+            stamp = _changed_at(f"{procfs.outlook(self._pid)}{os.path.dirname(path)}")
+            if not is_gone or os.path.dirname(path) == "/" or self._without_name.get(key) == (stamp, self.kin):
+                return ""
+            found = living_names.name_of(path, file, self._holders(), mapped_on=line.device)
+            if not found:
+                self._without_name[key] = stamp, self.kin
+            return found
+        if about.st_nlink <= (0 if is_gone else 1):
+            return ""
+        found = living_names.name_of(path, (about.st_dev, about.st_ino), self._holders())
+        return found if found != line.name else ""
+
+    def _holders(self) -> tuple[int, ...]:
+        return self._pid, *sorted(self.kin - {self._pid})
 
     def _place(self, line: MapsLine) -> str:
         """Where the very file that is mapped is read: its name may lead elsewhere by now, to what we may read and it may not."""
@@ -178,6 +215,14 @@ class Identities:
             digest=b"" if is_memory else files.digest_at(through, (about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns)),
             deleted=deleted,
         )
+
+
+def _changed_at(directory: str) -> int:
+    """When a name came to a directory, or left it, for the last time."""
+    try:
+        return os.stat(directory).st_mtime_ns
+    except OSError:
+        return 0
 
 
 def _mapped_twice(lines: Iterable[MapsLine]) -> frozenset[int]:

@@ -513,7 +513,7 @@ class PtraceSession:
             clocks=first.standing.told.clocks,
             process=self._first.process(first),
             threads=self._first.thread_states(first),
-            vmas=(*self._first.mappings(first, is_kin=others is not None), *parcel.vmas),
+            vmas=(*self._first.mappings(first, others.pids if others else frozenset()), *parcel.vmas),
             epoch=order.epoch,
             freeze_us=frozen.freeze_us,
             notes=self.notes,

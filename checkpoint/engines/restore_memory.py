@@ -250,6 +250,11 @@ def is_file_mapping(vma: Vma) -> bool:
     return vma.kind is VmaKind.FILE and vma.file is not None and not vma.file.deleted
 
 
+def is_only_read(vma: Vma) -> bool:
+    """Whether it is a mapping of a file with a name that nobody can write through: the C library has such ones."""
+    return is_file_mapping(vma) and not vma.protection & abi.PROT_WRITE and vm_flags.MAY_WRITE not in vma.flags
+
+
 def _file_order(vma: Vma) -> tuple[str, bool]:
     assert vma.file is not None
     return vma.file.path, vma.shared and (bool(vma.protection & abi.PROT_WRITE) or vm_flags.MAY_WRITE in vma.flags)
@@ -293,7 +298,9 @@ def first_protection(vma: Vma, carried: Carried) -> int:
     No instruction runs there by then: a processor whose caches do not see what is written among instructions (aarch64) is told
     by the kernel when a page becomes one of instructions, and not when it is written to afterwards.
     """
-    return (vma.protection | abi.PROT_READ | abi.PROT_WRITE) & ~abi.PROT_EXEC if carried.within(vma) else vma.protection
+    if not carried.within(vma) or (vma.shared and is_only_read(vma)):
+        return vma.protection
+    return (vma.protection | abi.PROT_READ | abi.PROT_WRITE) & ~abi.PROT_EXEC
 
 
 class Carried:
@@ -360,10 +367,14 @@ def _filled(snapshot: Snapshot, legacy: Legacy, untouched: Words) -> Words:
     """Where pages are written.
 
     Droppable memory begins empty, as its program must expect at any time: seeds of random numbers lie there (vgetrandom), which
-    two lives must not have in common.
+    two lives must not have in common. What is mapped shared and may not be written to has what its file has.
     """
-    mapped = pages.extents(vma for vma in snapshot.vmas if vma.kind not in KERNEL_KINDS and vm_flags.DROPPABLE not in vma.flags)
+    mapped = pages.extents(vma for vma in snapshot.vmas if vma.kind not in KERNEL_KINDS and not _keeps_its_own(vma))
     return pages.difference(pages.difference(mapped, legacy.there), untouched)
+
+
+def _keeps_its_own(vma: Vma) -> bool:
+    return vm_flags.DROPPABLE in vma.flags or (vma.shared and is_only_read(vma))
 
 
 def _write(memory: Memory, carried: Words, content: Buffer, filled: Words, threads: int = 1) -> None:

@@ -15,7 +15,6 @@ import contextlib
 import os
 import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import islice
 from typing import Final
 
 from blake3 import blake3
@@ -27,7 +26,7 @@ from checkpoint.linux import procfs
 from checkpoint.linux.descriptors import Descriptor
 from checkpoint.linux.digests import filled_extents
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings, locks
+from checkpoint.resources import OpenFile, Surroundings, living_names, locks
 
 KIND: Final = "files"
 
@@ -40,7 +39,8 @@ CAPABILITIES: Final = (
     preserved(
         Area.FILES,
         "deleted files, directories and symbolic links",
-        "carried whole, up to 16 MiB without holes; opened by another name where a file still has one near by; pages of private "
+        "carried whole, up to 16 MiB without holes; a file that still has another name, near by or in another process of the "
+        "program, is opened or mapped by that; pages of private "
         "mappings are carried too, so what is written to the file later does not show in those that were never touched",
     ),
     refused(
@@ -80,10 +80,6 @@ CONTENTS_LIMIT: Final = 24 << 20
 DIGESTS_KEPT: Final = 1024
 """Digests remembered; a file is digested again only when its device, inode, size or time of change differ."""
 
-LEVELS: Final = 3
-"""In how many directories, from its own upwards, another name of a deleted file is looked for."""
-ENTRIES_MAX: Final = 10_000
-"""Entries of each that are looked at: some milliseconds."""
 LOOKS: Final = 5
 """How often a file is looked for that seems to have no name."""
 
@@ -163,34 +159,11 @@ def must_carry(held: OpenFile) -> bool:
 
 
 def other_name(held: OpenFile) -> str:
-    """Another name of a file whose own was deleted: beside it, above, or where the process works; "" without one.
-
-    Source: a hard link is most often made beside its file, and then renamed over another, or kept as a backup.
-    """
+    """The name that is left of a file whose own was deleted; "" without one that is known."""
     first = held.first
     if not (first.links and stat.S_ISREG(first.mode) and is_deleted(first)):
         return ""
-    for directory in (*_above(first.target), procfs.read_link(held.pid, "cwd")):
-        if found := _entry_of(held, directory):
-            return found
-    return ""
-
-
-def _above(path: str) -> Iterator[str]:
-    for _ in range(LEVELS):
-        path = os.path.dirname(path)
-        yield path
-
-
-def _entry_of(held: OpenFile, directory: str) -> str:
-    try:
-        with os.scandir(f"{procfs.outlook(held.pid)}{directory}") as entries:
-            for entry in islice(entries, ENTRIES_MAX):
-                if entry.inode() == held.first.inode and entry.stat(follow_symlinks=False).st_dev == held.first.device:
-                    return os.path.join(directory, entry.name)
-    except OSError:  # it is gone, or closed to us
-        return ""
-    return ""
+    return living_names.name_of(first.target, (first.device, first.inode), (held.pid, *sorted(held.kin.pids - {held.pid})))
 
 
 def _is_or_was_found(held: OpenFile) -> bool:

@@ -381,3 +381,18 @@ def test_a_lane_that_goes_down_ends_the_asking_and_what_was_sure(store: Store, t
 
     assert bringing.ANSWER_S > BOUND_S, "or the test would not see the difference"
     run(body())
+
+
+def test_a_question_whose_answer_was_lost_is_asked_again(store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process that asks is another one by now, and the standby answered the one before it."""
+    monkeypatch.setattr(bringing, "ANSWER_S", BOUND_S / 10)
+
+    async def body() -> None:
+        two = Two(store, tmp_path)
+        need, answer = two.file(b"content"), two.back.deliver
+        two.back.deliver = lambda message: setattr(two.back, "deliver", answer)
+        await two.bring(need)
+        assert len(two.sent(Belongings)) == 2
+        assert store.contents.path(need.digest).read_bytes() == b"content"
+
+    run(body())

@@ -219,3 +219,42 @@ def test_a_component_of_another_user_takes_nothing_over_from_its_namesake(tmp_pa
         ours.close()
 
     asyncio.run(story())
+
+
+def test_who_goes_on_from_a_position_has_its_output_though_it_was_not_shown(tmp_path: Path) -> None:
+    """A voters' standby may be elected before its primary could say that the newest position counts."""
+    made = history(3)
+
+    async def story(directory: Path, restarts: bool) -> None:
+        directory.mkdir()
+        standing = Standing(directory)
+        for one in made:
+            await standing.take(one)
+            standing.deposit.accept(Accept(COMPONENT, 1, one.position))
+        await standing.deposit.show(Show(COMPONENT, 1, made[0].position))
+        if restarts:
+            standing.store.close()
+            standing = Standing(directory)
+        assert standing.seen() == b"ready\n"
+        await standing.deposit.settled(COMPONENT, made[-1].position)
+        assert standing.seen() == b"ready\nline 2\nline 3\n"
+
+    for restarts in (False, True):
+        asyncio.run(story(tmp_path / str(restarts), restarts))
+
+
+def test_output_after_a_restart_has_no_gap_where_the_snapshot_before_was_never_shown(tmp_path: Path) -> None:
+    first, second, third = history(3)
+
+    async def story() -> None:
+        standing = Standing(tmp_path)
+        for one in (first, second):
+            await standing.take(one)
+        standing.store.close()
+        again = Standing(tmp_path)
+        await again.take(third)
+        again.deposit.accept(Accept(COMPONENT, 1, third.position))
+        await again.deposit.show(Show(COMPONENT, 1, third.position))
+        assert again.seen() == b"ready\nline 2\nline 3\n"
+
+    asyncio.run(story())

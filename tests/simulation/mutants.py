@@ -475,7 +475,6 @@ ELECTIVE_MUTANTS: tuple[Mutant, ...] = (
     oldest_checkpoint,
     same_epoch_again,
     runs_the_finished,
-    shown_when_stored,
     shown_when_accepted,
 )
 """Mistakes that lives of voting teams catch."""
@@ -497,7 +496,7 @@ NEAR: dict[str, int] = {
 }
 """The first seed that catches a mistake, where that is a late one: it is tried first."""
 
-LONG = {"named_in_advance": 37, "takes_the_unreadable_for_silence": 0}
+LONG = {"named_in_advance": 37, "shown_when_accepted": 113, "takes_the_unreadable_for_silence": 0}
 """The first long life that catches one which hardly any short one does."""
 
 
