@@ -493,6 +493,7 @@ NEAR: dict[str, int] = {
     "claims_for_ever": 15,
     "generous_lease": 11,
     "runs_the_finished": 52,
+    "shown_when_stored": 631,
 }
 """The first seed that catches a mistake, where that is a late one: it is tried first."""
 

@@ -15,7 +15,7 @@ SEEDS = int(os.environ.get("FAILOVER_SEEDS", "400"))
 BLOCK = 50
 """Seeds a test, so that a failure names a narrow range and the story names the seed."""
 
-SEEDS_TO_CATCH = 450
+SEEDS_TO_CATCH = 650
 ONCE_BROKEN = (98, 161, 368)
 """A robot whose store was lost after a claim in vain began a program anew, of which another one that was just away had all."""
 

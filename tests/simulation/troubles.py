@@ -19,7 +19,7 @@ PAUSES_MS = (30, 100, 200, 400, 900)
 
 
 SEALED = 0.5
-"""Of the starts in careful teams: those with a wrong key, which is put right so long after the start:"""
+"""Of the starts in long lives of careful pairs: those with a wrong key, which is put right so long after the start:"""
 SEALED_MS = 3_000
 
 PROMOTED_MS = 300
@@ -39,6 +39,7 @@ class Trouble:
         self._world = world
         self._invariants = invariants
         self._random = random
+        self._endless = endless
         self._names = list(world.robots)
         self._name = random.choice(self._names)
         self._other = random.choice([robot for robot in self._names if robot != self._name])
@@ -155,7 +156,8 @@ class Trouble:
 
     def _outage(self, stop: Callable[[str], None]) -> None:
         stop(self._name)
-        if self._world.robots[self._name].config.boot_patience_ms and self._random.random() < SEALED:
+        is_careful = self._endless and self._world.robots[self._name].config.boot_patience_ms > 0
+        if is_careful and self._random.random() < SEALED:
             self._seal()
         self._world.after(self._pause_ns, lambda: self._world.power_on(self._name))
 
