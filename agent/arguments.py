@@ -64,6 +64,7 @@ class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
     portable: Annotated[str, msgspec.Meta(pattern=f"^(no|{'|'.join(EVERY_LEVEL)})?$")] = ""
     hooks: dict[HookName, list[Text]] = {}
     carry: list[Text] = []
+    shared: list[Text] = []
     devices: dict[Text, Text] = {}
     connections: Connections = ""
 
@@ -74,6 +75,7 @@ class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):
     pid: Annotated[int, msgspec.Meta(ge=1, le=PID_MAX)]
     name: str
     carry: list[Text] = []
+    shared: list[Text] = []
     devices: dict[Text, Text] = {}
     connections: Connections = ""
 

@@ -14,7 +14,7 @@ from agent.errors import ConfigError
 from agent.hook_kinds import KINDS, check_told
 from checkpoint.arch import EVERY_LEVEL
 from checkpoint.device_rules import RULES_MAX, DeviceRule, checked, rule_from
-from checkpoint.engine import is_carriable
+from checkpoint.engine import contradiction, is_carriable
 from failover.client import strict_toml
 from failover.client import team as team_directory
 from failover.client.quantities import size_bytes, span_ms
@@ -99,6 +99,7 @@ class ComponentConfig:
         carry: files and folders that travel with it when it is started here, besides those that `failover run` names.
         carry_limit: what they may hold while it runs here.
         carry_at: where they are laid down here, by their path on the other robots; the same path for those not named.
+        shared: files and folders that others write to as well: they keep the content that they have here.
     """
 
     on_loss: Literal["takeover", "hold"] = "takeover"
@@ -121,6 +122,7 @@ class ComponentConfig:
     carry: tuple[str, ...] = field(default_factory=tuple)
     carry_limit: str = "256MB"
     carry_at: dict[str, str] = field(default_factory=dict)
+    shared: tuple[str, ...] = field(default_factory=tuple)
 
     def device_rules(self) -> tuple[DeviceRule, ...]:
         """This robot's own rules for its devices.
@@ -358,11 +360,13 @@ def _check_devices(where: str, component: ComponentConfig) -> None:
 
 def _check_carry(where: str, component: ComponentConfig) -> None:
     """A path that names nothing in full would carry something else on another robot."""
-    for path in (*component.carry, *component.carry_at, *component.carry_at.values()):
+    for path in (*component.carry, *component.carry_at, *component.carry_at.values(), *component.shared):
         if not is_carriable(path):
             raise ConfigError(
-                f"{where}: carry or carry_at holds {path!r}; name each file or folder by its whole path, without . and .."
+                f"{where}: carry, carry_at or shared holds {path!r}; name each file or folder by its whole path, without . and .."
             )
+    if both := contradiction(component.carry, component.shared):
+        raise ConfigError(f"{where}: {both}")
     try:
         size_bytes(component.carry_limit)
     except ValueError as error:

@@ -139,6 +139,8 @@ class Figures(Struct):
     """Of a standby: as its primary told it with the newest snapshot."""
     lacks: tuple[str, ...] | None = None
     """Of a standby: what this robot lacks of what the program needs, by `agent.lacks`; None: nobody has looked."""
+    contested: tuple[str, ...] = ()
+    """Of a primary: which of its files others hold open for writing, so that a restore would be refused, by `agent.lacks`."""
     digests: tuple[KnownDigest, ...] = ()
     """Of files that were read for that."""
     devices: tuple[DeviceRule, ...] = ()

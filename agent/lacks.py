@@ -1,13 +1,15 @@
 """What this robot lacks of what a component needs to go on here: asked before it is moved here, and looked at while it stands by.
 
-Its newest checkpoint here tells what that is. A keeper compares, for it knows how a restore would; nothing is started.
+Where it runs it is looked which of its files others hold open for writing: each of them can be captured, and the restore of the
+one that comes second is refused. Its newest checkpoint here tells what it needs. A keeper compares, for it knows how a restore
+would; nothing is started.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from typing import Final
 
 from agent.bounds import check_rights
@@ -44,10 +46,47 @@ async def asked_of(errands: Errands, robot: str, name: str) -> tuple[str, ...]:
 
 
 async def look(around: Surroundings, charges: Iterable[Charge]) -> Mapping[str, tuple[str, ...]]:
-    """What is lacking here for each of these, as sentences, by name; one that cannot be looked at, or is not stored, is left out.
+    """What is lacking here for each of these, as sentences, by name; what cannot be looked at, or is not stored, is left out."""
+    return await _told_by_one_keeper(around, charges, _compared)
 
-    One keeper is asked about all of them.
+
+async def contested(around: Surroundings, charges: Collection[Charge]) -> Mapping[str, tuple[str, ...]]:
+    """Which files of those that run here, and have a checkpoint, others hold open for writing; as `look`.
+
+    Args:
+        charges: all of this robot's, so that others are known by name.
     """
+    components = {charge.name: charge.component.pid for charge in charges if charge.component is not None}
+    running = [charge for charge in charges if charge.name in components and charge.figures.snapshots]
+
+    async def compared(around: Surroundings, charge: Charge, keeper: KeeperLink) -> tuple[str, ...]:
+        component = charge.component
+        if component is None or not component.pid:
+            return ()  # it has just ended
+        terms, pid = component.keeper.terms, component.pid
+        order = channel.Compare(terms=terms, running=pid, components=components)
+        chain = await asyncio.to_thread(around.store.open_chain, charge.name)
+        try:
+            return (await _answer(keeper, order, chain[-1])).lacks
+        finally:
+            close_all(tuple(chain))
+
+    return await _told_by_one_keeper(around, running, compared)
+
+
+async def _answer(keeper: KeeperLink, order: channel.Compare, snapshot: int) -> Compared:
+    reply, _ = await keeper.dialogue.ask(order, (snapshot,))
+    if isinstance(reply, Failed):
+        raise CheckpointError(reply.message)
+    assert isinstance(reply, Compared)
+    return reply
+
+
+async def _told_by_one_keeper(
+    around: Surroundings,
+    charges: Iterable[Charge],
+    compared: Callable[[Surroundings, Charge, KeeperLink], Awaitable[tuple[str, ...]]],
+) -> Mapping[str, tuple[str, ...]]:
     found: dict[str, tuple[str, ...]] = {}
     keeper: KeeperLink | None = None
     try:
@@ -55,7 +94,7 @@ async def look(around: Surroundings, charges: Iterable[Charge]) -> Mapping[str, 
             await charge.cleared(CLEARING_S)
             keeper = keeper or await around.places.nursery.onlooker()
             try:
-                found[charge.name] = await _compared(around, charge, keeper)
+                found[charge.name] = await compared(around, charge, keeper)
             except StoreError:
                 continue  # there is no checkpoint of it here yet, or no more
             except (CheckpointError, OSError) as trouble:
@@ -78,12 +117,9 @@ async def _compared(around: Surroundings, charge: Charge, keeper: KeeperLink) ->
         terms = terms_here(spec.launch if spec is not None else None, around.here(name))
         is_ordinary = spec is not None and spec.owner != ROOT
         order = channel.Compare(around.places.contents, terms, charge.figures.digests, own_eyes=is_ordinary)
-        reply, _ = await keeper.dialogue.ask(order, (chain[-1],))
+        reply = await _answer(keeper, order, chain[-1])
     finally:
         close_all(tuple(chain))
-    if isinstance(reply, Failed):
-        raise CheckpointError(reply.message)
-    assert isinstance(reply, Compared)
     charge.figures.digests = reply.known
     try:
         if spec is not None:

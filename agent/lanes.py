@@ -303,6 +303,12 @@ class Lanes(Switchboard):
         task.add_done_callback(self._tasks.discard)
         task.add_done_callback(end_lanes_on_mistake)
 
+    def tell(self, event: events.Event) -> None:
+        """See `agent.switchboard.Switchboard.tell`."""
+        if isinstance(event, events.Captured) and self.charge(event.component).figures.snapshots == 1:
+            self._new_here.set()  # the first one of it: look at once who else writes to its files
+        super().tell(event)
+
     def _accepted(self, offer: Offer, snapshot: Snapshot) -> None:
         figures = self.charge(offer.component).figures
         if figures.spec is None:
@@ -311,7 +317,8 @@ class Lanes(Switchboard):
         self.charge(offer.component).copy.accepted(snapshot.position)
 
     async def _look_what_is_lacking(self) -> None:
-        """Now and then, and when this robot becomes a standby: what it lacks of what it stands by for."""
+        """Now and then, and when a component is new here: what this robot lacks of what it stands by for, and which files of what
+        runs here others write to."""
         while True:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._new_here.wait(), LACKS_S)
@@ -320,6 +327,9 @@ class Lanes(Switchboard):
             found = await lacks.look(self._around, waiting)
             for charge in waiting:
                 charge.figures.lacks = found.get(charge.name)
+            contested = await lacks.contested(self._around, tuple(self.charges.values()))
+            for charge in self.charges.values():
+                charge.figures.contested = contested.get(charge.name, ())
 
     async def lacking(self, name: str) -> tuple[str, ...]:
         """What this robot lacks, now, of what a component needs to go on here; nothing where it holds no checkpoint of it.

@@ -92,9 +92,10 @@ def terms_here(launch: Launch | None, component: ComponentConfig) -> Terms:
     carry = Carry(size_max=size_bytes(component.carry_limit), places=tuple(component.carry_at.items()))
     budget_ns = round(component.freeze_budget_ms * 1_000_000)
     if launch is None:
-        return Terms(carry, component.device_rules(), freeze_budget_ns=budget_ns)
+        return Terms(carry, component.device_rules(), freeze_budget_ns=budget_ns, shared=component.shared)
     devices = merged(arrived(launch.devices), component.device_rules())
-    return Terms(carry, devices, launch.connections == CARRY, budget_ns)
+    shared = tuple(dict.fromkeys((*launch.shared, *component.shared)))
+    return Terms(carry, devices, launch.connections == CARRY, budget_ns, shared)
 
 
 def begun_on(launch: Launch, component: ComponentConfig) -> Terms:

@@ -35,7 +35,7 @@ from agent.questions import Lines, Questions
 from agent.rules import level_of, rules_for
 from checkpoint import portable
 from checkpoint.device_rules import RULES_MAX, rule_from, travelling
-from checkpoint.engine import is_carriable
+from checkpoint.engine import contradiction, is_carriable
 from failover.core import acts, events
 from failover.core.names import check_component, weight
 from failover.core.types import COMMITTED, ComponentSpec, Launch, State
@@ -137,6 +137,7 @@ class Verbs(Questions):
             output=wanted.output,
             hooks=tuple((occasion, tuple(command)) for occasion, command in wanted.hooks.items() if command),
             carry=self._carried(name, wanted.carry),
+            shared=self._shared(name, wanted.shared, wanted.carry),
             devices=self._device_rules(name, wanted.devices),
             connections=self._connections(name, wanted.connections),
         )
@@ -172,7 +173,8 @@ class Verbs(Questions):
         name = await self._fresh_name(wanted.name, "", say.caller.uid)
         carried, devices = self._carried(name, wanted.carry), self._device_rules(name, wanted.devices)
         connections = self._connections(name, wanted.connections)
-        launch = Launch(pid=wanted.pid, carry=carried, devices=devices, connections=connections)
+        shared = self._shared(name, wanted.shared, wanted.carry)
+        launch = Launch(pid=wanted.pid, carry=carried, devices=devices, connections=connections, shared=shared)
         charge = await self._begin(name, launch, owner)
         return {"name": name, "pid": wanted.pid, "notes": list(charge.figures.notes)}
 
@@ -319,6 +321,20 @@ class Verbs(Questions):
         for path in paths:
             if not is_carriable(path):
                 raise RefusedError(f"cannot carry {path!r}: name the file or folder by its whole path, without . and ..")
+        return paths
+
+    def _shared(self, name: str, wanted: list[str], carried: list[str]) -> tuple[str, ...]:
+        """What others write to as well: what was asked for, and what this robot's operator rules besides.
+
+        Raises:
+            RefusedError: it is no path that means the same on every robot, or travels with the component.
+        """
+        paths = tuple(dict.fromkeys((*wanted, *self._lanes.settings.component(name).shared)))
+        for path in paths:
+            if not is_carriable(path):
+                raise RefusedError(f"cannot share {path!r}: name the file or folder by its whole path, without . and ..")
+        if both := contradiction(self._carried(name, carried), paths):
+            raise RefusedError(both)
         return paths
 
     def _connections(self, name: str, wanted: str) -> str:

@@ -144,6 +144,11 @@ def told_lacks(view: ComponentView, charge: Charge | None, robot: str) -> list[s
     return [f"{robot} could not go on with it: {lack}" for lack in lacks]
 
 
+def _contested(view: ComponentView, figures: Figures | None) -> tuple[str, ...]:
+    """Which of its files others hold open for writing where it runs: a restore of it would be refused."""
+    return figures.contested if figures is not None and view.state in PRIMARY_STATES else ()
+
+
 def _hung_up_devices(view: ComponentView, figures: Figures | None, settings: Settings) -> tuple[str, ...]:
     """Which devices a standby lacks that the program would find hung up there."""
     if figures is None or view.state is not State.STANDBY:
@@ -208,6 +213,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, s
         "kept": _kept(store.kept(view.name) if store is not None else None),
         "unstored": view.unstored,
         "lacks": _lacks(view, figures),
+        "contested": list(_contested(view, figures)),
         "prepared_first": charge is not None and charge.is_prepared_first,
         "promise": view.promise,
         "promise_differs": view.differs,
@@ -220,6 +226,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, s
         "notes": [
             *view.notes,
             *told_lacks(view, charge, settings.config.robot),
+            *(f"NOT PROTECTED, a restore of it is refused: {reason}" for reason in _contested(view, figures)),
             *_copy_notes(view, figures, settings.config.robot),
             *_own_notes(view, figures),
             *_over_budget(view, figures, settings),

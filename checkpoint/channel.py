@@ -313,12 +313,16 @@ class Compare(msgspec.Struct, frozen=True, tag=True):
     Attributes:
         contents, terms, own_eyes: see `checkpoint.engine.RestoreOptions`.
         known: what the last `Compared` told, so that only files that have changed are read again.
+        running: the program runs here, as this pid: tell only which of its files others hold open for writing; 0: it does not.
+        components: see `checkpoint.engine.Engine.contested`.
     """
 
     contents: str = ""
     terms: Terms = NO_TERMS
     known: tuple[KnownDigest, ...] = ()
     own_eyes: bool = False
+    running: int = 0
+    components: dict[str, int] = {}
 
 
 class OpenFile(msgspec.Struct, frozen=True, tag=True):

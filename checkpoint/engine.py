@@ -7,7 +7,7 @@ from below this file.
 from __future__ import annotations
 
 import os.path
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Final, Protocol
 
 from msgspec import Struct
@@ -124,12 +124,19 @@ class Terms(Struct, frozen=True):
         connections: TCP connections with others go along where it goes on from the state in which it stood still for good.
         freeze_budget_ns: how long it may stand still for a snapshot, so that what is left to copy then is copied beforehand as
             far as needed; 0: as short as can be.
+        shared: files, and folders with all that is in them, that others write to as well: they keep the content that they have
+            where the program goes on, and only its offsets are set; absolute.
     """
 
     carry: Carry = NOTHING_CARRIED
     devices: tuple[DeviceRule, ...] = ()
     connections: bool = False
     freeze_budget_ns: int = 0
+    shared: tuple[str, ...] = ()
+
+    def is_shared(self, path: str) -> bool:
+        """Whether a file is one of those that are shared, or lies in such a folder."""
+        return any(path == one or path.startswith(f"{one}/") for one in self.shared)
 
 
 NO_TERMS: Final = Terms()
@@ -163,6 +170,15 @@ def is_carriable(path: str) -> bool:
     )
 
 
+def contradiction(carry: Iterable[str], shared: tuple[str, ...]) -> str:
+    """Why files cannot both travel with a program and be shared with others; "" where none are to do both."""
+    for path in carry:
+        if Terms(shared=shared).is_shared(path) or any(one.startswith(f"{path}/") for one in shared):
+            what = "a carried file becomes what it was, a shared one keeps what it has"
+            return f"{path} is to be carried and shared: {what}; choose one"
+    return ""
+
+
 class CaptureOrder(Struct, frozen=True):
     """What the next snapshot is to be.
 
@@ -186,7 +202,8 @@ class RestoreOptions(Struct, frozen=True):
 
     Attributes:
         elapsed_ns: time between the snapshot and now, as far as known; the program's clocks go on by this much.
-        accept_changed: paths of files that may differ from what the snapshot recorded (rule ``shared``).
+        accept_changed: paths of files that may differ from what the snapshot recorded, as the restore itself finds; what an
+            operator rules to be shared stands in ``terms``.
         epoch: of the primacy under which it goes on; a program that was born with one finds it in its environment. 0: none.
         terms: this robot's, for its devices; its carried files have been named as they are laid down here.
         own_eyes: open its files with its own user's rights, not with ours: that user could have put other files in their place.
@@ -365,6 +382,15 @@ class Engine(Protocol):
         Args:
             outline: of its newest snapshot (`checkpoint.format.read_outline`).
             digest_of: tells what files of this machine contain (`checkpoint.digests_of_files`).
+        """
+        ...
+
+    def contested(self, outline: Snapshot, options: RestoreOptions, pid: int, components: Mapping[str, int]) -> tuple[str, ...]:
+        """Which files of a program that runs here are held open for writing by others, so that a restore would be refused.
+
+        Args:
+            pid: of its first process.
+            components: the first process of every component that runs here, by name.
         """
         ...
 

@@ -314,6 +314,8 @@ class Keeper:
         digests = DigestsOfFiles(request.known)
         with foreign.facts(f"compare {outline.component} with what is here"):
             options = RestoreOptions(own_eyes=request.own_eyes, contents=request.contents, terms=request.terms)
+            if request.running:
+                return channel.Compared(chosen.contested(outline, options, request.running, request.components)), ()
             found = chosen.lacks(outline, options, digests.of)
         return channel.Compared(found, tuple(digests.used.values())), ()
 

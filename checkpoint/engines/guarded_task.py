@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
 from checkpoint import program_files
@@ -172,6 +173,10 @@ class CooperativeEngine:
         files = program_of(outline)
         gone = [file.path for file in files if not os.path.lexists(file.path) and not _is_brought(options, file.digest)]
         return tuple(f"{path} is missing, from which it is started again: install it here" for path in gone)
+
+    def contested(self, outline: Snapshot, options: RestoreOptions, pid: int, components: Mapping[str, int]) -> tuple[str, ...]:
+        """See `checkpoint.engine.Engine.contested`: it opens its files itself, and no restore looks at them."""
+        return ()
 
     def restore(self, vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -> Restored:
         """Refused: see the class."""

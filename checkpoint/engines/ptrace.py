@@ -5,6 +5,8 @@ Imported by the keeper alone, and at once: a keeper that waits in advance must n
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from checkpoint.contents import digest_of_file
 from checkpoint.digests_of_files import DigestOf
 from checkpoint.engine import PTRACE, Copy, ProtectOrder, Report, Restored, RestoreOptions, Session
@@ -35,6 +37,10 @@ class PtraceEngine:
     def lacks(self, outline: Snapshot, options: RestoreOptions, digest_of: DigestOf = digest_of_file) -> tuple[str, ...]:
         """See ``checkpoint.engine.Engine.lacks``."""
         return restore_checks.lacks(outline, options, digest_of)
+
+    def contested(self, outline: Snapshot, options: RestoreOptions, pid: int, components: Mapping[str, int]) -> tuple[str, ...]:
+        """See ``checkpoint.engine.Engine.contested``."""
+        return restore_checks.contested(outline, options, pid, components)
 
     def restore(self, vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -> Restored:
         """See ``checkpoint.engine.Engine.restore``."""

@@ -8,9 +8,11 @@ from __future__ import annotations
 import functools
 import mmap
 import os
+import shlex
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 from msgspec import Struct, field
@@ -28,21 +30,22 @@ from checkpoint.engines.identities import build_id
 from checkpoint.engines.restore_memory import is_file_mapping, kernel_pages, makes_shared_memory
 from checkpoint.engines.restore_process import CAP_SYS_CHROOT, may_not_enter
 from checkpoint.engines.restore_vdso import ContentAt
-from checkpoint.errors import CheckpointError, MismatchError
-from checkpoint.linux import abi, processor, procfs
+from checkpoint.errors import MismatchError
+from checkpoint.linux import abi, kinship, processor, procfs
 from checkpoint.model import FileIdentity, Resource, Snapshot
-from checkpoint.resources import aio_rings, attached_devices, covered_files, kernel_files, rebuild, writers
+from checkpoint.resources import aio_rings, attached_devices, covered_files, kernel_files, laying, rebuild, writers
 from checkpoint.resources.rebuilding import number_of
 
 CAPABILITIES: Final = (
     refused(
         Area.THERE,
         "a file that is mapped or open is missing, or another one (size, build, content)",
-        "install the same on all robots, or accept it as shared where its content does not matter",
+        "install the same on all robots, or rule it shared where its content does not matter (`--shared`)",
         "is another file: {} bytes here",
         "is another file: as long",
         "is another build of that file",
         "cannot be used ({}): {}",
+        "and shared, cannot be used",
         "is of another type here",
         "bytes here and {} there",
         "has another content here",
@@ -50,8 +53,8 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.THERE,
-        "a file that the program writes was changed by somebody else, or is being written",
-        "one writer for each file",
+        "a file that the program writes was changed by another program, or is being written by one: found while it runs",
+        "one writer for each file, or rule it shared (`--shared`): it keeps its content, and the offset is set",
         "was written to since the snapshot",
         "is held open for writing by",
     ),
@@ -165,16 +168,40 @@ def _compare(
 def lacks(outline: Snapshot, options: RestoreOptions, digest_of: DigestOf) -> tuple[str, ...]:
     """What this machine lacks of what a program needs that still runs elsewhere, one sentence each.
 
-    What it writes to may change until it comes: of that only whether it is there is looked at. Not asked are who else writes to
-    it, and whether a vdso without its content can be led to ours (`require` does).
+    What it writes to may change until it comes: of that only whether it is there is looked at, and who else writes to it. Not
+    asked is whether a vdso without its content can be led to ours (`require` does).
 
     Args:
         outline: of its newest snapshot, which may be a delta.
     """
-    found = list(_of_views(outline, options))
-    for view in tree.views(carried.without(outline)):
-        expected = (*options.accept_changed, *carried.every_path(outline), *_in_flux(view))
+    views = tree.views(carried.without(outline))
+    travels, spared = carried.every_path(outline), _never_in_the_way(views)
+    found = [*_of_views(outline, options), *laying.written_by_others(outline, spared)]
+    for view in views:
+        expected = (*options.accept_changed, *travels, *_in_flux(view))
         found += (*_of_root(view), *_compare(view, replace(options, accept_changed=expected), digest_of)[0])
+        found += _of_writers(view, replace(options, accept_changed=travels), spared)
+    return tuple(dict.fromkeys(found))
+
+
+def _never_in_the_way(views: Sequence[Snapshot]) -> frozenset[int]:
+    """Processes that may write to a program's files now: we, and itself, where robots are processes of one machine."""
+    ours = writers.family(os.getpid())
+    if views[0].machine.boot_id != this_machine().boot_id:
+        return ours
+    theirs = {"\0".join(view.process.arguments).encode(errors="surrogateescape") for view in views} - {b""}
+    return ours | {pid for pid in writers.everybody() if writers.arguments_of(pid) in theirs}
+
+
+def contested(outline: Snapshot, options: RestoreOptions, pid: int, components: Mapping[str, int]) -> tuple[str, ...]:
+    """See `checkpoint.engine.Engine.contested`."""
+    own = {pid, *kinship.component(pid)}
+    spared = frozenset(own).union(*(writers.family(one) for one in (os.getpid(), pid)))
+    owners = {one: name for name, first in components.items() if first != pid for one in (first, *kinship.component(first))}
+    known = replace(options, accept_changed=carried.every_path(outline))
+    found = list(laying.written_by_others(outline, spared, owners))
+    for view in tree.views(carried.without(outline)):
+        found += _of_writers(view, known, spared, owners)
     return tuple(dict.fromkeys(found))
 
 
@@ -286,8 +313,12 @@ def _of_files(state: Snapshot, options: RestoreOptions, brought: dict[str, str],
     """
     mapped = [vma.file for vma in state.vmas if vma.file is not None and is_file_mapping(vma)]
     written = {vma.file.path for vma in state.vmas if vma.file is not None and vma.shared and vma.protection & abi.PROT_WRITE}
+    private = {vma.file.path for vma in state.vmas if vma.file is not None and not vma.shared} | {state.process.executable.path}
     for identity in {identity.path: identity for identity in (state.process.executable, *mapped)}.values():
         if identity.path in options.accept_changed or _is_made(state, identity.path):
+            continue
+        if options.terms.is_shared(identity.path) and identity.path not in private:
+            yield from _of_shared_file(identity.path, "mapped")
             continue
         reasons = tuple(_of_file(identity, digest_of, is_written=identity.path in written))
         content, damage = _content(options, identity.digest if reasons and identity.path not in written else b"", digest_of)
@@ -355,6 +386,9 @@ def _of_descriptors(state: Snapshot, options: RestoreOptions, brought: dict[str,
         elif held.kind == "files" and not held.facts.get("deleted") and path not in options.accept_changed:
             if _is_made(state, path):
                 continue
+            if options.terms.is_shared(path):
+                yield from _of_shared_file(path, f"open as {held.name}")
+                continue
             reasons = tuple(_of_open_file(held, path, state.machine.boot_id == this_machine().boot_id, digest_of))
             digest = held.facts.get("digest")
             content, damage = _content(options, digest if reasons and isinstance(digest, bytes) else b"", digest_of)
@@ -368,6 +402,14 @@ def _of_descriptors(state: Snapshot, options: RestoreOptions, brought: dict[str,
             yield covered_files.refuse_user(held)
         elif held.kind in rebuild.NEEDED:
             yield from rebuild.NEEDED[held.kind](held)
+
+
+def _of_shared_file(path: str, how: str) -> Iterator[str]:
+    """Why a file that keeps what it has cannot be used: it must be there."""
+    try:
+        os.stat(path)
+    except OSError as error:
+        yield f"{path}, {how} and shared, cannot be used ({error.strerror}): mount or make it here as it is there"
 
 
 def _of_open_file(held: Resource, path: str, same_boot: bool, digest_of: DigestOf) -> Iterator[str]:
@@ -388,7 +430,8 @@ def _of_open_file(held: Resource, path: str, same_boot: bool, digest_of: DigestO
     if not stat.S_ISREG(about.st_mode) or number_of(held.facts["flags"]) & rebuild.O_PATH:
         return
     facts, size = held.facts, number_of(held.facts["size"])
-    named, shared = f"{path}, open as {held.name},", "accept it as shared if its content does not matter"
+    named = f"{path}, open as {held.name},"
+    shared = f"accept it as shared if its content does not matter: --shared {shlex.quote(path)}"
     grows, digest = rebuild.grows_at_its_end(held), facts.get("digest", b"")
     same_file = same_boot and (about.st_dev, about.st_ino) == (facts["device"], facts["inode"])
     if about.st_size < size or (about.st_size > size and not grows):
@@ -399,21 +442,21 @@ def _of_open_file(held: Resource, path: str, same_boot: bool, digest_of: DigestO
         yield f"{named} has another content here; {_FAR}, or {shared}"
 
 
-def _of_writers(state: Snapshot, options: RestoreOptions, ours: frozenset[int]) -> Iterator[str]:
-    """Files that the program writes to and somebody else does, too: their words would mix, and the cut would lose some."""
+def _of_writers(
+    state: Snapshot, options: RestoreOptions, ours: frozenset[int], owners: Mapping[int, str] = MappingProxyType({})
+) -> Iterator[str]:
+    """Files that the program writes to and another process does, too: their words would mix, and the cut would lose some.
+
+    Args:
+        owners: which component a process belongs to, by pid.
+    """
     for held in state.resources:
         path = str(held.facts.get("path", ""))
-        if held.kind != "files" or held.facts.get("deleted") or path in options.accept_changed:
+        if held.kind != "files" or held.facts.get("deleted") or path in options.accept_changed or options.terms.is_shared(path):
             continue
         if not (os.path.isfile(path) and rebuild.is_written(held) and writers.may_be_written(path)):
             continue
         if pid := writers.writer_of(path, ours):
-            who = f"pid {pid} ({_name_of(pid)})"
-            yield f"{path}, open as {held.name}, is held open for writing by {who}: end that first, or accept it as shared"
-
-
-def _name_of(pid: int) -> str:
-    try:
-        return procfs.status(pid).name
-    except CheckpointError:
-        return "it has just ended"
+            who = writers.told(pid, owners)
+            cure = f"end that first, or accept it as shared: --shared {shlex.quote(path)}"
+            yield f"{path}, open as {held.name}, is held open for writing by {who}: {cure}"

@@ -20,6 +20,7 @@ from msgspec.structs import replace
 
 from checkpoint import pages
 from checkpoint.arrays import NDArray
+from checkpoint.engine import Terms
 from checkpoint.engines import restore_kinds
 from checkpoint.engines.forked_memory import Legacy
 from checkpoint.linux import abi, vm_flags
@@ -371,6 +372,12 @@ def _filled(snapshot: Snapshot, legacy: Legacy, untouched: Words) -> Words:
     """
     mapped = pages.extents(vma for vma in snapshot.vmas if vma.kind not in KERNEL_KINDS and not _keeps_its_own(vma))
     return pages.difference(pages.difference(mapped, legacy.there), untouched)
+
+
+def extents_shared(vmas: Iterable[Vma], terms: Terms) -> Words:
+    """Where files are mapped that keep the content that they have here: others write to them as well."""
+    files = (vma for vma in vmas if vma.shared and vma.file is not None and is_file_mapping(vma))
+    return pages.extents(vma for vma in files if vma.file is not None and terms.is_shared(vma.file.path))
 
 
 def _keeps_its_own(vma: Vma) -> bool:

@@ -155,7 +155,8 @@ class ProcessRestore:
         self._estate = estate
         self._thread = state.threads[0]
         self._filters_of_all = seccomp.of_all(state.resources, [thread.tid for thread in state.threads])
-        self._untouched = untouched.of(state.resources)
+        shared = restore_memory.extents_shared(state.vmas, options.terms)
+        self._untouched = pages.union(untouched.of(state.resources), shared)
         self._tracee = tracee
         self._others: list[tuple[Tracee, ThreadState]] = []
         self.notes: list[str] = []

@@ -22,6 +22,7 @@ import stat
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Final
 
 from msgspec import Struct, field
@@ -157,11 +158,26 @@ def _names_at(tree: Tree, path: str) -> set[bytes]:
 
 
 def _require_unwritten(state: Snapshot, tree: Tree, spared: frozenset[int]) -> None:
-    """Raises MismatchError: somebody would go on writing to files that the program takes for its own."""
-    for path in _files_below(tree.path):
+    """Raises MismatchError: another program would go on writing to files that the program takes for its own."""
+    if reason := next(_writers_below(tree.path, spared, {}), ""):
+        raise MismatchError(f"cannot restore {state.component} here: {reason}", (reason,))
+
+
+def written_by_others(state: Snapshot, spared: frozenset[int], owners: Mapping[int, str] = MappingProxyType({})) -> Iterator[str]:
+    """Which carried files, as they lie here, another program holds open for writing, so that they would not be laid down.
+
+    Args:
+        spared: processes that do not count.
+        owners: which component a process belongs to, by pid.
+    """
+    for tree in carried.trees_of(state):
+        yield from _writers_below(tree.path, spared, owners)
+
+
+def _writers_below(place: str, spared: frozenset[int], owners: Mapping[int, str]) -> Iterator[str]:
+    for path in _files_below(place):
         if writers.may_be_written(path) and (pid := writers.writer_of(path, spared)):
-            reason = f"{path}, which the program carries, is held open for writing by pid {pid}: end that first"
-            raise MismatchError(f"cannot restore {state.component} here: {reason}", (reason,))
+            yield f"{path}, which the program carries, is held open for writing by {writers.told(pid, owners)}: end that first"
 
 
 def _files_below(path: str) -> Iterator[str]:

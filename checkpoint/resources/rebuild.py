@@ -341,7 +341,9 @@ def _open(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
         path = f"/proc/self/fd/{brought}"  # what was brought along in its place
     descriptor = table.open(path, flags & (O_PATH | os.O_NOFOLLOW | os.O_DIRECTORY if flags & O_PATH else REOPENED_FLAGS))
     if held.kind == "files" and not flags & O_PATH:
-        if brought is None and path not in rebuilding.options.accept_changed and has_grown(held):
+        options = rebuilding.options
+        keeps = path in options.accept_changed or options.terms.is_shared(path)
+        if brought is None and not keeps and has_grown(held):
             size = number_of(facts["size"])
             table.call(f"cut {path} back to {size} bytes", "ftruncate", descriptor, size)
         _seek(table, descriptor, held)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import fcntl
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Final
 
 from checkpoint.errors import CheckpointError
@@ -59,6 +59,33 @@ def writer_of(path: str, spared: frozenset[int]) -> int:
             if _is_writing(pid, number, (about.st_dev, about.st_ino)):
                 return pid
     return 0
+
+
+def told(pid: int, owners: Mapping[int, str]) -> str:
+    """Who a process is.
+
+    Args:
+        owners: which component a process belongs to, by pid.
+    """
+    try:
+        name = procfs.status(pid).name
+    except CheckpointError:
+        name = "it has just ended"
+    return f"pid {pid} ({name}){f', of component {owners[pid]}' if pid in owners else ''}"
+
+
+def everybody() -> list[int]:
+    """All processes."""
+    return list(_others(frozenset()))
+
+
+def arguments_of(pid: int) -> bytes:
+    """Of a process, each ended by a zero byte but the last; b"" where it has ended, or is not ours to look at."""
+    try:
+        with open(f"/proc/{pid}/cmdline", "rb") as file:
+            return file.read().removesuffix(b"\0")
+    except OSError:
+        return b""
 
 
 def family(pid: int) -> frozenset[int]:

@@ -107,6 +107,7 @@ def run(room: argparse.ArgumentParser) -> None:
         option = f"--{hook.replace('_', '-')}"
         room.add_argument(option, metavar="CMD", type=shlex.split, default=[], help=f"run this, as you, {when}")
     _carry(room)
+    _shared(room)
     _devices(room)
     _connections(room, "carry: take its TCP connections with others along by a handover (default: as agent.toml says: reset)")
     room.add_argument("--user", metavar="USER", help="run it as this user, by name or number (only root may; default: as you)")
@@ -122,6 +123,17 @@ def _carry(room: argparse.ArgumentParser) -> None:
         default=[],
         help="let this file, or folder with all that is in it, travel with the program, as it was at each checkpoint; may be "
         "given again (see docs/files.md)",
+    )
+
+
+def _shared(room: argparse.ArgumentParser) -> None:
+    room.add_argument(
+        "--shared",
+        metavar="PATH",
+        action="append",
+        default=[],
+        help="others write to this file, or to what is in this folder, as well: it keeps the content that it has where the "
+        "program goes on, and only the program's offset is set; may be given again (see docs/files.md)",
     )
 
 
@@ -155,6 +167,7 @@ def protect(room: argparse.ArgumentParser) -> None:
     _pid(room)
     room.add_argument("--name", metavar="NAME", help="its name (default: /TEAM/ROBOT/pid-PID)")
     _carry(room)
+    _shared(room)
     _devices(room)
     _connections(room, "carry: take its TCP connections with others along by a handover (default: as agent.toml says: reset)")
     _agent(room)
@@ -246,6 +259,7 @@ def capture(room: argparse.ArgumentParser) -> None:
         "--leave-running", action="store_true", help="let the program run on (default: it is ended once the snapshot is safe)"
     )
     room.add_argument("--force", action="store_true", help="replace FILE if it exists")
+    _shared(room)
     _devices(room)
     _connections(room, "carry: take its TCP connections with others along (default: reset)", "reset")
     _json(room)
@@ -260,6 +274,7 @@ def restore(room: argparse.ArgumentParser) -> None:
         action="store_true",
         help="give the program all rights that FILE asks for, also if FILE is not root's (default: its owner's at most)",
     )
+    _shared(room)
     _devices(room)
     _connections(room, "reset: do not take up TCP connections that the capture took along (default: carry)", "carry")
     _json(room)

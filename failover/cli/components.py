@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     wanted |= {"output": arguments.output, "hooks": {kind: getattr(arguments, kind) for kind in HOOKS}}
     wanted["portable"] = arguments.portable
     wanted |= {"carry": [os.path.realpath(path) for path in arguments.carry], "devices": dict(arguments.devices)}
-    wanted["connections"] = arguments.connections
+    wanted |= {"connections": arguments.connections, "shared": [os.path.realpath(path) for path in arguments.shared]}
     if arguments.name:
         wanted["name"] = arguments.name
     if arguments.user:
@@ -182,7 +182,8 @@ def protect(arguments: argparse.Namespace) -> int:
     name = arguments.name or f"pid-{arguments.pid}"
     with connect(arguments) as agent:
         carry = [os.path.realpath(path) for path in arguments.carry]
-        rules = {"devices": dict(arguments.devices), "connections": arguments.connections}
+        shared = [os.path.realpath(path) for path in arguments.shared]
+        rules = {"devices": dict(arguments.devices), "connections": arguments.connections, "shared": shared}
         answer = agent.ask("protect", pid=arguments.pid, name=name, carry=carry, **rules)
     return _tell(arguments, answer, f"pid {answer['pid']} is protected as {answer['name']}")
 

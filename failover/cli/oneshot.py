@@ -19,7 +19,7 @@ import msgspec
 
 from checkpoint import channel, format, rights
 from checkpoint.authors import Author, author_of
-from checkpoint.channel import Capture, Captured, Protect, Protected, Restore, Restored, Resume, Resumed
+from checkpoint.channel import Capture, Captured, Compare, Compared, Protect, Protected, Restore, Restored, Resume, Resumed
 from checkpoint.device_rules import DeviceRule, rule_from
 from checkpoint.engine import Terms
 from checkpoint.errors import (
@@ -75,9 +75,22 @@ def capture(arguments: argparse.Namespace) -> int:
         whole = Capture(base=True, generation=1, sequence=1, hold=held)
         with _written_whole(target) as file:
             captured = _captured(keeper, whole, file, target)
+            notes = _contested(keeper, arguments, file)
         with _ended(arguments.pid) if held else contextlib.nullcontext():
             keeper.release()
-    return _tell_capture(arguments, captured, tuple(dict.fromkeys(protected.notes + captured.notes)))
+    return _tell_capture(arguments, captured, tuple(dict.fromkeys(protected.notes + captured.notes + notes)))
+
+
+def _contested(keeper: Keeper, arguments: argparse.Namespace, file: int) -> tuple[str, ...]:
+    """Which of its files others hold open for writing, as notes: as long as they do, a restore is refused."""
+    again = os.open(f"/proc/self/fd/{file}", os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        found, _ = keeper.ask(Compare(terms=terms_of(arguments), running=arguments.pid), Compared, (again,))
+    except CheckpointError as untold:
+        return (f"who else writes to its files is not known: {untold}",)
+    finally:
+        os.close(again)
+    return tuple(f"a restore here is refused as it is now: {reason}" for reason in found.lacks)
 
 
 def _captured(keeper: Keeper, order: Capture, file: int, target: Path) -> Captured:
@@ -203,7 +216,8 @@ def terms_of(arguments: argparse.Namespace) -> Terms:
     Raises:
         FailoverError: a rule is none.
     """
-    return Terms(devices=device_rules(arguments), connections=arguments.connections == CARRY)
+    shared = tuple(os.path.realpath(path) for path in arguments.shared)
+    return Terms(devices=device_rules(arguments), connections=arguments.connections == CARRY, shared=shared)
 
 
 def device_rules(arguments: argparse.Namespace) -> tuple[DeviceRule, ...]:

@@ -14,7 +14,7 @@ verb           arguments                                                result, 
 ``run``        ``argv`` *must*, ``name`` = argv[0]'s, ``env``, ``cwd``,  Update ``{"started": {name, pid, inner_pid, isolated,
                ``umask`` 18, ``isolate`` true, ``wait`` true,           notes}}``; with ``wait`` Output … and Result
                ``user`` "", ``engine`` "auto", ``output`` "immediate",  ``{name, exit_status}`` (a wait status); else at once
-               ``devices`` {}: path → rule,
+               ``devices`` {}: path → rule, ``carry`` [], ``shared`` [],
                ``connections`` "": reset, or carry,
                ``hooks`` {}: occasion → words of a command,
                ``portable`` "": a level, or "no"
@@ -67,7 +67,7 @@ peers_elsewhere: {robot: {peer: state}}: with ``team``, the same as the others s
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
     freeze_us_max, freeze_budget_missed, snapshot_size, dirty_bytes, xor_hit_rate, snapshots, restores, crashes, outage_ms,
-    exit_status, promise, promise_differs, kept, unstored, lacks, prepared_first, owner, reasons,
+    exit_status, promise, promise_differs, kept, unstored, lacks, contested, prepared_first, owner, reasons,
     output, output_waiting, notes, elsewhere, warm, cold, ready, ready_copy}]
     freeze_budget_missed: its snapshots that took longer than the freeze_budget_ms of its table in agent.toml; notes say more
     snapshot_size, dirty_bytes: of the newest one: bytes on the wire, and of pages; xor_hit_rate: which part of what the
@@ -84,6 +84,7 @@ components: [{name, role, primary, home, prefer, state, protection, epoch, gener
         whole ones besides that are kept for people, bytes of all; None where it has nothing
     lacks: what this robot, a standby, would need to go on with it and has not: a device, a file, a feature; by
         sentence, None where nobody has looked; prepared_first: a hook gets it ready before, and may bring that
+    contested: at its primary: which of its files others hold open for writing, so that a restore is refused; by sentence
     unstored: why the last snapshot that came to this robot was not stored there; "" otherwise
     role: primary | standby | none; protection: none | protected | degraded | stopped
     state: starting | running | frozen | held | restoring | ended | degraded | failed | released

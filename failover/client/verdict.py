@@ -50,7 +50,8 @@ def is_lacking(component: Sight) -> bool:
 def is_unprotected(component: Sight) -> bool:
     """It runs, and nobody could go on with what it does now."""
     checkpointed = component.get("protection") not in ("none", "stopped")
-    return component.get("role") == "primary" and (not checkpointed or is_lacking(component))
+    is_refused = is_lacking(component) or bool(component.get("contested"))
+    return component.get("role") == "primary" and (not checkpointed or is_refused)
 
 
 def is_unknown(component: Sight) -> bool:

@@ -136,6 +136,7 @@ class Launch(Struct, frozen=True):
         carry: files and folders that travel with it, as absolute paths.
         devices: (path, rule) of devices that it has open, where a robot has no rule of its own; see `checkpoint.device_rules`.
         connections: `RESET` or `CARRY`: what becomes of its TCP connections with others.
+        shared: files and folders that others write to as well, as absolute paths: they keep the content that each robot has.
     """
 
     argv: tuple[str, ...] = ()
@@ -152,6 +153,7 @@ class Launch(Struct, frozen=True):
     carry: tuple[str, ...] = ()
     devices: tuple[tuple[str, str], ...] = ()
     connections: str = RESET
+    shared: tuple[str, ...] = ()
 
 
 class Rules(Struct, frozen=True):

@@ -262,6 +262,7 @@ def restored(
     own_eyes: bool = False,
     devices: tuple[DeviceRule, ...] = (),
     isolate: bool = False,
+    shared: tuple[str, ...] = (),
 ) -> Program:
     """Bring a base, or a base with its deltas, back as a child of ours and let it run."""
     base = state if isinstance(state, Snapshot | StoredBase) else chain.fold(state) if len(state) > 1 else state[0]
@@ -273,7 +274,8 @@ def restored(
         inner_pid = outline.process.pid if keep_pid else 0
         born = spawn_vessel(Birth(inner_pid=inner_pid, isolate=isolate, clocks=clocks, elapsed_ns=elapsed_ns, stdio=stdio))
     try:
-        options = RestoreOptions(elapsed_ns, accept_changed, own_eyes, contents=str(contents), terms=Terms(devices=devices))
+        terms = Terms(devices=devices, shared=shared)
+        options = RestoreOptions(elapsed_ns, accept_changed, own_eyes, contents=str(contents), terms=terms)
         program = ENGINE.restore(born.pid, base, options)
         program.resume()
     except BaseException:
