@@ -36,7 +36,7 @@ from agent.switchboard import Switchboard, live, make_directory
 from agent.units import starter
 from agent.verbs import Verbs
 from agent.view import team_view
-from checkpoint import channel, format
+from checkpoint import allocator, channel, format
 from checkpoint.channel import Channel, close_all
 from checkpoint.contents import FOLDER as CONTENTS_FOLDER
 from checkpoint.engine import COOPERATIVE
@@ -63,6 +63,9 @@ from failover.core.types import HISTORY_MAX, Found, Held
 BYTES_A_MEGABIT: Final = 125_000
 TIDY_S: Final = 900.0
 """Between two looks for brought files that nobody needs any more."""
+
+GIVE_BACK_S: Final = 20.0
+"""Between two times that free memory goes back to the kernel: a few milliseconds in a thread of its own."""
 
 LOOK_S: Final = 3.0
 """Between two looks whether the files of running programs are still there."""
@@ -116,6 +119,7 @@ class Lanes(Switchboard):
         self._tasks: set[asyncio.Task[None]] = set()
         self._new_here = asyncio.Event()
         self._task(self._tidy_contents())
+        self._task(self._give_back())
         if self.settings.me.role == "robot":
             self._task(self._look_what_is_lacking())
         if self.settings.config.bring:
@@ -296,6 +300,12 @@ class Lanes(Switchboard):
                 continue
             if freed:
                 log.info("removed %d bytes of brought files that no checkpoint needs", freed)
+
+    async def _give_back(self) -> None:
+        """Now and then let the kernel have what is free."""
+        while True:
+            await asyncio.sleep(GIVE_BACK_S)
+            await asyncio.to_thread(allocator.give_back)
 
     def _task(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(work)

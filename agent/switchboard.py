@@ -32,6 +32,7 @@ from agent.questions import QUESTIONS, Questions
 from agent.transport import Keys, LinkState, public_key_of
 from agent.ways import BULK, Ways
 from agent.wires import Wires
+from checkpoint import allocator
 from checkpoint.channel import Channel, ChannelClosedError, ChannelError
 from checkpoint.errors import CheckpointError
 from failover.client.control import SOCKET_NAME
@@ -371,6 +372,7 @@ def live(kind: Callable[[Settings, Channel[ToLanes]], Switchboard]) -> int:
     """Be the other process of the heart that started us with CONFIG and DESCRIPTOR; its signals are its own."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    allocator.be_frugal()
     path, descriptor = Path(sys.argv[1]), int(sys.argv[2])
     try:
         settings = configuration.load(path)

@@ -17,8 +17,9 @@ def main() -> int:
 def run(words: list[str]) -> int:
     """Load and run the keeper."""
     gc.disable()  # of what is loaded nothing is rubbish, and what captures make is freed by counting
-    from checkpoint import lean
+    from checkpoint import allocator, lean
 
+    allocator.be_frugal()
     lean.begin()
     lean.load_numpy()
     from checkpoint import keeper

@@ -89,3 +89,17 @@ class SegmentBusyError(SegmentError):
 
 class TaskPacketError(CheckpointError):
     """What came over a task socket is no packet as TASK.md says; nothing of it was used."""
+
+
+def let_go(error: BaseException) -> None:
+    """Have an error that was answered hold nothing: the frames that it came through may hold memory, and often the error itself."""
+    import traceback  # seldom wanted
+
+    met: set[int] = set()
+    waiting: list[BaseException | None] = [error]
+    while waiting:
+        one = waiting.pop()
+        if one is not None and id(one) not in met:
+            met.add(id(one))
+            traceback.clear_frames(one.__traceback__)
+            waiting += (one.__cause__, one.__context__)

@@ -41,7 +41,8 @@ from checkpoint.resources import aio_rings, system_v_memory
 READ_CHUNK: Final = 8 << 20
 """Bytes that are read at a time while the program runs."""
 BUFFER_SIZE: Final = 8 << 20
-"""Bytes that a freeze may copy without asking for memory first."""
+"""Bytes that a freeze may copy without asking for memory first, where earlier ones copied as much."""
+BUFFER_SIZE_MIN: Final = 1 << 20
 ROOM_SIZE: Final = 64 << 10
 """Bytes that a copy has room for behind its pages: of the vdso, and of what came since."""
 WORTH_COUNT: Final = 16
@@ -96,6 +97,34 @@ class RunningCopy(Struct):
         self.valid = pages.difference(pages.difference(self.valid, scan.written), scan.cleared)
 
 
+class FreezeBuffer:
+    """Memory for what is copied while the program stands still, of all processes of a component together; used again each time."""
+
+    def __init__(self) -> None:
+        self._content = bytearray()
+        self._wanted = 0
+
+    @property
+    def size(self) -> int:
+        """Bytes that it holds."""
+        return len(self._content)
+
+    def begin(self) -> None:
+        """Before a freeze: nothing of the last one is needed any more."""
+        wanted = min(max(self._wanted, BUFFER_SIZE_MIN), BUFFER_SIZE)
+        if wanted > len(self._content):
+            self._content = bytearray(min(-(-wanted // BUFFER_SIZE_MIN) * BUFFER_SIZE_MIN, BUFFER_SIZE))
+        self._wanted = 0
+
+    def piece(self, size: int) -> memoryview:
+        """So many bytes of it; of new memory where what is left does not do."""
+        begin = self._wanted
+        self._wanted += size
+        if self._wanted <= len(self._content):
+            return memoryview(self._content)[begin : self._wanted]
+        return memoryview(bytearray(size))
+
+
 class MemoryCapture:
     """Follows the memory of one process.
 
@@ -109,6 +138,7 @@ class MemoryCapture:
         has_rings: some of them are rings of asynchronous I/O.
         has_segments: some of them are System V shared memory.
         readers: threads that copy while the program runs; more than one takes processors from it.
+        buffer: the component's; where nothing else is said, this process is all of it.
 
     Args:
         tracker: owned from now on.
@@ -134,7 +164,7 @@ class MemoryCapture:
         self._mapped: Words = NONE
         self._vdso: Words = NONE
         self._followed: Words = NONE
-        self._buffer = bytearray()
+        self.buffer = FreezeBuffer()
         self._is_armed = False
         self._unacknowledged: list[Unacknowledged] = []
         self._left_out: Words = NONE
@@ -185,8 +215,6 @@ class MemoryCapture:
                 with the program; 0: as few as is worth it.
         """
         self.refresh()
-        if not self._buffer:
-            self._buffer = bytearray(BUFFER_SIZE)
         copied = RunningCopy()
         if base:
             self._copy_everything(copied)
@@ -316,7 +344,8 @@ class MemoryCapture:
         if base:
             missing = pages.union(missing, self._vdso)  # for a machine whose kernel has another one
         began = time.perf_counter_ns()
-        content = memoryview(self._memory.read_pages(missing, self._buffer))[: pages.total_size(missing)]
+        content = self.buffer.piece(pages.total_size(missing))
+        self._memory.read_pages_into(missing, content)
         copy_ns = time.perf_counter_ns() - began
         self._left_out = guards
         return Taken(

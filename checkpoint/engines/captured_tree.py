@@ -216,6 +216,8 @@ class CapturedTree:
     def follow(self, first: CapturedProcess) -> None:
         """The first process is looked at anew."""
         self._first = first
+        for process in self._known.values():
+            process.memory.buffer = first.memory.buffer
 
     def processes(self) -> tuple[CapturedProcess, ...]:
         """Those that are followed."""
@@ -288,6 +290,7 @@ class CapturedTree:
 
     def _add(self, process: CapturedProcess) -> None:
         process.threads.is_one_of_many = True
+        process.memory.buffer = self._first.memory.buffer
         self._known[process.pid] = process
 
     def _forget(self, pid: int) -> None:

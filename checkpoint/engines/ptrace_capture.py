@@ -37,7 +37,7 @@ from checkpoint.engines.captured_process import CapturedProcess, Look
 from checkpoint.engines.captured_tree import CapturedTree, MovedError, SeenOthers
 from checkpoint.engines.freeze_budget import FreezeBudget
 from checkpoint.engines.outputs import Outputs
-from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError, UnsupportedError
+from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError, UnsupportedError, let_go
 from checkpoint.linux import abi, kinship, procfs, system_v
 from checkpoint.linux.kinship import Kinship
 from checkpoint.linux.memory import Memory
@@ -279,7 +279,8 @@ class PtraceSession:
                 if frozen.others:
                     frozen.others.describe()
                 return frozen
-            except MovedError:
+            except MovedError as moved:
+                let_go(moved)  # its frames hold what was copied
                 may_stay = False
                 if time.monotonic() > deadline:
                     raise
@@ -326,6 +327,7 @@ class PtraceSession:
 
     def _frozen_look(self, copied: RunningCopy | None, *, base: bool, hold: bool) -> Frozen:
         """Everything that needs the program to stand still."""
+        self._first.memory.buffer.begin()
         if copied is None:
             self._first.prepare(base=base)
         elif not self._held:

@@ -72,19 +72,14 @@ class Memory:
         """
         self._transfer(abi.process_vm_readv, "read", ranges, address_of(buffer))
 
-    def read_pages(self, extents: Ranges, buffer: bytearray | None = None) -> bytearray:
+    def read_pages(self, extents: Ranges) -> bytearray:
         """Read the pages of a set, rows ``[start, end)``, in order; pages that nobody may read are read all the same.
-
-        Args:
-            buffer: to be filled from its beginning, if it is long enough; otherwise a new one is made.
 
         Raises:
             ProcessGoneError: the process has ended.
             CaptureError: one of them is not mapped.
         """
-        size = pages.total_size(extents)
-        if buffer is None or len(buffer) < size:
-            buffer = bytearray(size)
+        buffer = bytearray(pages.total_size(extents))
         self.read_pages_into(extents, buffer)
         return buffer
 

@@ -8,8 +8,10 @@ import os
 import signal
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Final
 
 import pytest
 
@@ -409,3 +411,31 @@ def _target(number: str) -> str:
         return os.readlink(f"/proc/self/fd/{number}")
     except OSError:
         return ""
+
+
+MANY = """
+import os, subprocess, sys, time
+children = [subprocess.Popen(["sleep", "1000"]) for _ in range(int(sys.argv[1]))]
+print("ready", flush=True)
+time.sleep(1000)
+"""
+MORE: Final = 4
+BYTES_A_PROCESS: Final = 5 << 20
+
+
+def test_a_process_more_takes_little_memory_of_the_keeper(tmp_path: Path) -> None:
+    """A shell has short-lived children all day, several at a time."""
+    held = []
+    for count in (1, 1 + MORE):
+        place = tmp_path / str(count)
+        place.mkdir()
+        with ended(start([sys.executable, "-c", MANY, str(count)], place, isolate=True)) as program:
+            program.wait_for_line("ready")
+            tracemalloc.start()
+            try:
+                with protected(program) as session:
+                    captured_at_last(session, CaptureOrder())
+                    held.append(tracemalloc.get_traced_memory()[0])
+            finally:
+                tracemalloc.stop()
+    assert held[1] - held[0] < MORE * BYTES_A_PROCESS
