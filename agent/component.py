@@ -296,12 +296,13 @@ class Component:
         if self._awaits_commit:
             what = "it has committed nothing yet" if self.task_pid else "it has not said yet that it keeps a state"
             raise NothingCommittedError(f"cannot capture {self.name}: {what}")
-        order = channel.Capture(base, generation, sequence, epoch, hold, self._places.xor_cache)
+        order = channel.Capture(base, generation, sequence, epoch, hold, self.keeper.share())
         async with self._standing_still(is_held_by_guard):
             with self._patience():
                 captured, descriptors = await self.keeper.ask(order)
         if isinstance(captured, channel.Unchanged):
             return captured
+        self.keeper.note(captured)
         (snapshot,) = descriptors
         self._held = hold and not is_held_by_guard
         self._commits[captured.position] = captured.commit

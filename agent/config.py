@@ -156,8 +156,8 @@ class Config:
         snapshot_period_ms: between two snapshots of a component; grows by itself when link or standby is slower.
         realtime: ask for SCHED_FIFO and locked memory.
         link_mbit_s: cap on snapshot traffic; 0 for none.
-        xor_cache: of each component, on either side: memory for pages that deltas are told as differences from; "": no
-            differences are made here.
+        xor_cache: of this robot, for all components together, run or kept here: memory for pages that deltas are told as
+            differences from, and proved by; "": no differences are made here.
         snapshots_over: wired: they never leave over a wireless link; any: over whichever has the bulk address.
         bring: files of programs that this robot lacks, or has in another version, are brought here and kept, by content.
         bring_size: of all that is brought for one component; beyond it its checkpoints are refused.

@@ -116,6 +116,20 @@ class Budget(Struct):
         )
 
 
+class Memory(Struct, frozen=True):
+    """Bytes of private memory of this robot's agent.
+
+    Attributes:
+        agent: of the heart and the lanes; ``keepers``: of those that follow a component here.
+        remembered: of both, what holds pages that deltas are told from, and proved by; ``remembered_max``: its bound, xor_cache.
+    """
+
+    agent: int
+    keepers: int
+    remembered: int
+    remembered_max: int
+
+
 class Figures(Struct):
     """What ``failover status`` shows of one component on this robot; None where it is not known."""
 

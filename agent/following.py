@@ -29,11 +29,17 @@ class Following:
         self._name = name
         self._places = places
         self._link: KeeperLink | None = None
+        self._wanted = self._remembered = 0
 
     @property
     def is_there(self) -> bool:
         """Whether there is a keeper that listens."""
         return self._link is not None and self._link.dialogue.open
+
+    @property
+    def pid(self) -> int:
+        """Of the keeper that listens; 0: there is none."""
+        return self._link.pid if self._link is not None and self._link.dialogue.open else 0
 
     async def give(self) -> KeeperLink:
         """Have a keeper that follows nothing yet.
@@ -42,6 +48,7 @@ class Following:
             KeeperLostError: none can be had.
         """
         self._link, self.followed = await self._places.nursery.keeper(), None
+        self._remembers_nothing()
         return self._link
 
     async def follow(self, engine: str, pid: int, streams: tuple[int, ...]) -> tuple[str, ...]:
@@ -83,15 +90,29 @@ class Following:
 
     async def let_loose(self) -> None:
         """Have the keeper let go of what it follows, if it is there; it may follow something else then."""
+        self._remembers_nothing()
         if self.is_there:
             self.followed = None
             await self.ask(channel.Release())
 
     def drop(self) -> None:
         """The keeper ends, and lets go of what it follows."""
+        self._remembers_nothing()
         link, self._link, self.followed = self._link, None, None
         if link is not None:
             link.end()
+
+    def share(self) -> int:
+        """Bytes in which the keeper may remember pages, from its next capture on."""
+        return self._places.budget.share(self._name, self._wanted, self._remembered)
+
+    def note(self, captured: channel.Captured) -> None:
+        """What it remembers since a capture."""
+        self._wanted, self._remembered = captured.wanted_bytes, captured.remembered_bytes
+
+    def _remembers_nothing(self) -> None:
+        self._wanted = self._remembered = 0
+        self._places.budget.leave(self._name)
 
 
 def _failure(failed: Failed) -> CheckpointError:

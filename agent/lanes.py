@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
 from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any, Final
@@ -23,6 +24,7 @@ from agent.deposit import Deposit
 from agent.dispatch import Dispatch
 from agent.door import Inventory, ToLanes, Told
 from agent.errors import TROUBLE, GuardLostError, LaneError
+from agent.figures import Memory
 from agent.hooks import Hooks
 from agent.mistake import end_lanes_on_mistake
 from agent.nursery import Nursery
@@ -36,13 +38,14 @@ from agent.switchboard import Switchboard, live, make_directory
 from agent.units import starter
 from agent.verbs import Verbs
 from agent.view import team_view
-from checkpoint import allocator, channel, format
+from checkpoint import allocator, channel, format, room
 from checkpoint.channel import Channel, close_all
 from checkpoint.contents import FOLDER as CONTENTS_FOLDER
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CheckpointError, StoreError
 from checkpoint.model import Snapshot
 from checkpoint.needs import Need, names_of_contents, needs
+from checkpoint.page_budget import PageBudget
 from checkpoint.store import Store, open_store
 from failover.client.quantities import size_bytes
 from failover.core import acts, events
@@ -94,7 +97,9 @@ class Lanes(Switchboard):
         self._starter = starter()
         self._nursery = Nursery(sockets, self._starter)
         contents = str(self._store_path / CONTENTS_FOLDER) if config.bring else ""
-        self.places = Places(sockets, state / "logs", self._nursery, "", config.robot, contents, config.xor_cache_size)
+        self.places = Places(
+            sockets, state / "logs", self._nursery, "", config.robot, contents, PageBudget(config.xor_cache_size)
+        )
         self._shipper = Shipper(self._lane, config.link_mbit_s * BYTES_A_MEGABIT)
         self.connect(Verbs(self))
 
@@ -148,8 +153,8 @@ class Lanes(Switchboard):
         """Have the store to ourselves; an earlier life of the agent that still ends is waited for."""
         for _ in range(STORE_TRIES):
             try:
-                config = self.settings.config
-                return await asyncio.to_thread(open_store, self._store_path, None, retention(config), config.xor_cache_size)
+                kept = retention(self.settings.config)
+                return await asyncio.to_thread(open_store, self._store_path, None, kept, self.places.budget)
             except StoreError as error:
                 trouble: StoreError = error
                 await asyncio.sleep(STORE_PAUSE_S)
@@ -378,8 +383,22 @@ class Lanes(Switchboard):
         """What ``status`` shows."""
         notices = [*self.notices(), *self._around.store.notices[-NOTICES_SHOWN:]]
         return team_view(
-            self.settings, self._life, told, self.charges, self._lane.links, notices, self._links.shown(), self._around.store
+            self.settings,
+            self._life,
+            told,
+            self.charges,
+            self._lane.links,
+            notices,
+            self._links.shown(),
+            self._around.store,
+            self._memory(),
         )
+
+    def _memory(self) -> Memory:
+        keepers = {charge.component.keeper.pid for charge in self.charges.values() if charge.component is not None}
+        budget = self.places.budget
+        ours = (self._life.heart, os.getpid())
+        return Memory(sum(map(room.held, ours)), sum(room.held(pid) for pid in keepers if pid), budget.held, budget.limit)
 
 
 NOTICES_SHOWN: Final = 10

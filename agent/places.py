@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from msgspec import Struct
+from msgspec import Struct, field
 
 from agent.nursery import Nursery
 from agent.streams import OutputLogs, logs_of, total_of
 from checkpoint import format
+from checkpoint.page_budget import PageBudget
 from checkpoint.shelf import folder_name
 
 
@@ -23,7 +24,7 @@ class Places(Struct, frozen=True):
         cgroup: a delegated cgroup v2 directory that each component gets a cgroup of its own in; "" for the guard's own.
         robot: this robot's name, for the snapshots.
         contents: directory of files that programs brought along; "": none are brought to this robot.
-        xor_cache: see `checkpoint.channel.Capture`.
+        budget: for the pages that keepers and the store remember.
     """
 
     sockets: Path
@@ -32,7 +33,7 @@ class Places(Struct, frozen=True):
     cgroup: str = ""
     robot: str = ""
     contents: str = ""
-    xor_cache: int = 0
+    budget: PageBudget = field(default_factory=lambda: PageBudget(0))
 
 
 def guard_sockets(places: Places) -> tuple[Path, ...]:

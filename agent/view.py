@@ -9,6 +9,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from msgspec.structs import asdict
+
 from agent import clock, fence
 from agent.config import Settings
 from agent.door import Life, Told
@@ -20,7 +22,7 @@ from failover.core.types import COMMITTED, IMMEDIATE, ComponentView, PeerView, P
 
 if TYPE_CHECKING:  # a witness shows its status too, and has none of these
     from agent.charge import Charge
-    from agent.figures import Commits, Figures
+    from agent.figures import Commits, Figures, Memory
     from checkpoint.store import Kept, Store
 
 NANOSECONDS_A_MILLISECOND: Final = 1_000_000
@@ -62,6 +64,7 @@ def team_view(
     notices: list[str],
     interfaces: list[dict[str, object]],
     store: Store | None,
+    memory: Memory | None = None,
 ) -> dict[str, Any]:
     """The whole picture."""
     view = told.status
@@ -78,6 +81,7 @@ def team_view(
         "realtime": not life.notes,
         "rule": view.rule if view else None,
         "promise": view.promise if view else "not decided yet: the agent is starting",
+        "memory": asdict(memory) if memory is not None else None,
         "fencing": fence.sentence(fence.watchdog()),
         "healthy": view.healthy if view else False,
         "notes": notes,

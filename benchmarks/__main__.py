@@ -3,6 +3,7 @@
 python -m benchmarks                     all of it, some fifteen minutes; writes benchmarks/RESULTS.md
 python -m benchmarks --quick             fewer cases and repetitions, some minutes; prints only
 python -m benchmarks --quick restore     one of them
+python -m benchmarks soak --for 2h       what grows over hours; no part of the whole run
 
 As root more is measured (CRIU, beats on the wire). Nothing else should run meanwhile; a busy machine is warned of.
 """
@@ -18,6 +19,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -37,11 +39,13 @@ from benchmarks import (
     outage,
     overload,
     results,
+    soak,
     task,
 )
 from benchmarks.figures import Absent, Findings
 from benchmarks.running import BenchmarkError
 from checkpoint.errors import CheckpointError
+from failover.client.quantities import span_ms
 from failover.errors import FailoverError
 
 HERE: Final = Path(__file__).parent
@@ -108,6 +112,9 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "task": task.task,
 }
 
+BY_ITSELF: Final = "soak"
+"""Not a part of the whole run: it takes hours."""
+
 
 def main() -> int:
     """Measure, print, write."""
@@ -120,7 +127,9 @@ def main() -> int:
     if warning:
         print(f"WARNING: {warning}", file=sys.stderr)
     began, before = time.monotonic(), machine.ticks()
-    findings = [_measure(name, arguments.quick) for name in arguments.names or BENCHMARKS]
+    spans = {BY_ITSELF: partial(soak.soak, span_s=arguments.span_ms / 1_000 if arguments.span_ms else None)}
+    benchmarks = BENCHMARKS | spans
+    findings = [_measure(name, benchmarks[name], arguments.quick) for name in arguments.names or BENCHMARKS]
     facts["it took"] = f"{time.monotonic() - began:.0f} s"
     facts["given to others by the host meanwhile"] = f"{(machine.ticks() - before).stolen_share:.1%} of its cores' time"
     command = " ".join(["python -m benchmarks", *(["--quick"] if arguments.quick else []), *arguments.names])
@@ -131,13 +140,13 @@ def main() -> int:
     return 0 if all(found.figures for found in findings) else 1
 
 
-def _measure(name: str, quick: bool) -> Findings:
+def _measure(name: str, benchmark: Callable[[bool, Path], Findings], quick: bool) -> Findings:
     """One benchmark; one that comes to nothing says why and leaves the others their turn."""
     print(f"measuring {name} …", file=sys.stderr, flush=True)
     began, before = time.monotonic(), machine.ticks()
     try:
         with tempfile.TemporaryDirectory(prefix="failover-benchmark-") as directory:
-            found = BENCHMARKS[name](quick, Path(directory))
+            found = benchmark(quick, Path(directory))
         print(f"  in {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
         return replace(found, stolen=(machine.ticks() - before).stolen_share)
     except (BenchmarkError, CheckpointError, FailoverError, OSError) as error:
@@ -149,8 +158,15 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("names", nargs="*", choices=[*BENCHMARKS, []], metavar="NAME", help=f"which: {', '.join(BENCHMARKS)}")
+    parser.add_argument(
+        "names",
+        nargs="*",
+        choices=[*BENCHMARKS, BY_ITSELF, []],
+        metavar="NAME",
+        help=f"which: {', '.join(BENCHMARKS)}; {BY_ITSELF}",
+    )
     parser.add_argument("--quick", action="store_true", help="fewer cases and repetitions; nothing is written")
+    parser.add_argument("--for", dest="span_ms", type=span_ms, metavar="SPAN", help=f"of {BY_ITSELF}: 25m, 2h (the default)")
     parser.add_argument("--output", type=Path, metavar="DIR", help="write there (default: a whole run writes into benchmarks/)")
     return parser
 

@@ -141,7 +141,7 @@ def _idle(span_s: float, directory: Path) -> list[Figure]:
         before = _processor_s(parts)
         time.sleep(span_s)
         after = _processor_s(parts)
-        memory = {part: sum(map(_pss_mb, pids)) for part, pids in parts.items()}
+        memory = {part: sum(map(pss_mb, pids)) for part, pids in parts.items()}
     of_agent = [part for part in parts if part in ("heart", "lanes")]
     return [
         Figure("memory of an idle agent", "heart and lanes", "MB", (sum(memory[part] for part in of_agent),)),
@@ -185,7 +185,8 @@ def _used_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / TICKS_A_SECOND
 
 
-def _pss_mb(pid: int) -> float:
+def pss_mb(pid: int) -> float:
+    """Its share of memory (PSS), megabytes."""
     return _kb("Pss:", Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()) / 1000
 
 

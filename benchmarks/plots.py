@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from benchmarks import increments
+from benchmarks import increments, soak
 from benchmarks.figures import OURS, Figure, percentile
 
 if TYPE_CHECKING:
@@ -192,6 +192,29 @@ def _per_thing(axes: Axes, figures: Sequence[Figure]) -> bool:
     return bool(found)
 
 
+def _soaked(axes: Axes, figures: Sequence[Figure], measured: str) -> bool:
+    """What each process had, over the time."""
+    found = [figure for figure in figures if figure.benchmark == measured]
+    when = next((figure.values for figure in figures if figure.benchmark == soak.WHEN), ())
+    for figure in found:
+        is_first = figure.case.startswith("robot1")
+        axes.plot(when[-len(figure.values) :], figure.values, linewidth=1, linestyle="-" if is_first else "--", label=figure.case)
+    if found:
+        axes.set_ylim(bottom=0)
+        axes.set_xlabel(soak.WHEN)
+        axes.set_ylabel(found[0].unit or measured)
+        axes.legend(frameon=False, fontsize="xx-small", loc="upper left", bbox_to_anchor=(1, 1))
+    return bool(found)
+
+
+def _soaked_memory(axes: Axes, figures: Sequence[Figure]) -> bool:
+    return _soaked(axes, figures, soak.MEMORY)
+
+
+def _soaked_descriptors(axes: Axes, figures: Sequence[Figure]) -> bool:
+    return _soaked(axes, figures, soak.DESCRIPTORS)
+
+
 def _work(axes: Axes, figures: Sequence[Figure]) -> bool:
     """What is left of the program's work, by snapshots a second."""
     work = {(figure.case, figure.who): figure for figure in figures if figure.benchmark == "work done a second"}
@@ -212,6 +235,8 @@ PICTURES: Final[dict[str, tuple[str, Callable[[Axes, Sequence[Figure]], bool]]]]
     "per-thing": ("What one more thread, descriptor or carried name adds to the freeze", _per_thing),
     "resumes": ("From the snapshot to the running program", _resumes),
     "outages": ("A robot loses its power: until the program's next output elsewhere", _outages),
+    "soak-memory": ("Memory of our processes over the time", _soaked_memory),
+    "soak-descriptors": ("Descriptors of our processes over the time", _soaked_descriptors),
     "work": ("What protection leaves of a program's work", _work),
 }
 

@@ -393,6 +393,7 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
         dirty_bytes: of the pages that it carries, before compression.
         known_bytes: of those whose last content was remembered.
         frozen_bytes: of those that were copied while the program stood still.
+        remembered_bytes: of all pages that the keeper remembers; ``wanted_bytes``: with room for all, 0: not known yet.
         totals: bytes that the component had written to standard output and standard error at the freeze, or the commit.
         commit: its number, of a cooperative snapshot; ``age_ns``: how old it was by then.
     """
@@ -408,6 +409,8 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
     age_ns: int = 0
     known_bytes: int = 0
     frozen_bytes: int = 0
+    remembered_bytes: int = 0
+    wanted_bytes: int = 0
 
 
 class Unchanged(msgspec.Struct, frozen=True, tag=True):

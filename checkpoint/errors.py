@@ -92,7 +92,7 @@ class TaskPacketError(CheckpointError):
 
 
 def let_go(error: BaseException) -> None:
-    """Have an error that was answered hold nothing: the frames that it came through may hold memory, and often the error itself."""
+    """Have an error that was answered hold nothing: the frames that it came through hold memory, and often the error itself."""
     import traceback  # seldom wanted
 
     met: set[int] = set()

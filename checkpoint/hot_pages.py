@@ -19,7 +19,7 @@ from checkpoint.pages import Flags, PageMap, Words
 from checkpoint.tree import every_mapping
 
 CACHE_SIZE: Final = 64 << 20
-"""Bytes of one component's pages, where nothing else was said."""
+"""Bytes of pages of all components, where nothing else was said."""
 
 WHOLE_MAX: Final = 256
 """Deltas that are told whole, at most, before differences are tried again with a robot that does not take them."""
@@ -32,6 +32,7 @@ class Step(Struct, frozen=True, eq=False):
         kept: what is mapped now.
         gone: pages whose earlier content counts no more: cleared ones, and all that it tells.
         addresses: of those whose content is kept here, in order; ``rows``: that content.
+        count: of all that it tells.
     """
 
     position: Position
@@ -40,21 +41,23 @@ class Step(Struct, frozen=True, eq=False):
     gone: Words
     addresses: Words
     rows: Rows
+    count: int
 
     @classmethod
     def of(cls, snapshot: Snapshot, limit: int) -> Step:
         """
         Args:
             snapshot: tells its pages whole.
-            limit: bytes of them that are worth keeping; the first ones, where a program has its heap.
+            limit: bytes of them that are worth keeping: the first ones, where a program has its heap.
         """
         page_size = snapshot.machine.page_size
-        addresses = differences.addresses_of(snapshot.runs, page_size)[: limit // page_size]
+        every = differences.addresses_of(snapshot.runs, page_size)
+        addresses = every[: limit // page_size]
         rows = differences.rows_of(snapshot.contents, page_size)
         if len(addresses) < len(rows):
             rows = rows[: len(addresses)].copy()  # a base need not stay for the sake of a part of it
         told = pages.extents((*snapshot.runs, *snapshot.cleared, *snapshot.copies))
-        return cls(snapshot.position, snapshot.parent, pages.extents(every_mapping(snapshot)), told, addresses, rows)
+        return cls(snapshot.position, snapshot.parent, pages.extents(every_mapping(snapshot)), told, addresses, rows, len(every))
 
 
 class HotPages:
@@ -64,6 +67,8 @@ class HotPages:
 
     Attributes:
         position: None: nothing is known.
+        limit: bytes of content at most.
+        wanted: bytes that it would hold with room for all; 0 before the first step.
     """
 
     def __init__(self, page_size: int, limit: int) -> None:
@@ -72,6 +77,7 @@ class HotPages:
             limit: bytes of content at most.
         """
         self.limit = limit
+        self.wanted = 0
         self.position: Position | None = None
         self._slot_limit = limit // page_size
         self._slots = np.empty((0, page_size), dtype=np.uint8)
@@ -87,6 +93,17 @@ class HotPages:
         """Know nothing."""
         self.position, self._pages = None, PageMap.empty()
 
+    def resize(self, limit: int) -> None:
+        """Have another limit from now on; what was told longest ago goes, where it is less."""
+        page_size = self._slots.shape[1]
+        self.limit, self._slot_limit = limit, limit // page_size
+        if len(self._slots) <= self._slot_limit:
+            return
+        held = self._with_room(self._pages, 0)
+        slots = self._slots[held.words[:, 0].astype(np.intp)]
+        places = np.column_stack((np.arange(len(slots), dtype=np.uint64), held.words[:, 1]))
+        self._slots, self._pages = slots, PageMap(held.addresses, places)
+
     def lookup(self, wanted: Words) -> tuple[Flags, Rows]:
         """Which of these addresses, in order, are known, and the content of those."""
         found, places = pages.found_among(self._pages.addresses, wanted)
@@ -98,6 +115,7 @@ class HotPages:
             self.forget()
         self._round += 1
         held, _ = self._pages.without(step.kept, step.gone)
+        self.wanted = (len(held.addresses) + step.count) * self._slots.shape[1]
         addresses, rows = step.addresses[: self._slot_limit], step.rows[: self._slot_limit]
         held = self._with_room(held, len(addresses))
         self._grow(len(held.addresses) + len(addresses))
@@ -143,21 +161,36 @@ class Sender:
         """So many deltas are told whole from here on; ``_pause``: as many, after the next one that is not acknowledged."""
         self._pause = 0
 
+    @property
+    def held(self) -> int:
+        """Bytes of pages that it remembers."""
+        return self._hot.size if self._hot else 0
+
+    @property
+    def wanted(self) -> int:
+        """Bytes that it would remember with room for all; 0: not known yet."""
+        return self._hot.wanted if self._hot else 0
+
+    def limit(self, size: int) -> None:
+        """From now on remember so many bytes of pages at most; 0: tell no differences at all."""
+        if self._hot is not None:
+            self._hot.resize(size)
+
     def told(self, snapshot: Snapshot, limit: int) -> tuple[Snapshot, int]:
         """The same snapshot, with differences where that is worth it, and how many bytes of its pages were known.
 
         Args:
             snapshot: tells its pages whole.
-            limit: bytes to remember them in; 0 for no differences at all.
+            limit: as `limit` takes it.
         """
+        self.limit(limit)
         page_size = snapshot.machine.page_size
-        if limit < page_size:
-            self._hot = self._pending = None
-            return snapshot, 0
-        if self._hot is None or self._hot.limit != limit:
+        if self._hot is None:
             self._hot = HotPages(page_size, limit)
         self._pending = Step.of(snapshot, limit)
         self._count_untaken()
+        if limit < page_size:
+            return snapshot, 0
         if snapshot.parent is None or snapshot.parent != self._hot.position:
             return snapshot, 0
         if self._whole:

@@ -161,6 +161,7 @@ class Keeper:
 
     def _captured(self, request: channel.Capture, target: int | None) -> Answer:
         session = self._following("capture")
+        self._sender.limit(request.xor_cache)
         if unchanged := _unchanged(session, request):
             return unchanged, ()
         order = CaptureOrder(request.base, request.generation, request.sequence, request.epoch, self._robot, request.hold)
@@ -179,6 +180,8 @@ class Keeper:
             age_ns=age_ns,
             known_bytes=made.known_bytes,
             frozen_bytes=session.frozen_size,
+            remembered_bytes=self._sender.held,
+            wanted_bytes=self._sender.wanted,
         )
         return answer, made.descriptors
 

@@ -17,6 +17,7 @@ from checkpoint.errors import ChainError, FormatError
 from checkpoint.held_pages import pages_at
 from checkpoint.hot_pages import HotPages, Step
 from checkpoint.model import Position, Snapshot
+from checkpoint.page_budget import PageBudget
 from checkpoint.pages import PageTable, Words
 from checkpoint.shelf import Entry, Shelf
 from checkpoint.validity import place
@@ -39,13 +40,13 @@ class Proved(Struct, frozen=True):
 class Proofs:
     """The newest proved position of each component. Calls of one component follow one another."""
 
-    def __init__(self, cache_size: int, decoded: Callable[[str, Entry], Snapshot]) -> None:
+    def __init__(self, budget: PageBudget, decoded: Callable[[str, Entry], Snapshot]) -> None:
         """
         Args:
-            cache_size: bytes of content to remember of each component.
+            budget: for content to remember, of all components.
             decoded: reads a component's file; raises ChainError where it is damaged.
         """
-        self._cache_size = cache_size
+        self._budget = budget
         self._decoded = decoded
         self._proved: dict[str, Proved] = {}
 
@@ -64,18 +65,25 @@ class Proofs:
         """The snapshot is stored: the next one begins here."""
         if proved.step is not None:
             proved.hot.advance(proved.step)
+        self._limit(component, proved.hot)
         self._proved[component] = Proved(proved.position, proved.table, proved.hot)
 
     def forget(self, component: str) -> None:
         """Its files have changed."""
         self._proved.pop(component, None)
+        self._budget.leave(_user(component))
+
+    def _limit(self, component: str, hot: HotPages) -> None:
+        """Have it hold its share; what it then holds is told with the next one."""
+        hot.resize(self._budget.share(_user(component), hot.wanted, min(hot.size, hot.limit)))
 
     def _unproved(self, base: Snapshot) -> Proved:
         """Before a chain's base. What was known until now may go: its memory is used again."""
         known = self._proved.pop(base.component, None)
         page_size = base.machine.page_size
         fits = known is not None and known.table.page_size == page_size
-        hot = known.hot if known is not None and fits else HotPages(page_size, self._cache_size)
+        hot = known.hot if known is not None and fits else HotPages(page_size, 0)
+        self._limit(base.component, hot)
         return Proved(base.position, PageTable.empty(page_size), hot)
 
     def _at(self, shelf: Shelf, position: Position) -> Proved:
@@ -99,7 +107,12 @@ class Proofs:
                 f"the chain of {before.table.page_size}; ask for a base"
             )
         whole = resolved(snapshot, lambda wanted: _held(shelf, before, wanted))
-        return Proved(snapshot.position, chain.applied(before.table, whole), before.hot, Step.of(whole, self._cache_size))
+        return Proved(snapshot.position, chain.applied(before.table, whole), before.hot, Step.of(whole, before.hot.limit))
+
+
+def _user(component: str) -> str:
+    """In the budget, which has those too that send snapshots."""
+    return f"proofs of {component}"
 
 
 def _held(shelf: Shelf, proved: Proved, wanted: Words) -> Rows:

@@ -34,6 +34,7 @@ from checkpoint.history import HISTORY_FOLDER, History, Retention
 from checkpoint.hot_pages import CACHE_SIZE
 from checkpoint.model import OutputPiece, Position, Snapshot
 from checkpoint.needs import needs
+from checkpoint.page_budget import PageBudget
 from checkpoint.proofs import Proofs
 from checkpoint.shelf import BASE_SUFFIX, DELTA_SUFFIX, FOLDER_PREFIX, Entry, Shelf, file_name, folder_name, order_of_name
 from checkpoint.state import header_of
@@ -62,6 +63,9 @@ CHEAP_DELTA_COUNT = 12
 
 FOLD_DELTA_PART = 0.5
 """…and one whose deltas together take more than this part of its base: otherwise the store would grow without end."""
+
+NOTICES_KEPT = 100
+"""Of what was found damaged or left over."""
 
 NOTHING_OLD = Retention()
 
@@ -93,7 +97,7 @@ class Store:
     Made by ``open_store``. Every method raises StoreError when the disk fails; what the store already held is intact.
     """
 
-    def __init__(self, root: Path, disk: Disk, lock: int, retention: Retention, cache_size: int = CACHE_SIZE) -> None:
+    def __init__(self, root: Path, disk: Disk, lock: int, retention: Retention, budget: PageBudget) -> None:
         self._root = root
         self._files = WholeFiles(disk)
         self.contents = Contents(root, self._files)
@@ -104,7 +108,7 @@ class Store:
         self._lock = threading.RLock()
         self._changing: dict[str, threading.RLock] = {}
         self._shelves: dict[str, Shelf] = {}
-        self._proofs = Proofs(cache_size, self._decoded)
+        self._proofs = Proofs(budget, self._decoded)
         self._made_last: dict[str, tuple[Path, Snapshot]] = {}
         """Of each component what was put last without a proof, without its pages and its output, and where."""
         self.notices: list[str] = []
@@ -502,6 +506,7 @@ class Store:
 
     def _notice(self, sentence: str) -> None:
         self.notices.append(sentence)
+        del self.notices[:-NOTICES_KEPT]
         log.warning("%s", sentence)
 
     def _shelf(self, component: str) -> Shelf:
@@ -544,12 +549,14 @@ class Store:
         self._shelves[header.component] = self._shelf(header.component).with_entry(entry)
 
 
-def open_store(root: Path, disk: Disk | None = None, retention: Retention = NOTHING_OLD, cache_size: int = CACHE_SIZE) -> Store:
+def open_store(
+    root: Path, disk: Disk | None = None, retention: Retention = NOTHING_OLD, budget: PageBudget | None = None
+) -> Store:
     """Open a store, or make an empty one; removes leftovers and verifies what is there.
 
     Args:
         retention: what is kept for people besides what is needed; nothing.
-        cache_size: bytes of each component's pages that are remembered to prove deltas by; more are read from the files.
+        budget: for pages that are remembered to prove deltas by; others are read from the files.
 
     Raises:
         StoreError: another process has it open, or the folder cannot be used.
@@ -567,7 +574,7 @@ def open_store(root: Path, disk: Disk | None = None, retention: Retention = NOTH
         raise StoreError(f"cannot open the store {root}: {error.strerror}; it must be a folder that we may write") from error
     if lock is None:
         raise StoreError(f"cannot open the store {root}: another process has it open; one agent uses one store")
-    store = Store(root, disk, lock, retention, cache_size)
+    store = Store(root, disk, lock, retention, budget or PageBudget(CACHE_SIZE))
     try:
         store.read_folders()
     except StoreError:

@@ -98,7 +98,7 @@ class RunningCopy(Struct):
 
 
 class FreezeBuffer:
-    """Memory for what is copied while the program stands still, of all processes of a component together; used again each time."""
+    """Memory for what is copied while the program stands still, of all processes of a component; used again each time."""
 
     def __init__(self) -> None:
         self._content = bytearray()

@@ -188,6 +188,15 @@ HOURS_FROM_S: Final = 2 * 3_600
 DAYS_FROM_S: Final = 2 * 86_400
 
 
+def memory(status: Mapping[str, Any]) -> tuple[str, ...]:
+    """What the agent takes of this robot's memory, and what bounds that."""
+    found = status.get("memory")
+    if not found:
+        return ()
+    remembered = f"{size(found['remembered'])} of {size(found['remembered_max'])} remember pages (xor_cache)"
+    return (f"memory: agent {size(found['agent'])}, keepers {size(found['keepers'])}; of both {remembered}",)
+
+
 def remarks(status: Mapping[str, Any]) -> tuple[str, ...]:
     """What stands below the tree: reasons, promises that do not hold, and notes, each a sentence said once."""
     found: list[str] = []

@@ -87,6 +87,7 @@ def plain_tree(status: dict[str, Any]) -> str:
     lines = [plain_table(picture.COLUMNS, [row.cells for row in picture.rows(status)])]
     lines += picture.promises(status)
     lines += picture.kept(status)
+    lines += picture.memory(status)
     if status.get("fencing"):
         lines.append(f"fencing: {status['fencing']}")
     return "\n".join([*lines, *(f"note: {line}" for line in picture.remarks(status))])
@@ -174,6 +175,7 @@ def _rich_tree(status: dict[str, Any]) -> Any:
         parts = [_rich_table(picture.COLUMNS, lines, f"team {status.get('team') or ''}".strip())]
     parts += [Text(spoken(line), style="bold") for line in picture.promises(status)]
     parts += [Text(spoken(line)) for line in picture.kept(status)]
+    parts += [Text(spoken(line), style="dim") for line in picture.memory(status)]
     if status.get("fencing"):
         parts.append(Text(spoken(f"fencing: {status['fencing']}"), style="dim"))
     return Group(*parts, *(Text(spoken(line), style="yellow") for line in picture.remarks(status)))

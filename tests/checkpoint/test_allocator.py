@@ -30,7 +30,7 @@ for wave in range(4):
 allocator.give_back()
 
 class Held(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_size_t) for name in "arena ordblks smblks hblks hblkhd usmblks fsmblks uordblks fordblks keep".split()]
+    _fields_ = [(name, ctypes.c_size_t) for name in "arena a b c hblkhd d e uordblks fordblks keepcost".split()]
 
 mallinfo = ctypes.CDLL(None).mallinfo2
 mallinfo.restype = Held

@@ -22,6 +22,7 @@ from checkpoint.errors import ChainError, FormatError
 from checkpoint.held_pages import pages_at
 from checkpoint.hot_pages import WHOLE_MAX, HotPages, Sender, Step
 from checkpoint.model import PageRun, Snapshot
+from checkpoint.page_budget import PageBudget
 from checkpoint.pages import Buffer, PageTable, Words
 from checkpoint.store import open_store
 from checkpoint.stored_base import stored_base
@@ -277,12 +278,12 @@ def test_a_store_proves_differences_whatever_it_remembers_and_after_a_restart(tm
     whole = busy(8)
     files = files_of(as_told(whole), tmp_path)
     for some in (files[:3], files[3:5], files[5:]):
-        store = open_store(tmp_path / "store", cache_size=cache_size)
+        store = open_store(tmp_path / "store", budget=PageBudget(cache_size))
         for path in some:
             with path.open("rb") as file:
                 store.put(file.fileno())
         store.close()
-    store = open_store(tmp_path / "store", cache_size=cache_size)
+    store = open_store(tmp_path / "store", budget=PageBudget(cache_size))
     assert pages_of(store.load(COMPONENT)) == pages_of(chain.fold(whole))
     store.fold(COMPONENT, whole[4].position)
     store.prune(COMPONENT, whole[4].position)
