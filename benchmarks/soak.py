@@ -210,11 +210,12 @@ def measured(span_s: float, directory: Path) -> Findings:
         f"samples after the first {SETTLED_SHARE:.0%} of the time. Snapshots were taken of "
         + ", ".join(f"{name}: {count:,}" for name, count in sorted(snapshots.items()))
         + ".",
-        tuple(_figures(samples)),
+        tuple(figures_of(samples)),
     )
 
 
-def _figures(samples: Samples) -> Iterator[Figure]:
+def figures_of(samples: Samples) -> Iterator[Figure]:
+    """Of each process that lasted: all that was seen, and how it grew."""
     for told, growth, unit, lines in (
         (MEMORY, MEMORY_GROWTH, "MB", samples.memory),
         (DESCRIPTORS, DESCRIPTOR_GROWTH, "", samples.descriptors),
@@ -244,10 +245,9 @@ def _until_protected(robot: RobotMachine) -> None:
         if not wanted:
             return
         if time.monotonic() > deadline:
-            told = [
-                f"{name}: {'; '.join((*one['reasons'], *one['notes']))}" for one in components if (name := _short(one)) in wanted
-            ]
-            raise BenchmarkError(f"not all came to be protected: {'; '.join(told)}")
+            late = {_short(one): (*one["reasons"], *one["notes"]) for one in components if _short(one) in wanted}
+            told = "; ".join(f"{name}: {', '.join(late.get(name, ('it is not there',)))}" for name in sorted(wanted))
+            raise BenchmarkError(f"not all came to be protected: {told}")
         time.sleep(POLL_S)
 
 
