@@ -92,7 +92,7 @@ STOOD = 1024
 """The sender's copy stood still, or began without a word of the robots that ran it, since all its peers last agreed to it."""
 
 BEGUN = 2048
-"""A checkpoint of the component was given away in this epoch or an earlier one: a robot that has none does not start it afresh."""
+"""A checkpoint of it was given away in this epoch or an earlier one: a robot that has none does not start it afresh."""
 
 
 class Beat(msgspec.Struct, frozen=True, array_like=True):
