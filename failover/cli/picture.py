@@ -61,7 +61,7 @@ def size(value: float | None) -> str:
 def rows(status: Mapping[str, Any]) -> tuple[Row, ...]:
     """The team's tree, from one agent's answer: robots, below each the components that it is primary of."""
     robots = [(status["robot"], None), *((peer["name"], peer) for peer in status["peers"])]
-    components = [sight(component) for component in status["components"] if component.get("state") != "released"]
+    components = [seen for seen in map(sight, status["components"]) if seen.get("state") != "released"]
     found: list[Row] = []
     for name, peer in sorted(robots, key=lambda robot: robot[1] is not None):
         found.append(_robot_row(status, name, peer))
@@ -201,7 +201,7 @@ def remarks(status: Mapping[str, Any]) -> tuple[str, ...]:
     """What stands below the tree: reasons, promises that do not hold, and notes, each a sentence said once."""
     found: list[str] = []
     for component in status["components"]:
-        if component.get("state") != "released":
+        if sight(component).get("state") != "released":
             found += _remarks_on(component)
     found += [f"{peer['name']}: {line}" for peer in status["peers"] for line in peer.get("notes") or ()]
     forged = {reason: count for reason, count in (status.get("beats") or {}).get("refused", {}).items() if reason not in PASSING}
