@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 from typing import Final
 
 UNDECODABLE: Final = (ValueError, RecursionError)
@@ -93,13 +95,15 @@ class TaskPacketError(CheckpointError):
 
 def let_go(error: BaseException) -> None:
     """Have an error that was answered hold nothing: the frames that it came through hold memory, and often the error itself."""
-    import traceback  # seldom wanted
-
     met: set[int] = set()
     waiting: list[BaseException | None] = [error]
     while waiting:
         one = waiting.pop()
         if one is not None and id(one) not in met:
             met.add(id(one))
-            traceback.clear_frames(one.__traceback__)
+            step = one.__traceback__
+            while step is not None:
+                with contextlib.suppress(RuntimeError):  # it runs still
+                    step.tb_frame.clear()
+                step = step.tb_next
             waiting += (one.__cause__, one.__context__)
