@@ -15,7 +15,10 @@ from collections.abc import Coroutine
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from msgspec.structs import replace
+
 from agent import births, clock, comeback
+from agent.bounds import bound_of
 from agent.component import Component
 from agent.errors import TROUBLE, AgentError, GuardError, KeeperLostError
 from agent.figures import NOT_WANTED, Commits, CopyFigures, Figures, shortened
@@ -291,7 +294,8 @@ class Charge:
         self._cool()
         adopted = self.component is not None
         self._occasions.runs_here(act.spec)
-        terms = begun_on(act.spec.launch, self.around.here(self.name))
+        owner = bound_of(act.spec.owner, program_of(act.spec.launch).inheritance)
+        terms = replace(begun_on(act.spec.launch, self.around.here(self.name)), owner=owner)
         self.around.records.note(self.name, act.epoch, terms)
         if self.component is None:
             await self.around.settled(self.name)
