@@ -103,18 +103,23 @@ def _starting(
     )
 
 
-async def watch(name: str, pid: int, places: Places) -> Component:
+async def watch(name: str, guest: Guest, places: Places) -> Component:
     """Take a running process in: its guard is not its parent and does not own its streams.
 
+    Args:
+        guest: becomes the component's, whatever happens.
+
     Raises:
-        GuardError: there is no such process.
+        GuardError: it has ended.
     """
-    component = Component(name, await places.nursery.guard(), places)
-    component.pid = component.inner_pid = pid
-    born = await _born(component, guard_messages.Watch(name, pid))
-    with contextlib.suppress(ProcessLookupError):  # it has just ended: its guard says so
-        born.guest = Guest(name, pid)
-    return born
+    try:
+        component = Component(name, await places.nursery.guard(), places)
+    except (GuardError, OSError):
+        guest.close()
+        raise
+    component.guest = guest
+    component.pid = component.inner_pid = guest.pid
+    return await _born(component, guard_messages.Watch(name, guest.pid), (guest.fileno(),))
 
 
 async def restore(
@@ -408,7 +413,7 @@ async def reconnect(socket_path: Path, places: Places) -> Component:
     component.take(described, streams)
     if described.watched and described.state != "ended":
         with contextlib.suppress(ProcessLookupError):
-            component.guest = Guest(described.component, described.pid)
+            component.guest = Guest(described.pid)
     if described.state == "ended" and not component.ended.done():
         component.ended.set_result(described.exit_status)
     return component

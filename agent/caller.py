@@ -17,6 +17,7 @@ from typing import Final
 from msgspec import Struct
 
 from agent.errors import RefusedError
+from agent.guest import Guest
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.inheritance import Inheritance
@@ -103,22 +104,44 @@ def inheritance_for(caller: Caller, user: str) -> Inheritance:
     return wanted.as_user(ours, os.getegid(), tuple(os.getgroups()))
 
 
-def owner_of(pid: int, caller: Caller) -> int:
-    """Whose a running process is, for somebody who wants it protected.
+def guest_of(pid: int, caller: Caller) -> Guest:
+    """A running process that somebody wants protected, held by a pidfd: what is asked of it later is asked of the same one.
 
     A process that the system keeps from its own user (a set-user-id program, one that is not dumpable) is root's.
+    Its rights are those that it has now; they bound each capture (`agent.bounds`), for it may execute anything.
 
     Raises:
-        RefusedError: there is no such process, or it is not the caller's.
+        RefusedError: there is no such process, or it is not the caller's: all of its users and groups must be.
     """
+    gone = RefusedError(f"cannot protect pid {pid}: No such process", "ProcessGoneError")
     try:
-        owner = os.stat(f"/proc/{pid}").st_uid
-        users = procfs.status(pid).uids
+        guest = Guest(pid)
+    except (OSError, ValueError, OverflowError):
+        raise gone from None
+    try:
+        owner, status = os.stat(f"/proc/{pid}").st_uid, procfs.status(pid)
+        if guest.has_ended:
+            raise gone
+        if not may(caller.uid, None):
+            _check_own(pid, caller, {owner, *status.uids}, {*status.gids, *status.groups})
     except (OSError, CheckpointError):
-        raise RefusedError(f"cannot protect pid {pid}: No such process", "ProcessGoneError") from None
-    if may(caller.uid, None) or {owner, *users} == {caller.uid}:
-        return users[0]
-    raise RefusedError(f"pid {pid} is not a process of uid {caller.uid}; its owner and root may protect it", "PermissionError")
+        guest.close()
+        raise gone from None
+    except RefusedError:
+        guest.close()
+        raise
+    guest.rights = Inheritance(status.uids[0], status.gids[0], status.groups)
+    return guest
+
+
+def _check_own(pid: int, caller: Caller, uids: set[int], gids: set[int]) -> None:
+    """Raises RefusedError: a process has a user or a group that the caller has not."""
+    if uids != {caller.uid}:
+        sentence = f"pid {pid} is not a process of uid {caller.uid}; its owner and root may protect it"
+        raise RefusedError(sentence, "PermissionError")
+    if others := sorted(gids - {caller.gid, *caller.groups}):
+        told = f"pid {pid} runs with gid {', '.join(map(str, others))}, which uid {caller.uid} has not where it asks"
+        raise RefusedError(f"{told}; give the order with that group (newgrp), or as root", "PermissionError")
 
 
 def _as_user(caller: Caller, name: str) -> Inheritance:

@@ -246,9 +246,9 @@ class Guard:
         born = ward.born
         self._reply(VesselReady(born.pid, born.inner_pid, born.isolated, self._all_notes()), ward.descriptors())
 
-    def _watch(self, request: Watch, _: tuple[int, ...]) -> None:
+    def _watch(self, request: Watch, descriptors: tuple[int, ...]) -> None:
         self._check_free()
-        self._ward = Ward.watch(request)
+        self._ward = Ward.watch(request, *descriptors)
         self._reply(Watching(self._all_notes()))
 
     def _commit(self, request: Commit, _: tuple[int, ...]) -> None:
