@@ -12,7 +12,8 @@ import pwd
 import select
 import socket
 import struct
-from typing import Final
+from collections.abc import Mapping
+from typing import Any, Final
 
 from msgspec import Struct
 
@@ -32,6 +33,9 @@ SCHED_DEADLINE: Final = 6
 ROOT: Final = 0
 NOBODY: Final = -1
 """For what a robot asks another one by itself: it may be told how things stand, and no more."""
+
+SAID: Final = "; it said: "
+"""Begins, at the end of a sentence of status or story, what a program wrote last."""
 
 _CREDENTIALS: Final = struct.Struct("3i")
 
@@ -69,6 +73,16 @@ def check_right(uid: int, component: str, owner: int | None) -> None:
     if not may(uid, owner):
         whose = f"belongs to uid {owner}" if owner is not None else "is not known well enough here to say whose it is"
         raise RefusedError(f"{component} {whose}; its owner and root may give orders and read its output", "PermissionError")
+
+
+def without_output(told: Any) -> Any:
+    """The same without what programs said, in all of its sentences: for somebody who may not read their output."""
+    if isinstance(told, str):
+        sentence, said, _ = told.partition(SAID)
+        return f"{sentence}; what it said is shown to its owner and root" if said else told
+    if isinstance(told, Mapping):
+        return {key: without_output(value) for key, value in told.items()}
+    return [without_output(value) for value in told] if isinstance(told, list | tuple) else told
 
 
 def uid_of(connection: socket.socket) -> int:
