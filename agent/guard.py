@@ -248,7 +248,9 @@ class Guard:
 
     def _watch(self, request: Watch, descriptors: tuple[int, ...]) -> None:
         self._check_free()
-        self._ward = Ward.watch(request, *descriptors)
+        if len(descriptors) != 1:
+            raise WardError(f"cannot look after pid {request.pid}: its pidfd must come along")
+        self._ward = Ward.watch(request, descriptors[0])
         self._reply(Watching(self._all_notes()))
 
     def _commit(self, request: Commit, _: tuple[int, ...]) -> None:
