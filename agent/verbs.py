@@ -12,6 +12,7 @@ from typing import Any, Final, Protocol
 import msgspec
 
 from agent import clock, lacks
+from agent.admission import check_components
 from agent.arguments import (
     HandoverArguments,
     LogsArguments,
@@ -420,17 +421,20 @@ class Verbs(Questions):
         """A name for something new: as given, under this robot's own path, or made from the command.
 
         Raises:
-            RefusedError: it is no name, or one that somebody else has used and not released.
+            RefusedError: it is no name, or one that somebody else has used and not released; or this user has too many.
         """
         own = f"/{self._lanes.settings.team.team}/{self._lanes.settings.config.robot}/"
-        names = await self._names()
+        told = await self._lanes.ask("status")
+        known = {one.name: one for one in told.status.components} if told.status else {}
         if not wanted:
             stem = own + (os.path.basename(command) or "program")
-            numbered = (f"{stem}-{number}" for number in range(2, len(names) + 3))
-            wanted = stem if stem not in names else next(name for name in numbered if name not in names)
+            numbered = (stem, *(f"{stem}-{number}" for number in range(2, len(known) + 3)))
+            free = (State.RELEASED, uid)  # by the same user: what it wrote is another user's to read
+            wanted = next(name for name in numbered if name not in known or (known[name].state, known[name].owner) == free)
         name = wanted if wanted.startswith("/") else own + wanted
-        if names.get(name, State.RELEASED) not in (State.RELEASED, State.ABSENT):
-            await self._check_right(uid, name)
+        check_components(uid, name, known.values(), self._lanes.settings.config.components_per_user)
+        if name in known and known[name].state not in (State.RELEASED, State.ABSENT):
+            check_right(uid, name, known[name].owner)
         try:
             return check_component(name)
         except NameFormatError as error:
