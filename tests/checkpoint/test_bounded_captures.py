@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from checkpoint import carried
 from checkpoint.engine import CaptureOrder, Carry, ProtectOrder, Session, Terms
@@ -23,7 +24,16 @@ from checkpoint.linux.eyes import Eyes
 from checkpoint.model import Snapshot
 from checkpoint.resources import laying, thread_rights
 from checkpoint.rights import Owner
-from tests.checkpoint.round_trip import ENGINE, Program, at_last, captured_at_last, ended, start
+from tests.checkpoint.round_trip import (
+    ENGINE,
+    Program,
+    at_last,
+    captured_and_killed,
+    captured_at_last,
+    ended,
+    restored,
+    start,
+)
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
@@ -182,6 +192,17 @@ def test_what_the_kernel_lets_a_program_do_by_its_file_is_not_its_owners(ordinar
         program.wait_for_line(f"became {ALICE} {ALICE} {ALICE}")
         with pytest.raises(UnsupportedError, match="it has capabilities 0x4"):
             protect(program)
+
+
+@pytest.mark.parametrize("dumpable", [1, 2])
+def test_a_program_whose_memory_its_user_may_not_read_comes_back_so(program: Program, place: Path, dumpable: int) -> None:
+    """2: it has been a set-user-id program and gave its rights up, where fs.suid_dumpable is 2. Source: PR_SET_DUMPABLE."""
+    base = captured_and_killed(program)
+    for name in ("out", "err"):
+        os.chown(place / name, ALICE, ALICE)
+    base = replace(base, process=replace(base.process, dumpable=dumpable))
+    with ended(restored(base, place, own_eyes=True)) as again:
+        assert os.stat(f"/proc/{again.pid}").st_uid == (ALICE if dumpable == 1 else 0)
 
 
 def test_a_component_of_root_may_have_any_rights(program: Program) -> None:
