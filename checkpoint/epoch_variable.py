@@ -1,20 +1,21 @@
 """The fencing token of a program that nobody prepared: the epoch in its environment, always the one under which this copy runs.
 
 A program is born with ``FAILOVER_EPOCH=`` and twenty digits. They stand in its memory, where the kernel shows them as
-/proc/self/environ; a restore writes the digits of its own epoch over those of the snapshot. So the token belongs to the copy: the
-old one keeps what it had, whatever files or names the two robots share, and nothing is open while the program is captured.
+/proc/self/environ; a restore writes the digits of its own epoch over those of the snapshot, and the first capture of a copy that
+goes on under a later epoch writes them, too. So the token belongs to the copy: the old one keeps what it had, whatever files or
+names the two robots share, and nothing is open while the program is captured.
 
 In C, getenv(3) returns the place itself, so it tells the present epoch each time. Other languages copy their environment at their
 start: `failover.epoch` asks the C library, a shell script reads /proc/$$/environ. A program that writes over its environment, as
 some do to change what ps(1) shows, has no token after that.
 
-A copy that goes on under a later epoch without a restore keeps its token. After a total cut under the rule ``pair``
-another copy may have had a later one in between: docs/fencing.md says what that costs.
+The copy may be running meanwhile, so the last digit is written first. A reader that reads them in their order sees at most the
+new epoch: the first digits of the old one, the last ones of the new one.
 """
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, Protocol
 
 VARIABLE: Final = "FAILOVER_EPOCH"
 DIGITS: Final = 20
@@ -24,6 +25,18 @@ ENVIRONMENT_MAX: Final = 8 << 20
 """Bytes of an environment that are looked through; the kernel allows a quarter of the stack's limit, 2 MiB by default."""
 
 _ASSIGNMENT: Final = f"{VARIABLE}=".encode()
+
+
+class Memory(Protocol):
+    """Of a process."""
+
+    def read(self, address: int, size: int) -> bytes:
+        """So many bytes."""
+        ...
+
+    def write_each(self, contents: list[tuple[int, bytes]]) -> None:
+        """Pieces, one after the other."""
+        ...
 
 
 def assignment(epoch: int) -> bytes:
@@ -45,6 +58,24 @@ def place_in(environment: bytes) -> int | None:
             return offset + len(_ASSIGNMENT)
         offset += len(entry) + 1
     return None
+
+
+def renew(memory: Memory, start: int, end: int, epoch: int) -> None:
+    """Write the epoch under which a copy goes on into its environment, where the digits stand there and say another.
+
+    Args:
+        start, end: of the environment, as the kernel tells them (proc_pid_stat(5)).
+
+    Raises:
+        CaptureError: its memory cannot be written.
+    """
+    if not 0 < end - start <= ENVIRONMENT_MAX:
+        return
+    environment = memory.read(start, end - start)
+    place = place_in(environment)
+    if place is not None and epoch_in(environment) != epoch:
+        told = digits(epoch)
+        memory.write_each([(start + place + index, told[index : index + 1]) for index in reversed(range(DIGITS))])
 
 
 def epoch_in(environment: bytes) -> int:

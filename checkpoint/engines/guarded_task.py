@@ -11,7 +11,7 @@ import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
-from checkpoint import program_files
+from checkpoint import epoch_variable, program_files
 from checkpoint.contents import DIGEST_SIZE, digest_of_file, path_in
 from checkpoint.digests_of_files import DigestOf
 from checkpoint.engine import (
@@ -30,6 +30,7 @@ from checkpoint.engines.cooperative import CooperativeSession, now, open_segment
 from checkpoint.engines.outputs import Outputs
 from checkpoint.errors import CaptureError, ProcessGoneError, RestoreError, UnsupportedError
 from checkpoint.linux import procfs
+from checkpoint.linux.memory import Memory
 from checkpoint.linux.spokesman import spokesman_of, told_by_spokesman
 from checkpoint.model import Position, Snapshot
 from checkpoint.needs import program_of
@@ -56,6 +57,7 @@ class GuardedTask:
         self._terms = order.terms
         self._trees: CarriedTrees | None = None
         self._look_at_s = 0.0
+        self._epoch = 0
 
     @property
     def totals(self) -> tuple[int, int]:
@@ -68,6 +70,8 @@ class GuardedTask:
             raise ProcessGoneError(f"the process of {self.component} that keeps its state (pid {self.pid}) has ended")
         self._require_rights()
         session = self._following()
+        if order.epoch > self._epoch:
+            self._tell_epoch(order.epoch)
         if order.base or time.monotonic() >= self._look_at_s:
             self._look_at_s = time.monotonic() + LOOK_S
             arguments, directory = session.process.arguments, session.process.working_directory
@@ -81,6 +85,18 @@ class GuardedTask:
         """Raises UnsupportedError: it has rights that are not its owner's."""
         if reasons := told_by_spokesman(self.pid, lambda tid: thread_rights.refuse(tid, self._terms.owner)):
             raise UnsupportedError(f"cannot capture {self.component} (pid {self.pid}): {reasons[0]}", reasons)
+
+    def _tell_epoch(self, epoch: int) -> None:
+        """As the other engine does: the program finds in its environment what `Begin` could not tell yet."""
+        self._epoch = epoch
+        stat = procfs.stat(self.pid)
+        try:
+            epoch_variable.renew(Memory(self.pid), stat.env_start, stat.env_end, epoch)
+        except CaptureError as error:
+            if not isinstance(error, ProcessGoneError):
+                self.notes = (
+                    f"its fencing token may be older than epoch {epoch}: {error}; failover handover gives it the present one",
+                )
 
     def capture_standing(self, order: CaptureOrder) -> Snapshot:
         """See `checkpoint.engine.Session.capture_standing`: its segment holds what was committed, whatever it does."""

@@ -26,7 +26,7 @@ from typing import Final
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from checkpoint import pages, portable, rights, room, side_by_side, tree
+from checkpoint import epoch_variable, pages, portable, rights, room, side_by_side, tree
 from checkpoint.chain import position_of
 from checkpoint.engine import PTRACE, CaptureOrder, ProtectOrder
 from checkpoint.engines import description
@@ -130,6 +130,7 @@ class PtraceSession:
         self._reports = Reports()
         self._budget = FreezeBudget(order.terms.freeze_budget_ns)
         self._owner = order.terms.owner
+        self._epoch = 0
         self._closed = False
 
     # Opening and closing
@@ -226,6 +227,8 @@ class PtraceSession:
         parent = None if order.base else self._first.memory.acknowledged
         if self._refused:
             self._look_from_outside()
+        if order.epoch > self._epoch:
+            self._tell_epoch(order.epoch)
         try:
             if self._carried:
                 self._carried.prepare(carried_trees.mapped_shared(self._first.pid))
@@ -242,6 +245,14 @@ class PtraceSession:
             raise self._explained(gone) from error
         except ProcessGoneError as error:  # a child that it has a pidfd of, for one
             raise self._explained(error) from error
+
+    def _tell_epoch(self, epoch: int) -> None:
+        """Write it into the environment of each process: a copy may go on under a later one than it was born or restored with."""
+        self._epoch = epoch
+        for process in (self._first, *self._tree.processes()):
+            with contextlib.suppress(ProcessGoneError, ProbeError):  # it has ended, as the capture finds next
+                stat = procfs.stat(process.pid)
+                epoch_variable.renew(process.threads.leader.memory, stat.env_start, stat.env_end, epoch)
 
     def _speaks_by_another(self) -> bool:
         """Where the thread has ended by which the first process is looked at, enter it by another: the next capture is a base.

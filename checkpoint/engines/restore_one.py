@@ -324,7 +324,8 @@ class ProcessRestore:
             self._leave_old_vdso()
             tracee.memory.write_each(restore_vdso.jumps(state, self._content_at, self._vdso, self._own_functions))
         if self._options.epoch:
-            _renew_token(tracee, state, self._options.epoch)
+            layout = state.process.layout
+            epoch_variable.renew(tracee.memory, layout.env_start, layout.env_end, self._options.epoch)
         self.notes += self._stub.run(later.state)
         self._start_threads(self._stub.base, later.threads)
         self.notes += self._stub.run(later.rights)
@@ -548,17 +549,6 @@ class ProcessRestore:
         if self._source is not None:
             return self._source.content_at(address, size)
         return restore_memory.content_at(self._state, address, size)
-
-
-def _renew_token(tracee: Tracee, state: Snapshot, epoch: int) -> None:
-    """Write the epoch under which it goes on where the program was born with one."""
-    layout = state.process.layout
-    size = layout.env_end - layout.env_start
-    if not 0 < size <= epoch_variable.ENVIRONMENT_MAX:
-        return
-    place = epoch_variable.place_in(tracee.memory.read(layout.env_start, size))
-    if place is not None:
-        tracee.memory.write(layout.env_start + place, epoch_variable.digits(epoch))
 
 
 def _write_oom_score(pid: int, score: int, notes: list[str]) -> None:

@@ -21,11 +21,11 @@ def epoch() -> int:
     more. Ask each time: a program that keeps no state itself finds another number after a takeover. It opens nothing.
     """
     task = sys.modules[TASK_MODULE].PROCESS.task if TASK_MODULE in sys.modules else None
-    return (task.epoch if task is not None else 0) or _own_epoch()
+    return max(task.epoch if task is not None else 0, _own_epoch())
 
 
 def _own_epoch() -> int:
-    """What the C library finds in the environment, where a restore writes it: `os.environ` is a copy from the beginning."""
+    """What the C library finds in the environment, where the agent renews it: `os.environ` is a copy from the beginning."""
     told = _libc().getenv(epoch_variable.VARIABLE.encode())
     return int(told) if told is not None and told.isdigit() else 0
 

@@ -19,7 +19,7 @@ from failover.core import acts, lease
 from failover.core.component import LOST_MAX, Cause, Component, Turn
 from failover.core.consent import grants, state_of
 from failover.core.membership import Peer
-from failover.core.messages import HOLDS, ORDERED, SAFE, STOOD, UNPROTECTED, Entry
+from failover.core.messages import BEGUN, HOLDS, ORDERED, SAFE, STOOD, UNPROTECTED, Entry
 from failover.core.names import Weight, weight
 from failover.core.types import ENDED, HOLDING, MS, PEERS_MAX, Resumption, State
 
@@ -429,6 +429,12 @@ def refuse_request(component: Component, turn: Turn, sentence: str) -> None:
     if component.request:
         turn.order(acts.Answer(component.request, False, sentence))
         component.request = 0
+
+
+def heard_of_checkpoints(component: Component, entry: Entry) -> None:
+    """Of a component of which this robot has no checkpoint, perhaps since it has a new disk: whether there was one."""
+    if entry.flags & BEGUN and entry.epoch >= component.epoch and component.state in (State.ABSENT, State.STANDBY):
+        component.begun = True
 
 
 def heard_end(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:

@@ -40,7 +40,7 @@ class Entry(msgspec.Struct, frozen=True, array_like=True):
         flags: ``NEEDS_BASE`` (standby), ``UNPROTECTED`` (primary has stopped protecting), ``HOLDS`` (on_loss is hold),
             ``WARM`` (standby: its program waits there, started already); ``WANTS`` (a checkpoint, to run it);
             ``SAFE`` (primary: its newest position is acknowledged); ``STOOD`` (primary of a pair); ``FREE``, ``OPEN``,
-            ``STARTS``, ``ORDERED`` (majority).
+            ``STARTS``, ``ORDERED`` (majority); ``BEGUN``.
         status: of a finished component, waitpid's.
         born: epoch under which the sender's copy was started or restored; 0 does not tell.
     """
@@ -90,6 +90,9 @@ SAFE = 512
 
 STOOD = 1024
 """The sender's copy stood still, or began without a word of the robots that ran it, since all its peers last agreed to it."""
+
+BEGUN = 2048
+"""A checkpoint of it was given away in this epoch or an earlier one: a robot that has none does not start it afresh."""
 
 
 class Beat(msgspec.Struct, frozen=True, array_like=True):

@@ -255,6 +255,7 @@ class Node:
             if component is None:
                 continue
             rules.heard(component, turn, beat.sender, entry)
+            election.heard_of_checkpoints(component, entry)
             replication.acknowledged(component, turn, beat.sender, entry)
             touched[component.name] = component
         return list(touched.values())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from failover.core.component import Component
 from failover.core.consent import STATES
 from failover.core.messages import (
+    BEGUN,
     FREE,
     HOLDS,
     NEEDS_BASE,
@@ -41,6 +42,7 @@ def entry_of(component: Component, me: str) -> Entry:
     flags |= WANTS * (component.wanted is not None)
     flags |= STOOD * (component.holding and component.stood)
     flags |= SAFE * (component.holding and newest is not None and component.safe == newest)
+    flags |= BEGUN * component.has_begun
     flags |= STARTS * (component.autostart and not component.held and not component.entrusted)
     return Entry(
         component.name,

@@ -6,6 +6,8 @@ primary never stops, and not one number that it has counted is lost.
 
 from __future__ import annotations
 
+import os
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +21,8 @@ from failover.core.membership import UNREAD_NS
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_deaths import COUNT, numbers
+from tests.e2e.test_epoch import IN_PYTHON, epoch, until_told
+from tests.include import programs
 
 pytestmark = [
     pytest.mark.root,  # an agent is started again inside its robot
@@ -29,6 +33,17 @@ GRACE_S = 3
 """After so long a robot that starts counts those as dead of which it has heard nothing. Source: `failover.core.types.Config`."""
 
 MORE = 20
+
+KEEPS_A_STATE = """
+import time
+import failover
+
+failover.resume("token", default={"told": 0})
+while True:
+    print(failover.epoch(), flush=True)
+    failover.commit()
+    time.sleep(0.01)
+"""
 
 Pair = tuple[RobotMachine, RobotMachine]
 
@@ -179,3 +194,30 @@ def test_after_its_patience_it_goes_on_and_at_reunion_the_copy_that_never_stoppe
         assert list((first.directory / "state" / "lost").glob("*.snapshot")), "what robot1's copy had become is kept aside"
         told = robots.failover(second, "why", "count").stdout
         assert "robot2 keeps its copy, which never stopped acting" in told, told
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("kind", ["unprepared", "keeps a state", "keeps a state, in C"])
+def test_the_copy_that_stays_finds_its_new_epoch_and_a_gateway_obeys_it(tmp_path: Path, kind: str) -> None:
+    engine = "ptrace" if kind == "unprepared" else "auto"
+    words = {
+        "unprepared": lambda: (sys.executable, "-c", IN_PYTHON),
+        "keeps a state": lambda: (sys.executable, "-c", KEEPS_A_STATE),
+        "keeps a state, in C": lambda: (str(programs.program("token")),),
+    }[kind]()
+    with robots.two_robots(tmp_path) as pair:
+        first, second = pair
+        robots.run(second, "token", *words, env={"PYTHONPATH": os.getcwd()}, engine=engine)
+        robots.until_protected(second, "token")
+        until_told(second, second)
+        robots.cable(first, "down")
+        robots.until_taken_over(first, "token")
+        until_told(first, first)
+        others = epoch(first)
+        robots.cable(first, "up")
+        robots.until(lambda: robots.component(first, "token").get("primary") == "robot2", "robot1 to know who runs it")
+        robots.until_protected(second, "token")
+        until_told(second, second)
+        told = list(dict.fromkeys(robots.numbers(second, "token")))
+        assert told[-1] > others and told == sorted(told), told
+        assert not robots.component(second, "token").get("restores")

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from failover.core.names import weight
 from failover.core.types import MS, ComponentSpec, Config, Launch, Rule, State
 from tests.simulation.invariants import Invariants, seen_at, state_at
-from tests.simulation.teams import pair
+from tests.simulation.teams import elective, pair
 from tests.simulation.world import World
 
 SPEC = ComponentSpec("/team/part", launch=Launch(("part",)))
@@ -86,6 +86,25 @@ def test_in_any_order_of_arrival_the_first_that_may_act_stays_and_the_late_comer
         sorted({*order} - {first}), State.STANDBY
     )
     assert standby in {*order} - {first}
+
+
+def test_a_robot_with_a_new_disk_begins_nothing_afresh_of_which_another_member_knows_checkpoints() -> None:
+    world = World(1, elective(2, (SPEC,), witnesses=1), (Invariants(safe={SPEC.name}, votes=True),))
+    for name in ("robot1", "robot2", "witness1"):
+        world.power_on(name)
+    world.run(2_000 * MS)
+    assert world.acting(SPEC.name) == ["robot1"]
+    world.power_off("robot1")
+    world.run(4_000 * MS)
+    assert world.acting(SPEC.name) == ["robot2"]
+    world.power_off("robot2")
+    world.new_disk("robot2", ballot=True)
+    world.power_on("robot2")
+    world.run(10_000 * MS)
+    assert world.acting(SPEC.name) == []
+    world.power_on("robot1")
+    world.run(13_000 * MS)
+    assert world.acting(SPEC.name) == ["robot1"]
 
 
 @pytest.mark.parametrize("rule", list(Rule))
