@@ -552,9 +552,7 @@ def _capabilities(table: CallTable, theirs: Credentials, ours: Credentials) -> l
 
 
 def last_marks(table: CallTable, process: ProcessState) -> None:
-    """What a change of user undoes, so it comes last: dumpable, and the signal at the parent's death (ours until now).
-
-    2 is the kernel's alone, for what was a set-user-id program: 0 keeps such a one from its own user as well. Source: prctl(2).
-    """
-    table.call("set dumpable", "prctl", abi.PR_SET_DUMPABLE, int(process.dumpable == 1))
+    """What a change of user undoes, so it comes last: dumpable, and the signal at the parent's death (ours until now)."""
+    if process.dumpable in (0, 1):
+        table.call("set dumpable", "prctl", abi.PR_SET_DUMPABLE, process.dumpable)
     table.call("set the signal at the parent's death", "prctl", abi.PR_SET_PDEATHSIG, process.parent_death_signal)

@@ -21,7 +21,7 @@ from agent.places import Places
 from checkpoint.errors import ProcessGoneError
 from checkpoint.linux import namespaces, procfs
 from checkpoint.linux.inheritance import Inheritance
-from tests.agent.guards import PATIENCE_S, until
+from tests.agent.guards import PATIENCE_S, PYTHON, until
 from tests.agent.test_component import live
 
 NAME = "/test/robot1/guest"
@@ -143,7 +143,7 @@ def test_the_successor_of_a_process_that_is_held_is_not_stopped() -> None:
     ("become", "why"),
     [
         (("--reuid=7001", "--regid=7001", "--clear-groups"), ""),
-        (("--reuid=7001", "--rgid=7001", f"--egid={GIVEN}", "--clear-groups"), "runs with gid 42, which uid 7001 has not"),
+        (("--reuid=7001", "--rgid=7001", f"--egid={GIVEN}", "--clear-groups"), "is not a process of uid 7001"),
         (("--reuid=7001", "--regid=7001", f"--groups={GIVEN}"), "runs with gid 42, which uid 7001 has not"),
         (("--ruid=7001", "--euid=7002", "--regid=7001", "--clear-groups"), "is not a process of uid 7001"),
     ],
@@ -164,3 +164,17 @@ def test_a_group_that_the_caller_has_may_be_the_process_s_too() -> None:
     caller = Caller(SOMEBODY, SOMEBODY, (GIVEN,), CALLER.inheritance)
     with sleeping("setpriv", "--reuid=7001", "--regid=7001", f"--groups={GIVEN}") as pid:
         guest_of(pid, caller).close()
+
+
+@as_root
+def test_a_process_that_the_system_keeps_from_its_own_user_is_roots() -> None:
+    """As one that has executed a set-user-id program, which gave its rights up again."""
+    script = f"import ctypes, os, time; os.setresgid(*[{SOMEBODY}] * 3); os.setgroups([]); os.setresuid(*[{SOMEBODY}] * 3)"
+    script += "; ctypes.CDLL(None).prctl(4, 0); print('ready', flush=True); time.sleep(1000)"
+    with subprocess.Popen([PYTHON, "-S", "-c", script], stdout=subprocess.PIPE) as process:
+        try:
+            assert process.stdout is not None and process.stdout.readline()
+            with pytest.raises(RefusedError, match="is not a process of uid 7001"):
+                guest_of(process.pid, CALLER)
+        finally:
+            process.kill()

@@ -202,7 +202,7 @@ def test_a_program_whose_memory_its_user_may_not_read_comes_back_so(program: Pro
         os.chown(place / name, ALICE, ALICE)
     base = replace(base, process=replace(base.process, dumpable=dumpable))
     with ended(restored(base, place, own_eyes=True)) as again:
-        assert os.stat(f"/proc/{again.pid}").st_uid == (ALICE if dumpable == 1 else 0)
+        assert os.stat(f"/proc/{again.pid}/fd").st_uid == (ALICE if dumpable == 1 else 0)
 
 
 def test_a_component_of_root_may_have_any_rights(program: Program) -> None:
