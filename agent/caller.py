@@ -133,7 +133,7 @@ def guest_of(pid: int, caller: Caller) -> Guest:
     except (OSError, ValueError, OverflowError):
         raise gone from None
     try:
-        owner, status = os.stat(f"/proc/{pid}").st_uid, procfs.status(pid)  # /proc/PID itself is its user's, dumpable or not
+        owner, status = os.stat(f"/proc/{pid}/fd").st_uid, procfs.status(pid)  # /proc/PID itself is its user's, dumpable or not
         if guest.has_ended:
             raise gone
         if not may(caller.uid, None):
