@@ -1,4 +1,5 @@
-"""How many connections of the control socket each user may hold, and how many bytes of requests: no user shuts another out.
+"""How many connections of the control socket each user may hold, how many bytes of requests, and how many components: no user
+shuts another out.
 
 Root and the agent's own user have places of their own, which no other user can take. Everybody else shares a number of places and
 of bytes, of which one user gets a part.
@@ -8,10 +9,12 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Iterable
 from typing import Final
 
 from agent.caller import ROOT
 from agent.errors import RefusedError
+from failover.core.types import ENDED, ComponentView, State
 
 TRUSTED_CONNECTIONS_MAX: Final = 128
 """Of root, and of the agent's own user: a script that forgets to close them is told."""
@@ -24,6 +27,9 @@ OTHERS_CONNECTIONS_MAX: Final = 128
 
 USER_BYTES_MAX: Final = 8 << 20
 """Of requests of one user that have arrived and are not answered, without the first 32 KB of each: a small one is heard."""
+
+NAMES_FOR_EACH: Final = 2
+"""Names of components that a user may have used, those that were released included, for each component that he may have."""
 
 OTHERS_BYTES_MAX: Final = 32 << 20
 """The same of all users together who are neither root nor the agent's own."""
@@ -80,6 +86,37 @@ class Admission:
     def let_go(self, uid: int, size: int) -> None:
         """The request is answered, or has come to nothing."""
         _take(self._bytes, uid, size)
+
+
+def check_components(uid: int, name: str, known: Iterable[ComponentView], most: int) -> None:
+    """Let a user begin a component of this name.
+
+    The team follows a number of names (`failover.core.types.COMPONENTS_MAX`), and a name that was used and released keeps its
+    place: its epochs must not be forgotten. So names count as well, `NAMES_FOR_EACH` for each component that a user may have.
+
+    Args:
+        known: all components that this robot knows.
+        most: that a user may have, whether they run or have ended.
+
+    Raises:
+        RefusedError: the user has as many, or has used as many names.
+    """
+    if is_trusted(uid):
+        return
+    theirs = [one for one in known if one.owner == uid and one.name != name]
+    held = [one for one in theirs if one.state not in (State.RELEASED, State.ABSENT)]
+    if len(held) >= most:
+        over = sum(one.state in ENDED for one in held)
+        raise RefusedError(
+            f"uid {uid} has {len(held)} components, the most for one user (components_per_user); {over} of them have ended: "
+            "failover release NAME forgets one"
+        )
+    if len(theirs) >= NAMES_FOR_EACH * most:
+        released = min(one.name for one in theirs if one not in held)
+        raise RefusedError(
+            f"uid {uid} has used {len(theirs)} names for components, the most for one user; take one of them again that was "
+            f"released, {released} for one (--name)"
+        )
 
 
 def is_trusted(uid: int) -> bool:

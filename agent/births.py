@@ -17,7 +17,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from agent import guard_messages
-from agent.bounds import check_rights
+from agent.bounds import bound_of, check_rights
 from agent.caller import ROOT
 from agent.clock import Laps, now_ns
 from agent.component import Component, Prepared
@@ -35,6 +35,7 @@ from checkpoint.errors import ChainError, CheckpointError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
 from checkpoint.model import Snapshot
 from checkpoint.needs import names_of_contents, needs
+from checkpoint.rights import Owner
 from checkpoint.task_channel import Origin
 
 
@@ -102,18 +103,23 @@ def _starting(
     )
 
 
-async def watch(name: str, pid: int, places: Places) -> Component:
+async def watch(name: str, guest: Guest, places: Places) -> Component:
     """Take a running process in: its guard is not its parent and does not own its streams.
 
+    Args:
+        guest: becomes the component's, whatever happens.
+
     Raises:
-        GuardError: there is no such process.
+        GuardError: it has ended.
     """
-    component = Component(name, await places.nursery.guard(), places)
-    component.pid = component.inner_pid = pid
-    born = await _born(component, guard_messages.Watch(name, pid))
-    with contextlib.suppress(ProcessLookupError):  # it has just ended: its guard says so
-        born.guest = Guest(name, pid)
-    return born
+    try:
+        component = Component(name, await places.nursery.guard(), places)
+    except (GuardError, OSError):
+        guest.close()
+        raise
+    component.guest = guest
+    component.pid = component.inner_pid = guest.pid
+    return await _born(component, guard_messages.Watch(name, guest.pid), (guest.fileno(),))
 
 
 async def restore(
@@ -156,7 +162,7 @@ async def restore(
     component = Component(name, await places.nursery.guard(), places)
     request = _vessel_for(name, outline, places, outage_ns, total_of(outline.output), task)
     component.engine_wanted = task.engine if task is not None else PTRACE
-    component.keeper.terms = terms_of(outline, terms)
+    component.keeper.terms = terms_of(outline, terms, bound_of(owner, started))
     component.keeper.names = names_of_contents(needs(outline), places.contents)
     try:
         keeper = await component.keeper.give()
@@ -227,7 +233,7 @@ async def lay(
     outline = await asyncio.to_thread(format.read_outline, chain[-1])
     check_rights(name, outline, owner, started)
     component = Component(name, await places.nursery.guard(), places)
-    component.keeper.terms = terms_of(outline, terms)
+    component.keeper.terms = terms_of(outline, terms, bound_of(owner, started))
     request = _vessel_for(name, outline, places, age_ns + COPY_CLOCKS_AHEAD_NS, None, counted_ns=counted_ns)
     try:
         keeper = await component.keeper.give()
@@ -273,7 +279,7 @@ async def finish(
     try:
         check_rights(name, outline, owner, started)
         component.engine_wanted = task.engine if task is not None else PTRACE
-        component.keeper.terms = terms_of(outline, terms)
+        component.keeper.terms = terms_of(outline, terms, bound_of(owner, started))
         component.keeper.names = names_of_contents(needs(outline), places.contents)
         order = channel.Restore(
             component.pid,
@@ -294,10 +300,15 @@ async def finish(
     component.notes = (*component.notes, *restored.notes)
 
 
-def terms_of(outline: Snapshot, here: Terms) -> Terms:
-    """On which terms a component that comes back is followed on this robot: it carries what its snapshot says."""
+def terms_of(outline: Snapshot, here: Terms, owner: Owner | None) -> Terms:
+    """On which terms a component that comes back is followed on this robot: it carries what its snapshot says.
+
+    Args:
+        owner: whose rights bound it, see `agent.bounds.bound_of`.
+    """
     places = dict(here.carry.places)
-    return replace(here, carry=replace(here.carry, paths=tuple(places.get(path, path) for path in paths_of(outline))))
+    paths = tuple(places.get(path, path) for path in paths_of(outline))
+    return replace(here, carry=replace(here.carry, paths=paths), owner=owner)
 
 
 async def begin_again(
@@ -341,7 +352,7 @@ async def begin_again(
         raise
     component = waiting or Component(name, await places.nursery.guard(), places)
     component.engine_wanted = COOPERATIVE  # what another engine took before it says Hello would be older than its state
-    component.keeper.terms = terms_of(outline, terms)
+    component.keeper.terms = terms_of(outline, terms, bound_of(owner, program.inheritance))
     try:
         await component.keeper.give()
         filled, (segment,) = await component.keeper.ask(channel.Fill(name, owner != ROOT, terms.carry.places), tuple(chain))
@@ -402,7 +413,7 @@ async def reconnect(socket_path: Path, places: Places) -> Component:
     component.take(described, streams)
     if described.watched and described.state != "ended":
         with contextlib.suppress(ProcessLookupError):
-            component.guest = Guest(described.component, described.pid)
+            component.guest = Guest(described.pid)
     if described.state == "ended" and not component.ended.done():
         component.ended.set_result(described.exit_status)
     return component

@@ -28,12 +28,19 @@ def check_rights(name: str, outline: Snapshot, owner: int, started: Inheritance 
             or securebits. Priorities and limits are as they were: root may have given them to it while it ran.
         FormatError: it does not tell them as we know it.
     """
+    theirs = bound_of(owner, started)
+    if theirs is not None and (reason := rights.refusal(rights.beyond(outline, theirs), theirs)):
+        raise MismatchError(f"cannot restore {name}: {reason}", (reason,))
+
+
+def bound_of(owner: int, started: Inheritance | None) -> Owner | None:
+    """Whose rights bound a component, also at each capture; None: it may have any, or there is nothing to be gained.
+
+    Root may; and where we are not root, the kernel lets us have no more than our own user's.
+
+    Args:
+        started: as for `check_rights`.
+    """
     if owner == ROOT or os.geteuid() != ROOT:
-        return  # root may; where we are not root, there is nothing to be gained
-    groups = (started.gid, *started.groups) if started is not None else None
-    theirs = Owner(owner, started.gid if started is not None else -1, groups)
-    if not (asked := tuple(dict.fromkeys(rights.beyond(outline, theirs)))):
-        return
-    reason = f"it runs with other rights than those of its owner, uid {owner}: it has {', '.join(asked)}"
-    reason += ": only a program of root may; start it as root"
-    raise MismatchError(f"cannot restore {name}: {reason}", (reason,))
+        return None
+    return Owner(owner) if started is None else Owner(owner, started.gid, (started.gid, *started.groups))

@@ -12,11 +12,13 @@ import pwd
 import select
 import socket
 import struct
-from typing import Final
+from collections.abc import Mapping
+from typing import Any, Final
 
 from msgspec import Struct
 
 from agent.errors import RefusedError
+from agent.guest import Guest
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.inheritance import Inheritance
@@ -31,6 +33,9 @@ SCHED_DEADLINE: Final = 6
 ROOT: Final = 0
 NOBODY: Final = -1
 """For what a robot asks another one by itself: it may be told how things stand, and no more."""
+
+SAID: Final = "; it said: "
+"""Begins, at the end of a sentence of status or story, what a program wrote last."""
 
 _CREDENTIALS: Final = struct.Struct("3i")
 
@@ -70,6 +75,16 @@ def check_right(uid: int, component: str, owner: int | None) -> None:
         raise RefusedError(f"{component} {whose}; its owner and root may give orders and read its output", "PermissionError")
 
 
+def without_output(told: Any) -> Any:
+    """The same without what programs said, in all of its sentences: for somebody who may not read their output."""
+    if isinstance(told, str):
+        sentence, said, _ = told.partition(SAID)
+        return f"{sentence}; what it said is shown to its owner and root" if said else told
+    if isinstance(told, Mapping):
+        return {key: without_output(value) for key, value in told.items()}
+    return [without_output(value) for value in told] if isinstance(told, list | tuple) else told
+
+
 def uid_of(connection: socket.socket) -> int:
     """Whose the client is."""
     return int(_CREDENTIALS.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))[1])
@@ -103,22 +118,44 @@ def inheritance_for(caller: Caller, user: str) -> Inheritance:
     return wanted.as_user(ours, os.getegid(), tuple(os.getgroups()))
 
 
-def owner_of(pid: int, caller: Caller) -> int:
-    """Whose a running process is, for somebody who wants it protected.
+def guest_of(pid: int, caller: Caller) -> Guest:
+    """A running process that somebody wants protected, held by a pidfd: what is asked of it later is asked of the same one.
 
     A process that the system keeps from its own user (a set-user-id program, one that is not dumpable) is root's.
+    Its rights are those that it has now; they bound each capture (`agent.bounds`), for it may execute anything.
 
     Raises:
-        RefusedError: there is no such process, or it is not the caller's.
+        RefusedError: there is no such process, or it is not the caller's: all of its users and groups must be.
     """
+    gone = RefusedError(f"cannot protect pid {pid}: No such process", "ProcessGoneError")
     try:
-        owner = os.stat(f"/proc/{pid}").st_uid
-        users = procfs.status(pid).uids
+        guest = Guest(pid)
+    except (OSError, ValueError, OverflowError):
+        raise gone from None
+    try:
+        owner, status = os.stat(f"/proc/{pid}/fd").st_uid, procfs.status(pid)  # /proc/PID itself is its user's, dumpable or not
+        if guest.has_ended:
+            raise gone
+        if not may(caller.uid, None):
+            _check_own(pid, caller, {owner, *status.uids}, {*status.gids, *status.groups})
     except (OSError, CheckpointError):
-        raise RefusedError(f"cannot protect pid {pid}: No such process", "ProcessGoneError") from None
-    if may(caller.uid, None) or {owner, *users} == {caller.uid}:
-        return users[0]
-    raise RefusedError(f"pid {pid} is not a process of uid {caller.uid}; its owner and root may protect it", "PermissionError")
+        guest.close()
+        raise gone from None
+    except RefusedError:
+        guest.close()
+        raise
+    guest.rights = Inheritance(status.uids[0], status.gids[0], status.groups)
+    return guest
+
+
+def _check_own(pid: int, caller: Caller, uids: set[int], gids: set[int]) -> None:
+    """Raises RefusedError: a process has a user or a group that the caller has not."""
+    if uids != {caller.uid}:
+        sentence = f"pid {pid} is not a process of uid {caller.uid}; its owner and root may protect it"
+        raise RefusedError(sentence, "PermissionError")
+    if others := sorted(gids - {caller.gid, *caller.groups}):
+        told = f"pid {pid} runs with gid {', '.join(map(str, others))}, which uid {caller.uid} has not where it asks"
+        raise RefusedError(f"{told}; give the order with that group (newgrp), or as root", "PermissionError")
 
 
 def _as_user(caller: Caller, name: str) -> Inheritance:

@@ -15,10 +15,14 @@ from collections.abc import Coroutine
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from msgspec.structs import replace
+
 from agent import births, clock, comeback
+from agent.bounds import bound_of
 from agent.component import Component
 from agent.errors import TROUBLE, AgentError, GuardError, KeeperLostError
 from agent.figures import NOT_WANTED, Commits, CopyFigures, Figures, shortened
+from agent.guest import Guest
 from agent.mistake import end_lanes_on_mistake
 from agent.occasions import Occasions
 from agent.ready_copy import ReadyCopy
@@ -28,7 +32,7 @@ from agent.standby import Standby
 from agent.surroundings import Surroundings, program_of
 from checkpoint.channel import close_all
 from checkpoint.engine import COOPERATIVE
-from checkpoint.errors import CheckpointError, NothingCommittedError, UnsupportedError
+from checkpoint.errors import CheckpointError, NothingCommittedError, ProcessGoneError, UnsupportedError
 from failover.core import acts, events
 from failover.core.acts import Act
 from failover.core.types import ComponentSpec, Resumption
@@ -48,6 +52,7 @@ class Charge:
         standby, copy: what waits here to take it over: a program that keeps its state, or any other's memory.
         epoch: of the newest act; an older one is dropped.
         ended: set by the core's word that the component's end is a record.
+        guest: the running process that a client has just named, to be taken in; the client's, while it waits.
     """
 
     name: str
@@ -57,6 +62,7 @@ class Charge:
     figures: Figures = field(default_factory=Figures)
     started: asyncio.Event = field(default_factory=asyncio.Event)
     ended: asyncio.Future[acts.ReportExit] | None = None
+    guest: Guest | None = None
     standby: Standby = field(init=False)
     copy: ReadyCopy = field(init=False)
     _snapshots: Snapshots = field(init=False)
@@ -291,7 +297,8 @@ class Charge:
         self._cool()
         adopted = self.component is not None
         self._occasions.runs_here(act.spec)
-        terms = begun_on(act.spec.launch, self.around.here(self.name))
+        owner = bound_of(act.spec.owner, program_of(act.spec.launch).inheritance)
+        terms = replace(begun_on(act.spec.launch, self.around.here(self.name)), owner=owner)
         self.around.records.note(self.name, act.epoch, terms)
         if self.component is None:
             await self.around.settled(self.name)
@@ -310,8 +317,24 @@ class Charge:
 
     async def _begun(self, spec: ComponentSpec, epoch: int) -> Component:
         if spec.launch.pid:
-            return await births.watch(self.name, spec.launch.pid, self.around.places)
+            return await births.watch(self.name, self._named(spec.launch.pid), self.around.places)
         return await births.start(self.name, program_of(spec.launch), self.around.places, epoch, spec.owner)
+
+    def _named(self, pid: int) -> Guest:
+        """The process that a client named: the one that was asked whose it is, where no other life of these lanes did that.
+
+        Raises:
+            ProcessGoneError: it has ended.
+        """
+        asked = self.guest if self.guest is not None and self.guest.pid == pid else None
+        try:
+            found = Guest(pid)
+        except OSError as error:
+            raise ProcessGoneError(f"cannot protect pid {pid}: {error.strerror}") from error
+        if asked is not None and asked.has_ended:  # asked after it was opened: else both are of one process
+            found.close()
+            raise ProcessGoneError(f"cannot protect pid {pid}: it has ended, and another process may have its number")
+        return found
 
     async def _protect(self, *, refuse: bool) -> None:
         """Give it a keeper. A program that was started here runs on unprotected where it cannot have one; a guest is refused."""

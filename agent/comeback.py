@@ -10,6 +10,7 @@ from typing import Final
 from msgspec.structs import replace
 
 from agent import births
+from agent.caller import SAID
 from agent.clock import Laps
 from agent.component import Component
 from agent.guard_messages import Task
@@ -129,7 +130,7 @@ def refusal(component: Component, status: int) -> str:
     if not component.goes_on or component.keeps or not os.WIFEXITED(status) or not os.WEXITSTATUS(status):
         return ""
     said = _last_line(component) or "nothing"
-    return f"{component.name} did not take its state: exit code {os.WEXITSTATUS(status)} before its first commit; it said: {said}"
+    return f"{component.name} did not take its state: exit code {os.WEXITSTATUS(status)} before its first commit{SAID}{said}"
 
 
 def _last_line(component: Component) -> str:

@@ -39,7 +39,7 @@ from agent.streams import STREAMS, OutputLogs, discard, logs_of
 from checkpoint import channel
 from checkpoint.channel import close_all
 from checkpoint.engine import AUTO, COOPERATIVE, PTRACE
-from checkpoint.errors import CheckpointError, NothingCommittedError, UnsupportedError
+from checkpoint.errors import CheckpointError, NothingCommittedError, ProcessGoneError, UnsupportedError
 from checkpoint.model import Position
 
 HELLO_PATIENCE_S: Final = 10.0
@@ -244,6 +244,7 @@ class Component:
 
         Raises:
             checkpoint.errors.UnsupportedError: with the reasons; the program was not touched.
+            ProcessGoneError: somebody else's child has ended, so that its number may be another process's.
             ProbeError, KeeperLostError.
         """
         followed = self.engine, (self.task_pid or self.pid) if self.engine == COOPERATIVE else self.pid
@@ -254,7 +255,11 @@ class Component:
         if self.keeper.followed == followed or self._awaits_commit:
             return ()
         with self._patience():
-            return await self.keeper.follow(*followed, self.streams)
+            notes = await self.keeper.follow(*followed, self.streams)
+        if self.guest is not None and self.guest.has_ended:
+            self._drop_keeper()
+            raise ProcessGoneError(f"cannot protect pid {self.pid}: it has ended, and another process may have its number")
+        return notes
 
     @contextlib.contextmanager
     def _patience(self) -> Iterator[None]:
@@ -497,7 +502,7 @@ class Component:
 
     def _guard_lost(self) -> None:
         if self.guest is not None:
-            self.guest.end()
+            self.guest.end(self.name)
         if not self.ended.done():
             self.ended.set_exception(GuardLostError(f"the guard of {self.name} ended, and its program with it"))
             self.ended.exception()  # noted: after a release nobody waits for the end

@@ -20,7 +20,7 @@ from failover.client import team as team_directory
 from failover.client.quantities import size_bytes, span_ms
 from failover.client.team import Robot, Team
 from failover.core.names import check_component
-from failover.core.types import BEAT_MS_MAX, BEATS_IN_LEASE_MIN, PERIOD_MS_MAX
+from failover.core.types import BEAT_MS_MAX, BEATS_IN_LEASE_MIN, COMPONENTS_MAX, PERIOD_MS_MAX
 from failover.errors import FailoverError, NameFormatError
 
 PATIENCE_S_MAX: Final = 86_400
@@ -147,6 +147,7 @@ class Config:
         runtime_directory: sockets; gone after a reboot.
         insecure: run without keys: anybody on the network can read memory and start programs.
         group: unix group that may use the control socket besides its owner; "" for nobody.
+        components_per_user: that a user other than root may have here, those that have ended included.
         beat_ms: period of beats to each peer.
         lease_ms: how long a primary acts without being heard, and how long a standby stays loyal to a silent one.
         patience_s: under the majority rule: how long the robots that hold the newest checkpoint are waited for.
@@ -174,6 +175,7 @@ class Config:
     runtime_directory: str = "/run/failover"
     insecure: bool = False
     group: str = ""
+    components_per_user: int = 64
     beat_ms: int = 20
     lease_ms: int = 200
     rule: Literal["auto", "pair", "majority"] = "auto"
@@ -222,6 +224,10 @@ class Config:
             raise ValueError(f"patience_s is {self.patience_s}; it must be at least 1 and at most {PATIENCE_S_MAX}")
         if not 0 <= self.boot_patience_s <= PATIENCE_S_MAX:
             raise ValueError(f"boot_patience_s is {self.boot_patience_s}; it must be at least 0 and at most {PATIENCE_S_MAX}")
+        if not 1 <= self.components_per_user <= COMPONENTS_MAX:
+            raise ValueError(
+                f"components_per_user is {self.components_per_user}; it must be at least 1 and at most {COMPONENTS_MAX}"
+            )
         if not 0 <= self.keep_checkpoints <= KEEP_MAX:
             raise ValueError(f"keep_checkpoints is {self.keep_checkpoints}; at most {KEEP_MAX}, and 0 keeps none")
         _check_quantity("keep_for", span_ms, self.keep_for)

@@ -167,6 +167,7 @@ class SignalFreezer:
 
     def __init__(self) -> None:
         self._roots: list[int] = []
+        self._pidfds: dict[int, int] = {}
         self._stopped: set[int] = set()
 
     @contextmanager
@@ -174,9 +175,15 @@ class SignalFreezer:
         """There is no place to be: whoever is born is added."""
         yield
 
-    def add(self, pid: int) -> None:
-        """Remember the process."""
+    def add(self, pid: int, pidfd: int = -1) -> None:
+        """Remember the process.
+
+        Args:
+            pidfd: of one that is not our child: once it has ended, its number may be another process's. Stays the caller's.
+        """
         self._roots.append(pid)
+        if pidfd >= 0:
+            self._pidfds[pid] = pidfd
 
     def freeze(self) -> bool:
         """Stop all; again until no new one appears and none runs."""
@@ -187,7 +194,7 @@ class SignalFreezer:
             if not running and set(states.values()) <= HELD:
                 return True
             for pid in running:
-                _send(pid, signal.SIGSTOP)
+                self._send(pid, signal.SIGSTOP)
             self._stopped |= running
             if time.monotonic() > deadline:
                 return False
@@ -199,16 +206,23 @@ class SignalFreezer:
     def thaw(self) -> None:
         """Continue those that we stopped; what stood before by itself stays as it was."""
         for pid in sorted(self._stopped, reverse=True):
-            _send(pid, signal.SIGCONT)
+            self._send(pid, signal.SIGCONT)
         self._stopped.clear()
 
     def kill(self) -> None:
         """Kill all; parents first, so that none starts another."""
         for pid in self._everybody():
-            _send(pid, signal.SIGKILL)
+            self._send(pid, signal.SIGKILL)
 
     def close(self) -> None:
         """Nothing was made."""
+
+    def _send(self, pid: int, number: int) -> None:
+        if pid not in self._pidfds:
+            _send(pid, number)
+            return
+        with suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self._pidfds[pid], number)
 
     def _everybody(self) -> list[int]:
         """The processes, their orphans and all descendants, parents before children."""

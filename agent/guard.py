@@ -246,9 +246,11 @@ class Guard:
         born = ward.born
         self._reply(VesselReady(born.pid, born.inner_pid, born.isolated, self._all_notes()), ward.descriptors())
 
-    def _watch(self, request: Watch, _: tuple[int, ...]) -> None:
+    def _watch(self, request: Watch, descriptors: tuple[int, ...]) -> None:
         self._check_free()
-        self._ward = Ward.watch(request)
+        if len(descriptors) != 1:
+            raise WardError(f"cannot look after pid {request.pid}: its pidfd must come along")
+        self._ward = Ward.watch(request, descriptors[0])
         self._reply(Watching(self._all_notes()))
 
     def _commit(self, request: Commit, _: tuple[int, ...]) -> None:

@@ -87,7 +87,7 @@ class MakeVessel(Message, frozen=True):
 
 
 class Watch(Message, frozen=True):
-    """Look after a process that is somebody else's child: its end is noticed, its exit status is not known."""
+    """Look after a process that is somebody else's child: its end is noticed, its exit status is not known. With its pidfd."""
 
     component: str
     pid: int

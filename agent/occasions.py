@@ -10,6 +10,7 @@ from msgspec import Struct, field
 from msgspec.structs import replace
 
 from agent import clock, hooks
+from agent.caller import SAID
 from agent.errors import AgentError
 from agent.figures import Figures
 from agent.hook_kinds import Kind, signal_in
@@ -134,7 +135,7 @@ class Occasions(Struct):
         outcome = await self.around.hooks.run(kind, hook, occasion)
         if outcome.failure:
             self.figures.hooks[kind] = outcome.failure + ("; the checkpoint was taken without it" * (kind == "before_capture"))
-        said = f"; it said: {outcome.last_line}" if outcome.last_line else ""
+        said = f"{SAID}{outcome.last_line}" if outcome.last_line else ""
         took_ms = (clock.now_ns() - began_ns) / 1e6
         told = outcome.failure or f"{kind} ({' '.join(hook.command)}) ended well after {took_ms:.0f} ms"
         self.around.tell(events.Noticed(self.name, told + said))

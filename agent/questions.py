@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any, Final, Protocol
 
 from agent.arguments import NameArguments, StatusArguments, WhyArguments, arguments_of
+from agent.caller import may, without_output
 from agent.config import Settings
 from agent.control import Conversation, Verb
 from agent.door import Told
@@ -95,12 +96,12 @@ class Questions:
         """How does the team stand?"""
         wanted = arguments_of(StatusArguments, "status", arguments)
         while wanted.watch:
-            await say.update(await self._sight(wanted.team))
+            await say.update(await self._sight(wanted.team, say.caller.uid))
             await asyncio.sleep(max(wanted.every_ms, 10) / 1_000)
-        return await self._sight(wanted.team)
+        return await self._sight(wanted.team, say.caller.uid)
 
-    async def _sight(self, team: bool) -> dict[str, Any]:
-        """This robot's picture; with ``team`` each component also as the other living robots see it."""
+    async def _sight(self, team: bool, uid: int) -> dict[str, Any]:
+        """This robot's picture, for a user; with ``team`` each component also as the other living robots see it."""
         mine = self._lines.picture(await self._lines.ask("status"))
         for component in mine["components"]:
             component["elsewhere"] = {}
@@ -109,6 +110,7 @@ class Questions:
             answers = await asyncio.gather(*(self._asked(peer, "picture", {}) for peer in living))
             _join(mine, {robot: picture for robot, picture in zip(living, answers, strict=True) if picture})
             mine["healthy"] = is_healthy(mine)
+        mine["components"] = [_shown_to(uid, one) for one in mine["components"]]
         return mine
 
     async def _reachable(self) -> list[str]:
@@ -123,11 +125,15 @@ class Questions:
         except RefusedError:
             return {}
 
-    async def why(self, _say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
-        """What was decided, when and by whom: the stories of all robots that answer, in one."""
+    async def why(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """What was decided, when and by whom: the stories of all robots that answer, in one.
+
+        What programs said is left out but for root: a line does not tell whose component had the name then.
+        """
         wanted = arguments_of(WhyArguments, "why", arguments)
         name = await self._known(wanted.name) if wanted.name else ""
-        return await self._telling.whole(name, wanted.robot, wanted.age_ms_max)
+        told = await self._telling.whole(name, wanted.robot, wanted.age_ms_max)
+        return told if may(say.caller.uid, None) else {**told, "story": without_output(told["story"])}
 
     async def standing(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         """How one component stands on this robot; empty where it is unknown."""
@@ -165,6 +171,13 @@ class Questions:
             raise RefusedError(f"{wanted!r} could be {', '.join(sorted(fitting))}; give the whole name", "UnknownComponentError")
         known = ", ".join(sorted(name for name, state in names.items() if state is not State.RELEASED)) or "nothing"
         raise RefusedError(f"no component is called {wanted!r}; this team protects {known}", "UnknownComponentError")
+
+
+def _shown_to(uid: int, one: dict[str, Any]) -> dict[str, Any]:
+    """A component as a user may see it; a name may be another user's at another robot, while that has not heard the news."""
+    elsewhere = {robot: _shown_to(uid, seen) for robot, seen in one.get("elsewhere", {}).items()}
+    seen = one if may(uid, one.get("owner")) else without_output(one)
+    return {**seen, "elsewhere": elsewhere} if "elsewhere" in one else seen
 
 
 def _join(mine: dict[str, Any], theirs: dict[str, dict[str, Any]]) -> None:

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from agent import births, clock
 from agent.births import Program
+from agent.caller import SAID
 from agent.component import Component
 from agent.errors import TROUBLE, GuardError
 from agent.mistake import end_lanes_on_mistake
@@ -148,4 +149,4 @@ def _how(component: Component) -> str:
 
 def _said(component: Component) -> str:
     """Its last words."""
-    return f"; it said: {component.last_words[-1]}" if component.last_words else ""
+    return f"{SAID}{component.last_words[-1]}" if component.last_words else ""

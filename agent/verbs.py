@@ -12,6 +12,7 @@ from typing import Any, Final, Protocol
 import msgspec
 
 from agent import clock, lacks
+from agent.admission import check_components
 from agent.arguments import (
     HandoverArguments,
     LogsArguments,
@@ -23,11 +24,12 @@ from agent.arguments import (
     StopArguments,
     arguments_of,
 )
-from agent.caller import check_right, inheritance_for, owner_of
+from agent.caller import Caller, check_right, guest_of, inheritance_for
 from agent.charge import Charge
 from agent.control import Conversation, Verb
 from agent.errands import Order
 from agent.errors import RefusedError
+from agent.guest import Guest
 from agent.hook_kinds import check_told
 from agent.outflow import Outflow
 from agent.places import Places
@@ -166,16 +168,31 @@ class Verbs(Questions):
     async def protect(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """Take a running process under protection."""
         wanted = arguments_of(ProtectArguments, "protect", arguments)
-        owner = owner_of(wanted.pid, say.caller)
+        guest = guest_of(wanted.pid, say.caller)
+        try:
+            return await self._taken_in(wanted, guest, say.caller)
+        finally:
+            guest.close()
+
+    async def _taken_in(self, wanted: ProtectArguments, guest: Guest, caller: Caller) -> dict[str, Any]:
+        """Protect a process that is the caller's."""
+        assert guest.rights is not None, "it was asked whose it is"
         for known in self._lanes.charges.values():
             if known.component is not None and known.component.pid == wanted.pid:
                 raise RefusedError(f"pid {wanted.pid} is protected already, as {known.name}; failover release lets it go")
-        name = await self._fresh_name(wanted.name, "", say.caller.uid)
+        name = await self._fresh_name(wanted.name, "", caller.uid)
         carried, devices = self._carried(name, wanted.carry), self._device_rules(name, wanted.devices)
         connections = self._connections(name, wanted.connections)
         shared = self._shared(name, wanted.shared, wanted.carry)
-        launch = Launch(pid=wanted.pid, carry=carried, devices=devices, connections=connections, shared=shared)
-        charge = await self._begin(name, launch, owner)
+        launch = Launch(
+            pid=wanted.pid,
+            inheritance=msgspec.msgpack.encode(guest.rights),
+            carry=carried,
+            devices=devices,
+            connections=connections,
+            shared=shared,
+        )
+        charge = await self._begin(name, launch, guest.rights.uid, guest)
         return {"name": name, "pid": wanted.pid, "notes": list(charge.figures.notes)}
 
     async def release(self, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -357,8 +374,11 @@ class Verbs(Questions):
         own = travelling(self._lanes.settings.component(name).device_rules())
         return tuple({**wanted, **dict(own)}.items())
 
-    async def _begin(self, name: str, launch: Launch, owner: int) -> Charge:
+    async def _begin(self, name: str, launch: Launch, owner: int, guest: Guest | None = None) -> Charge:
         """Have a component started or taken in, and wait until it is.
+
+        Args:
+            guest: the process that is to be taken in; stays the caller's.
 
         Raises:
             RefusedError: the core says no, or it could not be started; with the reasons.
@@ -366,6 +386,7 @@ class Verbs(Questions):
         config = self._lanes.settings.config
         rules = rules_for(config, self._lanes.settings.component(name))
         charge = self._lanes.charge(name)
+        charge.guest = guest
         charge.started.clear()
         charge.ended = None
         end = charge.end()
@@ -379,6 +400,7 @@ class Verbs(Questions):
             await asyncio.wait(both, timeout=START_PATIENCE_S, return_when=asyncio.FIRST_COMPLETED)
         finally:
             begun.cancel()
+            charge.guest = None
         if end.done() and end.result().failed:
             raise RefusedError(f"cannot start {name}: {end.result().reason}", "RefusedError", charge.figures.reasons)
         if not charge.started.is_set():
@@ -399,17 +421,20 @@ class Verbs(Questions):
         """A name for something new: as given, under this robot's own path, or made from the command.
 
         Raises:
-            RefusedError: it is no name, or one that somebody else has used and not released.
+            RefusedError: it is no name, or one that somebody else has used and not released; or this user has too many.
         """
         own = f"/{self._lanes.settings.team.team}/{self._lanes.settings.config.robot}/"
-        names = await self._names()
+        told = await self._lanes.ask("status")
+        known = {one.name: one for one in told.status.components} if told.status else {}
         if not wanted:
             stem = own + (os.path.basename(command) or "program")
-            numbered = (f"{stem}-{number}" for number in range(2, len(names) + 3))
-            wanted = stem if stem not in names else next(name for name in numbered if name not in names)
+            numbered = (stem, *(f"{stem}-{number}" for number in range(2, len(known) + 3)))
+            free = (State.RELEASED, uid)  # by the same user: what it wrote is another user's to read
+            wanted = next(name for name in numbered if name not in known or (known[name].state, known[name].owner) == free)
         name = wanted if wanted.startswith("/") else own + wanted
-        if names.get(name, State.RELEASED) not in (State.RELEASED, State.ABSENT):
-            await self._check_right(uid, name)
+        check_components(uid, name, known.values(), self._lanes.settings.config.components_per_user)
+        if name in known and known[name].state not in (State.RELEASED, State.ABSENT):
+            check_right(uid, name, known[name].owner)
         try:
             return check_component(name)
         except NameFormatError as error:

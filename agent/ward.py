@@ -124,15 +124,19 @@ class Ward(Struct):
         return ward
 
     @classmethod
-    def watch(cls, order: Watch) -> Ward:
+    def watch(cls, order: Watch, pidfd: int) -> Ward:
         """Look after somebody else's child.
 
+        Args:
+            pidfd: of it; stays the caller's.
+
         Raises:
-            ProcessLookupError: there is no such process.
+            ProcessLookupError: it has ended; another process may have its number by now.
         """
-        pidfd = os.pidfd_open(order.pid)
+        signal.pidfd_send_signal(pidfd, 0)
+        pidfd = os.dup(pidfd)
         hold = freezing.SignalFreezer()
-        hold.add(order.pid)
+        hold.add(order.pid, pidfd)
         notes = [WATCHED, "it is frozen by SIGSTOP, which it can notice: it keeps the cgroup that it was started in"]
         return cls(order.component, Born(order.pid, _inner_pid(order.pid)), hold, pidfd=pidfd, notes=notes)
 

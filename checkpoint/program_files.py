@@ -20,9 +20,10 @@ from typing import Final
 
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import procfs
-from checkpoint.linux.eyes import Eyes, seeing_as
+from checkpoint.linux.eyes import eyes_for, seeing_as
 from checkpoint.model import Fact, Resource
 from checkpoint.resources.files import digest_at
+from checkpoint.rights import Owner
 
 KIND: Final = "program"
 
@@ -36,14 +37,15 @@ INTERPRETERS: Final = ("python", "pypy", "node", "ruby", "perl", "lua", "sh", "b
 CACHE: Final = "__pycache__"
 
 
-def describe(pid: int, component: str, arguments: Sequence[str], directory: str) -> Resource | None:
+def describe(pid: int, component: str, arguments: Sequence[str], directory: str, owner: Owner | None = None) -> Resource | None:
     """The files of a running program, None where there are none, or too many.
 
     Args:
         arguments, directory: as it was started.
+        owner: whose it is: it chooses its arguments, and shall not have us read for it what that user may not read.
     """
     try:
-        with seeing_as(_eyes_of(pid)):
+        with seeing_as(eyes_for(pid, owner)):
             entry, listed = _listed(pid, arguments, directory)
             paths = list(dict.fromkeys((entry, *listed)))
             if not entry or len(paths) > FILES_MAX:
@@ -55,16 +57,14 @@ def describe(pid: int, component: str, arguments: Sequence[str], directory: str)
     return Resource(KIND, component, {"files": files}) if is_told else None
 
 
-def open_file(pid: int, path: str) -> int:
-    """A descriptor of one of them, as the program sees paths. Raises OSError, ProbeError, ProcessGoneError."""
-    with seeing_as(_eyes_of(pid)):
+def open_file(pid: int, path: str, owner: Owner | None = None) -> int:
+    """A descriptor of one of them, as the program sees paths. Raises OSError, ProbeError, ProcessGoneError.
+
+    Args:
+        owner: as for `describe`.
+    """
+    with seeing_as(eyes_for(pid, owner)):
         return os.open(_seen(pid, path), os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
-
-
-def _eyes_of(pid: int) -> Eyes:
-    """The rights of the program's own user: it chooses its arguments, and shall not have us read for it what it may not read."""
-    status = procfs.status(pid)
-    return Eyes(status.uids[3], status.gids[3], status.groups)
 
 
 def is_of_the_system(path: str) -> bool:

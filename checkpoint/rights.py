@@ -95,25 +95,38 @@ def excess(state: Snapshot | State, owner: Owner) -> tuple[str, ...]:
     return tuple(found)
 
 
+def refusal(asked: Iterable[str], owner: Owner) -> str:
+    """Why a program is not its owner's to have captured, or to come back, of what `beyond` tells; "" if it tells nothing."""
+    if not (told := ", ".join(dict.fromkeys(asked))):
+        return ""
+    reason = f"it runs with other rights than those of its owner, uid {owner.uid}: it has {told}"
+    return f"{reason}: only a program of root may; start it as root"
+
+
 def beyond(state: Snapshot | State, owner: Owner) -> Iterator[str]:
     """What only root can give: users, groups, capabilities, securebits, filters and root directories. As `excess`."""
     for theirs in everybodys(state):
-        if others := sorted(set(theirs.uids) - {owner.uid}):
-            yield f"uid {', '.join(map(str, others))}"
-        gids = {*theirs.gids, *theirs.groups} if owner.groups is not None else set(theirs.gids)
-        if others := sorted(gid for gid in gids if not owner.may_have((gid,))):
-            yield f"gid {', '.join(map(str, others))}"
-        if owner.groups is None and len(gids) > 1:
-            yield f"several groups ({', '.join(map(str, sorted(gids)))})"
-        _, permitted, effective, _, ambient = theirs.capabilities
-        if permitted | effective | ambient:
-            yield f"capabilities {permitted | effective | ambient:#x}"
-        if theirs.securebits & ~SECBIT_KEEP_CAPS:
-            yield f"securebits {theirs.securebits:#x}"
+        yield from above(theirs, owner)
     if could_gain(state):
         yield "a seccomp filter, and may gain rights by what it executes (no_new_privs is off)"
     for directory in sorted({one.process.root_directory for one in (state, *state.members)} - {"/"}):
         yield f"a root directory of its own ({directory}), by whose files it may gain rights"
+
+
+def above(theirs: Credentials, owner: Owner) -> Iterator[str]:
+    """As `beyond`, of the rights of one thread."""
+    if others := sorted(set(theirs.uids) - {owner.uid}):
+        yield f"uid {', '.join(map(str, others))}"
+    gids = {*theirs.gids, *theirs.groups} if owner.groups is not None else set(theirs.gids)
+    if others := sorted(gid for gid in gids if not owner.may_have((gid,))):
+        yield f"gid {', '.join(map(str, others))}"
+    if owner.groups is None and len(gids) > 1:
+        yield f"several groups ({', '.join(map(str, sorted(gids)))})"
+    _, permitted, effective, _, ambient = theirs.capabilities
+    if permitted | effective | ambient:
+        yield f"capabilities {permitted | effective | ambient:#x}"
+    if theirs.securebits & ~SECBIT_KEEP_CAPS:
+        yield f"securebits {theirs.securebits:#x}"
 
 
 def _of_process(process: ProcessState) -> Iterator[str]:

@@ -49,6 +49,7 @@ from checkpoint.resources import (
     sharing,
     stops,
     streams,
+    thread_rights,
     unsupported,
 )
 from checkpoint.resources import look as sorted_into_kinds
@@ -266,6 +267,7 @@ class CapturedTree:
         """Why one cannot be entered."""
         status = procfs.status(pid)
         found = [
+            *thread_rights.refuse(pid, self._first.order.terms.owner),
             *refused_threads.refuse_shared_memory(pid, status),
             *unsupported.refuse_entering(pid, status, files_kept=self._first.files_kept),
         ]

@@ -34,7 +34,7 @@ from checkpoint.linux.memory import Memory
 from checkpoint.linux.spokesman import spokesman_of, told_by_spokesman
 from checkpoint.model import Position, Snapshot
 from checkpoint.needs import program_of
-from checkpoint.resources import carried_trees
+from checkpoint.resources import carried_trees, thread_rights
 from checkpoint.resources.carried_trees import CarriedTrees
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class GuardedTask:
         self.component = order.component
         self._outputs = Outputs(order.streams) if order.streams else None
         self._session: CooperativeSession | None = None
-        self._carry = order.terms.carry
+        self._terms = order.terms
         self._trees: CarriedTrees | None = None
         self._look_at_s = 0.0
         self._epoch = 0
@@ -68,15 +68,23 @@ class GuardedTask:
         """See `checkpoint.engine.Session.capture`."""
         if procfs.status(self.pid).has_ended:
             raise ProcessGoneError(f"the process of {self.component} that keeps its state (pid {self.pid}) has ended")
+        self._require_rights()
         session = self._following()
         if order.epoch > self._epoch:
             self._tell_epoch(order.epoch)
         if order.base or time.monotonic() >= self._look_at_s:
             self._look_at_s = time.monotonic() + LOOK_S
             arguments, directory = session.process.arguments, session.process.working_directory
-            program = program_files.describe(spokesman_of(self.pid), self.component, arguments, directory)
+            program = program_files.describe(spokesman_of(self.pid), self.component, arguments, directory, self._terms.owner)
             session.program = (program,) if program is not None else ()
-        return session.capture(order)
+        captured = session.capture(order)
+        self._require_rights()  # it runs meanwhile
+        return captured
+
+    def _require_rights(self) -> None:
+        """Raises UnsupportedError: it has rights that are not its owner's."""
+        if reasons := told_by_spokesman(self.pid, lambda tid: thread_rights.refuse(tid, self._terms.owner)):
+            raise UnsupportedError(f"cannot capture {self.component} (pid {self.pid}): {reasons[0]}", reasons)
 
     def _tell_epoch(self, epoch: int) -> None:
         """As the other engine does: the program finds in its environment what `Begin` could not tell yet."""
@@ -121,7 +129,7 @@ class GuardedTask:
     def open_file(self, path: str, digest: bytes) -> int:
         """See `checkpoint.engine.Session.open_file`."""
         try:
-            return program_files.open_file(spokesman_of(self.pid), path)
+            return program_files.open_file(spokesman_of(self.pid), path, self._terms.owner)
         except OSError as error:
             raise CaptureError(f"cannot open {path} of {self.component}: {error.strerror}") from error
 
@@ -154,8 +162,8 @@ class GuardedTask:
         Raises:
             UnsupportedError: they cannot be carried.
         """
-        if self._trees is None and self._carry.paths:
-            trees = told_by_spokesman(self.pid, lambda tid: carried_trees.followed(tid, self._carry))
+        if self._trees is None and self._terms.carry.paths:
+            trees = told_by_spokesman(self.pid, lambda tid: carried_trees.followed(tid, self._terms))
             assert trees is not None, "it has paths"
             if reasons := trees.refuse():
                 trees.close()

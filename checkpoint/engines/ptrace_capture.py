@@ -26,7 +26,7 @@ from typing import Final
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from checkpoint import epoch_variable, pages, portable, room, side_by_side, tree
+from checkpoint import epoch_variable, pages, portable, rights, room, side_by_side, tree
 from checkpoint.chain import position_of
 from checkpoint.engine import PTRACE, CaptureOrder, ProtectOrder
 from checkpoint.engines import description
@@ -58,6 +58,7 @@ from checkpoint.resources import (
     look,
     refused_threads,
     system_v_memory,
+    thread_rights,
 )
 from checkpoint.resources.carried_connections import Departing
 from checkpoint.resources.carried_trees import NO_PARCEL, CarriedTrees, Parcel, Seen
@@ -128,6 +129,7 @@ class PtraceSession:
         self._precedence = Precedence()
         self._reports = Reports()
         self._budget = FreezeBudget(order.terms.freeze_budget_ns)
+        self._owner = order.terms.owner
         self._epoch = 0
         self._closed = False
 
@@ -139,9 +141,11 @@ class PtraceSession:
         outputs = Outputs(order.streams) if order.streams else None
         trees = None
         try:
+            if reasons := told_by_spokesman(pid, lambda tid: thread_rights.refuse(tid, order.terms.owner)):
+                raise UnsupportedError(f"cannot protect pid {pid}: {reasons[0]}", reasons)
             surroundings = probing.surroundings_of(pid, order.streams, order.terms)
             report = probing.probe(pid, surroundings, files_kept=order.names is not None)
-            trees = told_by_spokesman(pid, lambda tid: carried_trees.followed(tid, order.terms.carry))
+            trees = told_by_spokesman(pid, lambda tid: carried_trees.followed(tid, order.terms))
             reasons = (*report.reasons, *(trees.refuse() if trees else ()))
             if reasons:
                 raise UnsupportedError(f"cannot protect pid {pid} ({report.command}): {'; '.join(reasons)}", reasons)
@@ -313,7 +317,8 @@ class PtraceSession:
         """What was refused once is looked at without stopping it: a program that has an epoll for a week is left in peace."""
         with contextlib.suppress(ProcessGoneError, ProbeError):
             reasons = probing.reasons_of(self.pid, self._surroundings, files_kept=self._first.files_kept)
-            self._refuse((*reasons, *(self._carried.refuse() if self._carried else ())))
+            of_rights = told_by_spokesman(self.pid, lambda tid: thread_rights.refuse(tid, self._owner))
+            self._refuse((*of_rights, *reasons, *(self._carried.refuse() if self._carried else ())))
 
     def _refuse(self, reasons: tuple[str, ...]) -> None:
         self._refused = bool(reasons)
@@ -478,6 +483,8 @@ class PtraceSession:
             output=self._outputs.pieces(self._output_since(parent), totals) if self._outputs else (),
         )
         outline = frozen.departing.added_to(outline)
+        if self._owner is not None and (beyond := rights.refusal(rights.beyond(outline, self._owner), self._owner)):
+            self._refuse((beyond,))
         if first.taken.unread is not None:
             self.totals = totals
             return self._unread(outline, first.taken.unread)

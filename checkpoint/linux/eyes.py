@@ -15,6 +15,9 @@ from typing import Final
 
 from msgspec import Struct
 
+from checkpoint.linux import procfs
+from checkpoint.rights import Owner
+
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 ROOT: Final = 0
 
@@ -27,9 +30,29 @@ class Eyes(Struct, frozen=True):
     groups: tuple[int, ...] = ()
 
 
+def eyes_for(pid: int, owner: Owner | None) -> Eyes:
+    """With whose rights files are opened for a process: its owner's. It chooses their names, and may have other rights by now.
+
+    Args:
+        owner: None: not known; those that the process has now.
+
+    Raises:
+        ProcessGoneError: it has ended.
+    """
+    if owner is not None and owner.groups is not None:
+        return Eyes(owner.uid, owner.gid, owner.groups)
+    status = procfs.status(pid)
+    return Eyes(status.uids[3] if owner is None else owner.uid, status.gids[3], status.groups)
+
+
 def own_uid() -> int:
     """Whose rights to files count just now: what is made belongs to him. Source: setfsuid(2), which always answers."""
     return int(_LIBC.setfsuid(-1)) & 0xFFFFFFFF
+
+
+def own_eyes() -> Eyes | None:
+    """Our own rights; None: root's."""
+    return Eyes(os.geteuid(), os.getegid(), tuple(os.getgroups())) if os.geteuid() != ROOT else None
 
 
 @contextmanager

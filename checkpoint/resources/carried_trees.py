@@ -29,10 +29,10 @@ from msgspec.structs import replace
 from checkpoint import carried, gathering, pages
 from checkpoint.capability import Area, by_rule, refused
 from checkpoint.carried import Entry, Tree
-from checkpoint.engine import CARRIED_SIZE_MAX, Carry, is_carriable
+from checkpoint.engine import CARRIED_SIZE_MAX, Terms, is_carriable
 from checkpoint.errors import CaptureError
 from checkpoint.linux import abi, digests, procfs
-from checkpoint.linux.eyes import Eyes, seeing_as
+from checkpoint.linux.eyes import Eyes, eyes_for, own_eyes, seeing_as
 from checkpoint.linux.mounts import network_mount
 from checkpoint.linux.tracking import NONE
 from checkpoint.model import PageRun, Position, Resource, Vma
@@ -79,6 +79,7 @@ CAPABILITIES: Final = (
         "no file of that size is carried",
         "which is no absolute path of a file or folder",
         "which is a link, or behind one",
+        "can give no file to at another robot",
         "lies on a network mount",
         "is to be carried and cannot be read",
     ),
@@ -148,13 +149,16 @@ class CarriedTrees(Struct):
 
     Attributes:
         paths: absolute, as the process names them.
+        eyes: with whose rights they are read; None: our own.
         size_max: bytes that they may hold together.
+        giver: with whose rights they are laid down at another robot, where only that user's own can be; None: root's.
     """
 
     pid: int
     paths: tuple[str, ...]
     eyes: Eyes | None = None
     size_max: int = CARRIED_SIZE_MAX
+    giver: Eyes | None = None
     _root: int = -1
     _known: dict[Key, Content] = field(default_factory=dict)
     _place_of: dict[tuple[int, bytes], int] = field(default_factory=dict)
@@ -374,6 +378,12 @@ class CarriedTrees(Struct):
             return f"{self._called(name)} is to be carried and is neither a file nor a folder: name another path"
         if name.about.st_dev != device:
             return f"another file system is mounted at or above {self._called(name)}: name its own path as one to be carried"
+        giver = self.giver
+        if giver is not None and not (name.about.st_uid == giver.uid and name.about.st_gid in (giver.gid, *giver.groups)):
+            return (
+                f"{self._called(name)} belongs to uid {name.about.st_uid}, gid {name.about.st_gid}, which uid {giver.uid} can "
+                "give no file to at another robot: give that user the file (chown), or carry paths without it"
+            )
         if name.about.st_size >= carried.STRETCH and name.kind == stat.S_IFREG:
             return f"{self._called(name)} looks larger than {carried.STRETCH >> 30} GiB: no file of that size is carried"
         return ""
@@ -436,16 +446,18 @@ class CarriedTrees(Struct):
         self._at = {position: self._at[position] for position in positions if position in self._at}
 
 
-def followed(pid: int, carry: Carry) -> CarriedTrees | None:
+def followed(pid: int, terms: Terms) -> CarriedTrees | None:
     """What follows the carried files of a process; None where it has none.
 
     Raises:
         ProcessGoneError, CaptureError: it has ended.
     """
+    carry = terms.carry
     if not carry.paths:
         return None
-    status = procfs.status(pid)
-    return CarriedTrees(pid, carry.paths, Eyes(status.uids[3], status.gids[3], status.groups), carry.size_max)
+    eyes = eyes_for(pid, terms.owner)
+    giver = eyes if terms.owner is not None else own_eyes()
+    return CarriedTrees(pid, carry.paths, eyes, carry.size_max, giver)
 
 
 def mapped_shared(pid: int) -> frozenset[int]:

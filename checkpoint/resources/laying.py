@@ -30,7 +30,7 @@ from msgspec import Struct, field
 from checkpoint import carried
 from checkpoint.carried import Entry, Tree
 from checkpoint.errors import MismatchError, RestoreError
-from checkpoint.linux.eyes import Eyes, own_uid, seeing_as
+from checkpoint.linux.eyes import ROOT, Eyes, own_uid, seeing_as
 from checkpoint.linux.mounts import is_mount_point
 from checkpoint.model import Snapshot
 from checkpoint.resources import writers
@@ -388,10 +388,16 @@ class _Laying(Struct):
                 _write(path, entry, self.pieces.get(entry.place, []))
 
     def _give_attributes(self, top: str) -> list[str]:
-        """Owners, modes, times, of what lies in a folder before its own; a note for owners that could not be given."""
+        """Owners, modes, times, of what lies in a folder before its own; a note for owners that could not be given.
+
+        Raises:
+            PermissionError: where root restores for a user: that user would be given another one's file.
+        """
         strangers = [self._called(entry) for entry in reversed(self.tree.entries) if not give(top, entry, entry.name)]
         if not strangers:
             return []
+        if os.geteuid() == ROOT:
+            raise PermissionError(errno.EPERM, f"it would belong to uid {own_uid()}, not to its owner", strangers[0])
         more = f" and {len(strangers) - 1} more" if len(strangers) > 1 else ""
         return [f"{strangers[0]}{more} belongs to whom the program runs as, not to its former owner: only root gives files away"]
 

@@ -22,7 +22,7 @@ from checkpoint.linux import procfs
 from checkpoint.linux.procfs import Status
 from checkpoint.linux.tasks import thread_count, thread_ids
 from checkpoint.model import Credentials, Fact, Resource
-from checkpoint.rights import KIND
+from checkpoint.rights import KIND, Owner, above, refusal
 
 CAPABILITIES: Final = (
     preserved(
@@ -87,6 +87,23 @@ class ThreadRights:
         return (
             Resource(KIND, "rights of threads", {"descriptors": [], "threads": [_told(*one) for one in before.odd.values()]}),
         )
+
+
+def refuse(pid: int, owner: Owner | None) -> tuple[str, ...]:
+    """Why a process is not its owner's to have captured: one of its threads may something that its owner may not.
+
+    It has executed a set-user-id program, for one, since somebody looked whose it is. What counts is a look while it stands still
+    (`checkpoint.rights.beyond`, of the snapshot); this one is taken before, so that such a process is not touched.
+
+    Args:
+        owner: None: it may anything.
+    """
+    if owner is None:
+        return ()
+    seen = _seen(pid)
+    everybodys = (_credentials(procfs.status(pid)), *(theirs for _, theirs in seen.odd.values()))
+    reason = refusal((text for theirs in everybodys for text in above(theirs, owner)), owner)
+    return (reason,) if reason else ()
 
 
 def _seen(pid: int) -> Seen:

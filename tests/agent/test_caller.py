@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from agent import caller
 from agent.bounds import check_rights
-from agent.caller import NOBODY, caller_of, check_right, inheritance_for, may, owner_of
+from agent.caller import NOBODY, caller_of, check_right, guest_of, inheritance_for, may
 from agent.errors import RefusedError
 from checkpoint.errors import FormatError, MismatchError
 from checkpoint.linux.inheritance import Inheritance
@@ -148,7 +148,7 @@ def test_an_agent_without_roots_rights_runs_nobody_elses_programs(monkeypatch: p
 def test_somebody_elses_process_is_not_ones_own() -> None:
     stranger = caller.Caller(OTHER, OTHER, (), Inheritance(OTHER, OTHER))
     with pytest.raises(RefusedError, match=f"pid {os.getpid()} is not a process of uid 7002"):
-        owner_of(os.getpid(), stranger)
+        guest_of(os.getpid(), stranger)
 
 
 @as_root

@@ -451,7 +451,10 @@ def test_a_guard_comes_before_keepers_that_hold_programs_still(guard: GuardProce
 def test_the_end_of_somebody_elses_child_is_noticed_without_its_status(guard: GuardProcess) -> None:
     agent = guard.agent()
     child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
-    agent.ask(Watch("/test/one", child.pid))
+    assert isinstance(agent.ask(Watch("/test/one", child.pid)), Refused), "its number alone may be another process's"
+    pidfd = os.pidfd_open(child.pid)
+    agent.ask(Watch("/test/one", child.pid), (pidfd,))
+    os.close(pidfd)
     child.communicate()
     assert agent.event(Exited).status is None
 

@@ -400,11 +400,17 @@ def contents(top: Path) -> dict[str, tuple[object, ...]]:
     return {name: (*about[:3], about[4]) for name, about in portrait(top).items()}
 
 
-def of_two_paths(tmp_path: Path, one: Path, other: Path) -> Snapshot:
-    """A snapshot that carries two folders, which are of another content now."""
+def of_two_paths(tmp_path: Path, one: Path, other: Path, uid: int = -1) -> Snapshot:
+    """A snapshot that carries two folders, which are of another content now.
+
+    Args:
+        uid: whose they are; -1: our own.
+    """
     for folder in (one, other):
         folder.mkdir()
         (folder / "state").write_text("of the checkpoint")
+        for path in (folder, folder / "state"):
+            os.chown(path, uid, uid)
     with asleep(tmp_path) as program, carrying(program, one, other) as session:
         state = once_more(session, 1)
     for folder in (one, other):
@@ -420,11 +426,11 @@ def test_a_path_that_cannot_be_laid_down_leaves_the_others_as_they_were(tmp_path
     top = open_path / "top"
     top.mkdir()
     one, other = top / "a", top / "z"
-    state = of_two_paths(tmp_path, one, other)
+    state = of_two_paths(tmp_path, one, other, round_trip.NOBODY)
     for path in (top, one, *one.iterdir()):
         os.chown(path, round_trip.NOBODY, round_trip.NOBODY)
-    if built:
-        os.chown(other, round_trip.NOBODY, round_trip.NOBODY)
+    if not built:
+        os.chown(other, 0, 0)
     other.chmod(0o555)
     if not built:
         top.chmod(0o555)
