@@ -61,7 +61,11 @@ class Ballot:
         Raises:
             BallotError: the file is unreadable, altered, or another robot's; or the directory cannot be written.
         """
-        found = self._read()
+        self._take(self._read())
+        self._write(msgspec.structs.replace(self._record, boot=self._record.boot + 1))
+        return self._record
+
+    def _take(self, found: Record | None) -> None:
         if found is not None:
             if found.robot != self._record.robot:
                 raise BallotError(
@@ -69,7 +73,14 @@ class Ballot:
                     "state_directory of its own, or the robot its old name"
                 )
             self._record = found
-        self._write(msgspec.structs.replace(self._record, boot=self._record.boot + 1))
+
+    def read(self) -> Record:
+        """What an earlier life left, without beginning a new one; an empty record where there is none. `keep` changes it then.
+
+        Raises:
+            BallotError: the file is unreadable, altered, or another robot's.
+        """
+        self._take(self._read())
         return self._record
 
     def outlive(self, boot: int) -> None:

@@ -30,6 +30,8 @@ components outlive it, and the next agent finds them again. People talk to it by
   failover-agent check --config /etc/failover/agent.toml     read configuration, team file and key, and say what is wrong
   failover-agent keypair                                     a new pair as JSON; the secret half stays on this robot, in
                                                              /etc/failover/team/keys/ROBOT.secret, mode 600
+  failover-agent mend /lab/robot1/mapper --epoch 12          a record whose epoch leaves none above it (failover status says so)
+                                                             is set right; says what that costs, and asks
 """
 
 EPILOG: Final = """
@@ -42,11 +44,14 @@ log = logging.getLogger("failover.agent")
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the agent until SIGTERM, or print a key pair, or check a configuration."""
-    command, config = _wanted(sys.argv[1:] if arguments is None else arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    command, config = _wanted(arguments)
     try:
         if command == "keypair":
             return _print_keys()
         settings = configuration.load(config)
+        if command == "mend":
+            return _mend(settings, arguments)
         if command == "check":
             peers = ", ".join(settings.peers) or "none"
             print(f"{config}: robot {settings.config.robot} of team {settings.team.team}; peers: {peers}")
@@ -64,6 +69,15 @@ def _wanted(arguments: list[str]) -> tuple[str, Path]:
             return "run", Path(path)
     found = command_line().parse_args(arguments)
     return found.command, found.config
+
+
+def _mend(settings: configuration.Settings, arguments: list[str]) -> int:
+    from agent.mending import mend
+
+    wanted = command_line().parse_args(arguments)
+    if not wanted.component or wanted.epoch is None:
+        raise AgentError("mend needs a component and the epoch that its record is to have: failover-agent mend NAME --epoch N")
+    return mend(settings, wanted.component, wanted.epoch, agreed=wanted.yes)
 
 
 def _run(settings: configuration.Settings) -> int:
@@ -101,9 +115,13 @@ def command_line() -> argparse.ArgumentParser:
         "command",
         nargs="?",
         default="run",
-        choices=("run", "check", "keypair"),
-        help="run (the default); check reads the configuration and says what it found; keypair prints a new pair as JSON",
+        choices=("run", "check", "keypair", "mend"),
+        help="run (the default); check reads the configuration and says what it found; keypair prints a new pair as JSON; mend "
+        "lowers the epoch that is on record here for COMPONENT, while the agent is stopped",
     )
+    parser.add_argument("component", nargs="?", default="", metavar="COMPONENT", help="of mend: its whole name")
+    parser.add_argument("--epoch", type=int, metavar="N", help="of mend: the epoch that its record is to have")
+    parser.add_argument("--yes", action="store_true", help="of mend: do what it costs without asking")
     parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG, metavar="FILE", help=f"default {DEFAULT_CONFIG}")
     return parser
 

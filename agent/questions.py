@@ -190,6 +190,9 @@ def _join(mine: dict[str, Any], theirs: dict[str, dict[str, Any]]) -> None:
                 mine["components"].append(known[one["name"]])
             known[one["name"]]["elsewhere"][robot] = one
     mine["components"].sort(key=lambda one: str(one["name"]))
+    mine["doubted_elsewhere"] = {
+        robot: [peer["name"] for peer in picture.get("peers", ()) if peer.get("doubted")] for robot, picture in theirs.items()
+    }
     mine["peers_elsewhere"] = {
         robot: {peer["name"]: peer["state"] for peer in picture.get("peers", ())} for robot, picture in theirs.items()
     }

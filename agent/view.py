@@ -102,7 +102,7 @@ def team_view(
 
 
 def _peer(peer: PeerView, link: Link | None, told: Told, settings: Settings) -> dict[str, Any]:
-    reason = list(dict.fromkeys(filter(None, (link.reason if link is not None else "", peer.unread))))
+    reason = list(dict.fromkeys(filter(None, (link.reason if link is not None else "", peer.unread, *peer.refused))))
     return {
         "name": peer.robot,
         "role": settings.team.robots[peer.robot].role,
@@ -113,6 +113,7 @@ def _peer(peer: PeerView, link: Link | None, told: Told, settings: Settings) -> 
         "links": list(peer.links),
         "lane": str(link.state if link is not None else LinkState.DOWN),
         "beats_lost": told.beats.lost.get(peer.robot, 0),
+        "doubted": peer.doubted,
         "notes": reason,
     }
 

@@ -63,9 +63,11 @@ beats: {sent, heard, unsent, refused, late_us_max, gap_us_max, gaps}: of this li
 links: [{name, medium, because, carrier, addresses, snapshots, bytes_in, bytes_out}]: interfaces with an address of this robot
     medium: wired | wireless | loopback; because: the fact that tells; carrier: its cable is in; snapshots: they may travel there
     bytes_in, bytes_out: all that the kernel counted on it
-peers: [{name, role, state, last_heard_ms, hears_us, load, beats_lost, links, lane, notes}]
+peers: [{name, role, state, last_heard_ms, hears_us, load, beats_lost, links, lane, doubted, notes}]
     role: robot | server | witness; state: unknown | live | suspect | dead; links: ours, over which it was heard lately
     lane: connected | connecting | refused | down
+    doubted: it said lately what it may not say (its notes tell what): its key may be stolen
+doubted_elsewhere: {robot: [peer, …]}: with ``team``, of whom each of the others heard lately what it may not say
 peers_elsewhere: {robot: {peer: state}}: with ``team``, the same as the others see it
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,

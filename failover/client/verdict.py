@@ -63,7 +63,7 @@ def is_healthy(status: Mapping[str, Any]) -> bool:
     """Whether all that should be protected is, as far as any robot that answered knows.
 
     No component is degraded, failed, unprotected, without a standby that can run it, or where no answer came from; no robot
-    counts a peer as dead.
+    counts a peer as dead, or has heard one say lately what it may not say.
     """
     living = [one for one in map(sight, status["components"]) if one.get("state") not in OVER_STATES]
     unwell = any(
@@ -72,5 +72,6 @@ def is_healthy(status: Mapping[str, Any]) -> bool:
     unwell |= any(
         seen.get("cold") or seen.get("unstored") or is_lacking(seen) for one in status["components"] for seen in sights(one)
     )
+    unwell |= any(peer.get("doubted") for peer in status["peers"]) or any((status.get("doubted_elsewhere") or {}).values())
     peers = {peer["name"]: peer["state"] for peer in status["peers"]}
     return not unwell and all("dead" not in seen.values() for seen in (peers, *(status.get("peers_elsewhere") or {}).values()))

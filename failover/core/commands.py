@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from failover.core import acts, handover, majority, promotion
 from failover.core.component import Cause, Component, Turn
-from failover.core.election import claim, drop, vacant
+from failover.core.election import claim, drop, exhaustion, vacant
 from failover.core.events import Command, Failback, Handover, Prefer, Promote, Release, Run, Stop
 from failover.core.types import ENDED, State
 
@@ -52,6 +52,8 @@ def _why_not_run(component: Component, turn: Turn) -> str:
     name = component.name
     if not turn.config.runs(turn.me):
         return f"cannot run {name}: {turn.me} runs nothing; ask at a robot"
+    if spent := exhaustion(component, turn.me):
+        return f"cannot run {name}: {spent}"
     heard, voters = 1 + len(turn.team.living(turn.now_ns)), len(turn.config.peers) + 1
     if turn.config.by_majority and (heard < turn.config.quorum or not majority.is_free(component, turn)):
         if heard >= turn.config.quorum and not turn.team.rested(turn.now_ns):
@@ -72,6 +74,11 @@ def _why_not_run(component: Component, turn: Turn) -> str:
 
 
 def _release(component: Component, turn: Turn, command: Release) -> None:
+    if not turn.config.runs(turn.me):
+        turn.order(
+            acts.Answer(command.request, False, f"cannot release {component.name}: {turn.me} runs nothing; ask at a robot")
+        )
+        return
     if component.state in _RUNNING:
         turn.order(acts.LetGo(component.name, component.epoch))
     elif component.holding or component.state is State.STOPPING or not (component.state in ENDED or vacant(component, turn)):

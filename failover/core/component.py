@@ -12,6 +12,7 @@ from failover.core.acts import Act
 from failover.core.membership import Membership
 from failover.core.story import Decision, Facts, Sighting
 from failover.core.types import (
+    EPOCH_MAX,
     HISTORY_MAX,
     HOLDING,
     Ballot,
@@ -28,6 +29,10 @@ from failover.core.types import (
 
 LOST_MAX = 8
 """Generations that lost and are remembered; the agent moves their snapshots out of the chain long before."""
+
+
+EPOCHS_LEFT_MIN = 3
+"""An operator's claim leaves one epoch out, and its answer goes above it."""
 
 
 class Cause(enum.StrEnum):
@@ -148,8 +153,10 @@ class Component(Struct):
         ordered: the claim was, by an operator.
         former: what was known of its namesake before an operator had it started.
         wanted: an operator promoted this robot, and a checkpoint is on its way here.
+        remembered_epoch: the one that this life began with.
         seen: highest epoch that anybody told of; a claim goes above it. contested_ns: when this copy, which stands still, last
-            met another that does.
+            met another that does, or went above an epoch that only servers and witnesses know.
+        behind_ns: since when this robot would claim it, and a server says that it keeps a newer checkpoint; 0: it does not wait.
         trail: the last acknowledged positions and their parents, for servers (``archive.py``); ``archives``: on their way there.
         promise: what the journal has been told of it, where it differs from the team's.
         undelivered: why the last snapshot did not become a checkpoint; ``unstored``: on a standby, why it was not stored.
@@ -232,8 +239,10 @@ class Component(Struct):
     former: ComponentSpec | None = None
     wanted: Wanted | None = None
     elects: bool = False
+    remembered_epoch: int = 0
     seen: int = 0
     contested_ns: int = 0
+    behind_ns: int = 0
     trail: deque[tuple[Position, Position | None]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
     archives: dict[str, Flight] = field(default_factory=dict)
     archived_ns: int = 0
@@ -272,6 +281,11 @@ class Component(Struct):
         if self.holding and not self.elects:
             return self.standby if self.standby in self.entrusted else ""
         return self.entrusted[0] if self.entrusted else ""
+
+    @property
+    def is_exhausted(self) -> bool:
+        """Whether there is no later epoch that a beat could carry: nobody claims it before its record is mended."""
+        return max(self.epoch, self.seen) + EPOCHS_LEFT_MIN >= EPOCH_MAX
 
     @property
     def newest(self) -> Position | None:
@@ -330,6 +344,7 @@ class Component(Struct):
             record.claimed,
             record.begun,
             record.bare,
+            remembered_epoch=record.epoch,
         )
 
 

@@ -38,7 +38,7 @@ def consider(component: Component, turn: Turn) -> None:
     """Claim the component if it is vacant, a majority would agree, and this robot is the one to run it."""
     if component.state not in (State.ABSENT, State.STANDBY) or turn.now_ns < component.retry_ns:
         return
-    if not turn.config.runs(turn.me) or not vacant(component, turn):
+    if component.is_exhausted or not turn.config.runs(turn.me) or not vacant(component, turn):
         return
     mine = component.newest
     if _chosen(component, turn, mine) and majority.may_claim(component, turn, mine):
@@ -47,13 +47,37 @@ def consider(component: Component, turn: Turn) -> None:
 
 def _chosen(component: Component, turn: Turn, mine: Position | None) -> bool:
     entries = [one for one in living_entries(component, turn) if state_of(one[1]) not in HOLDING]
-    best = max((position for _, entry in entries if (position := entry.position)), default=None)
     if mine is None:
         first = all(_starts_before(component, turn.me, robot) for robot in majority.starters(component, turn))
-        return best is None and first and may_start_afresh(component, turn)
-    if best is not None and mine < best:
+        is_nowhere = _newest_of(entries) is None and not _is_untold(component, turn)
+        return is_nowhere and first and may_start_afresh(component, turn)
+    best = _newest_of([one for one in entries if turn.config.runs(one[0])])
+    if (best is not None and mine < best) or _waits_for_a_server(component, turn, mine, _newest_of(entries)):
         return False
     return component.primary == turn.me if component.waits else first_of_equals(component, turn, entries, mine)
+
+
+def _newest_of(entries: list[tuple[str, Entry]]) -> Position | None:
+    return max((position for _, entry in entries if (position := entry.position)), default=None)
+
+
+def _is_untold(component: Component, turn: Turn) -> bool:
+    """Whether a server that lives has not said yet what it keeps of the component."""
+    return any(
+        peer.entry(component.name) is None and not peer.complete
+        for peer in turn.team.living(turn.now_ns)
+        if peer.robot in turn.config.servers
+    )
+
+
+def _waits_for_a_server(component: Component, turn: Turn, mine: Position, best: Position | None) -> bool:
+    """Whether a server may give us something newer: a standby has all that it can have, and nobody waits for it for ever."""
+    is_behind = (best is not None and mine < best) or _is_untold(component, turn)
+    if not is_behind or turn.me in component.entrusted:
+        component.behind_ns = 0
+        return False
+    component.behind_ns = component.behind_ns or turn.now_ns
+    return turn.now_ns < component.behind_ns + turn.config.ship_ms * MS
 
 
 def _starts_before(component: Component, one: str, other: str) -> bool:
@@ -110,9 +134,9 @@ def heard(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
     elif theirs in HOLDING:
         _heard_holder(component, turn, sender, entry)
     elif theirs in ENDED and entry.epoch >= component.epoch:
-        heard_end(component, turn, sender, entry, theirs)
+        _heard_end(component, turn, sender, entry, theirs)
     elif entry.epoch > component.epoch:
-        _heard_later_epoch(component, turn, entry)
+        _heard_later_epoch(component, turn, sender, entry)
 
 
 def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
@@ -167,17 +191,43 @@ def _contend(component: Component, turn: Turn, sender: str, entry: Entry, theirs
             renew(component, turn, entry.epoch)
 
 
-def _heard_later_epoch(component: Component, turn: Turn, entry: Entry) -> None:
+def _heard_end(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
+    """A copy that acts, or stands still, gives up to an end as it would to the copy that ended: never to a word alone."""
+    if not component.holding or component.state is State.CLAIMING:
+        heard_end(component, turn, sender, entry, theirs)
+    elif entry.epoch > component.epoch and majority.leased(component, turn):
+        if component.state in _SETTLED and turn.config.runs(sender):
+            renew(component, turn, entry.epoch)
+    elif _is_decided(component, turn, entry) or (sender == entry.primary and _prevails(component, turn, sender, entry)):
+        lose(component, turn, entry.primary, entry)
+
+
+def _is_decided(component: Component, turn: Turn, entry: Entry) -> bool:
+    elsewhere = entry.primary not in ("", turn.me)
+    return elsewhere and entry.epoch > component.epoch and majority.elected(component, turn, entry.primary, entry.epoch)
+
+
+def _heard_later_epoch(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
     """Somebody who does not hold it knows a later epoch than ours."""
-    decided = entry.primary not in ("", turn.me) and majority.elected(component, turn, entry.primary, entry.epoch)
+    decided = _is_decided(component, turn, entry)
     if component.state is State.CLAIMING:
-        withdraw(component, turn, f"epoch {entry.epoch} is known already")
+        if turn.config.runs(sender):
+            withdraw(component, turn, f"epoch {entry.epoch} is known already")
     elif component.state in _SETTLED and (majority.leased(component, turn) or not decided):
-        renew(component, turn, entry.epoch)
+        if turn.config.runs(sender) or _needs_the_vote(component, turn):
+            renew(component, turn, entry.epoch)
     elif component.holding and decided and not majority.leased(component, turn):
         lose(component, turn, entry.primary, entry)
     elif not component.holding and (decided or (not component.primary and turn.team.rested(turn.now_ns))):
         _adopt(component, turn, entry)
+
+
+def _needs_the_vote(component: Component, turn: Turn) -> bool:
+    """A server or a witness that knows a later epoch can agree to a later one only: where it must, but not again and again."""
+    if majority.leased(component, turn) or turn.now_ns < component.contested_ns + turn.config.retry_ms * MS:
+        return False
+    component.contested_ns = turn.now_ns
+    return True
 
 
 def _adopt(component: Component, turn: Turn, entry: Entry) -> None:

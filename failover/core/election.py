@@ -21,7 +21,7 @@ from failover.core.consent import grants, state_of
 from failover.core.membership import Peer
 from failover.core.messages import BEGUN, HOLDS, ORDERED, SAFE, STOOD, UNPROTECTED, Entry
 from failover.core.names import Weight, weight
-from failover.core.types import ENDED, HOLDING, MS, PEERS_MAX, Resumption, State
+from failover.core.types import ENDED, EPOCH_MAX, HOLDING, MS, PEERS_MAX, Resumption, State
 
 ACTS_FULLY = 2
 _ACTS = {State.CLAIMING: 0, State.FROZEN: 1}
@@ -38,7 +38,7 @@ def consider(component: Component, turn: Turn) -> None:
     """Claim the component if it is vacant and this robot is the one to run it."""
     if component.state not in (State.ABSENT, State.STANDBY) or turn.now_ns < component.retry_ns or not vacant(component, turn):
         return
-    if not turn.config.runs(turn.me) or waits_after_boot_ns(component, turn):
+    if component.is_exhausted or not turn.config.runs(turn.me) or waits_after_boot_ns(component, turn):
         return
     entries = living_entries(component, turn)
     best = max((position for _, entry in entries if (position := entry.position)), default=None)
@@ -74,6 +74,17 @@ def _begins_in_the_dark(component: Component, turn: Turn) -> bool:
     return bool(unheard(component, turn)) or (is_unknown and any(map(turn.team.unheard, turn.team.peers)))
 
 
+def exhaustion(component: Component, me: str) -> str:
+    """Why nobody can claim it, for an operator; "" where there are epochs left."""
+    if not component.is_exhausted:
+        return ""
+    epoch = max(component.epoch, component.seen)
+    return (
+        f"no epoch is left above {epoch}, which {me} has on record; failover-agent mend {component.name} --epoch N, at each "
+        "member with such a record, sets it right (docs/bad-input.md)"
+    )
+
+
 def waits_after_boot_ns(component: Component, turn: Turn) -> int:
     """For how long this robot waits for them still before it claims the component; 0: not any more."""
     absent = unheard(component, turn)
@@ -88,21 +99,34 @@ def waits_after_boot_ns(component: Component, turn: Turn) -> int:
 def vacant(component: Component, turn: Turn, *, is_ordered: bool = False) -> bool:
     """Nobody who lives holds it or knows its end, and everybody is heard or dead.
 
+    A server or a witness repeats what it has heard of an end: its word, or its silence, counts until a majority knows of none.
+
     Args:
         is_ordered: an operator says so of robots that send what cannot be authenticated.
     """
+    is_doubtful = False
     for robot, peer in turn.team.peers.items():
         if turn.gone(robot) or (is_ordered and turn.team.keeps_waiting(robot, turn.now_ns)):
             continue
         if not turn.alive(robot):
             return False
-        entry = peer.entry(component.name)
-        if entry is None:
-            if not peer.complete:
+        if not _is_free_of(component, robot, peer):
+            if turn.config.runs(robot):
                 return False
-        elif _takes(component, robot, entry):
-            return False
-    return True
+            is_doubtful = True
+    return not is_doubtful or _is_not_ended(component, turn)
+
+
+def _is_free_of(component: Component, robot: str, peer: Peer) -> bool:
+    """Whether a peer that lives neither holds the component nor knows its end, by its fresh word."""
+    entry = peer.entry(component.name)
+    return peer.complete if entry is None else not _takes(component, robot, entry)
+
+
+def _is_not_ended(component: Component, turn: Turn) -> bool:
+    """Whether a majority knows of no end: none was acknowledged then, for that takes a majority."""
+    free = (turn.alive(robot) and _is_free_of(component, robot, peer) for robot, peer in turn.team.peers.items())
+    return (component.state not in ENDED) + sum(free) >= turn.config.quorum
 
 
 def _takes(component: Component, robot: str, entry: Entry) -> bool:
@@ -158,7 +182,7 @@ def advance(component: Component, turn: Turn) -> None:
 
 def begin(component: Component, turn: Turn) -> None:
     """The claim is granted: start the program, or restore it."""
-    component.claimed = False
+    component.claimed, component.behind_ns = False, 0
     component.until_ns = turn.now_ns + turn.config.restore_ms * MS
     component.born = component.epoch
     lease_ns = lease.first_ns(component, turn)
@@ -208,7 +232,7 @@ def restart_line(component: Component, turn: Turn) -> None:
 
 def renew(component: Component, turn: Turn, above: int) -> None:
     """The running primary goes on under an epoch above one that came to nothing; a capture under way is waited for."""
-    if component.flight is not None and component.flight.position is None:
+    if (component.flight is not None and component.flight.position is None) or above + 1 >= EPOCH_MAX:
         return
     component.epoch = above + 1
     component.handing = None
@@ -438,8 +462,13 @@ def heard_of_checkpoints(component: Component, entry: Entry) -> None:
 
 
 def heard_end(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
+    """Record an end that a robot tells of; a copy that acted all the time goes on above it. Servers and witnesses end nothing."""
+    if not turn.config.runs(sender):
+        return
     if component.holding:
-        if entry.epoch > component.epoch:
+        if entry.epoch > component.epoch and _acted_all_along(component, turn):
+            _go_on_above_the_end(component, turn, sender, entry)
+        elif entry.epoch > component.epoch:
             lose(component, turn, sender, entry)
         return
     forgotten = theirs is State.RELEASED and component.state is not State.RELEASED
@@ -452,6 +481,20 @@ def heard_end(component: Component, turn: Turn, sender: str, entry: Entry, their
     if theirs is State.RELEASED:
         drop(component, turn, f"{sender} released it")
     turn.say(component, f"{turn.me} records that it is {theirs}, as {sender} says")
+
+
+def _acted_all_along(component: Component, turn: Turn) -> bool:
+    """Under pair: what ended elsewhere was then another copy, begun from a checkpoint of ours."""
+    return component.state is State.PRIMARY and not component.stood and not turn.config.by_majority
+
+
+def _go_on_above_the_end(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
+    """As soon as the other robot hears us: until then it would not follow."""
+    if turn.team.lease_ns(sender) > turn.now_ns:
+        turn.say(
+            component, f"{turn.me} keeps its copy, which never stopped acting; {sender} tells of an end in epoch {entry.epoch}"
+        )
+        renew(component, turn, entry.epoch)
 
 
 def _heard_later_epoch(component: Component, turn: Turn, sender: str, entry: Entry) -> None:

@@ -10,6 +10,7 @@ from failover.core.component import Cause, Component, Turn
 from failover.core.consent import state_of
 from failover.core.election import refuse_request, restart_line
 from failover.core.events import ActFailed, Exited
+from failover.core.membership import Peer
 from failover.core.types import ENDED, MS, OnCrash, State
 
 SIGNAL_BITS = 0x7F
@@ -104,18 +105,23 @@ def retry(component: Component, turn: Turn) -> None:
 
 
 def report(component: Component, turn: Turn) -> None:
-    """Tell whoever waits for the end, once a living standby has it on record too, or this robot is alone."""
+    """Tell whoever waits for the end, once every living robot has it on record too (and a majority), or this robot is alone."""
     if component.state not in ENDED or component.reported or component.primary != turn.me:
         return
     living = turn.team.living(turn.now_ns)
-    known = [entry is not None and state_of(entry) in ENDED for entry in (peer.entry(component.name) for peer in living)]
-    agreed = not turn.config.by_majority or 1 + sum(known) >= turn.config.quorum
-    if all(known) and agreed:
+    knows = {peer.robot: _knows_the_end(component, peer) for peer in living}
+    agreed = not turn.config.by_majority or 1 + sum(knows.values()) >= turn.config.quorum
+    if agreed and all(known for robot, known in knows.items() if turn.config.runs(robot)):
         component.reported = True
         failed_here = component.state is State.FAILED
         turn.order(
             acts.ReportExit(component.name, component.epoch, component.status, bool(living), failed_here, component.reason)
         )
+
+
+def _knows_the_end(component: Component, peer: Peer) -> bool:
+    entry = peer.entry(component.name)
+    return entry is not None and state_of(entry) in ENDED
 
 
 def _recover(component: Component, turn: Turn, status: int) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from failover.core import acts, majority, replication
 from failover.core.component import Cause, Component, Handing, Turn
 from failover.core.contest import step_down
-from failover.core.election import claim, renew, vacant
+from failover.core.election import claim, exhaustion, renew, vacant
 from failover.core.types import MS, State
 
 
@@ -27,6 +27,8 @@ def resume_here(component: Component, turn: Turn, request: int) -> None:
         _answer(turn, request, False, f"{turn.me} holds no checkpoint of {component.name}")
     elif not turn.config.runs(turn.me):
         _answer(turn, request, False, f"{turn.me} runs nothing; ask at a robot")
+    elif component.is_exhausted:
+        _answer(turn, request, False, exhaustion(component, turn.me))
     elif not vacant(component, turn) or (turn.config.by_majority and not majority.is_free(component, turn)):
         _answer(turn, request, False, f"{component.name} belongs to {component.primary}; ask there")
     elif component.elects and not majority.may_claim(component, turn, component.newest):

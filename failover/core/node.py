@@ -58,6 +58,7 @@ from failover.core.events import (
 from failover.core.membership import Membership
 from failover.core.messages import Beat, Entry
 from failover.core.speaker import Speaker, entry_of
+from failover.core.testimony import Testimony
 from failover.core.types import COMPONENTS_MAX, ENDED, MS, Ballot, Config, Found, Held, Resumption, State, StatusView
 from failover.core.watch import Watch
 
@@ -104,6 +105,8 @@ class Node:
         self._team = Membership(config, boot, now_ns)
         self._speaker = Speaker(config.robot, boot, config.rule)
         self._watch = Watch()
+        self._testimony = Testimony()
+        self._outlivers: set[str] = set()
         self._components = {record.name: Component.remembered(record) for record in ballot.records}
         self._found = {one.component: one for one in found}
         self._begun = False
@@ -138,8 +141,17 @@ class Node:
     def outlived_by(self, beat: Beat) -> int:
         """A life of this robot that the sender has heard and that is not an earlier one of ours; 0 for none.
 
-        Our ballot was lost, or is an old copy: whoever remembers that life believes none of our beats before a later one.
+        Our ballot was lost, or is an old copy: whoever remembers that life believes none of our beats before a later one. It is
+        a lie where at least as many others have heard this life of ours.
         """
+        life = self._life_told(beat)
+        self._outlivers.discard(beat.sender)
+        if life and beat.sender in self._team.peers:
+            self._outlivers.add(beat.sender)
+        others = [peer for peer in self._team.living(self._now_ns) if peer.robot not in self._outlivers]
+        return life if len(self._outlivers) > sum(peer.heard_us > 0 for peer in others) else 0
+
+    def _life_told(self, beat: Beat) -> int:
         ours = (self._boot, self._speaker.counter)
         lives = (echo.boot for echo in beat.echoes if echo.robot == self._config.robot and (echo.boot, abs(echo.counter)) > ours)
         return next((life for life in lives if life < LIVES_MAX), 0)
@@ -155,7 +167,7 @@ class Node:
 
     def status(self, now_ns: int) -> StatusView:
         """The team as this robot sees it."""
-        return view.status(self._components, self._turn(max(now_ns, self._now_ns)), self._boot)
+        return view.status(self._components, self._turn(max(now_ns, self._now_ns)), self._boot, self._testimony)
 
     def _turn(self, now_ns: int) -> Turn:
         return Turn(now_ns, self._config, self._team, self._speaker.counter + 1, self._durable, self._watch.late_ns, self._load)
@@ -244,14 +256,14 @@ class Node:
             turn.say_of_robot(sentence)
 
     def _hear(self, event: Received, turn: Turn) -> list[Component]:
-        beat = event.beat
+        beat, refused = self._testimony.take(event.beat, turn, self._components)
         news = self._team.hear(beat, event.link, event.came_ns or turn.now_ns)
         if beat.sender in self._team.peers:
             self._team.peers[beat.sender].carried(event.copies)
         rules = contest if self._config.by_majority else election
         touched = {name: component for name, component in self._components.items() if component.holding}
         for entry in news:
-            component = self._known(entry.name)
+            component = None if entry.name in refused else self._known(entry.name, beat.sender)
             if component is None:
                 continue
             rules.heard(component, turn, beat.sender, entry)
@@ -260,8 +272,12 @@ class Node:
             touched[component.name] = component
         return list(touched.values())
 
-    def _known(self, name: str) -> Component | None:
-        if name not in self._components and len(self._components) < COMPONENTS_MAX:
+    def _known(self, name: str, sender: str = "") -> Component | None:
+        """The component, made if there is room. A server fills half of it; a witness, which has nothing of it, makes none."""
+        room = COMPONENTS_MAX
+        if sender and not self._config.runs(sender):
+            room = COMPONENTS_MAX // 2 if self._config.keeps(sender) else 0
+        if name not in self._components and len(self._components) < room:
             self._components[name] = Component(name, elects=self._config.by_majority)
         return self._components.get(name)
 

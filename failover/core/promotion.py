@@ -11,7 +11,7 @@ from checkpoint.model import Position
 from failover.core import acts, majority
 from failover.core.archive import offer
 from failover.core.component import Component, Turn, Wanted
-from failover.core.election import claim, living_entries, renew, vacant
+from failover.core.election import claim, exhaustion, living_entries, renew, vacant
 from failover.core.events import Promote
 from failover.core.types import MS, State
 
@@ -66,6 +66,8 @@ def _refusal(component: Component, turn: Turn) -> str:
     me, name = turn.me, component.name
     if not turn.config.runs(me):
         return f"{me} runs nothing; name a robot with --robot"
+    if spent := exhaustion(component, me):
+        return spent
     if component.state in _ENDED_WELL:
         return f"it is {component.state}; failover run starts it anew"
     waits = not turn.config.by_majority and component.state in (State.CLAIMING, State.FROZEN)

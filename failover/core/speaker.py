@@ -22,7 +22,7 @@ from failover.core.messages import (
     Echo,
     Entry,
 )
-from failover.core.types import HOLDING, Rule, State
+from failover.core.types import EPOCH_MAX, HOLDING, Rule, State
 from failover.core.wire import BODY_SIZE_MAX, beat_size, entry_size
 
 LOAD_MAX = 255
@@ -34,7 +34,8 @@ BEAT_OVERHEAD = 16
 
 def entry_of(component: Component, me: str) -> Entry:
     """One component as this robot holds it."""
-    newest = component.newest
+    epoch = min(component.epoch, EPOCH_MAX - 1)  # a record that is to be mended spoils no beat
+    newest = component.newest if component.epoch == epoch else None
     handing = component.handing
     flags = NEEDS_BASE * component.needs_base | UNPROTECTED * component.unprotected
     flags |= HOLDS * component.waits | WARM * component.warm
@@ -47,7 +48,7 @@ def entry_of(component: Component, me: str) -> Entry:
     return Entry(
         component.name,
         STATES.index(component.state),
-        component.epoch,
+        epoch,
         component.primary,
         newest.generation if newest else 0,
         newest.sequence if newest else 0,
@@ -56,7 +57,7 @@ def entry_of(component: Component, me: str) -> Entry:
         handing.to if handing and handing.yielded else "",
         flags,
         component.status,
-        component.epoch if component.state is State.CLAIMING else component.born,
+        epoch if component.state is State.CLAIMING else min(component.born, epoch),
     )
 
 

@@ -323,6 +323,12 @@ class Config(Struct, frozen=True, dict=True):
         return max(self.grace_ms * MS, self.loyalty_ns)
 
 
+EPOCH_MAX = 1 << 40
+"""No epoch is as large as this: its beats would be malformed to all."""
+
+EPOCH_SAID_MAX = EPOCH_MAX - (1 << 30)
+"""The words of others raise no epoch above this: from there on a robot could claim each second for 34 years."""
+
 BEAT_MS_MAX = 10_000
 PERIOD_MS_MAX = 3_600_000
 
@@ -408,7 +414,8 @@ class Found(Struct, frozen=True):
 class PeerView(Struct, frozen=True):
     """One peer as this robot sees it: ``state`` is alive, suspect, dead or unheard; ``silent_ns`` since its last beat.
 
-    ``unread``: why what comes from it cannot be authenticated, if something of that kind came lately.
+    ``unread``: why what comes from it cannot be authenticated, if something of that kind came lately. ``refused``: what it said
+    beyond what it may say, a sentence for each reason; ``doubted``: some of it lately.
     """
 
     robot: str
@@ -419,6 +426,8 @@ class PeerView(Struct, frozen=True):
     load: int
     links: tuple[str, ...] = ()
     unread: str = ""
+    refused: tuple[str, ...] = ()
+    doubted: bool = False
 
 
 class ComponentView(Struct, frozen=True):

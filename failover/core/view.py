@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from msgspec.structs import replace
+
 from failover.core import election, homecoming, promise, replication
 from failover.core.component import Component, Turn
 from failover.core.consent import state_of
+from failover.core.testimony import Testimony
 from failover.core.types import MS, ComponentView, Protection, State, StatusView
 from failover.core.warmth import is_warm
 
@@ -18,13 +21,16 @@ STALE_NS = 2 * NS_PER_S
 """A checkpoint that is older is not what was promised: the protection is degraded while the next one does not arrive."""
 
 
-def status(components: dict[str, Component], turn: Turn, boot: int) -> StatusView:
+def status(components: dict[str, Component], turn: Turn, boot: int, testimony: Testimony) -> StatusView:
     """Everything, as this robot sees it."""
     views = tuple(_component(component, turn) for _, component in sorted(components.items()) if not _is_nothing(component))
-    peers = turn.team.views(turn.now_ns)
+    peers = tuple(
+        replace(peer, refused=testimony.told(peer.robot, turn.now_ns), doubted=testimony.is_recent(peer.robot, turn.now_ns))
+        for peer in turn.team.views(turn.now_ns)
+    )
     bad = any(view.protection is Protection.DEGRADED or view.state is State.FAILED for view in views)
-    bad = bad or any(view.cold or view.unstored for view in views)
-    bad = bad or bool(turn.team.at_odds(turn.now_ns)) or any(peer.unread for peer in peers)
+    bad = bad or any(view.cold or view.unstored for view in views) or any(one.is_exhausted for one in components.values())
+    bad = bad or bool(turn.team.at_odds(turn.now_ns)) or any(peer.unread or peer.doubted for peer in peers)
     lost = any(peer.state == "dead" for peer in peers)
     return StatusView(turn.me, boot, str(turn.config.rule), promise.team(turn), not bad and not lost, peers, views)
 
@@ -176,6 +182,8 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
         notes.append(f"held still: {who} hears this robot; it goes on when the peers are back")
     if component.state is State.CLAIMING and turn.now_ns > component.until_ns:
         notes.append("waiting for the others' consent: when_alone = freeze")
+    if spent := election.exhaustion(component, turn.me):
+        notes.append(spent)
     if component.reason:
         notes.append(component.reason)
     return tuple(notes)

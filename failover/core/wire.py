@@ -19,7 +19,7 @@ from msgspec import Struct
 from checkpoint.errors import UNDECODABLE
 from failover.core.messages import VERSION, Beat, Bulk, Entry
 from failover.core.names import COMPONENT_SIZE_MAX, ROBOT_SIZE_MAX, text_size
-from failover.core.types import PEERS_MAX
+from failover.core.types import EPOCH_MAX, PEERS_MAX
 from failover.errors import FailoverError
 
 FRAME_SIZE_MAX = 1_200
@@ -34,7 +34,6 @@ WINDOW = 64
 KEYS_PER_SENDER = 2
 """The present key and the one before it, while a new one is being handed over."""
 
-EPOCH_MAX = 1 << 40
 NUMBER_MAX = 1 << 62
 DIGEST_SIZE_MAX = 32
 """Beyond these a number is somebody's mistake; believing it would leave no room to count on."""

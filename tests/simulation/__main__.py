@@ -21,7 +21,9 @@ def main() -> int:
     lives = -(-arguments.faults // FAULTS_A_LIFE) or arguments.seeds
     each = FAULTS_A_LIFE if arguments.faults else 0
     began, broken, faults = time.monotonic(), 0, 0
-    for seed, (happened, story) in _played(range(arguments.first, arguments.first + lives), each, arguments.jobs):
+    for seed, (happened, story) in _played(
+        range(arguments.first, arguments.first + lives), each, arguments.jobs, liars=arguments.liars
+    ):
         faults += happened
         if story:
             broken += 1
@@ -32,20 +34,20 @@ def main() -> int:
     return 1 if broken else 0
 
 
-def play(seed: int, faults: int) -> tuple[int, str]:
+def play(seed: int, faults: int, liars: bool = False) -> tuple[int, str]:
     """One life: how many faults there were, and the story if it broke a promise."""
     try:
-        return life(seed, faults=faults).faults, ""
+        return life(seed, faults=faults, liars=liars).faults, ""
     except AssertionError as story:
         return 0, str(story) or repr(story)
 
 
-def _played(seeds: range, faults: int, jobs: int) -> Iterator[tuple[int, tuple[int, str]]]:
+def _played(seeds: range, faults: int, jobs: int, *, liars: bool) -> Iterator[tuple[int, tuple[int, str]]]:
     if jobs == 1:
-        yield from ((seed, play(seed, faults)) for seed in seeds)
+        yield from ((seed, play(seed, faults, liars)) for seed in seeds)
         return
     with ProcessPoolExecutor(jobs) as pool:
-        yield from zip(seeds, pool.map(play, seeds, itertools.repeat(faults), chunksize=8), strict=True)
+        yield from zip(seeds, pool.map(play, seeds, itertools.repeat(faults), itertools.repeat(liars), chunksize=8), strict=True)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -55,6 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--faults", type=int, default=0, help=f"instead: long lives of {FAULTS_A_LIFE} faults, until there were as many"
     )
+    parser.add_argument("--liars", action="store_true", help="somebody has the key of a server or a witness, and lies by it")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--keep-going", action="store_true", help="do not stop at the first that breaks")
     return parser

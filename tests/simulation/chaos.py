@@ -8,6 +8,7 @@ from unittest.mock import patch
 from failover.core import speaker
 from failover.core.types import MS, ComponentSpec, Config, Launch, OnLoss, Rule, Rules, WhenAlone
 from tests.simulation.invariants import Broken, Invariants
+from tests.simulation.liars import LIES
 from tests.simulation.robots import KEEPS_STATE
 from tests.simulation.teams import elective, pair
 from tests.simulation.troubles import Trouble
@@ -50,29 +51,46 @@ CAREFUL = 4
 BOOT_PATIENCE_MS = 1_500
 """Every so many-th pair waits that long after a start for a word of the robot that ran a component."""
 
+LIARS_TEAMS = tuple(team for team in TEAMS if sum(team[1:]))
+"""Those in which there is a server or a witness whose key can be stolen."""
+
+LIE_NS = 300 * MS
+"""After so long, on the average, a liar says something else."""
+
 PACES = (1.0, 0.02)
 """How long disks, captures and restores take: as on a robot, or next to nothing, so that no delay hides a mistake."""
 
 
-def life(seed: int, engines: tuple[str, ...] = ENGINES, team: tuple[int, int, int] | None = None, faults: int = 0) -> World:
+def life(
+    seed: int,
+    engines: tuple[str, ...] = ENGINES,
+    team: tuple[int, int, int] | None = None,
+    faults: int = 0,
+    *,
+    liars: bool = False,
+) -> World:
     """Play one seed to its end; raises ``Broken`` when an invariant does not hold.
 
     Args:
         team: of ``TEAMS``; None for what the seed says.
         faults: how many, in a life that is as long as they take and whose programs do not end; 0 for what the seed says.
+        liars: somebody has the key of a server or a witness, and lies by it until the world is healed.
     """
     random, engine = Random(seed ^ 0x5EED), Random(seed)
     specs = tuple(_spec(random, index, engine.choice(engines)) for index in range(random.choice((1, 1, 2, 3))))
-    robots, servers, witnesses = team or TEAMS[seed // HARSH % len(TEAMS)]
+    teams = LIARS_TEAMS if liars else TEAMS
+    robots, servers, witnesses = team or teams[seed // HARSH % len(teams)]
     configs = pair(specs, boot_patience_ms=0 if seed % CAREFUL else BOOT_PATIENCE_MS)
     if robots + servers + witnesses > 2:
         configs = elective(robots, specs, servers, witnesses, lease_ms=150 if seed % HARSH else LONG_LEASE_MS)
     narrow = NARROW_BODY_SIZE + ECHO_SIZE * (len(configs) - 2)
     with patch.object(speaker, "BODY_SIZE_MAX", speaker.BODY_SIZE_MAX if seed % NARROW else narrow):
-        return _live(seed, random, configs, specs, faults)
+        return _live(seed, random, configs, specs, faults, liars=liars)
 
 
-def _live(seed: int, random: Random, configs: list[Config], specs: tuple[ComponentSpec, ...], faults: int) -> World:
+def _live(
+    seed: int, random: Random, configs: list[Config], specs: tuple[ComponentSpec, ...], faults: int, *, liars: bool
+) -> World:
     votes = configs[0].rule is Rule.MAJORITY
     safe = {spec.name for spec in specs if votes or spec.rules.when_alone is WhenAlone.FREEZE}
     invariants = Invariants(safe=safe, votes=votes)
@@ -86,7 +104,9 @@ def _live(seed: int, random: Random, configs: list[Config], specs: tuple[Compone
     trouble_ns = faults * FAULT_NS or TROUBLE_NS
     for _ in range(faults or (random.randrange(4, 16) if votes else random.randrange(1, 9))):
         world.at(random.randrange(trouble_ns), Trouble(world, invariants, random, specs, endless=faults > 0))
-    if votes and random.random() < 0.3:
+    if liars:
+        _let_one_lie(world, Random(seed ^ 0x11A2), trouble_ns)
+    elif votes and random.random() < 0.3:
         _lose_a_disk(world, random)
     world.run(trouble_ns)
     _heal(world)
@@ -126,6 +146,20 @@ def _make_harsh(world: World) -> None:
         robot.slow, robot.clock.rate = 1, 1 + DRIFT_MAX * (1 if place else -1)
 
 
+def _let_one_lie(world: World, random: Random, until_ns: int) -> None:
+    """A server or a witness, and one lie after the other."""
+    name = random.choice([name for name, robot in world.robots.items() if not robot.config.runs(name)])
+
+    def lie() -> None:
+        if world.now_ns < until_ns:
+            world.faults += 1
+            world.robots[name].lie = chosen = random.choice(LIES)
+            world.note(f"{name} lies: {chosen.__name__}")
+            world.after(int(random.expovariate(1) * LIE_NS), lie)
+
+    world.at(random.randrange(500) * MS, lie)
+
+
 def _lose_a_disk(world: World, random: Random) -> None:
     """One robot of the team, once: it comes back empty."""
     name, ballot = random.choice(list(world.robots)), random.random() < 0.3
@@ -144,5 +178,5 @@ def _heal(world: World) -> None:
     world.note("healing")
     world.network.heal()
     for name, robot in world.robots.items():
-        robot.slow, robot.broken_store = 1, False
+        robot.slow, robot.broken_store, robot.lie = 1, False, None
         world.power_on(name)

@@ -9,7 +9,20 @@ from unittest.mock import patch
 
 from msgspec.structs import replace
 
-from failover.core import acts, archive, contest, election, endings, handover, lease, majority, node, replication, warmth
+from failover.core import (
+    acts,
+    archive,
+    contest,
+    election,
+    endings,
+    handover,
+    lease,
+    majority,
+    node,
+    replication,
+    testimony,
+    warmth,
+)
 from failover.core.component import Component, Turn
 from failover.core.membership import UNREAD_NS, Membership, Peer
 from failover.core.messages import Entry
@@ -401,6 +414,49 @@ def miserly_server() -> Any:
     return patch.object(archive, "_heir", lambda component, turn: honest(component, turn) if turn.config.runs(turn.me) else "")
 
 
+# Mistakes in whom to believe
+
+
+def no_roles() -> Any:
+    """A witness and a server are believed like a robot."""
+    return patch.object(Config, "runs", lambda *_: True), patch.object(Config, "keeps", lambda *_: True)
+
+
+def believes_every_word() -> Any:
+    """No entry is looked at before the rules see it."""
+    return patch.object(testimony.Testimony, "take", lambda _, beat, *__: (beat, frozenset()))
+
+
+def believes_any_epoch() -> Any:
+    """The words of others raise an epoch without bound."""
+    return patch.object(testimony, "epoch_max", lambda *_: 1 << 62)
+
+
+def deaf_to_denial() -> Any:
+    """What is told of a robot counts, although that robot lives and says otherwise."""
+    return patch.object(testimony, "_denier", lambda *_: "")
+
+
+def gives_up_to_any_end() -> Any:
+    """A copy that acts is stopped when anybody tells of an end."""
+    return patch.object(contest, "_heard_end", election.heard_end), patch.object(election, "_acted_all_along", lambda *_: False)
+
+
+def waits_for_every_server() -> Any:
+    """A standby waits for what a server says to have, however long."""
+    return patch.object(contest, "_waits_for_a_server", lambda component, turn, mine, best: best is not None and mine < best)
+
+
+def never_mind_who_repeats() -> Any:
+    """The word of a witness that something has ended keeps a majority from running it."""
+    return patch.object(election, "_is_not_ended", lambda *_: False)
+
+
+def forgets_weeks() -> Any:
+    """A robot that was away believes no more epochs than can have passed since it is back."""
+    return patch.object(testimony, "EPOCHS_AWAY_MAX", 0)
+
+
 SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (blind_to_the_better, "the_newest_checkpoint_wins_over_the_lesser_name"),
     (loyal_to_the_lost, "three_robots_stand_in_for_one_another"),
@@ -426,6 +482,16 @@ SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (forgets_the_order, "an_operator_need_not_wait_for_what_cannot_be_authenticated"),
     (remembers_the_order_for_ever, "an_operator_need_not_wait_for_what_cannot_be_authenticated"),
     (believes_its_team_file, "a_robot_whose_team_file_is_old_rewinds_nothing"),
+    (no_roles, "a_lying_witness_ends_nothing"),
+    (no_roles, "a_lying_server_ends_and_runs_nothing"),
+    (believes_every_word, "a_lying_witness_runs_and_keeps_nothing"),
+    (believes_any_epoch, "a_lying_witness_raises_no_epoch"),
+    (deaf_to_denial, "a_lying_witness_ends_nothing"),
+    (gives_up_to_any_end, "a_lying_robot_ends_nothing_of_a_majority"),
+    (gives_up_to_any_end, "a_lying_robot_of_a_pair_ends_nothing"),
+    (waits_for_every_server, "a_robot_is_replaced_although_a_server_lies"),
+    (never_mind_who_repeats, "a_robot_is_replaced_although_a_witness_lies"),
+    (forgets_weeks, "a_robot_that_was_away_while_epochs_passed_takes_them_over"),
     (tireless_giver, "a_chain_that_is_not_taken_is_offered_again_after_a_pause"),
 )
 """Mistakes that a pair survives, or that cost no promise but the peace: each spoils a scenario."""

@@ -11,6 +11,7 @@ from failover.core.events import Event
 from failover.core.node import Node
 from failover.core.story import Decision
 from failover.core.types import MS, Ballot, Config, Launch
+from tests.simulation.liars import Lie
 
 TEAM = "simulated"
 KEY = bytes(range(32))
@@ -70,6 +71,7 @@ class Robot:
 
     Attributes:
         lacks: what it says that it lacks when it is asked; None: something now and then.
+        lie: what becomes of its beats on their way, while somebody else has its key.
         read: robots whose beats it has authenticated in this life; ``unread_ns``: when it last received what it could not.
     """
 
@@ -100,6 +102,7 @@ class Robot:
     refuses: bool = False
     lacks: tuple[str, ...] | None = ()
     pending: Ballot | None = None
+    lie: Lie | None = None
     told: list[Decision] = field(default_factory=list)
     writing: list[tuple[str, Position]] = field(default_factory=list)
 

@@ -12,6 +12,9 @@ A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment. ``expect`` 
     500  sealed robot1 robot2              neither can authenticate the other, until both have been told: read robot1 robot2
     500  noise robot2 robot1 900           for 900 ms somebody sends robot1 garbage from robot2's address
     550  old-team robot1 robot2            from its next start on robot1's team file does not know robot2;  new-team robot1 robot2
+    500  lies witness1 finishes            from now on its beats are changed on their way, see liars.py;  honest: not any more
+    900  later robot1 5000                 it is off, and on its disk so many more epochs have passed
+    900  tells robot1 witness1 ends runs   robot1 has refused words of witness1 for these reasons, and for no others
     600  stall robot1 300                  its loop gets no processor for 300 ms
     600  slow robot1 40                    its disk and its captures take so many times as long
     600  refuses robot1                    a program that is resumed there ends at once: it cannot read its state;  takes: it can
@@ -40,6 +43,7 @@ from failover.core import acts
 from failover.core.events import Handover, Promote, Run, Stop
 from failover.core.types import MS, ComponentSpec, Config, Launch, Rules
 from tests.simulation.invariants import Invariants, seen_at, state_at
+from tests.simulation.liars import by_name
 from tests.simulation.teams import elective, pair
 from tests.simulation.world import World
 
@@ -97,6 +101,16 @@ class Story:
             case "exit":
                 self.invariants.crashing.add((robot, COMPONENT))
                 world.program_ends(robot, COMPONENT, int(arguments[1]))
+            case "lies":
+                world.robots[robot].lie = by_name(arguments[1])
+            case "honest":
+                world.robots[robot].lie = None
+            case "later":
+                world.later(robot, int(arguments[1]))
+            case "tells":
+                node = world.robots[robot].node
+                found = {str(why) for (whose, why) in (node._testimony.refusals if node else ()) if whose == arguments[1]}
+                self._expect(f"{robot} has refused words of {arguments[1]}:", str(sorted(found)), str(sorted(arguments[2:])))
             case "stall":
                 world.stall(robot, int(arguments[1]) * MS)
             case "refuses" | "takes":

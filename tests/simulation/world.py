@@ -12,6 +12,8 @@ import itertools
 from collections.abc import Callable
 from random import Random
 
+from msgspec.structs import replace
+
 from checkpoint.model import Position
 from failover.core import acts, wire
 from failover.core.ballot import decode, encode
@@ -23,8 +25,9 @@ from failover.core.events import (
     Unread,
 )
 from failover.core.node import Node
-from failover.core.types import MS, Config, Found, Held
+from failover.core.types import MS, Ballot, Config, Found, Held
 from tests.simulation.deeds import Deeds
+from tests.simulation.liars import fitting
 from tests.simulation.robots import KEEPS_STATE, KEY, TEAM, Clock, Network, NewDisk, Program, Robot
 
 QUEUE_MAX = 4_096
@@ -163,6 +166,13 @@ class World:
         self.note(f"{name} gets a new disk{', and forgets its votes' if ballot else ''}")
         self._tell(name, NewDisk(ballot, lost))
 
+    def later(self, name: str, epochs: int) -> None:
+        """Switch a robot off; so many epochs more have passed when it comes back, as its disk says."""
+        self.power_off(name)
+        robot = self.robots[name]
+        records = (replace(record, epoch=record.epoch + epochs) for record in decode(robot.ballot).records)
+        robot.ballot = encode(Ballot(tuple(records)))
+
     def power_off(self, name: str) -> None:
         """Take everything that is not on the disk."""
         self.agent_dies(name)
@@ -269,10 +279,10 @@ class World:
         robot.told += ready.told
         for beat in ready.send:
             self._tell(robot.name, beat)
-            frame = wire.seal(beat, TEAM, KEY + robot.name.encode())
             for other in self.robots.values():
                 if other is not robot:
-                    self._transmit(robot.name, other, frame)
+                    said = fitting(robot.lie(self, beat, other.name)) if robot.lie is not None else beat
+                    self._transmit(robot.name, other, wire.seal(said, TEAM, KEY + robot.name.encode()))
         for act in ready.act:
             self._tell(robot.name, act)
             self._deeds.carry_out(robot, act)
