@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import increments, plots, results
+from benchmarks import increments, plots, results, soak
 from benchmarks.figures import Figure, Findings
 
 STILL = "the program stands still (its own clock)"
@@ -24,6 +24,9 @@ FIGURES = (
     Figure("restore", "10 MB", "ms", (60.0, 66.0)),
     Figure("takeover from a ready copy", "10 MB", "ms", (6.0, 7.0)),
     Figure("power cut to next output", "1 at once", "ms", (210.0, 230.0)),
+    Figure(soak.WHEN, "each sample", "min", (0.0, 1.0, 2.0)),
+    Figure(soak.MEMORY, "robot1: lanes", "MB", (90.0, 95.0, 94.0)),
+    Figure(soak.DESCRIPTORS, "robot1: lanes", "", (130.0, 132.0, 131.0)),
     Figure("one more thread", "of 64", "µs", (90.0, 100.0)),
     Figure("work done a second", "10 snapshots a second", "steps", (97.0,)),
     Figure("work done a second", "10 snapshots a second", "steps", (100.0,), "unprotected"),
