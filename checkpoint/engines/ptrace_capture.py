@@ -141,7 +141,8 @@ class PtraceSession:
         outputs = Outputs(order.streams) if order.streams else None
         trees = None
         try:
-            if reasons := told_by_spokesman(pid, lambda tid: thread_rights.refuse(tid, order.terms.owner)):
+            owner = order.terms.owner
+            if owner is not None and (reasons := told_by_spokesman(pid, lambda tid: thread_rights.refuse(tid, owner))):
                 raise UnsupportedError(f"cannot protect pid {pid}: {reasons[0]}", reasons)
             surroundings = probing.surroundings_of(pid, order.streams, order.terms)
             report = probing.probe(pid, surroundings, files_kept=order.names is not None)
