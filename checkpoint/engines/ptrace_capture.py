@@ -141,8 +141,7 @@ class PtraceSession:
         outputs = Outputs(order.streams) if order.streams else None
         trees = None
         try:
-            owner = order.terms.owner
-            if owner is not None and (reasons := told_by_spokesman(pid, lambda tid: thread_rights.refuse(tid, owner))):
+            if reasons := thread_rights.refuse(pid, order.terms.owner):
                 raise UnsupportedError(f"cannot protect pid {pid}: {reasons[0]}", reasons)
             surroundings = probing.surroundings_of(pid, order.streams, order.terms)
             report = probing.probe(pid, surroundings, files_kept=order.names is not None)
@@ -318,8 +317,9 @@ class PtraceSession:
         """What was refused once is looked at without stopping it: a program that has an epoll for a week is left in peace."""
         with contextlib.suppress(ProcessGoneError, ProbeError):
             reasons = probing.reasons_of(self.pid, self._surroundings, files_kept=self._first.files_kept)
-            of_rights = told_by_spokesman(self.pid, lambda tid: thread_rights.refuse(tid, self._owner))
-            self._refuse((*of_rights, *reasons, *(self._carried.refuse() if self._carried else ())))
+            self._refuse(
+                (*thread_rights.refuse(self.pid, self._owner), *reasons, *(self._carried.refuse() if self._carried else ()))
+            )
 
     def _refuse(self, reasons: tuple[str, ...]) -> None:
         self._refused = bool(reasons)

@@ -20,6 +20,7 @@ from checkpoint.capability import Area, preserved
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.procfs import Status
+from checkpoint.linux.spokesman import told_by_spokesman
 from checkpoint.linux.tasks import thread_count, thread_ids
 from checkpoint.model import Credentials, Fact, Resource
 from checkpoint.rights import KIND, Owner, above, refusal
@@ -100,10 +101,14 @@ def refuse(pid: int, owner: Owner | None) -> tuple[str, ...]:
     """
     if owner is None:
         return ()
-    seen = _seen(pid)
-    everybodys = (_credentials(procfs.status(pid)), *(theirs for _, theirs in seen.odd.values()))
-    reason = refusal((text for theirs in everybodys for text in above(theirs, owner)), owner)
+    reason = refusal(told_by_spokesman(pid, lambda tid: _above(tid, owner)), owner)
     return (reason,) if reason else ()
+
+
+def _above(pid: int, owner: Owner) -> list[str]:
+    """What its threads may, and their owner may not."""
+    everybodys = (_credentials(procfs.status(pid)), *(theirs for _, theirs in _seen(pid).odd.values()))
+    return [text for theirs in everybodys for text in above(theirs, owner)]
 
 
 def _seen(pid: int) -> Seen:
