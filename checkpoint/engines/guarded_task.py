@@ -6,6 +6,7 @@ nothing, and each capture looks where its commits go now.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Mapping
@@ -83,20 +84,15 @@ class GuardedTask:
 
     def _require_rights(self) -> None:
         """Raises UnsupportedError: it has rights that are not its owner's."""
-        if reasons := told_by_spokesman(self.pid, lambda tid: thread_rights.refuse(tid, self._terms.owner)):
+        if reasons := thread_rights.refuse(self.pid, self._terms.owner):
             raise UnsupportedError(f"cannot capture {self.component} (pid {self.pid}): {reasons[0]}", reasons)
 
     def _tell_epoch(self, epoch: int) -> None:
         """As the other engine does: the program finds in its environment what `Begin` could not tell yet."""
         self._epoch = epoch
         stat = procfs.stat(self.pid)
-        try:
+        with contextlib.suppress(CaptureError):  # its memory is not ours to write: `failover handover` tells it
             epoch_variable.renew(Memory(self.pid), stat.env_start, stat.env_end, epoch)
-        except CaptureError as error:
-            if not isinstance(error, ProcessGoneError):
-                self.notes = (
-                    f"its fencing token may be older than epoch {epoch}: {error}; failover handover gives it the present one",
-                )
 
     def capture_standing(self, order: CaptureOrder) -> Snapshot:
         """See `checkpoint.engine.Session.capture_standing`: its segment holds what was committed, whatever it does."""
