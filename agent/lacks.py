@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Mapping
+from contextlib import asynccontextmanager
 from typing import Final
 
 from agent.bounds import check_rights
@@ -65,13 +66,20 @@ async def contested(around: Surroundings, charges: Collection[Charge]) -> Mappin
             return ()  # it has just ended
         terms, pid = component.keeper.terms, component.pid
         order = channel.Compare(terms=terms, running=pid, components=components)
-        chain = await asyncio.to_thread(around.store.open_chain, charge.name)
-        try:
-            return (await _answer(keeper, order, chain[-1])).lacks
-        finally:
-            close_all(tuple(chain))
+        async with _newest(around, charge.name) as snapshot:
+            return (await _answer(keeper, order, snapshot)).lacks
 
     return await _told_by_one_keeper(around, running, compared)
+
+
+@asynccontextmanager
+async def _newest(around: Surroundings, name: str) -> AsyncIterator[int]:
+    """Its newest checkpoint here, open for reading in the body. Raises StoreError: there is none, or no more."""
+    chain = await asyncio.to_thread(around.store.open_chain, name)
+    try:
+        yield chain[-1]
+    finally:
+        close_all(tuple(chain))
 
 
 async def _answer(keeper: KeeperLink, order: channel.Compare, snapshot: int) -> Compared:
@@ -109,17 +117,14 @@ async def _told_by_one_keeper(
 
 async def _compared(around: Surroundings, charge: Charge, keeper: KeeperLink) -> tuple[str, ...]:
     name, spec = charge.name, charge.figures.spec
-    chain = await asyncio.to_thread(around.store.open_chain, name)
-    try:
-        outline = await asyncio.to_thread(format.read_outline, chain[-1])
+    async with _newest(around, name) as snapshot:
+        outline = await asyncio.to_thread(format.read_outline, snapshot)
         if outline.engine == COOPERATIVE and around.here(name).command:
             return ()  # it is started by that
         terms = terms_here(spec.launch if spec is not None else None, around.here(name))
         is_ordinary = spec is not None and spec.owner != ROOT
         order = channel.Compare(around.places.contents, terms, charge.figures.digests, own_eyes=is_ordinary)
-        reply = await _answer(keeper, order, chain[-1])
-    finally:
-        close_all(tuple(chain))
+        reply = await _answer(keeper, order, snapshot)
     charge.figures.digests = reply.known
     try:
         if spec is not None:

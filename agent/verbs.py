@@ -6,7 +6,7 @@ import asyncio
 import functools
 import logging
 import os
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from typing import Any, Final, Protocol
 
 import msgspec
@@ -334,11 +334,7 @@ class Verbs(Questions):
         Raises:
             RefusedError: it is no path that means the same on every robot.
         """
-        paths = tuple(dict.fromkeys((*wanted, *self._lanes.settings.component(name).carry)))
-        for path in paths:
-            if not is_carriable(path):
-                raise RefusedError(f"cannot carry {path!r}: name the file or folder by its whole path, without . and ..")
-        return paths
+        return _named_whole("carry", (*wanted, *self._lanes.settings.component(name).carry))
 
     def _shared(self, name: str, wanted: list[str], carried: list[str]) -> tuple[str, ...]:
         """What others write to as well: what was asked for, and what this robot's operator rules besides.
@@ -346,10 +342,7 @@ class Verbs(Questions):
         Raises:
             RefusedError: it is no path that means the same on every robot, or travels with the component.
         """
-        paths = tuple(dict.fromkeys((*wanted, *self._lanes.settings.component(name).shared)))
-        for path in paths:
-            if not is_carriable(path):
-                raise RefusedError(f"cannot share {path!r}: name the file or folder by its whole path, without . and ..")
+        paths = _named_whole("share", (*wanted, *self._lanes.settings.component(name).shared))
         if both := contradiction(self._carried(name, carried), paths):
             raise RefusedError(both)
         return paths
@@ -444,3 +437,12 @@ class Verbs(Questions):
 def _age_of(view: dict[str, Any]) -> tuple[int, int]:
     """Of what a robot could go on from: the newest sorts first, nothing at all last."""
     return -(view.get("generation") or 0), -(view.get("sequence") or 0)
+
+
+def _named_whole(verb: str, wanted: Iterable[str]) -> tuple[str, ...]:
+    """Each path once. Raises RefusedError: one of them does not mean the same on every robot."""
+    paths = tuple(dict.fromkeys(wanted))
+    for path in paths:
+        if not is_carriable(path):
+            raise RefusedError(f"cannot {verb} {path!r}: name the file or folder by its whole path, without . and ..")
+    return paths

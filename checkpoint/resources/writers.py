@@ -82,9 +82,8 @@ def everybody() -> list[int]:
 def arguments_of(pid: int) -> bytes:
     """Of a process, each ended by a zero byte but the last; b"" where it has ended, or is not ours to look at."""
     try:
-        with open(f"/proc/{pid}/cmdline", "rb") as file:
-            return file.read().removesuffix(b"\0")
-    except OSError:
+        return procfs.read_bytes(pid, "cmdline").removesuffix(b"\0")
+    except CheckpointError:
         return b""
 
 
