@@ -30,26 +30,6 @@ os._exit(keeper.main(["keeper", sys.argv[1]]))
 """
 
 
-def test_what_holds_itself_is_found_after_some_requests() -> None:
-    ours, theirs = channel.pair()
-    command = [sys.executable, "-c", MAKES_GARBAGE, str(theirs.fileno())]
-    with theirs:
-        process = subprocess.Popen(
-            command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
-        )
-    link: Channel[Reply] = Channel(ours, Reply)
-    try:
-        for _ in range(keeper.COLLECTED_AFTER):
-            link.send(channel.Probe(1))
-            reply, _ = link.receive()
-            assert isinstance(reply, channel.Failed)
-    finally:
-        link.close()
-        told, _ = process.communicate()
-    assert told == "collected\n" * keeper.COLLECTED_AFTER
-    assert process.returncode == 0
-
-
 HOLDS_ERRORS = """
 import os, sys, weakref
 from checkpoint import keeper
@@ -78,22 +58,31 @@ os._exit(keeper.main(["keeper", sys.argv[1]]))
 """
 
 
-def test_an_error_that_was_answered_holds_nothing() -> None:
-    """A capture that fails has copied pages, and on a busy machine many fail before garbage is looked for."""
+def printed(script: str, requests: int) -> str:
+    """What a keeper with such an engine writes while so many requests fail."""
     ours, theirs = channel.pair()
-    command = [sys.executable, "-c", HOLDS_ERRORS, str(theirs.fileno())]
+    command = [sys.executable, "-c", script, str(theirs.fileno())]
     with theirs:
         process = subprocess.Popen(
             command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
         )
     link: Channel[Reply] = Channel(ours, Reply)
     try:
-        for _ in range(3):
+        for _ in range(requests):
             link.send(channel.Probe(1))
             reply, _ = link.receive()
             assert isinstance(reply, channel.Failed)
     finally:
         link.close()
         told, _ = process.communicate()
-    assert told == "let go\n" * 3
     assert process.returncode == 0
+    return told
+
+
+def test_what_holds_itself_is_found_after_some_requests() -> None:
+    assert printed(MAKES_GARBAGE, keeper.COLLECTED_AFTER) == "collected\n" * keeper.COLLECTED_AFTER
+
+
+def test_an_error_that_was_answered_holds_nothing() -> None:
+    """A capture that fails has copied pages, and on a busy machine many fail before garbage is looked for."""
+    assert printed(HOLDS_ERRORS, 3) == "let go\n" * 3
