@@ -43,7 +43,7 @@ class Origins(Struct, frozen=True, eq=False):
         changed = pages.distinct(np.concatenate([np.empty(0, dtype=np.uint64), *(layer.addresses for layer in lasting)]))
         together = np.zeros((len(changed), page_size), dtype=np.uint8)
         for layer in lasting:
-            together[np.searchsorted(changed, layer.addresses)] ^= layer.differences
+            together[np.searchsorted(changed, layer.addresses)] ^= layer.rows[layer.places]
         return cls(sources, changed, together)
 
     def gathered(self, chain: Sequence[Snapshot], wanted: PageMap) -> NDArray[np.uint8]:
@@ -71,18 +71,19 @@ class _Layer(Struct, frozen=True, eq=False):
 
     Attributes:
         index: of the snapshot in its chain.
-        differences: of ``addresses``, which are in order, one row a page.
+        places: of ``addresses``, which are in order, among ``rows``, which are all of the snapshot's and not copied.
     """
 
     index: int
     addresses: Words
-    differences: Rows
+    places: NDArray[np.intp]
+    rows: Rows
 
     def lasting(self, sources: PageMap) -> _Layer:
         """What of it no later snapshot has set or taken away."""
         found, places = pages.found_among(sources.addresses, self.addresses)
         found[found] = sources.words[places, 0] < np.uint64(self.index)
-        return _Layer(self.index, self.addresses[found], self.differences[found])
+        return _Layer(self.index, self.addresses[found], self.places[found], self.rows)
 
 
 def _newest_sources(chain: Sequence[Snapshot], page_size: int) -> tuple[PageMap, list[_Layer]]:
@@ -120,7 +121,7 @@ def _newest_sources(chain: Sequence[Snapshot], page_size: int) -> tuple[PageMap,
 def _layer_of(snapshot: Snapshot, index: int, carried: Words, page_size: int) -> _Layer:
     addresses = differences.addresses_of(snapshot.differences, page_size)
     rows = differences.rows_of(snapshot.contents, page_size)
-    return _Layer(index, addresses, rows[np.searchsorted(carried, addresses)])
+    return _Layer(index, addresses, np.searchsorted(carried, addresses), rows)
 
 
 def _check_there(snapshot: Snapshot, wanted: Words, held: Words) -> None:

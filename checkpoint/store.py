@@ -19,6 +19,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import accumulate
 from pathlib import Path
 from typing import TypeVar
 
@@ -66,6 +67,10 @@ FOLD_DELTA_PART = 0.5
 
 NOTICES_KEPT = 100
 """Of what was found damaged or left over."""
+
+FOLDED_AT_ONCE_SIZE = 64 << 20
+"""Bytes of the pages of deltas that a fold holds in memory; a chain with more is folded in several steps. Of a large base, which
+takes long to write again, half as much as its own."""
 
 NOTHING_OLD = Retention()
 
@@ -347,14 +352,18 @@ class Store:
             StoreError: the position cannot be loaded, or the disk does not take the base.
             FormatError: see `_write_fold`.
         """
-        entries = self.chain_of(component, position)
-        written = self._write_fold(component, entries)
-        if written is None:
-            raise StoreError(f"position {place(position)} of {component} cannot be restored: {self.notices[-1]}")
-        with self._change_of(component):
-            if self._shelf(component).order_of(position) is None:  # dropped or set aside meanwhile
-                self._files.remove(written.path)
-            else:
+        is_there = False
+        while not is_there:
+            entries = _held_at_once(self.chain_of(component, position))
+            reached = entries[-1].position
+            is_there = reached == position
+            written = self._write_fold(component, entries)
+            if written is None:
+                raise StoreError(f"position {place(position)} of {component} cannot be restored: {self.notices[-1]}")
+            with self._change_of(component):
+                if self._shelf(component).order_of(reached) is None:  # dropped or set aside meanwhile
+                    self._files.remove(written.path)
+                    return
                 self._add(component, written)
 
     def _write_fold(self, component: str, entries: tuple[Entry, ...]) -> Entry | None:
@@ -597,6 +606,22 @@ def why_not_ours(about: os.stat_result) -> str:
 
 def _entry_of(path: Path, snapshot: Snapshot, size: int) -> Entry:
     return Entry(path, snapshot.position, snapshot.parent, snapshot.epoch, size, time.time())
+
+
+def _held_at_once(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
+    """The beginning of a chain, with one delta at least, whose deltas' pages may be held together; files hold them compressed."""
+    sizes = [_pages_size(entry) for entry in entries]
+    limit = max(FOLDED_AT_ONCE_SIZE, int(FOLD_DELTA_PART * sizes[0]))
+    count = sum(total <= limit for total in accumulate(sizes[1:]))
+    return entries[: 1 + max(count, 1)]
+
+
+def _pages_size(entry: Entry) -> int:
+    """Bytes of the pages that a file tells; 0 where it is damaged, as whoever reads it will find."""
+    try:
+        return format.read_header(entry.path).contents_size
+    except FormatError:
+        return 0
 
 
 def _newest_output(output: tuple[OutputPiece, ...]) -> tuple[OutputPiece, ...]:

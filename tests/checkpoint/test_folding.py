@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import io
 import random
+import tracemalloc
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 import pytest
 from hypothesis import given, settings
 from msgspec.structs import replace
 
 from checkpoint import chain, format, frames
+from checkpoint import store as store_module
 from checkpoint.byte_sources import opened
 from checkpoint.errors import ChainError, FormatError
 from checkpoint.folding import Folding
+from checkpoint.hot_pages import Sender
 from checkpoint.layout import FRAME_SIZE
 from checkpoint.model import PageRun, Snapshot
 from checkpoint.store import open_store
@@ -145,5 +149,39 @@ def test_a_fold_that_cannot_be_written_blames_no_file(base: Snapshot, tmp_path: 
         assert store.positions(COMPONENT) == (base.position, delta.position)
         assert pages_of(store.load(COMPONENT)) == pages_of(base)
         assert not store.notices
+    finally:
+        store.close()
+
+
+DELTAS: Final = 24
+DELTA_PAGES: Final = 1_500
+
+
+def test_a_fold_holds_a_bounded_part_of_the_deltas_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program that changes a little of many pages has small files: 20 of them took 500 MB to fold."""
+    sender, store = Sender(), open_store(tmp_path / "store")
+    whole = [snapshot(dict.fromkeys(range(DELTA_PAGES), page("base")), vmas=ROOM)]
+    for number in range(DELTAS):
+        state = dict.fromkeys(range(DELTA_PAGES), page(f"base, changed {number}"))
+        whole.append(snapshot(state, carried=state, parent=whole[-1].position, sequence=number + 2, vmas=ROOM))
+    size = DELTA_PAGES * PAGE
+    monkeypatch.setattr(store_module, "FOLDED_AT_ONCE_SIZE", 4 * size)
+    try:
+        for one in whole:
+            told, _ = sender.told(one, 2 * size)
+            sender.acknowledge(one.position)
+            file = tmp_path / "one"
+            file.write_bytes(format.encode_bytes(told))
+            with open(file, "rb") as source:
+                store.put(source.fileno())
+        tracemalloc.start()
+        try:
+            store.fold(COMPONENT, whole[-1].position)
+            peak = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        assert peak < 10 * size
+        assert len(store.chain_of(COMPONENT)) == 1
+        assert pages_of(store.load(COMPONENT)) == pages_of(whole[-1])
     finally:
         store.close()
