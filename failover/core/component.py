@@ -76,7 +76,7 @@ TABLE: dict[tuple[State, Cause], State] = {
     **{(state, Cause.CRASH): State.RECOVERING for state in _RUNS_HERE},
     (State.STARTING, Cause.CRASH): State.RECOVERING,
     (State.TAKING_OVER, Cause.CRASH): State.RECOVERING,
-    **{(state, Cause.OUTBID): State.STOPPING for state in _RUNNING},
+    **{(state, Cause.OUTBID): State.STOPPING for state in (*_RUNNING, State.FINISHED, State.FAILED, State.RELEASED)},
     **{(state, Cause.CANNOT): State.STOPPING for state in (State.TAKING_OVER, *_RUNS_HERE)},
     (State.STOPPING, Cause.CLEARED): State.STANDBY,
     **{(state, Cause.FOLLOW): State.STANDBY for state in _IDLE},

@@ -341,6 +341,9 @@ def follow(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
     """The accepted primary's word: keep its checkpoints, and claim the component when it gives way to us."""
     if component.state in ENDED:
         drop(component, turn, f"{sender} runs it anew")
+        component.move(Cause.OUTBID)  # a copy that ended here, and whose end was not agreed, may be left
+        component.until_ns = turn.now_ns + turn.config.retry_ms * MS
+        turn.order(acts.Stop(component.name, component.epoch))
     if component.state is not State.STANDBY and component.state is not State.STOPPING:
         component.move(Cause.FOLLOW)
     component.trusted = entry.standby == turn.me and turn.config.runs(turn.me)
