@@ -64,6 +64,11 @@ def may(uid: int, owner: int | None) -> bool:
     return uid in (ROOT, os.geteuid()) or uid == owner
 
 
+def asking(uid: int) -> int | None:
+    """The user as the core's commands name him (``by``): None if he may give any order."""
+    return None if may(uid, None) else uid
+
+
 def check_right(uid: int, component: str, owner: int | None) -> None:
     """Let a user act on a component.
 

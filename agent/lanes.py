@@ -38,8 +38,8 @@ from agent.switchboard import Switchboard, live, make_directory
 from agent.units import starter
 from agent.verbs import Verbs
 from agent.view import team_view
-from checkpoint import allocator, channel, format, room
-from checkpoint.channel import Channel, close_all
+from checkpoint import allocator, channel, room
+from checkpoint.channel import Channel
 from checkpoint.contents import FOLDER as CONTENTS_FOLDER
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CheckpointError, StoreError
@@ -411,15 +411,8 @@ def _held(store: Store) -> tuple[Held, ...]:
 
 def _keeps_state(store: Store, name: str) -> bool:
     """Whether the newest snapshot is of a program that keeps its state; False also where it cannot be read now."""
-    chain: list[int] = []
-    try:
-        chain = store.open_chain(name)
-        return format.read_outline(chain[-1]).engine == COOPERATIVE
-    except (CheckpointError, OSError) as error:
-        log.warning("%s: its newest checkpoint cannot be read: %s", name, error)
-        return False
-    finally:
-        close_all(tuple(chain))
+    newest = newest_of(store, name)
+    return newest is not None and newest.engine == COOPERATIVE
 
 
 def main() -> int:

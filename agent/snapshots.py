@@ -103,11 +103,13 @@ class Snapshots(Struct, frozen=True):
 def newest_of(store: Store, name: str) -> Snapshot | None:
     """The newest snapshot of a component here, without its pages; None where there is none that can be read."""
     chain: list[int] = []
+    if not store.positions(name):
+        return None
     try:
         chain = store.open_chain(name)
         return format.read_outline(chain[-1])
     except (CheckpointError, OSError) as error:
-        log.info("%s: its newest checkpoint cannot be read: %s", name, error)
+        log.warning("%s: its newest checkpoint cannot be read: %s", name, error)
         return None
     finally:
         close_all(tuple(chain))

@@ -24,7 +24,7 @@ from agent.arguments import (
     StopArguments,
     arguments_of,
 )
-from agent.caller import Caller, check_right, guest_of, inheritance_for
+from agent.caller import Caller, asking, check_right, guest_of, inheritance_for
 from agent.charge import Charge
 from agent.control import Conversation, Verb
 from agent.errands import Order
@@ -50,10 +50,6 @@ START_PATIENCE_S: Final = 30.0
 """How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
 
 log = logging.getLogger("failover.verbs")
-
-Act = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
-"""Carries an order out, for whoever may give it: its arguments → its result."""
-
 
 class Lanes(Lines, Protocol):
     """What of `agent.lanes.Lanes` is needed here."""
@@ -91,7 +87,7 @@ class Verbs(Questions):
 
     def orders(self) -> dict[str, Order]:
         """Those that are carried out where the component runs, wherever they are given."""
-        found: dict[str, Act] = {
+        found: dict[str, Order] = {
             "handover": self.handover,
             "failback": self.failback,
             "prefer": self.prefer,
@@ -100,11 +96,11 @@ class Verbs(Questions):
         }
         return {name: functools.partial(self._permitted, act) for name, act in found.items()}
 
-    async def _permitted(self, order: Act, arguments: dict[str, Any], by: int) -> dict[str, Any]:
+    async def _permitted(self, order: Order, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Carry an order out here, if whoever gives it may give it."""
         name = await self._known(str(arguments.get("name", "")))
         await self._check_right(by, name)
-        return await order({**arguments, "name": name})
+        return await order({**arguments, "name": name}, by)
 
     async def _order(self, verb: str, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """Carry an order out here, or have the robot do it where the component runs."""
@@ -143,7 +139,7 @@ class Verbs(Questions):
             devices=self._device_rules(name, wanted.devices),
             connections=self._connections(name, wanted.connections),
         )
-        charge = await self._begin(name, launch, inheritance.uid)
+        charge = await self._begin(name, launch, inheritance.uid, say.caller.uid)
         started: dict[str, Any] = {"name": name, "notes": list(charge.figures.notes), "reasons": list(charge.figures.reasons)}
         if charge.component is not None:
             component = charge.component
@@ -192,40 +188,40 @@ class Verbs(Questions):
             connections=connections,
             shared=shared,
         )
-        charge = await self._begin(name, launch, guest.rights.uid, guest)
+        charge = await self._begin(name, launch, guest.rights.uid, caller.uid, guest)
         return {"name": name, "pid": wanted.pid, "notes": list(charge.figures.notes)}
 
-    async def release(self, arguments: dict[str, Any]) -> dict[str, Any]:
+    async def release(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Let a component run on unprotected; answers once its guard has been told, so that no later agent finds it again."""
         name = await self._known(arguments_of(NameArguments, "release", arguments).name)
         charge = self._lanes.charge(name)
         pid = charge.component.pid if charge.component is not None else None
-        await self._command(lambda number: events.Release(number, name))
+        await self._command(lambda number: events.Release(number, name, asking(by)))
         await charge.let_go()  # the order came before the answer
         return {"name": name, "pid": pid}
 
-    async def stop(self, arguments: dict[str, Any]) -> dict[str, Any]:
+    async def stop(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """End a component."""
         wanted = arguments_of(StopArguments, "stop", arguments)
         name = await self._known(wanted.name)
         end = self._lanes.charge(name).end()
-        await self._command(lambda number: events.Stop(number, name, wanted.signal))
+        await self._command(lambda number: events.Stop(number, name, wanted.signal, asking(by)))
         report = await asyncio.shield(end)
         return {"name": name, "exit_status": report.status}
 
-    async def handover(self, arguments: dict[str, Any]) -> dict[str, Any]:
+    async def handover(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Move a component."""
         wanted = arguments_of(HandoverArguments, "handover", arguments)
         name = await self._known(wanted.name)
         await self._check_fit(name, "hand over", wanted.to or (await self._view(name))["standby"])
-        return await self._moved(name, lambda number: events.Handover(number, name, wanted.to))
+        return await self._moved(name, lambda number: events.Handover(number, name, wanted.to, asking(by)))
 
-    async def failback(self, arguments: dict[str, Any]) -> dict[str, Any]:
+    async def failback(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Move a component back to the robot that is preferred, or where it was started."""
         name = await self._known(arguments_of(NameArguments, "failback", arguments).name)
         view = await self._view(name)
         await self._check_fit(name, "fail back", view["prefer"] or view["home"])
-        return await self._moved(name, lambda number: events.Failback(number, name))
+        return await self._moved(name, lambda number: events.Failback(number, name, asking(by)))
 
     async def lacks(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         """What this robot lacks of what a component needs to go on here."""
@@ -276,12 +272,12 @@ class Verbs(Questions):
                 )
             await asyncio.sleep(STANDING_POLL_S)
 
-    async def prefer(self, arguments: dict[str, Any]) -> dict[str, Any]:
+    async def prefer(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Say where a component should run."""
         wanted = arguments_of(PreferArguments, "prefer", arguments)
         name = await self._known(wanted.name)
         await self._check_fit(name, "prefer", wanted.robot)
-        await self._command(lambda number: events.Prefer(number, name, wanted.robot))
+        await self._command(lambda number: events.Prefer(number, name, wanted.robot, asking(by)))
         return {"name": name, "robot": wanted.robot}
 
     async def promote(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -297,10 +293,10 @@ class Verbs(Questions):
             return await self._permitted(self._promoted, order, say.caller.uid)
         return await self._lanes.errands.send(robot, "promoted", order, say.caller.uid)
 
-    async def _promoted(self, arguments: dict[str, Any]) -> dict[str, Any]:
+    async def _promoted(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Promote this robot, or tell what that would risk."""
         wanted = arguments_of(PromoteArguments, "promote", arguments)
-        answer = await self._command(lambda number: events.Promote(number, wanted.name, not wanted.sure))
+        answer = await self._command(lambda number: events.Promote(number, wanted.name, not wanted.sure, asking(by)))
         view = await self._view(wanted.name)
         told = {"name": wanted.name, "to": wanted.robot, "epoch": view["epoch"], "sentence": answer.sentence}
         return {**told, "promoted": wanted.sure, "risks": list(answer.risks)}
@@ -367,10 +363,11 @@ class Verbs(Questions):
         own = travelling(self._lanes.settings.component(name).device_rules())
         return tuple({**wanted, **dict(own)}.items())
 
-    async def _begin(self, name: str, launch: Launch, owner: int, guest: Guest | None = None) -> Charge:
+    async def _begin(self, name: str, launch: Launch, owner: int, by: int, guest: Guest | None = None) -> Charge:
         """Have a component started or taken in, and wait until it is.
 
         Args:
+            by: uid of the user who asks, also for another owner.
             guest: the process that is to be taken in; stays the caller's.
 
         Raises:
@@ -384,7 +381,8 @@ class Verbs(Questions):
         charge.ended = None
         end = charge.end()
         try:
-            await self._command(lambda number: events.Run(number, ComponentSpec(name, config.robot, launch, rules, owner)))
+            spec = ComponentSpec(name, config.robot, launch, rules, owner)
+            await self._command(lambda number: events.Run(number, spec, asking(by)))
         except RefusedError as refusal:
             raise RefusedError(str(refusal), refusal.kind, charge.figures.reasons) from refusal
         begun = asyncio.ensure_future(charge.started.wait())

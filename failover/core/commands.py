@@ -15,6 +15,9 @@ _RUNNING = frozenset({State.PRIMARY, State.FROZEN})
 
 def obey(component: Component, turn: Turn, command: Command) -> None:
     """Carry out one command, or say why not."""
+    if refusal := _why_not_by(component, command):
+        turn.order(acts.Answer(command.request, False, refusal))
+        return
     match command:
         case Run():
             _run(component, turn, command)
@@ -33,6 +36,14 @@ def obey(component: Component, turn: Turn, command: Command) -> None:
             promotion.obey(component, turn, command)
         case Failback():
             _fail_back(component, turn, command)
+
+
+def _why_not_by(component: Component, command: Command) -> str:
+    """The agent let a user ask by the owner of that instant; another user may have taken the name since."""
+    is_new = isinstance(command, Run) and component.state in (State.RELEASED, State.ABSENT)
+    if command.by is None or component.spec is None or is_new or component.spec.owner == command.by:
+        return ""
+    return f"{component.name} belongs to uid {component.spec.owner}, not to uid {command.by} who asked; nothing was done"
 
 
 def _run(component: Component, turn: Turn, command: Run) -> None:

@@ -228,6 +228,7 @@ class Run(Struct, frozen=True):
 
     request: int
     spec: ComponentSpec
+    by: int | None = None
 
 
 class Release(Struct, frozen=True):
@@ -235,6 +236,7 @@ class Release(Struct, frozen=True):
 
     request: int
     component: str
+    by: int | None = None
 
 
 class Stop(Struct, frozen=True):
@@ -243,6 +245,7 @@ class Stop(Struct, frozen=True):
     request: int
     component: str
     signal: int = 15
+    by: int | None = None
 
 
 class Handover(Struct, frozen=True):
@@ -251,6 +254,7 @@ class Handover(Struct, frozen=True):
     request: int
     component: str
     to: str = ""
+    by: int | None = None
 
 
 class Promote(Struct, frozen=True):
@@ -263,6 +267,7 @@ class Promote(Struct, frozen=True):
     request: int
     component: str
     is_trial: bool = False
+    by: int | None = None
 
 
 class Failback(Struct, frozen=True):
@@ -270,6 +275,7 @@ class Failback(Struct, frozen=True):
 
     request: int
     component: str
+    by: int | None = None
 
 
 class Prefer(Struct, frozen=True):
@@ -278,9 +284,11 @@ class Prefer(Struct, frozen=True):
     request: int
     component: str
     robot: str
+    by: int | None = None
 
 
 Command = Run | Release | Stop | Handover | Promote | Failback | Prefer
+"""``by``: uid of the user who gives the order; None: one who may give any. Its right is looked at when it is obeyed."""
 
 Event = (
     Tick

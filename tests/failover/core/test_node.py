@@ -14,12 +14,18 @@ from failover.core.consent import STATES
 from failover.core.events import (
     Captured,
     CaptureFailed,
+    Command,
     Committed,
+    Failback,
+    Handover,
     NothingToCapture,
+    Prefer,
+    Promote,
     Received,
     Release,
     Run,
     Started,
+    Stop,
     Stored,
     Tick,
     Unchanged,
@@ -262,6 +268,38 @@ def test_a_configuration_that_contradicts_itself_is_refused(settings: dict[str, 
 def test_every_state_can_be_reached_and_every_cause_is_used() -> None:
     assert set(TABLE.values()) == set(State) - {State.ABSENT}
     assert {cause for _, cause in TABLE} == set(Cause)
+
+
+ORDERS: tuple[Command, ...] = (
+    Run(2, replace(SPEC, owner=1001)),
+    Release(2, SPEC.name),
+    Stop(2, SPEC.name),
+    Handover(2, SPEC.name),
+    Promote(2, SPEC.name),
+    Failback(2, SPEC.name),
+    Prefer(2, SPEC.name, "robot1"),
+)
+
+
+@pytest.mark.parametrize("order", ORDERS, ids=lambda order: type(order).__name__)
+def test_an_order_about_a_name_that_another_user_has_taken_meanwhile_does_nothing(order: Command) -> None:
+    node = Node(ALONE, 1, Ballot(), 0)
+    running(node, replace(SPEC, owner=1000))
+    (answer,) = node.step(replace(order, by=1001), 2 * MS).act
+    assert isinstance(answer, acts.Answer) and not answer.ok and "belongs to uid 1000" in answer.sentence
+    assert node.status(2 * MS).components[0].state is State.PRIMARY
+    for by in (1000, None):
+        answers = only(node.step(replace(order, by=by), 3 * MS), acts.Answer)
+        assert not any("belongs to uid" in one.sentence for one in answers)
+
+
+def test_a_released_name_is_free_for_another_user_and_what_is_kept_under_it_is_not() -> None:
+    node = Node(ALONE, 1, Ballot(), 0)
+    running(node, replace(SPEC, owner=1000))
+    node.step(Release(2, SPEC.name, by=1000), 2 * MS)
+    (answer,) = only(node.step(Release(3, SPEC.name, by=1001), 3 * MS), acts.Answer)
+    assert not answer.ok and "belongs to uid 1000" in answer.sentence
+    assert only(node.step(Run(4, replace(SPEC, owner=1001), by=1001), 4 * MS), acts.Start)
 
 
 def test_a_command_about_an_unknown_component_is_answered() -> None:
