@@ -8,7 +8,7 @@ from unittest.mock import patch
 from failover.core import speaker
 from failover.core.types import MS, ComponentSpec, Config, Launch, OnLoss, Rule, Rules, WhenAlone
 from tests.simulation.invariants import Broken, Invariants
-from tests.simulation.liars import LIES
+from tests.simulation.liars import LIES, ROBOTS_LIES
 from tests.simulation.robots import KEEPS_STATE
 from tests.simulation.teams import elective, pair
 from tests.simulation.troubles import Trouble
@@ -51,8 +51,8 @@ CAREFUL = 4
 BOOT_PATIENCE_MS = 1_500
 """Every so many-th pair waits that long after a start for a word of the robot that ran a component."""
 
-LIARS_TEAMS = tuple(team for team in TEAMS if sum(team[1:]))
-"""Those in which there is a server or a witness whose key can be stolen."""
+LIARS_TEAMS = tuple(team for team in TEAMS if sum(team) > 2)
+"""Those that vote: of two, a liar is the other half of every decision."""
 
 LIE_NS = 300 * MS
 """After so long, on the average, a liar says something else."""
@@ -74,7 +74,7 @@ def life(
     Args:
         team: of ``TEAMS``; None for what the seed says.
         faults: how many, in a life that is as long as they take and whose programs do not end; 0 for what the seed says.
-        liars: somebody has the key of a server or a witness, and lies by it until the world is healed.
+        liars: an attacker has the key of a member, and lies by it until the world is healed.
     """
     random, engine = Random(seed ^ 0x5EED), Random(seed)
     specs = tuple(_spec(random, index, engine.choice(engines)) for index in range(random.choice((1, 1, 2, 3))))
@@ -147,13 +147,14 @@ def _make_harsh(world: World) -> None:
 
 
 def _let_one_lie(world: World, random: Random, until_ns: int) -> None:
-    """A server or a witness, and one lie after the other."""
-    name = random.choice([name for name, robot in world.robots.items() if not robot.config.runs(name)])
+    """A member, and one lie after the other."""
+    name = random.choice(list(world.robots))
+    lies = ROBOTS_LIES if world.robots[name].config.runs(name) else LIES
 
     def lie() -> None:
         if world.now_ns < until_ns:
             world.faults += 1
-            world.robots[name].lie = chosen = random.choice(LIES)
+            world.robots[name].lie = chosen = random.choice(lies)
             world.note(f"{name} lies: {chosen.__name__}")
             world.after(int(random.expovariate(1) * LIE_NS), lie)
 

@@ -53,6 +53,11 @@ def _robot(world: World, sender: str, index: int = 0) -> str:
     return robots[index % len(robots)]
 
 
+def _by_order(world: World, sender: str) -> int:
+    """An operator's order is behind it, says a member that runs nothing; a robot may give orders, and its claim needs none."""
+    return FREE | OPEN if world.robots[sender].config.runs(sender) else ORDERED
+
+
 @_of_each
 def finishes(world: World, beat: Beat, entry: Entry, _: str) -> Entry:
     """It is finished, one epoch above, at the robot that runs it."""
@@ -92,13 +97,13 @@ def releases(world: World, beat: Beat, entry: Entry, _: str) -> Entry:
 @_of_each
 def runs(world: World, beat: Beat, entry: Entry, _: str) -> Entry:
     """The liar runs it, one epoch above."""
-    return _says(State.PRIMARY, entry, _highest(world, entry.name) + 1, beat.sender, ORDERED)
+    return _says(State.PRIMARY, entry, _highest(world, entry.name) + 1, beat.sender, _by_order(world, beat.sender))
 
 
 @_of_each
 def claims(world: World, beat: Beat, entry: Entry, _: str) -> Entry:
     """The liar claims it, one epoch above."""
-    return _says(State.CLAIMING, entry, _highest(world, entry.name) + 1, beat.sender, ORDERED)
+    return _says(State.CLAIMING, entry, _highest(world, entry.name) + 1, beat.sender, _by_order(world, beat.sender))
 
 
 @_of_each
@@ -110,7 +115,7 @@ def huge_epoch(world: World, beat: Beat, entry: Entry, _: str) -> Entry:
 @_of_each
 def huge_claim(world: World, beat: Beat, entry: Entry, _: str) -> Entry:
     """The liar claims the last epoch that a beat can carry."""
-    return _says(State.CLAIMING, entry, EPOCH_MAX - 1, beat.sender, ORDERED)
+    return _says(State.CLAIMING, entry, EPOCH_MAX - 1, beat.sender, _by_order(world, beat.sender))
 
 
 @_of_each
@@ -225,6 +230,9 @@ LIES: Final[tuple[Lie, ...]] = (
     others_name,
 )
 """Whatever else goes wrong meanwhile, these cost a member's vote, or a server's checkpoints, and nothing else."""
+
+ROBOTS_LIES: Final = tuple(lie for lie in LIES if lie is not orders)
+"""Of a robot in a team that votes; it may give orders."""
 
 FALSE_GRANTS: Final[tuple[Lie, ...]] = (votes_twice, echoes_ahead)
 """Together with a robot that is cut off, or stands still and comes back, these can have a component run twice."""
