@@ -12,7 +12,7 @@ PAGE = Path(__file__).parent.parent / "docs" / "capabilities.md"
 BEGIN, END = "<!-- capabilities:begin (written by ./run table) -->\n", "<!-- capabilities:end -->\n"
 
 
-HEAD = "| thing | | how it comes back, or what to do instead |\n|---|---|---|\n"
+HEAD = "| thing | verdict | how it comes back, or what to do instead |\n|---|---|---|\n"
 
 
 def line_of(row: Capability) -> str:
