@@ -53,7 +53,7 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.THERE,
-        "a file of the program that another program has changed, or is writing: found while the program runs",
+        "a file that the program writes, and that another program has changed or is writing: found while the program runs",
         "let one program write each file, or make the file shared (`--shared`): it then keeps its content, and the "
         "restore sets the offset",
         "was written to since the snapshot",
