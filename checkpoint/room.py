@@ -24,8 +24,8 @@ from checkpoint.model import Snapshot
 CAPABILITIES: Final = (
     refused(
         Area.MEMORY,
-        "a program of several processes that hold more, each counted alone, than its machine has free",
-        "start fewer processes, give the machine memory or swap",
+        "a program of several processes that together hold more than its machine has free, each counted alone",
+        "start fewer processes, or give the machine memory or swap",
         "its processes hold {} GB together, and copying them takes {} GB",
         "its processes hold {} GB where each has its own",
     ),

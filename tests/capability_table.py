@@ -1,4 +1,4 @@
-"""Writes the table of what comes back into README.md and docs/capabilities.md: ``./run table``, after a row was changed."""
+"""Writes the table of what comes back into docs/capabilities.md: ``./run table``, after a row was changed."""
 
 from __future__ import annotations
 
@@ -6,14 +6,17 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from checkpoint import capabilities
-from checkpoint.capability import Capability, Verdict
+from checkpoint.capability import Capability
 
-ROOT = Path(__file__).parent.parent
+PAGE = Path(__file__).parent.parent / "docs" / "capabilities.md"
 BEGIN, END = "<!-- capabilities:begin (written by ./run table) -->\n", "<!-- capabilities:end -->\n"
 
 
+HEAD = "| thing | verdict | how it comes back, or what to do instead |\n|---|---|---|\n"
+
+
 def line_of(row: Capability) -> str:
-    """A row with its sentence."""
+    """One thing with its verdict and its sentence."""
     return f"| {row.kind} | {row.verdict.value} | {row.sentence} |"
 
 
@@ -22,18 +25,8 @@ def whole() -> str:
     parts = []
     for area, rows in capabilities.by_area().items():
         lines = "\n".join(line_of(row) for row in rows)
-        parts.append(f"## {area.value[0].upper()}{area.value[1:]}\n\n| | | |\n|---|---|---|\n{lines}\n")
+        parts.append(f"## {area.value[0].upper()}{area.value[1:]}\n\n{HEAD}{lines}\n")
     return "\n".join(parts)
-
-
-def short() -> str:
-    """The kinds by area and verdict, without sentences."""
-    verdicts = " | ".join(verdict.value for verdict in Verdict)
-    lines = [f"| | {verdicts} |", f"|---|{'---|' * len(Verdict)}"]
-    for area, rows in capabilities.by_area().items():
-        cells = ["; ".join(row.kind for row in rows if row.verdict == verdict) for verdict in Verdict]
-        lines.append(f"| {area.value} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
 
 
 def put_into(text: str, table: str) -> str:
@@ -50,9 +43,8 @@ def put_into(text: str, table: str) -> str:
 
 
 def written() -> Mapping[Path, str]:
-    """Each document as it must be."""
-    tables = {ROOT / "README.md": short(), ROOT / "docs" / "capabilities.md": whole()}
-    return {path: put_into(path.read_text(), table) for path, table in tables.items()}
+    """The document as it must be."""
+    return {PAGE: put_into(PAGE.read_text(), whole())}
 
 
 if __name__ == "__main__":

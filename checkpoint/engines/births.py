@@ -30,9 +30,9 @@ from checkpoint.resources import joint
 CAPABILITIES: Final = (
     preserved(
         Area.PROCESS,
-        "child processes, zombies and orphans: who is whose parent, process groups, sessions, exit statuses",
-        "all together, under the PIDs that they had; orphans of a program that `failover run` started, of others those that are "
-        "known by their session, or by standard streams that only the program has",
+        "child processes, zombies and orphans: parents, process groups, sessions, exit statuses",
+        "all together, under their PIDs. Orphans: all, if `failover run` started the program; otherwise those that "
+        "failover knows by their session, or by standard streams that only the program has",
     ),
     preserved(
         Area.MEMORY,
@@ -41,26 +41,26 @@ CAPABILITIES: Final = (
     ),
     preserved(
         Area.MEMORY,
-        "private memory that processes have in common since a fork (copy-on-write)",
-        "there once until one of them writes to it, and carried once",
+        "private memory that processes share since a fork (copy-on-write)",
+        "shared until one process writes to it, and carried once",
     ),
     refused(
         Area.PROCESS,
-        "a session or process group of another program, a namespace that only a child lives in",
+        "a session or process group of another program; a namespace in which only a child lives",
         "start such processes as components of their own",
         "namespace of its own, which is not kept yet",
     ),
     refused(
         Area.PROCESS,
-        "child processes on a kernel without kcmp(2); more than 16,383",
+        "child processes on a kernel without kcmp(2); more than 16,383 of them",
         "boot a kernel with CONFIG_KCMP; start fewer",
         "and this kernel does not tell what they share",
         "processes, which is the limit",
     ),
     refused(
         Area.THERE,
-        "the PIDs of a program of several processes where they are taken, or nobody may choose them",
-        "free them, or start the program with `failover run`, in PIDs of its own",
+        "PIDs of a program of several processes that are taken, or that failover may not choose",
+        "free them, or start the program with `failover run`, which gives it PIDs of its own",
         "by which they know it, cannot be had",
         "processes, which takes the right to choose their pids",
     ),

@@ -15,7 +15,8 @@ CAPABILITIES: Final = (
     preserved(
         Area.PROCESS,
         "a root directory of its own (chroot)",
-        "entered again, by who may (CAP_SYS_CHROOT), under an agent of root that is a program of root; it must be there",
+        "entered again, if failover has CAP_SYS_CHROOT and the directory is there; an agent of root does so for programs "
+        "of root only",
     ),
     refused(
         Area.THERE,
@@ -25,39 +26,40 @@ CAPABILITIES: Final = (
     ),
     preserved(
         Area.PROCESS,
-        "signals: actions, masks, what is pending, alternate stacks",
+        "signals: actions, masks, pending signals, alternate stacks",
         "as they were; how often a timer went off while its signal was pending is lost",
     ),
     by_rule(
         Area.PROCESS,
         "the PID",
-        "the same in a PID namespace of `failover run` (also for ordinary users), or where it is free; else another, and noted",
+        "the same, in a PID namespace of `failover run` (also for ordinary users) or where it is free; otherwise another "
+        "one, and a note says so",
     ),
     by_rule(
         Area.PROCESS,
-        "keys and keyrings of the kernel (keyctl); rules of Landlock, labels of AppArmor and SELinux",
-        "they stay behind: the program has those of whoever restores it",
+        "keys and keyrings of the kernel (keyctl); rules of Landlock; labels of AppArmor and SELinux",
+        "not carried: the program gets those of the process that restores it",
     ),
     by_rule(
         Area.MEMORY,
-        "policies for the memory of several nodes (mbind, set_mempolicy)",
-        "the other machine’s own: its nodes are others",
+        "memory policies for several nodes (mbind, set_mempolicy)",
+        "those of the other machine, which has other nodes",
     ),
     by_rule(
         Area.PROCESS,
         "user, groups, capabilities",
-        "as far as the agent has them; the program of an ordinary user comes back with his and no more",
+        "as far as the agent has them; the program of an ordinary user comes back with that user's rights and no more",
         "of the program are not kept: we do not have them",
     ),
     preserved(
         Area.THREADS,
         "system calls in which a thread sleeps or waits",
-        "made again with the time that is left; a few with a finite timeout end early with EINTR (README)",
+        "made again with the time that is left; a few with a finite timeout end early with EINTR (docs/limits.md)",
     ),
     refused(
         Area.THERE,
-        "a PID or thread id that is taken, of a program of several threads or one whose lock names it",
-        "free it, or start the program with `failover run`, in PIDs of its own",
+        "a PID or thread id that is taken, if the program has several threads or one of its locks names the id",
+        "free the id, or start the program with `failover run`, which gives it PIDs of its own",
         "by which they know it, cannot be had",
         "it holds a lock that names its own pid",
         "and a lock that the program holds names it",
@@ -67,12 +69,12 @@ CAPABILITIES: Final = (
     preserved(
         Area.MEMORY,
         "private memory: heap, stacks, mapped files",
-        "with protection, guard pages and advice; zero pages and untouched ones cost nothing, swapped ones are carried",
+        "with protection, guard pages and advice; zero pages and untouched pages cost nothing, swapped pages are carried",
     ),
     preserved(
         Area.MEMORY,
-        "shared memory that is the program's alone: anonymous, POSIX (/dev/shm), files",
-        "made again, or mapped again where the file is",
+        "shared memory that the program alone has: anonymous, POSIX (/dev/shm), files",
+        "made again, or mapped again where the file exists",
     ),
     preserved(
         Area.PROCESS,
@@ -81,17 +83,18 @@ CAPABILITIES: Final = (
     ),
     preserved(
         Area.TIME,
-        "interval timers, POSIX timers, sleeps, relative or absolute, of the realtime, monotonic, boot and TAI clocks",
-        "go on with what was left, the outage counted; where the hour is set later, a POSIX timer does not follow",
+        "interval timers, POSIX timers and sleeps, relative or absolute, of the realtime, monotonic, boot and TAI clocks",
+        "go on with the time that was left, and count the outage; if the clock is set later, a POSIX timer does not follow",
     ),
     preserved(
         Area.TIME,
         "timers of processor time (setitimer, CLOCK_PROCESS_CPUTIME_ID, CLOCK_THREAD_CPUTIME_ID)",
-        "go on with what was left; the clocks themselves, and what getrusage tells, begin anew",
+        "go on with the time that was left; the clocks themselves, and the figures of getrusage, begin anew",
     ),
     by_rule(
         Area.TIME,
         "monotonic and boot clocks",
-        "never go back, and go on from their reading where `failover run` gave a time namespace; the hour is the machine's",
+        "never go back; they go on from their reading where `failover run` gave the program a time namespace. The time of "
+        "day is the machine's",
     ),
 )

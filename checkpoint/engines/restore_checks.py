@@ -39,8 +39,8 @@ from checkpoint.resources.rebuilding import number_of
 CAPABILITIES: Final = (
     refused(
         Area.THERE,
-        "a file that is mapped or open is missing, or another one (size, build, content)",
-        "install the same on all robots, or rule it shared where its content does not matter (`--shared`)",
+        "a mapped or open file that is missing, or different (size, build, content)",
+        "install the same file on all robots, or make it shared if its content does not matter (`--shared`)",
         "is another file: {} bytes here",
         "is another file: as long",
         "is another build of that file",
@@ -53,46 +53,49 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.THERE,
-        "a file that the program writes was changed by another program, or is being written by one: found while it runs",
-        "one writer for each file, or rule it shared (`--shared`): it keeps its content, and the offset is set",
+        "a file that the program writes, and that another program has changed or is writing: found while the program runs",
+        "let one program write each file, or make the file shared (`--shared`): it then keeps its content, and the "
+        "restore sets the offset",
         "was written to since the snapshot",
         "is held open for writing by",
     ),
     refused(
         Area.THERE,
         "another architecture or page size",
-        "processors of the same kind",
+        "use processors of the same kind",
         "it was taken on {}, this machine is",
         "its pages are {} bytes",
     ),
     by_rule(
         Area.THERE,
         "a processor without instructions that the other one has (AVX-512 …)",
-        "a program that was started with `--portable`; of another it is not known what it chose: processors alike",
+        "start the program with `--portable`; without it use equal processors, because failover cannot know which "
+        "instructions the program chose",
         "this processor lacks",
     ),
     refused(
         Area.THERE,
-        "a processor without the registers that a thread is just using; AMX tiles in use",
-        "the same processor, or another checkpoint; registers at rest do not count, nor where the processor puts them",
+        "a processor without registers that a thread is just using; AMX tiles in use",
+        "use the same processor, or another checkpoint. Registers at rest do not count, nor does the place where the "
+        "processor puts them",
         "is using {}, which cannot be had here",
     ),
     refused(
         Area.THERE,
-        "a kernel without what the program uses",
-        "boot one that has it",
+        "a kernel without a feature that the program uses",
+        "boot a kernel that has it",
         "which our kernel ({}) does not know",
     ),
     refused(
         Area.THERE,
-        "the directory in which the program works, or its root directory, is missing",
-        "make it",
+        "a missing directory in which the program works, or a missing root directory",
+        "make the directory",
         "its working directory {} is missing",
         "its root directory {} is missing",
     ),
     refused(
         Area.THERE,
-        "a snapshot of another version, or one that is not whole",
+        "a snapshot of another version, or an incomplete one",
         "use the version that captured it, or capture again",
         "which this version does not know",
         "its first thread is not told",

@@ -21,19 +21,20 @@ from checkpoint.resources.unsupported import HUGE_NAME
 CAPABILITIES: Final = (
     by_rule(
         Area.MEMORY,
-        "huge pages (MAP_HUGETLB), up to 64 MiB each where they are private",
-        "huge pages again where enough are free there; else, and where relatives share them, ordinary ones, and that is noted",
+        "huge pages (MAP_HUGETLB), up to 64 MiB each if they are private",
+        "huge pages again if enough are free there; otherwise, and if processes of the program share them, ordinary "
+        "pages, and a note says so",
         "which its processes share, are ordinary ones here",
     ),
     preserved(
         Area.MEMORY,
         "advice: transparent huge pages, DONTFORK, WIPEONFORK, DONTDUMP, merging; droppable and sealed mappings",
-        "as it was; what is excluded from core dumps is carried all the same, what is droppable begins empty",
+        "as it was; memory that is excluded from core dumps is carried all the same, droppable memory begins empty",
     ),
     preserved(
         Area.MEMORY,
         "protection keys (pkeys)",
-        "the same keys and rights, where the other processor has keys; a key that guards nothing and allows nothing is free",
+        "the same keys and rights, if the other processor has keys; a key that guards nothing and allows nothing is free",
         "it has memory with protection keys",
     ),
 )

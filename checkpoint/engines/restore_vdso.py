@@ -42,7 +42,8 @@ CAPABILITIES: Final = (
     preserved(
         Area.THERE,
         "another kernel, with another vdso",
-        "its calls are led to ours; refused where the program has moved its vdso, or was just reading a coarse clock",
+        "calls to the old vdso are led to the new one; refused if the program has moved its vdso, or was just reading a "
+        "coarse clock",
         "and the program has moved or unmapped it",
         "and the snapshot does not hold the old one",
     ),

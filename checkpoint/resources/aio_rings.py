@@ -36,18 +36,18 @@ CAPABILITIES: Final = (
     preserved(
         Area.PIPES,
         "rings of asynchronous I/O (io_setup)",
-        "at their addresses, with the events that were not read; a poll that is under way (IOCB_CMD_POLL), of which the kernel "
-        "tells nobody, is lost",
+        "at their addresses, with the events that were not read yet; a poll under way (IOCB_CMD_POLL) is lost, because "
+        "the kernel does not tell of it",
     ),
     refused(
         Area.PIPES,
-        "asynchronous direct I/O (O_DIRECT) that is under way, or to where nobody can tell",
-        "it is kept as soon as that is done; use a file system on a block device",
+        "asynchronous direct I/O (O_DIRECT) that is under way, or on a file system that does not tell what is under way",
+        "wait: failover captures it as soon as the I/O is done; use a file system on a block device",
         "opened for direct I/O (O_DIRECT), and its file system does not say",
     ),
     refused(
         Area.THERE,
-        "a ring of asynchronous I/O on a machine with many more processors, or with too many of them",
+        "a ring of asynchronous I/O on a machine with many more processors, or with too many of these rings",
         "raise fs.aio-max-nr; let the program ask for more events",
         "rings of asynchronous I/O have",
         "a ring of asynchronous I/O of",

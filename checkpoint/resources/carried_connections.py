@@ -39,8 +39,8 @@ CAPABILITIES: Final = (
     by_rule(
         Area.SOCKETS,
         'TCP connections with others (`connections = "carry"`)',
-        "a handover, a failback, and `failover capture` with `restore`, take established ones along with what waits in them "
-        "(TCP_REPAIR); their address is to follow (docs/connections.md). After a crash they are reset",
+        "a handover, a failback, and `failover capture` with `restore` carry established connections, with the data in "
+        "them (TCP_REPAIR); their address must follow (docs/connections.md). After a crash they are reset",
         "it takes CAP_NET_ADMIN",
         "goes on once this machine has its address",
     ),

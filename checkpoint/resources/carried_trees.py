@@ -66,12 +66,12 @@ FOLDER_FLAGS: Final = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXE
 CAPABILITIES: Final = (
     by_rule(
         Area.FILES,
-        "files and folders that it writes",
-        "carried (`--carry`) as of the instant of its memory, block by changed block: docs/files.md",
+        "files and folders that the program writes",
+        "carried (`--carry`) as they were at the instant of its memory, block by changed block: docs/files.md",
     ),
     refused(
         Area.FILES,
-        "in a carried folder: sockets, devices, network mounts, other file systems; more than its limits allow",
+        "in a carried folder: sockets, devices, network mounts, other file systems; more than the limits of carrying allow",
         "carry less, or name a folder without them",
         "which is not carried: let it lie outside that folder",
         "is to be carried and is neither a file nor a folder",

@@ -31,12 +31,12 @@ CAPABILITIES: Final = (
     by_rule(
         Area.FILES,
         "files over whose path something was mounted",
-        "as others, on the same machine, for root; where their file system has handles",
+        "like other files, on the same machine, for root, and where their file system has handles",
     ),
     refused(
         Area.THERE,
-        "a file that a mount covers, on another machine, or changed meanwhile",
-        "run it where it was captured",
+        "a file that a mount covers, on another machine or after a change",
+        "run the program where it was captured",
         "{} is not on this machine: restore it where it was captured",
         "{} has another content by now",
         "{} is opened again for root alone",

@@ -30,8 +30,8 @@ KIND: Final = "deadlines"
 CAPABILITIES: Final = (
     preserved(
         Area.THREADS,
-        "scheduling by deadlines (SCHED_DEADLINE), time slices of a thread’s own",
-        "set again as far as rights and the other machine’s load allow; else a note says what is not",
+        "deadline scheduling (SCHED_DEADLINE), and time slices of a thread",
+        "set again as far as rights and the other machine's load allow; otherwise a note says what is not",
     ),
 )
 

@@ -23,8 +23,8 @@ KIND: Final = "death_signals"
 CAPABILITIES: Final = (
     preserved(
         Area.THREADS,
-        "signals at the parent’s death (PR_SET_PDEATHSIG), of each thread",
-        "set again; the parent is whoever has brought the program back, or its parent in the program",
+        "each thread's signal at its parent's death (PR_SET_PDEATHSIG)",
+        "set again; the parent is the process that restored the program, or its parent within the program",
     ),
 )
 

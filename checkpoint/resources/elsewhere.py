@@ -22,8 +22,8 @@ from checkpoint.resources import OpenFile
 CAPABILITIES: Final = (
     refused(
         Area.PIPES,
-        "an event, timer, signal, epoll or inotify descriptor, memory file or socket that another process holds too",
-        "protect the program when that has ended",
+        "an event, timer, signal, epoll or inotify descriptor, memory file or socket that another process holds, too",
+        "protect the program after the other process has ended",
         "holds too: protect the program when that has ended",
     ),
 )

@@ -31,12 +31,14 @@ KIND: Final = "epolls"
 
 CAPABILITIES: Final = (
     preserved(
-        Area.PIPES, "epoll, also nested", "with all that it watches; what was reported by edge (EPOLLET) is reported once more"
+        Area.PIPES,
+        "epoll, also nested",
+        "with everything that it watches; it reports once more what it had reported by edge (EPOLLET)",
     ),
     refused(
         Area.PIPES,
-        "an epoll instance that watches what the program has closed and somebody else holds",
-        "take it out (EPOLL_CTL_DEL) before closing",
+        "an epoll instance that watches a descriptor which the program has closed and another process holds",
+        "remove it from the instance (EPOLL_CTL_DEL) before closing it",
         "take that out (EPOLL_CTL_DEL)",
     ),
 )

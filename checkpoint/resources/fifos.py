@@ -31,21 +31,21 @@ KIND: Final = "fifos"
 CAPABILITIES: Final = (
     preserved(
         Area.PIPES,
-        "named pipes (fifo) that nobody else has open",
-        "opened again by name, or without one where that was deleted, by handle where a mount covers it, with what is in them; "
-        "made where they are missing",
+        "named pipes (fifo) that no other process has open",
+        "opened again with the data in them: by name, or without one if the name was deleted, or by handle if a mount "
+        "covers it. Made where they are missing",
     ),
     refused(
         Area.PIPES,
         "a named pipe that another process has open, or whose name is gone",
-        "protect the program when the other has closed it; let it open a name that stays",
+        "protect the program after the other process has closed it; let it open a name that stays",
         "whose name is gone",
         "has open too",
     ),
     refused(
         Area.THERE,
-        "the place of a named pipe is missing, or something else has its name; one that a mount covers, on another machine",
-        "make the directory; remove what is there",
+        "a missing directory of a named pipe; another file under its name; a named pipe that a mount covers, on another machine",
+        "make the directory; remove the other file",
         "is no named pipe here",
         "the directory of the named pipe",
         "is not on this machine: restore it where it was captured",

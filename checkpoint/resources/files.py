@@ -34,18 +34,19 @@ CAPABILITIES: Final = (
     preserved(
         Area.FILES,
         "regular files, directories and paths (O_PATH)",
-        "opened again at the same offset; what was only read must be the same, what only grew is cut back",
+        "opened again at the same offset. A file that was only read must be the same; a file that only grew is cut back",
     ),
     preserved(
         Area.FILES,
         "deleted files, directories and symbolic links",
-        "carried whole, up to 16 MiB without holes; a file that still has another name, near by or in another process of the "
-        "program, is opened or mapped by that; pages of private "
-        "mappings are carried too, so what is written to the file later does not show in those that were never touched",
+        "carried whole, up to 16 MiB without holes. A file that still has another name, near by or in another process of "
+        "the program, is opened or mapped by that name. Pages of private mappings are carried too: what is written to the "
+        "file later does not show in pages that were never touched",
     ),
     refused(
         Area.FILES,
-        "a deleted file over 16 MiB, or with another name far away; the mere path (O_PATH) of a deleted device, socket or pipe",
+        "a deleted file over 16 MiB, or one whose other name is far away; the mere path (O_PATH) of a deleted device, "
+        "socket or pipe",
         "give it a name",
         "cannot be opened again; let it close that",
         "still has another name",
@@ -60,12 +61,12 @@ CAPABILITIES: Final = (
     refused(
         Area.FILES,
         "secret memory (memfd_secret)",
-        "it cannot be read, that is its purpose; run the program without it",
+        "run the program without it: its purpose is that no other process can read it",
         "secret memory cannot be read",
     ),
     refused(
         Area.FILES,
-        "files that no path leads to (message queues)",
+        "files without a path (message queues)",
         "let the program close them, or use a unix socket",
         "which no path leads to from here",
     ),

@@ -39,7 +39,9 @@ KIND: Final = "internet_sockets"
 
 CAPABILITIES: Final = (
     preserved(
-        Area.SOCKETS, "TCP listeners", "bound and listening again, with their options; connections not accepted yet are reset"
+        Area.SOCKETS,
+        "TCP listeners",
+        "bound and listening again, with their options; connections that were not accepted yet are reset",
     ),
     preserved(
         Area.SOCKETS,
@@ -48,19 +50,19 @@ CAPABILITIES: Final = (
     ),
     preserved(
         Area.SOCKETS,
-        "raw sockets, and those for ICMP echoes",
-        "with address, groups, filters and options; what waits in them is lost, as the network may lose it",
+        "raw sockets, and sockets for ICMP echoes",
+        "with address, groups, filters and options; packets that wait are lost, as the network may lose them",
     ),
     refused(
         Area.SOCKETS,
-        "a UDP socket with a datagram that is not finished (UDP_CORK)",
-        "it is kept as soon as that is sent",
+        "a UDP socket with an unfinished datagram (UDP_CORK)",
+        "wait: failover captures it as soon as the datagram is sent",
         "begun and not sent yet (UDP_CORK)",
     ),
     refused(
         Area.THERE,
-        "an address or an interface that a socket is bound to is missing",
-        "bind to all addresses (0.0.0.0, ::), or give it to the machine",
+        "a missing address or interface to which a socket is bound",
+        "bind to all addresses (0.0.0.0, ::), or give the address to the machine",
         "this machine does not have that address",
         "has joined the group",
     ),

@@ -28,13 +28,13 @@ CAPABILITIES: Final = (
     preserved(
         Area.PROCESS,
         "processes that share their table of descriptors, or directories and umask, with their parent (clone(2))",
-        "they share them again; record locks of such a table are those of the parent",
+        "they share them again; the record locks of such a table belong to the parent",
     ),
     refused(
         Area.PROCESS,
-        "a root directory (chroot) that two processes share by CLONE_FS; a thread with a table of descriptors of its own in a "
-        "process that shares its table with another (CLONE_FILES)",
-        "have the child make it its own (unshare), or run it without the chroot",
+        "a root directory (chroot) that two processes share by CLONE_FS; a thread with its own table of descriptors in a "
+        "process that shares its table with another process (CLONE_FILES)",
+        "let the child make it its own (unshare), or run the program without the chroot",
         "it has its directories in common with its parent",
         "it has its open files in common with its parent",
     ),

@@ -31,7 +31,8 @@ CAPABILITIES: Final = (
     preserved(
         Area.FILES,
         "files of /proc and /sys that are read",
-        "opened again where they stood; those of the program itself lead to itself again, those of what has ended to nobody",
+        "opened again where they stood. A file about the program itself is about the restored program; a file about an "
+        "ended process is about no process",
     ),
     refused(
         Area.FILES,
@@ -41,7 +42,7 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.FILES,
-        "files of /proc of single threads and of other programs that live",
+        "files of /proc about single threads, or about other programs that live",
         "let the program close them after reading",
         "of one of its threads: let the program close it",
         "a view of another process",
@@ -49,13 +50,13 @@ CAPABILITIES: Final = (
     refused(
         Area.FILES,
         "files of /proc and /sys that are open for writing",
-        "let the program open them only to write",
+        "let the program open them only while it writes",
         "by which it acts on this machine",
     ),
     refused(
         Area.THERE,
         "a file of /proc or /sys that the other kernel lacks",
-        "boot the same kernel, or attach what the file shows",
+        "boot the same kernel, or attach the device that the file shows",
         "is not offered by this kernel",
     ),
 )

@@ -28,8 +28,9 @@ KIND: Final = "logins"
 CAPABILITIES: Final = (
     by_rule(
         Area.PROCESS,
-        "the login that a program belongs to (loginuid, sessionid of the kernel's audit)",
-        "its user (for all threads the first one’s) where nobody has logged in, or with CAP_AUDIT_CONTROL; its number is new",
+        "the login of a program (loginuid, sessionid of the kernel's audit)",
+        "the user of its login (all threads get the first thread's), if no login is set at the other robot, or with "
+        "CAP_AUDIT_CONTROL; the session number is new",
         "the user of its login (loginuid",
         "the number of its audit session",
     ),

@@ -33,10 +33,11 @@ KIND: Final = "memory_files"
 
 CAPABILITIES: Final = (
     preserved(Area.FILES, "memory files (memfd)", "with name, content, size and seals, up to 16 MiB"),
-    preserved(Area.MEMORY, "scratch memory", "a memory file called failover-scratch: mapped again, filled with zeros"),
+    preserved(Area.MEMORY, "scratch memory", "a memory file named failover-scratch: mapped again, filled with zeros"),
     refused(
         Area.FILES,
-        "memory files over 16 MiB, of huge pages, or sealed against writing and mapped; shared memory that is opened and mapped",
+        "memory files over 16 MiB, of huge pages, or sealed against writing and mapped; shared memory that is both opened "
+        "and mapped",
         "use a file in /dev/shm",
         "of huge pages, which are not kept",
         "MiB, which is the limit",

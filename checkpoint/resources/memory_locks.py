@@ -22,8 +22,8 @@ KIND: Final = "memory_locks"
 CAPABILITIES: Final = (
     preserved(
         Area.MEMORY,
-        "locked memory: mlock, also on fault, and mlockall for what is still to come",
-        "locked again as far as its limit and rights allow there; else a note says what is not",
+        "locked memory: mlock, also on fault, and mlockall for future mappings",
+        "locked again as far as its limit and rights allow there; otherwise a note says what is not",
     ),
 )
 MCL_FUTURE: Final = 2

@@ -25,7 +25,7 @@ CAPABILITIES: Final = (
     preserved(
         Area.PIPES,
         "a descriptor of a namespace in which the program lives (/proc/self/ns/net)",
-        "it stands for the one in which it lives then",
+        "stands for the namespace in which the restored program lives",
     ),
     refused(
         Area.PIPES,

@@ -33,12 +33,14 @@ CAPABILITIES: Final = (
     preserved(
         Area.SOCKETS,
         "netlink sockets (routes, links, kernel events, generic netlink, diagnosis)",
-        "bound to their number again, with groups and options; what a driver keeps for a generic one is to be asked for again",
+        "bound to their number again, with groups and options; the program must ask again for what a driver keeps for a "
+        "generic one",
     ),
     refused(
         Area.SOCKETS,
         "a netlink socket in which an answer waits, or of a family that keeps more for it (netfilter, audit, connector …)",
-        "it is kept as soon as the program has read; others: open it for a moment and close it again",
+        "an answer: wait, failover captures the socket as soon as the program has read it. Another family: open it only "
+        "for a moment, then close it",
         "is a netlink socket in which",
         "is a netlink socket of family",
     ),

@@ -39,8 +39,8 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.THERE,
-        "the interface of a packet socket is missing",
-        "rename or add it",
+        "a missing interface of a packet socket",
+        "rename or add the interface",
         "is a packet socket at the interface",
     ),
 )

@@ -28,14 +28,14 @@ KIND: Final = "pidfds"
 CAPABILITIES: Final = (
     preserved(
         Area.PIPES,
-        "a pidfd of the program itself, of a child or a thread of it, or of a process that has ended",
-        "it stands for it again",
+        "a pidfd of the program itself, of its child or thread, or of a process that has ended",
+        "stands for the same process or thread again",
     ),
     refused(
         Area.PIPES,
-        "a pidfd of another program, of a thread that has ended, or that an epoll instance watches, or that is on its way in a "
-        "unix socket; one of a living process that several share",
-        "let the program close them, or wait by number",
+        "a pidfd of another program, of a thread that has ended, that an epoll instance watches, or that is on its way in "
+        "a unix socket; a pidfd of a living process that several processes share",
+        "let the program close it, or wait for the process by its number",
         "is a pidfd of {}, which is not kept",
     ),
 )

@@ -39,11 +39,11 @@ from checkpoint.resources.rebuilding import number_of
 KIND: Final = "pipes"
 
 CAPABILITIES: Final = (
-    preserved(Area.PIPES, "pipes that the program keeps to itself", "with what is in them"),
+    preserved(Area.PIPES, "pipes that only the program has", "with the data in them"),
     refused(
         Area.PIPES,
         "a pipe to another process",
-        "redirect it to a file, or start the programs so that one holds both ends",
+        "redirect it to a file, or start the programs so that one component holds both ends",
         "to somebody else: only pipes of which",
         "that another process holds too",
     ),

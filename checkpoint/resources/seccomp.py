@@ -34,12 +34,14 @@ CAPABILITIES: Final = (
     preserved(
         Area.PROCESS,
         "seccomp: filters of the process and of single threads, strict mode",
-        "in force again from the first instruction on; where failover has CAP_SYS_ADMIN and the kernel CONFIG_CHECKPOINT_RESTORE",
+        "in force again from the first instruction on; failover needs CAP_SYS_ADMIN, and the kernel CONFIG_CHECKPOINT_RESTORE",
     ),
     refused(
         Area.PROCESS,
-        "a seccomp filter that leaves calls to another process to judge (SECCOMP_RET_USER_NOTIF); any without CAP_SYS_ADMIN",
-        "run it without, or failover as root: a capture asks system calls of it that the filter may forbid",
+        "a seccomp filter that lets another process judge calls (SECCOMP_RET_USER_NOTIF); any seccomp filter without "
+        "CAP_SYS_ADMIN",
+        "run the program without the filter, or failover as root: a capture makes system calls in the program that the "
+        "filter may forbid",
         "runs under a seccomp filter",
     ),
 )

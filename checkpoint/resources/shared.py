@@ -15,8 +15,8 @@ KIND: Final = "shared"
 CAPABILITIES: Final = (
     preserved(
         Area.PIPES,
-        "open files, pipes and sockets that several processes of a program share, or that lead from one to the other",
-        "shared as before, with one offset; what waits in them comes back",
+        "open files, pipes and sockets that several processes of a program share, or that connect them",
+        "shared as before, with one offset; data that waits in them comes back",
     ),
 )
 

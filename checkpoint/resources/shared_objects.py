@@ -24,8 +24,8 @@ from checkpoint.linux.tracking import ANONYMOUS, MEMORY_PLACE
 CAPABILITIES: Final = (
     refused(
         Area.MEMORY,
-        "shared memory that another process has mapped too",
-        "protect the program when that has ended",
+        "shared memory that another process has mapped, too",
+        "protect the program after the other process has ended",
         "which stays behind: protect the program",
     ),
 )

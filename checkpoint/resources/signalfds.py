@@ -20,7 +20,11 @@ from checkpoint.resources.rebuilding import Rebuilding, number_of
 KIND: Final = "signalfds"
 
 CAPABILITIES: Final = (
-    preserved(Area.PIPES, "signals that are read (signalfd)", "with their mask; what waits in them are pending signals"),
+    preserved(
+        Area.PIPES,
+        "signals that are read (signalfd)",
+        "with their mask; the signals that wait in them are the program's pending signals",
+    ),
 )
 
 TARGET: Final = "anon_inode:[signalfd]"

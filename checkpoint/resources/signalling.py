@@ -26,16 +26,16 @@ from checkpoint.resources.rebuilding import number_of
 CAPABILITIES: Final = (
     preserved(
         Area.PIPES,
-        "signals of a descriptor (F_SETOWN, F_SETSIG, O_ASYNC) to a process of the program, or its first thread",
+        "signals of a descriptor (F_SETOWN, F_SETSIG, O_ASYNC) to a process of the program, or to its first thread",
         "set again",
     ),
     refused(
         Area.PIPES,
         "signals of a descriptor to another process, a group or another thread",
-        "let the program own them itself",
+        "let the program itself be the owner (F_SETOWN)",
         "sends its signals to",
     ),
-    refused(Area.PIPES, "notifications of a directory by signals (F_NOTIFY)", "use inotify, which is kept", "(F_NOTIFY)"),
+    refused(Area.PIPES, "notifications of a directory by signals (F_NOTIFY)", "use inotify, which is preserved", "(F_NOTIFY)"),
 )
 
 F_SETOWN_EX: Final = 15

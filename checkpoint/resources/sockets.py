@@ -41,7 +41,7 @@ CAPABILITIES: Final = (
     refused(
         Area.SOCKETS,
         "a socket with a filter of extended BPF (SO_ATTACH_BPF)",
-        "use a classic one (SO_ATTACH_FILTER), which is kept",
+        "use a classic filter (SO_ATTACH_FILTER), which is preserved",
         "with a filter of extended BPF",
     ),
 )

@@ -25,13 +25,14 @@ CAPABILITIES: Final = (
     preserved(
         Area.PROCESS,
         "processes that are stopped (SIGSTOP, job control)",
-        "stopped again, and their parent is told what it had not been told; the first process of a program that an agent "
-        "looks after, and with it all others, runs on",
+        "stopped again, and their parent learns what it had not been told yet. Exception: the first process of a program "
+        "under an agent runs on, and then all others do",
     ),
     by_rule(
         Area.PROCESS,
-        "that children go on which their parent has not been told (WCONTINUED); the time of ended children (RUSAGE_CHILDREN)",
-        "of several such children it is told of one; that time begins at zero",
+        "a continued child of which its parent has not been told (WCONTINUED); processor time of ended children "
+        "(RUSAGE_CHILDREN)",
+        "the parent is told of one such child only; the time begins at zero",
     ),
 )
 CLD_STOPPED: Final = 5

@@ -24,7 +24,7 @@ CAPABILITIES: Final = (
     preserved(
         Area.TERMINALS,
         "standard input, output and error",
-        "become the streams of the component where it goes on; nothing written is lost or repeated",
+        "become the streams of the component at the other robot; nothing written is lost or repeated",
     ),
 )
 

@@ -35,21 +35,21 @@ PREFIX: Final = "/SYSV"
 CAPABILITIES: Final = (
     preserved(
         Area.MEMORY,
-        "System V shared memory that is the program's alone",
-        "made again, once for all of its processes, with its content, key, owner and id; another id, where that one is taken, "
-        "is noted",
+        "System V shared memory that only the program has",
+        "made again, once for all of its processes, with its content, key, owner and id; if the id is taken, it gets "
+        "another one, and a note says so",
     ),
     refused(
         Area.MEMORY,
-        "System V shared memory that others have too, or of which a part is unmapped",
-        "use a file in /dev/shm, or protect it when the others have ended",
+        "System V shared memory that other programs have too, or that is partly unmapped",
+        "use a file in /dev/shm, or protect the program after the others have ended",
         "attached by other processes, too",
         "of which it has unmapped a part",
     ),
     refused(
         Area.THERE,
-        "somebody has the key of its System V shared memory",
-        "end that first, or remove it (ipcrm)",
+        "a key of its System V shared memory that another program has",
+        "end that program, or remove its segment (ipcrm)",
         "belongs to another segment here",
     ),
 )

@@ -49,19 +49,19 @@ CAPABILITIES: Final = (
     preserved(
         Area.SOCKETS,
         "TCP connections of the program with itself",
-        "with what waits in them, between the same addresses where their ports are free",
+        "with the data in them, between the same addresses, if their ports are free",
         "the TCP connection",
     ),
     by_rule(
         Area.SOCKETS,
         "TCP connections with others",
-        "they are reset: the program finds what it would find had its peer crashed (ECONNRESET, EPOLLHUP, EPOLLERR); after the "
-        "end of file it reads that again; one that is being asked for is asked for anew",
+        "reset: the program sees what it would see after a crash of its peer (ECONNRESET, EPOLLHUP, EPOLLERR). After an "
+        "end of file it reads the end of file again; a connection that it is just opening is opened anew",
     ),
     refused(
         Area.SOCKETS,
         "a TCP connection of the program with itself that is full",
-        "it is kept as soon as what was sent has arrived, or was read",
+        "wait: failover captures it as soon as the data has arrived, or was read",
         "have not arrived at its other end",
         "in which more than {} MiB wait",
         "in which an out-of-band byte waits (MSG_OOB)",
@@ -69,7 +69,7 @@ CAPABILITIES: Final = (
     refused(
         Area.SOCKETS,
         "a TCP connection of the program with itself that the kernel encrypts (kTLS)",
-        "have the program's library encrypt it",
+        "let the program's library encrypt it",
         "which the kernel encrypts (TCP_ULP)",
     ),
 )

@@ -44,20 +44,20 @@ CAPABILITIES: Final = (
     preserved(
         Area.TERMINALS,
         "pseudo-terminals of which the program has the master",
-        "both ends with settings, window size, modes and controlling session, under the same name (/dev/pts/3) where that is "
-        "free; of a line that is being typed nothing is kept",
+        "both ends with settings, window size, modes and controlling session, under the same name (/dev/pts/3) if it is "
+        "free; a line that is being typed is lost",
     ),
     refused(
         Area.TERMINALS,
-        "a pseudo-terminal in which something waits to be read, or with a line discipline",
-        "it is kept as soon as that is read; let the program use the ordinary line discipline",
+        "a pseudo-terminal with data that waits to be read, or with a line discipline of another kind",
+        "wait: failover captures it as soon as the data is read; let the program use the ordinary line discipline",
         "with {} bytes that wait in it",
         "with line discipline",
     ),
     refused(
         Area.TERMINALS,
         "a pseudo-terminal whose other end another process has open",
-        "protect the program when that has closed it",
+        "protect the program after the other process has closed it",
         "a pseudo-terminal that pid",
     ),
 )

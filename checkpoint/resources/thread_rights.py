@@ -28,8 +28,8 @@ from checkpoint.rights import KIND, Owner, above, refusal
 CAPABILITIES: Final = (
     preserved(
         Area.THREADS,
-        "threads with a user, groups or capabilities of their own",
-        "each gets its own again; securebits are those of the first",
+        "threads with their own user, groups or capabilities",
+        "each gets its own again; all get the securebits of the first thread",
     ),
 )
 

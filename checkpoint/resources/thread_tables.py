@@ -37,13 +37,13 @@ KIND: Final = "thread_tables"
 CAPABILITIES: Final = (
     preserved(
         Area.THREADS,
-        "a thread with a working directory and umask, or a table of descriptors, of its own (unshare)",
-        "its own again; what it has open there the first thread must have open, too",
+        "a thread with its own working directory and umask, or its own table of descriptors (unshare)",
+        "its own again; the first thread must have open, too, what this thread has open there",
     ),
     refused(
         Area.THREADS,
-        "a thread with open files that the first one has not, or a root, record lock or deleted directory of its own; two that "
-        "share what the others do not",
+        "a thread with open files that the first thread does not have; a thread with its own root, record lock or deleted "
+        "directory; two threads that share what the others do not",
         "let the first thread have them, too",
         "which its first thread has not",
         "a root directory of its own",
@@ -51,7 +51,7 @@ CAPABILITIES: Final = (
         "has directories or open files {}",
         "a record lock of its own",
     ),
-    refused(Area.THERE, "the working directory of a single thread is missing", "make it", "in which its thread"),
+    refused(Area.THERE, "a missing working directory of a single thread", "make the directory", "in which its thread"),
 )
 
 CLONE_FS: Final = 0x200

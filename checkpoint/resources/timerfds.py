@@ -38,7 +38,7 @@ CAPABILITIES: Final = (
     preserved(
         Area.TIME,
         "timers that are read (timerfd)",
-        "with what was left, the outage counted, and the expirations that were not read yet",
+        "with the time that was left, the outage counted, and with expirations that were not read yet",
     ),
 )
 

@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 CAPABILITIES: Final = (
     refused(
         Area.SOCKETS,
-        "a descriptor on its way in a unix socket that the program has closed, of a terminal, watch or device, or with a lock",
-        "it is kept as soon as the program has received it",
+        "a descriptor on its way in a unix socket that the program itself has closed, if it is of a terminal, watch or "
+        "device, or has a lock",
+        "wait: failover captures it as soon as the program has received it",
         "is on its way in a unix socket",
     ),
 )

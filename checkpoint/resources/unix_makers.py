@@ -28,8 +28,9 @@ from checkpoint.resources.rebuilding import number_of
 CAPABILITIES: Final = (
     preserved(
         Area.SOCKETS,
-        "whom a unix socket tells as its peer (SO_PEERCRED)",
-        "user and group that made it, also before a change of user; a note where they cannot be had, or another process made it",
+        "the peer that a unix socket names (SO_PEERCRED)",
+        "the user and group that made the socket, also before a change of user; a note says where failover cannot set "
+        "them, or where another process made the socket",
     ),
 )
 

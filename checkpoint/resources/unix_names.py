@@ -38,8 +38,9 @@ from checkpoint.resources.rebuilding import number_of
 CAPABILITIES: Final = (
     refused(
         Area.SOCKETS,
-        "a unix socket whose name a mount hides (not an accepted one), or was given from a directory that was left (../name)",
-        "let the program bind a name that stays, or give its file another one in the same directory only",
+        "a unix socket whose name a mount hides (except an accepted one), or whose name was given from a directory that "
+        "the program has left (../name)",
+        "let the program bind a name that stays; another name for its file must be in the same directory",
         "than it was bound in",
         "is a unix socket whose name a mount hides",
         "is a unix socket whose name is something else",
@@ -47,7 +48,7 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.THERE,
-        "something else has the name of a unix socket, or there is no place for it",
+        "a unix socket's name that something else has, or a missing directory for it",
         "end or remove what is there; make the directory",
         "the directory of the unix socket",
         "is something else here",

@@ -36,33 +36,35 @@ KIND: Final = "unix_sockets"
 CAPABILITIES: Final = (
     preserved(
         Area.SOCKETS,
-        "unix sockets that the program keeps to itself",
-        "pairs and connections with what waits in them, descriptors on their way included",
+        "unix sockets that only the program has",
+        "pairs and connections with the data in them, descriptors on their way included",
     ),
     preserved(
         Area.SOCKETS,
         "unix listeners, and unix sockets for datagrams",
-        "bound to their names again, or connected to the names that they were connected to",
+        "bound to their names again, or connected to the same names again",
     ),
     refused(
         Area.SOCKETS,
         "a unix socket that is connected to another process",
-        "open it for a moment and close it again: captures are taken in between",
+        "open it only for a moment, then close it: failover captures in between",
         "connected to another process",
         "connected to a socket of another process",
     ),
     refused(
         Area.SOCKETS,
-        "a unix socket with descriptors on their way between several processes, an out-of-band byte, or over 4 MiB that wait",
-        "it is kept as soon as the program has taken them",
+        "a unix socket with descriptors on their way between several processes, with an out-of-band byte, or with over 4 "
+        "MiB of data that waits",
+        "wait: failover captures it as soon as the program has taken them",
         "in which an out-of-band byte waits (MSG_OOB): it",
         "with descriptors on their way",
         "MiB wait: it is kept as soon as",
     ),
     refused(
         Area.SOCKETS,
-        "a unix listener where a connection of another process waits, or one with data in it, or of a client that has gone",
-        "it is kept as soon as the program has accepted it",
+        "a unix listener where a connection of another process waits, or a connection with data in it, or of a client "
+        "that has gone",
+        "wait: failover captures it as soon as the program has accepted the connection",
         "waits to be accepted",
     ),
 )

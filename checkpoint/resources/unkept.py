@@ -24,13 +24,14 @@ PR_GET_IO_FLUSHER: Final = 58
 CAPABILITIES: Final = (
     by_rule(
         Area.PROCESS,
-        "the right to every I/O port (iopl), a cookie for core scheduling (PR_SCHED_CORE)",
-        "they stay behind: nobody tells that it has them",
+        "the right to every I/O port (iopl); a cookie for core scheduling (PR_SCHED_CORE)",
+        "not carried: the kernel does not tell that the program has them",
     ),
     refused(
         Area.PROCESS,
-        "segments of its own (modify_ldt), I/O ports (ioperm), cpuid switched off, the rights of a file system (IO_FLUSHER)",
-        "run it without; looked for when protection begins",
+        "segments of its own (modify_ldt); I/O ports (ioperm); a cpuid instruction that is switched off; the rights of a "
+        "file system (IO_FLUSHER)",
+        "run the program without them; failover looks for them when protection begins",
         "it has {}, which no restore gives it",
     ),
 )

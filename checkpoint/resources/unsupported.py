@@ -24,9 +24,15 @@ from checkpoint.resources import OpenFile, Surroundings, kernel_files, refused_t
 KIND: Final = "unsupported"
 
 CAPABILITIES: Final = (
-    refused(Area.PIPES, "io_uring", "poll(2) or epoll on what is kept", "an io_uring", "the rings of an io_uring"),
-    refused(Area.PIPES, "fanotify", "use inotify, which is kept", "a fanotify group"),
-    refused(Area.PIPES, "perf events", "run it without", "a perf event", "the buffer of a perf event"),
+    refused(
+        Area.PIPES,
+        "io_uring",
+        "use poll(2) or epoll on descriptors that are preserved",
+        "an io_uring",
+        "the rings of an io_uring",
+    ),
+    refused(Area.PIPES, "fanotify", "use inotify, which is preserved", "a fanotify group"),
+    refused(Area.PIPES, "perf events", "run the program without them", "a perf event", "the buffer of a perf event"),
     refused(
         Area.PIPES,
         "open files of any other kind (BPF …)",
@@ -39,34 +45,34 @@ CAPABILITIES: Final = (
     refused(
         Area.SOCKETS,
         "sockets of other families (CAN, vsock, Bluetooth …) and protocols (SCTP, MPTCP …)",
-        "open it for a moment and close it again; captures are taken in between",
+        "open them only for a moment, then close them: failover captures in between",
         "a socket ({}, {})",
     ),
-    refused(
-        Area.SOCKETS, "the rings of a packet socket that are mapped", "read its frames by recv(2)", "the rings of a packet socket"
-    ),
-    refused(Area.DEVICES, "memory of a device", "the driver process maps it", "memory of a device"),
-    refused(Area.MEMORY, "secret memory that is mapped", "run it without", "secret memory"),
+    refused(Area.SOCKETS, "mapped rings of a packet socket", "read its frames by recv(2)", "the rings of a packet socket"),
+    refused(Area.DEVICES, "memory of a device", "let a driver process of its own map it", "memory of a device"),
+    refused(Area.MEMORY, "secret memory that is mapped", "run the program without it", "secret memory"),
     refused(
         Area.MEMORY,
-        "huge pages of a file or memory file (hugetlbfs), and more than 64 MiB of private ones at once",
-        "use MAP_HUGETLB in smaller pieces, or transparent ones, which are kept as ordinary pages",
+        "huge pages of a file or memory file (hugetlbfs); more than 64 MiB of private huge pages in one piece",
+        "use MAP_HUGETLB in smaller pieces, or transparent huge pages, which come back as ordinary pages",
         "huge pages of a file (hugetlbfs)",
         "MiB of huge pages, which every checkpoint compares",
     ),
-    refused(Area.MEMORY, "files that are stored by touching memory (DAX, MAP_SYNC)", "map them without", "memory that is stored"),
+    refused(
+        Area.MEMORY, "files that are stored by touching memory (DAX, MAP_SYNC)", "map them without it", "memory that is stored"
+    ),
     refused(
         Area.MEMORY,
         "memory that the program itself watches by userfaultfd",
-        "run it without",
+        "run the program without it",
         "a userfaultfd",
         "own userfaultfd watches",
         "own userfaultfd write-protects",
     ),
-    refused(Area.MEMORY, "shadow stacks", "run it without", "a shadow stack"),
+    refused(Area.MEMORY, "shadow stacks", "run the program without them", "a shadow stack"),
     refused(
         Area.MEMORY,
-        "memory with tags and code with guarded branch targets (MTE, BTI; arm64)",
+        "tagged memory, and code with guarded branch targets (MTE, BTI; arm64)",
         "boot with arm64.nomte or arm64.nobti",
         "memory with tags",
         "code whose branch targets are guarded",
@@ -74,7 +80,8 @@ CAPABILITIES: Final = (
     preserved(
         Area.MEMORY,
         "mapped files that were replaced or deleted since the program started",
-        "the old ones are carried, compared at every checkpoint, up to 64 MiB each; what is written to one still shows in them",
+        "the old files are carried, up to 64 MiB each, and compared at every checkpoint; what is written to an old file "
+        "still shows in its mappings",
         "KiB of the old one are carried",
     ),
     refused(
@@ -85,7 +92,7 @@ CAPABILITIES: Final = (
         "and larger than",
     ),
     refused(Area.PROCESS, "programs of 32 bits", "use a 64-bit build", "it is a program of 32 bits"),
-    refused(Area.PROCESS, "a program without the kernel’s vdso", "do not unmap it", "it has no vdso"),
+    refused(Area.PROCESS, "a program without the kernel’s vdso", "let the program keep it mapped", "it has no vdso"),
     refused(
         Area.PROCESS,
         "a program whose own file is gone",
@@ -95,20 +102,20 @@ CAPABILITIES: Final = (
     refused(
         Area.PROCESS,
         "a working directory of /sys, or a root directory of its own (chroot), that is gone",
-        "change the directory; run it in one that stays",
+        "change the directory; run the program in one that stays",
         "its working directory",
         "its root directory",
     ),
     refused(
         Area.PROCESS,
         "network, IPC, UTS, cgroup, mount and user namespaces of its own (containers)",
-        "run it, and failover, in the same one",
+        "run the program and failover in the same namespaces",
         "namespace of its own, which is not kept yet: run it",
         "its children are to live in a {} namespace of their own",
     ),
     refused(
         Area.PROCESS,
-        "kernel threads, zombies, threads named as processes, what a debugger traces, failover itself",
+        "kernel threads, zombies, threads named as processes, programs under a debugger, failover itself",
         "name a program that runs, and end the debugger",
         "it is a thread of process",
         "it is a kernel thread",

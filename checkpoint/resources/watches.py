@@ -39,23 +39,24 @@ CAPABILITIES: Final = (
     preserved(
         Area.PIPES,
         "watches of files (inotify)",
-        "each on the same path under its number; what happens between the checkpoint and the restore is not told",
+        "each on the same path under its number; events between the checkpoint and the restore are lost",
     ),
     refused(
         Area.PIPES,
-        "an inotify instance with events that were not read",
-        "it is kept as soon as they are read",
+        "an inotify instance with unread events",
+        "wait: failover captures it as soon as the program has read them",
         "with events that the program has not read yet",
     ),
     refused(
         Area.PIPES,
-        "an inotify watch of a file without a name that is not open, or outside its root directory, or the ten thousandth",
+        "an inotify watch of a nameless file that is not open, of a file outside the program's root directory, or with a "
+        "number above 10,000",
         "remove the watch, or open another instance",
         "is of a file that no path leads to",
         "outside its root directory",
         "whose watch has number",
     ),
-    refused(Area.THERE, "what the program watches (inotify) is missing", "make it", "which the program watches by"),
+    refused(Area.THERE, "a missing file that the program watches (inotify)", "make the file", "which the program watches by"),
 )
 
 TARGET: Final = "anon_inode:inotify"

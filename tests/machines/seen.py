@@ -1,14 +1,14 @@
-"""What was seen on which machine: runs of the tests there, kept beside this file, and the table in docs/machines.md made of them.
+"""What was seen on which machine: runs of the tests there, kept beside this file, and the tables of docs/machines.md.
 
 pytest --junitxml=run.xml [--tracking digest] tests/checkpoint/test_tracees.py …     on that machine
-python -m tests.machines.seen run.xml …                                              keeps the runs, and writes the table
+python -m tests.machines.seen run.xml …                                              keeps the runs, and writes the tables
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
@@ -19,6 +19,10 @@ PAGE: Final = Path(__file__).parents[2] / "docs" / "machines.md"
 BEGIN, END = "<!-- seen:begin (written by python -m tests.machines.seen) -->\n", "<!-- seen:end -->\n"
 
 PASSED: Final = "passed"
+FAILED: Final = "failed"
+NOT_RUN: Final = "not run there"
+NAMED_MAX: Final = 2
+"""Tests that a case is named with; of more, their count."""
 FACTS: Final = ("processor", "kernel", "tracking", "page_size", "on")
 
 
@@ -69,7 +73,7 @@ def seen_in(path: Path) -> Seen:
 
 def _result(case: ElementTree.Element) -> str:
     if case.find("failure") is not None or case.find("error") is not None:
-        return "failed"
+        return FAILED
     skipped = case.find("skipped")
     return PASSED if skipped is None else str(skipped.get("message"))
 
@@ -90,37 +94,67 @@ def kept() -> list[Seen]:
 
 
 def table(machines: Sequence[Seen]) -> str:
-    """A table for each test of several cases, one for all others; below them why something could not be seen."""
-    tests = list(dict.fromkeys(test for one in machines for test in one.results))
-    sections: dict[str, list[tuple[str, str]]] = {}
-    for test in tests:
+    """The machines; tests that passed whole on all of them; of the others, how many cases passed where; why the rest did not."""
+    letters = {one.name: chr(ord("A") + place) for place, one in enumerate(machines)}
+    cases = _cases_by_title(machines)
+    kinds = [_row(letters[one.name], [one.name, one.on]) for one in machines]
+    counts = {title: [_count(one, tests.values()) for one in machines] for title, tests in cases.items()}
+    whole = [title for title, cells in counts.items() if set(cells) == {str(len(cases[title]))}]
+    others = [_row(title, cells) for title, cells in counts.items() if title not in whole]
+    parts = (
+        [_row("", ["machine", "last run"]), "|---|---|---|", *kinds],
+        ["Whole on every machine (cases in brackets):"],
+        [f"* {title}{f' ({len(cases[title])})' if len(cases[title]) > 1 else ''}" for title in whole],
+        ["The others, cases that passed:"],
+        [_row("test", list(letters.values())), "|---|" + "---|" * len(machines), *others],
+        ["Why the rest could not be tried:"],
+        [_row("reason", ["cases", "machines"]), "|---|---|---|", *_missing(machines, letters, cases)],
+    )
+    return "\n\n".join("\n".join(part) for part in parts) + "\n"
+
+
+def _cases_by_title(machines: Sequence[Seen]) -> Mapping[str, Mapping[str, str]]:
+    """By each test its cases ("" of a test without any), and their names in the runs; those of most cases first."""
+    found: dict[str, dict[str, str]] = {}
+    for test in dict.fromkeys(test for one in machines for test in one.results):
         title, _, case = test.partition("::")[2].removeprefix("test_").partition("[")
-        sections.setdefault(title.replace("_", " "), []).append((case.removesuffix("]"), test))
-    reasons: dict[str, int] = {}
-    single = [(title, rows[0][1]) for title, rows in sections.items() if len(rows) == 1]
-    parts = [_section(title, rows, machines, reasons) for title, rows in sections.items() if len(rows) > 1]
-    parts.append(_section("one program each", single, machines, reasons))
-    notes = "\n".join(f"{number}. {reason}" for reason, number in reasons.items())
-    return "\n".join(parts) + f"\nWhy something could not be seen there:\n\n{notes}\n"
+        title = f"{title[0].upper()}{title[1:]}".replace("_", " ")
+        found.setdefault(title, {})[case.removesuffix("]")] = test
+    return dict(sorted(found.items(), key=lambda one: -len(one[1])))
 
 
-def _section(title: str, rows: list[tuple[str, str]], machines: Sequence[Seen], reasons: dict[str, int]) -> str:
-    lines = [f"### {title[0].upper()}{title[1:]}", "", _row("", [one.name for one in machines]), "|---|" + "---|" * len(machines)]
-    lines += [_row(name, [_cell(one, test, reasons) for one in machines]) for name, test in rows]
-    return "\n".join(lines) + "\n"
+def _count(machine: Seen, tests: Collection[str]) -> str:
+    results = [machine.results.get(test) for test in tests]
+    passed, failed = results.count(PASSED), results.count(FAILED)
+    told = f"{passed} of {len(tests)}" if passed < len(tests) else str(passed)
+    return f"{told}, **{failed} failed**" if failed else told
+
+
+def _missing(machines: Sequence[Seen], letters: Mapping[str, str], cases: Mapping[str, Mapping[str, str]]) -> Iterator[str]:
+    """A row for each reason and set of machines."""
+    found: dict[tuple[str, str], dict[str, list[str]]] = {}
+    for title, tests in cases.items():
+        for case, test in tests.items():
+            where: dict[str, str] = {}
+            for one in machines:
+                if (result := one.results.get(test, NOT_RUN)) != PASSED:
+                    where[result] = where.get(result, "") + letters[one.name]
+            for reason, which in where.items():
+                found.setdefault((reason.partition(": /")[0], which), {}).setdefault(case, []).append(title)
+    for (reason, which), titles in sorted(found.items()):
+        together: dict[tuple[str, ...], list[str]] = {}
+        for case, of in titles.items():
+            together.setdefault(tuple(of), []).append(case)
+        yield _row(reason, ["; ".join(_told(names, of) for of, names in together.items()), " ".join(which)])
+
+
+def _told(cases: Sequence[str], titles: Sequence[str]) -> str:
+    of = " / ".join(titles) if len(titles) <= NAMED_MAX else f"{len(titles)} tests"
+    return f"{', '.join(cases)} ({of})" if any(cases) else of
 
 
 def _row(name: str, cells: Sequence[str]) -> str:
     return f"| {name} | {' | '.join(cells)} |"
-
-
-def _cell(machine: Seen, test: str, reasons: dict[str, int]) -> str:
-    result = machine.results.get(test)
-    if result is None:
-        return "–"
-    if result in (PASSED, "failed"):
-        return {PASSED: "yes", "failed": "**no**"}[result]
-    return f"({reasons.setdefault(result, len(reasons) + 1)})"
 
 
 def written() -> str:
