@@ -57,7 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--faults", type=int, default=0, help=f"instead: long lives of {FAULTS_A_LIFE} faults, until there were as many"
     )
-    parser.add_argument("--liars", action="store_true", help="an attacker has the key of a member of a team that votes, and lies by it")
+    parser.add_argument("--liars", action="store_true", help="an attacker lies by the key of a member of a team that votes")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--keep-going", action="store_true", help="do not stop at the first that breaks")
     return parser
