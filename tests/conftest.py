@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from hypothesis import settings
 
 from checkpoint.engines import entering
 from checkpoint.linux import abi, dirty
@@ -29,6 +30,10 @@ TRACEES = Path(__file__).parent / "tracees"
 PR_SET_CHILD_SUBREAPER = 36  # linux/prctl.h
 LEAVE_S = 30.0
 """How long a process that a test has told to end may take for it."""
+
+settings.register_profile("busy", deadline=None)
+settings.load_profile("busy")
+"""An example may take as long as a busy machine takes for it."""
 
 signal.signal(signal.SIGINT, signal.default_int_handler)
 """In the background of a shell we are started with Ctrl-C ignored, and so would be every program that a test interrupts."""
