@@ -13,8 +13,9 @@ from typing import Final, Literal
 from agent.errors import ConfigError
 from agent.hook_kinds import KINDS, check_told
 from checkpoint.arch import EVERY_LEVEL
+from checkpoint.carried import is_carriable
 from checkpoint.device_rules import RULES_MAX, DeviceRule, checked, rule_from
-from checkpoint.engine import contradiction, is_carriable
+from checkpoint.engine import contradiction
 from failover.client import strict_toml
 from failover.client import team as team_directory
 from failover.client.quantities import size_bytes, span_ms

@@ -36,8 +36,9 @@ from agent.places import Places
 from agent.questions import Lines, Questions
 from agent.rules import level_of, rules_for
 from checkpoint import portable
+from checkpoint.carried import is_carriable
 from checkpoint.device_rules import RULES_MAX, rule_from, travelling
-from checkpoint.engine import contradiction, is_carriable
+from checkpoint.engine import contradiction
 from failover.core import acts, events
 from failover.core.names import check_component, weight
 from failover.core.types import COMMITTED, ComponentSpec, Launch, State
@@ -50,6 +51,7 @@ START_PATIENCE_S: Final = 30.0
 """How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
 
 log = logging.getLogger("failover.verbs")
+
 
 class Lanes(Lines, Protocol):
     """What of `agent.lanes.Lanes` is needed here."""

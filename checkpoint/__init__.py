@@ -14,7 +14,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from checkpoint.engine import Report, engine_named
+    from checkpoint.engine import Report
+    from checkpoint.engines.registry import engine_named
     from checkpoint.errors import CheckpointError
     from checkpoint.format import decode, encode
     from checkpoint.model import Position, Snapshot
@@ -30,7 +31,7 @@ _HOMES = {
     "Store": "checkpoint.store",
     "decode": "checkpoint.format",
     "encode": "checkpoint.format",
-    "engine_named": "checkpoint.engine",
+    "engine_named": "checkpoint.engines.registry",
     "open_store": "checkpoint.store",
 }
 

@@ -25,7 +25,6 @@ from typing import Final
 from msgspec import Struct
 from msgspec.structs import replace
 
-from checkpoint.engine import is_carriable
 from checkpoint.errors import RestoreError
 from checkpoint.model import Fact, PageRun, Resource, Snapshot, Vma, VmaKind
 
@@ -90,6 +89,13 @@ class Tree(Struct, frozen=True):
     def resource(self) -> Resource:
         """As it stands in a snapshot."""
         return Resource(KIND, self.path, {"entries": [entry.fact() for entry in self.entries], "size": self.held_size})
+
+
+def is_carriable(path: str) -> bool:
+    """Whether a path names a file or folder in full: absolute, normal, and not the root of everything."""
+    return (
+        path.startswith("/") and path != "/" and not path.startswith("//") and os.path.normpath(path) == path and "\0" not in path
+    )
 
 
 def start_of(place: int) -> int:

@@ -6,7 +6,6 @@ from below this file.
 
 from __future__ import annotations
 
-import os.path
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -14,7 +13,7 @@ from msgspec import Struct
 
 from checkpoint.device_rules import DeviceRule
 from checkpoint.digests_of_files import DigestOf
-from checkpoint.errors import ProbeError, RestoreError
+from checkpoint.errors import RestoreError
 from checkpoint.model import Position, Snapshot
 from checkpoint.rights import Owner
 
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
 
 PTRACE: Final = "ptrace"
 COOPERATIVE: Final = "cooperative"
-"""Names of the engines, see `engine_named`."""
+"""Names of the engines, see `checkpoint.engines.registry`."""
 AUTO: Final = "auto"
 """The cooperative engine for a program that says that it keeps its state, before that and for all others ptrace."""
 
@@ -164,13 +163,6 @@ class ProtectOrder(Struct, frozen=True):
     def is_guarded(self) -> bool:
         """Whether it has a guard, which may hold it by SIGSTOP: that the whole of it is stopped says nothing then."""
         return self.streams is not None or self.names is not None
-
-
-def is_carriable(path: str) -> bool:
-    """Whether a path names a file or folder in full: absolute, normal, and not the root of everything."""
-    return (
-        path.startswith("/") and path != "/" and not path.startswith("//") and os.path.normpath(path) == path and "\0" not in path
-    )
 
 
 def contradiction(carry: Iterable[str], shared: tuple[str, ...]) -> str:
@@ -416,20 +408,3 @@ class Engine(Protocol):
             RestoreError: it did not work; the caller kills the vessel.
         """
         ...
-
-
-def engine_named(name: str) -> Engine:
-    """Look an engine up.
-
-    Raises:
-        ProbeError: there is none of that name.
-    """
-    if name == COOPERATIVE:
-        from checkpoint.engines.guarded_task import CooperativeEngine
-
-        return CooperativeEngine()
-    if name != PTRACE:
-        raise ProbeError(f"no engine is called {name!r}: choose {PTRACE} or {COOPERATIVE}")
-    from checkpoint.engines.ptrace import PtraceEngine
-
-    return PtraceEngine()

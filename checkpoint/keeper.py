@@ -27,6 +27,7 @@ from checkpoint import allocator, carried, chain, channel, engine, foreign, form
 from checkpoint.channel import Channel, ChannelClosedError, ChannelError, Failed, Reply, Request
 from checkpoint.digests_of_files import DigestsOfFiles
 from checkpoint.engine import CaptureOrder, Copy, Engine, ProtectOrder, Restored, RestoreOptions, Session, Streams
+from checkpoint.engines import registry
 from checkpoint.errors import CaptureError, CheckpointError, FormatError, ProcessGoneError, RestoreError, StoreError, let_go
 from checkpoint.hot_pages import Sender
 from checkpoint.linux import namespaces
@@ -148,7 +149,7 @@ class Keeper:
             raise CaptureError(f"cannot protect pid {request.pid}: this keeper follows another one already; start another")
         self._robot = request.robot
         streams = streams_of(descriptors) if request.streams else None
-        chosen = self._tracer if request.engine == self._tracer.name else engine.engine_named(request.engine)
+        chosen = self._tracer if request.engine == self._tracer.name else registry.engine_named(request.engine)
         names = request.names if request.robot else None
         self._session = chosen.protect(request.pid, ProtectOrder(request.component, streams, request.terms, names))
         return channel.Protected(self._session.notes), ()
@@ -315,7 +316,7 @@ class Keeper:
                 outline = carried.relocated(format.read_outline(descriptors[-1]), dict(request.terms.carry.places))
         finally:
             channel.close_all(descriptors)
-        chosen = self._tracer if outline.engine == self._tracer.name else engine.engine_named(outline.engine)
+        chosen = self._tracer if outline.engine == self._tracer.name else registry.engine_named(outline.engine)
         digests = DigestsOfFiles(request.known)
         with foreign.facts(f"compare {outline.component} with what is here"):
             options = RestoreOptions(own_eyes=request.own_eyes, contents=request.contents, terms=request.terms)
@@ -509,7 +510,7 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"keeper: nobody to serve at {arguments[1]}: {error.strerror or error}\n")
         return 1
     link: Channel[Request] = Channel(end, Request)
-    Keeper(link, engine.engine_named(engine.PTRACE)).serve()
+    Keeper(link, registry.engine_named(engine.PTRACE)).serve()
     return 0
 
 

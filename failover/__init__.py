@@ -29,8 +29,9 @@ if TYPE_CHECKING:
     from failover.client.scratch import scratch
     from failover.client.task import Resumed, activations, commit, resume, resumed, transaction, wait_committed
     from failover.client.task_component import component, kept, run
-    from failover.client.task_loop import FINISHED, every
+    from failover.client.task_loop import every
     from failover.client.task_resumable import resumable
+    from failover.client.task_rhythm import FINISHED
     from failover.errors import (
         AgentRefusedError,
         FailoverError,
@@ -59,7 +60,7 @@ _HOMES = {
     "component": "failover.client.task_component",
     "kept": "failover.client.task_component",
     "run": "failover.client.task_component",
-    "FINISHED": "failover.client.task_loop",
+    "FINISHED": "failover.client.task_rhythm",
     "every": "failover.client.task_loop",
     "resumable": "failover.client.task_resumable",
     "scratch": "failover.client.scratch",

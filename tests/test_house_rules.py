@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.imports import circles, graph, imported
+
 ROOT = Path(__file__).parent.parent
 FLOORS = ("checkpoint", "failover", "agent")
 
@@ -138,6 +140,15 @@ def test_every_arrow_points_down() -> None:
 def test_an_arrow_that_points_up_is_seen_wherever_it_hides(text: str) -> None:
     assert upward(ROOT / "failover" / "errors.py", ast.parse(text)) != [] or ".." in text
     assert upward(ROOT / "failover" / "core" / "node.py", ast.parse(text.replace("..agent", "...agent"))) != []
+
+
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    assert circles(graph()) == []
+
+
+def test_a_circle_is_seen() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
+    assert imported(ast.parse("def f():\n    from a.b import c, d"), {"a.b", "a.b.c"}) == {"a.b", "a.b.c"}
 
 
 # --- Whole robots ----------------------------------------------------------------------------------------------------

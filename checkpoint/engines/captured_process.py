@@ -35,11 +35,9 @@ from checkpoint.linux.vm_flags import WATCHED, FlagsReader
 from checkpoint.memo import Memo
 from checkpoint.model import Position, ProcessState, Resource, ThreadState, Vma
 from checkpoint.resources import (
-    Opened,
     aio_rings,
     deadlines,
     death_signals,
-    gather,
     logins,
     memory_locks,
     seccomp,
@@ -48,6 +46,8 @@ from checkpoint.resources import (
     unsupported,
     untouched,
 )
+from checkpoint.resources.open_file import Opened
+from checkpoint.resources.survey import gather
 
 NOBODY: SharedPlaces = frozenset()
 

@@ -38,21 +38,10 @@ from checkpoint.linux.kinship import Kinship
 from checkpoint.linux.procfs import Stat, Status
 from checkpoint.linux.threads import Threads
 from checkpoint.model import Member, Position, ProcessState, Resource, ThreadState, Vma, Zombie
-from checkpoint.resources import (
-    Held,
-    Owners,
-    Surroundings,
-    elsewhere,
-    gather,
-    joint,
-    refused_threads,
-    sharing,
-    stops,
-    streams,
-    thread_rights,
-    unsupported,
-)
-from checkpoint.resources import look as sorted_into_kinds
+from checkpoint.resources import elsewhere, joint, refused_threads, sharing, stops, streams, thread_rights, unsupported
+from checkpoint.resources.open_file import Held, Owners, Surroundings
+from checkpoint.resources.survey import gather
+from checkpoint.resources.survey import look as sorted_into_kinds
 
 ENDING_S: Final = 0.2
 """How long a process that is about to end may take."""

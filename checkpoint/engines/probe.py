@@ -23,17 +23,8 @@ from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import MapsLine, Status
 from checkpoint.linux.spokesman import told_by_spokesman
 from checkpoint.resources import (
-    Held,
-    Kin,
-    Opened,
-    OpenFile,
-    Surroundings,
     aio_rings,
-    gather,
-    glance,
     kinds,
-    look,
-    pipes_of,
     refused_threads,
     sharing,
     streams,
@@ -41,6 +32,8 @@ from checkpoint.resources import (
     terminals,
     unsupported,
 )
+from checkpoint.resources.open_file import Held, Kin, Opened, OpenFile, Surroundings
+from checkpoint.resources.survey import gather, glance, look, pipes_of
 
 LOOKS: Final = 10
 """How often a component whose processes come and go is looked at until it stays the same meanwhile."""

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from checkpoint.contents import digest_of_file
 from checkpoint.digests_of_files import DigestOf
 from checkpoint.engine import PTRACE, Copy, ProtectOrder, Report, Restored, RestoreOptions, Session
-from checkpoint.engines import ready_copy, restore_checks
+from checkpoint.engines import lay_copy, restore_checks
 from checkpoint.engines.probe import probe
 from checkpoint.engines.ptrace_capture import PtraceSession
 from checkpoint.engines.ptrace_restore import restore
@@ -48,4 +48,4 @@ class PtraceEngine:
 
     def lay(self, vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -> Copy:
         """See ``checkpoint.engine.Engine.lay``."""
-        return ready_copy.lay(vessel_pid, base, options)
+        return lay_copy.lay(vessel_pid, base, options)

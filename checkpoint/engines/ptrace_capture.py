@@ -49,19 +49,17 @@ from checkpoint.linux.system_v import Segment
 from checkpoint.model import Position, Snapshot
 from checkpoint.pages import PageTable, Words
 from checkpoint.resources import (
-    OpenFile,
-    Surroundings,
     carried_connections,
     carried_trees,
-    glance,
     kinds,
-    look,
     refused_threads,
     system_v_memory,
     thread_rights,
 )
 from checkpoint.resources.carried_connections import Departing
 from checkpoint.resources.carried_trees import NO_PARCEL, CarriedTrees, Parcel, Seen
+from checkpoint.resources.open_file import OpenFile, Surroundings
+from checkpoint.resources.survey import glance, look
 from checkpoint.stream_counts import Totals
 from checkpoint.unread_base import UnreadBase
 

@@ -21,7 +21,7 @@ import os
 import time
 from collections.abc import Container, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -30,10 +30,9 @@ from checkpoint import chain, differences, pages
 from checkpoint.differences import Rows
 from checkpoint.engine import Copy, RestoreOptions, pid_taken
 from checkpoint.engines import restore_checks, restore_memory, restore_process, restore_vdso
-from checkpoint.engines.copy_hindrances import require_covered, require_room
+from checkpoint.engines.copy_hindrances import require_covered
 from checkpoint.engines.copy_mappings import Change
 from checkpoint.engines.forked_memory import Legacy
-from checkpoint.engines.proved_later import held_or_stored
 from checkpoint.engines.ptrace_restore import RestoredProgram
 from checkpoint.engines.restore_checks import Brought
 from checkpoint.engines.restore_one import RSEQ_SECTION_OFFSET, Estate, LaterTables, ProcessRestore, options_for
@@ -48,10 +47,6 @@ from checkpoint.page_source import PageSource
 from checkpoint.pages import Words
 from checkpoint.resources import carried_connections, seccomp
 from checkpoint.resources.rebuilding import number_of
-from checkpoint.stored_base import StoredBase
-
-if TYPE_CHECKING:
-    from checkpoint.engines.family_copy import FamilyCopy
 
 ROOM: Final = 16 << 20
 """Bytes of address space for all tables to come: some 100,000 calls. Only what is used takes memory."""
@@ -64,34 +59,8 @@ AHEAD_NS: Final = 60_000_000_000
 checkpoint was on its way."""
 
 
-def lay(vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -> Copy:
-    """Map and fill everything of a base in a vessel, and leave it standing there.
-
-    Raises:
-        UnsupportedError: the program can have no ready copy, or this machine has no room for it.
-        MismatchError: this machine lacks a file that is mapped.
-        RestoreError: it did not work; the caller kills the vessel.
-    """
-    outline = base if isinstance(base, Snapshot) else base.outline
-    require_covered(outline)
-    require_room(outline)
-    state, stored = held_or_stored(base)
-    copy = _copy_of(vessel_pid, state, options, stored)
-    with ended_on_error(copy, f"lay a ready copy of {state.component} in pid {vessel_pid}"):
-        copy.lay()
-    return copy
-
-
-def _copy_of(vessel_pid: int, state: Snapshot, options: RestoreOptions, stored: StoredBase | None) -> ReadyCopy | FamilyCopy:
-    from checkpoint.engines.family_copy import FamilyCopy
-
-    if state.is_tree:
-        return FamilyCopy(vessel_pid, state, options)
-    return ReadyCopy(Tracee(vessel_pid), state, options, source=stored)
-
-
 @contextmanager
-def ended_on_error(copy: ReadyCopy | FamilyCopy, what: str) -> Iterator[None]:
+def ended_on_error(copy: Copy, what: str) -> Iterator[None]:
     """End a copy with which something goes wrong.
 
     Raises:

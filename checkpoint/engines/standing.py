@@ -27,8 +27,10 @@ from checkpoint.linux.readings import Readings, Unread, Waiting
 from checkpoint.linux.remote import Answers
 from checkpoint.linux.threads import Threads
 from checkpoint.linux.timers import parse_timers
-from checkpoint.resources import Kept, Opened, OpenFile, Owners, gather, owners, with_contents
+from checkpoint.resources import owners
+from checkpoint.resources.open_file import Opened, OpenFile, Owners
 from checkpoint.resources.recollection import Recollection
+from checkpoint.resources.survey import Kept, gather, with_contents
 from checkpoint.resources.thread_rights import ThreadRights
 from checkpoint.resources.thread_tables import ThreadTables
 from checkpoint.stream_counts import Totals

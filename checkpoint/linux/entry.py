@@ -23,7 +23,8 @@ from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import Call, EntryCalls
 from checkpoint.errors import CaptureError
 from checkpoint.linux import abi, procfs, vdso
-from checkpoint.linux.descriptors import Descriptor, descriptors_to
+from checkpoint.linux.descriptor import Descriptor
+from checkpoint.linux.descriptors import descriptors_to
 from checkpoint.linux.memory import Memory
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.remote import (

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from checkpoint.linux.descriptors import Descriptor, Standing, head_of, standing_of
+from checkpoint.linux.descriptor import Descriptor, Standing, head_of, standing_of
 from checkpoint.linux.own_calls import FIRST_ARGUMENT, ROW, OwnCalls, row
 
 TEXTS_KEPT: Final = 256

@@ -30,7 +30,7 @@ from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.mounts import type_of_mount
 from checkpoint.linux.procfs import MapsLine
 from checkpoint.model import Vma
-from checkpoint.resources import OpenFile
+from checkpoint.resources.open_file import OpenFile
 
 CAPABILITIES: Final = (
     preserved(

@@ -23,9 +23,10 @@ from checkpoint import device_rules
 from checkpoint.capability import Area, by_rule, refused
 from checkpoint.device_rules import DeviceRule, rule_for, rule_of
 from checkpoint.linux.call_table import CallTable
-from checkpoint.linux.descriptors import Descriptor, copy_of
+from checkpoint.linux.descriptor import Descriptor
+from checkpoint.linux.descriptors import copy_of
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings
+from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = device_rules.KIND

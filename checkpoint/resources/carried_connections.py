@@ -31,7 +31,8 @@ from checkpoint.linux.descriptors import copy_of
 from checkpoint.linux.silence import Connection
 from checkpoint.linux.tcp_repair import CannotCarryError, InUseError, Kept
 from checkpoint.model import Fact, Resource, Snapshot
-from checkpoint.resources import OpenFile, internet_addresses, tcp_connections
+from checkpoint.resources import internet_addresses, tcp_connections
+from checkpoint.resources.open_file import OpenFile
 from checkpoint.resources.rebuilding import number_of
 from checkpoint.resources.tcp_connections import KIND, LEFT, TAKEN
 

@@ -28,8 +28,8 @@ from msgspec.structs import replace
 
 from checkpoint import carried, gathering, pages
 from checkpoint.capability import Area, by_rule, refused
-from checkpoint.carried import Entry, Tree
-from checkpoint.engine import CARRIED_SIZE_MAX, Terms, is_carriable
+from checkpoint.carried import Entry, Tree, is_carriable
+from checkpoint.engine import CARRIED_SIZE_MAX, Terms
 from checkpoint.errors import CaptureError
 from checkpoint.linux import abi, digests, procfs
 from checkpoint.linux.eyes import Eyes, eyes_for, own_eyes, seeing_as

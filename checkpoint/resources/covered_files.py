@@ -22,7 +22,8 @@ from checkpoint.errors import ProcessGoneError
 from checkpoint.linux import mounts, procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Resource
-from checkpoint.resources import OpenFile, Surroundings, files, writers
+from checkpoint.resources import files, writers
+from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "covered_files"

@@ -14,7 +14,8 @@ from checkpoint.capability import Area, preserved
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings, nameless
+from checkpoint.resources import nameless
+from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "devices"

@@ -17,7 +17,7 @@ from typing import Final
 
 from checkpoint.capability import Area, refused
 from checkpoint.linux import abi
-from checkpoint.resources import OpenFile
+from checkpoint.resources.open_file import OpenFile
 
 CAPABILITIES: Final = (
     refused(

@@ -24,7 +24,8 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.linux import abi
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings, elsewhere
+from checkpoint.resources import elsewhere
+from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "epolls"

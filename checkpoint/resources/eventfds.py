@@ -18,9 +18,11 @@ from typing import Final
 from checkpoint.capability import Area, preserved
 from checkpoint.errors import CaptureError
 from checkpoint.linux.call_table import CallTable
-from checkpoint.linux.descriptors import Descriptor, copy_of
+from checkpoint.linux.descriptor import Descriptor
+from checkpoint.linux.descriptors import copy_of
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings, elsewhere
+from checkpoint.resources import elsewhere
+from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "eventfds"

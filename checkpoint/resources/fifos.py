@@ -21,9 +21,11 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
-from checkpoint.linux.descriptors import Descriptor, copy_of
+from checkpoint.linux.descriptor import Descriptor
+from checkpoint.linux.descriptors import copy_of
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings, covered_files, elsewhere, nameless, pipes
+from checkpoint.resources import covered_files, elsewhere, nameless, pipes
+from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "fifos"

@@ -23,10 +23,11 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.engine import REFUSED, Finding
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import procfs
-from checkpoint.linux.descriptors import Descriptor
+from checkpoint.linux.descriptor import Descriptor
 from checkpoint.linux.digests import filled_extents
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings, living_names, locks
+from checkpoint.resources import living_names, locks
+from checkpoint.resources.open_file import OpenFile, Surroundings
 
 KIND: Final = "files"
 

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Struct
 
 from checkpoint.linux import abi
-from checkpoint.linux.descriptors import Descriptor
+from checkpoint.linux.descriptor import Descriptor
 from checkpoint.linux.own_calls import OwnCalls, row
 
 Group = tuple[Descriptor, ...]

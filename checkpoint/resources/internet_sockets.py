@@ -29,9 +29,10 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.engine import NOTED, Finding
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import Opened, OpenFile, Surroundings, elsewhere, sockets, waiting_datagrams
+from checkpoint.resources import elsewhere, sockets, waiting_datagrams
 from checkpoint.resources.internet_addresses import in_words, is_ours, level_of, size_of, sockaddr, unpacked
 from checkpoint.resources.listings import Group, Listings
+from checkpoint.resources.open_file import Opened, OpenFile, Surroundings
 from checkpoint.resources.rebuilding import number_of
 from checkpoint.resources.unix_makers import Disguise
 

@@ -9,12 +9,9 @@ from typing import Final, Protocol
 
 from checkpoint.engine import REFUSED, Finding
 from checkpoint.errors import CaptureError
-from checkpoint.linux.descriptors import Descriptor
+from checkpoint.linux.descriptor import Descriptor
 from checkpoint.model import Fact, Resource
 from checkpoint.resources import (
-    Opened,
-    OpenFile,
-    Surroundings,
     attached_devices,
     covered_files,
     devices,
@@ -42,6 +39,7 @@ from checkpoint.resources import (
     unsupported,
     watches,
 )
+from checkpoint.resources.open_file import Opened, OpenFile, Surroundings
 
 Observer = Callable[[OpenFile, Opened], Mapping[str, Fact]]
 """Given one open file, and all."""

@@ -24,7 +24,8 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import AT_FDCWD, CallTable
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, signalling
+from checkpoint.resources import signalling
+from checkpoint.resources.open_file import OpenFile
 from checkpoint.resources.rebuilding import number_of
 
 CAPABILITIES: Final = (

@@ -16,7 +16,7 @@ from checkpoint.errors import ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Resource
-from checkpoint.resources import OpenFile, Surroundings
+from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.resources.rebuilding import Rebuilding
 
 KIND: Final = "namespace_files"

@@ -22,8 +22,9 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.engine import NOTED, Finding
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import Opened, OpenFile, Surroundings, elsewhere, sockets
+from checkpoint.resources import elsewhere, sockets
 from checkpoint.resources.listings import Listings
+from checkpoint.resources.open_file import Opened, OpenFile, Surroundings
 from checkpoint.resources.rebuilding import number_of
 from checkpoint.resources.unix_makers import Disguise
 

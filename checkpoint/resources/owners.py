@@ -17,11 +17,10 @@ import struct
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-from msgspec import Struct
 from msgspec.structs import replace
 
 from checkpoint.linux.descriptors import copy_of, lending
-from checkpoint.resources import OpenFile, Owners
+from checkpoint.resources.open_file import OpenFile, Owners, Signals
 
 F_GETOWN_EX: Final = 16
 OWNER: Final = struct.Struct("<ii")
@@ -29,21 +28,6 @@ OWNER: Final = struct.Struct("<ii")
 O_PATH: Final = 0o10000000
 _O_ASYNC: Final = os.O_ASYNC
 _LEASE: Final = b" LEASE "
-
-
-class Signals(Struct, frozen=True):
-    """What an open file sends, to whom.
-
-    Attributes:
-        signal: 0 for SIGIO; ``kind``: F_OWNER_TID, F_OWNER_PID or F_OWNER_PGRP; ``owner``: 0 for nobody.
-    """
-
-    signal: int = 0
-    kind: int = 0
-    owner: int = 0
-
-    def __bool__(self) -> bool:
-        return bool(self.signal or self.owner)
 
 
 NOTHING_SENT: Final = Signals()

@@ -24,7 +24,8 @@ from checkpoint.engine import NOTED, Finding
 from checkpoint.errors import CaptureError
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import Opened, OpenFile, Surroundings, elsewhere, sockets
+from checkpoint.resources import elsewhere, sockets
+from checkpoint.resources.open_file import Opened, OpenFile, Surroundings
 from checkpoint.resources.rebuilding import number_of
 from checkpoint.resources.unix_makers import Disguise
 

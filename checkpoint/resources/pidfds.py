@@ -18,9 +18,10 @@ from checkpoint.engine import REFUSED, Finding
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
-from checkpoint.linux.descriptors import Descriptor
+from checkpoint.linux.descriptor import Descriptor
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings, elsewhere
+from checkpoint.resources import elsewhere
+from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "pidfds"

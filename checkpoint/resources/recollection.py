@@ -25,18 +25,9 @@ from checkpoint.linux.second_thread import SecondThread
 from checkpoint.linux.socket_questions import WORTH_SHARING, Asking, Subject, Told, events
 from checkpoint.memo import Memo
 from checkpoint.model import Fact
-from checkpoint.resources import (
-    Opened,
-    OpenFile,
-    Recalled,
-    internet_addresses,
-    internet_sockets,
-    pipes,
-    sockets,
-    tcp_connections,
-    unix_sockets,
-)
+from checkpoint.resources import internet_addresses, internet_sockets, pipes, sockets, tcp_connections, unix_sockets
 from checkpoint.resources.listings import Group
+from checkpoint.resources.open_file import Opened, OpenFile, Recalled
 from checkpoint.resources.rebuilding import number_of
 
 COPIES_MAX: Final = 128

@@ -15,8 +15,9 @@ from typing import Final
 from msgspec.structs import replace
 
 from checkpoint.linux import abi
-from checkpoint.linux.descriptors import Descriptor
-from checkpoint.resources import Kin, Opened, OpenFile, pidfds, pipes, sockets, terminals
+from checkpoint.linux.descriptor import Descriptor
+from checkpoint.resources import pidfds, pipes, sockets, terminals
+from checkpoint.resources.open_file import Kin, Opened, OpenFile
 
 _OTHER_END: Final = {os.O_RDONLY: os.O_WRONLY, os.O_WRONLY: os.O_RDONLY}
 OpenedByAll = dict[int, Opened]

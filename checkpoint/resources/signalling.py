@@ -19,7 +19,8 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, owners
+from checkpoint.resources import owners
+from checkpoint.resources.open_file import OpenFile
 from checkpoint.resources.owners import O_PATH, OWNER
 from checkpoint.resources.rebuilding import number_of
 

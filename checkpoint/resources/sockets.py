@@ -32,9 +32,10 @@ from msgspec import Struct
 
 from checkpoint.capability import Area, refused
 from checkpoint.linux.call_table import CallTable
-from checkpoint.linux.descriptors import Descriptor, copy_of
+from checkpoint.linux.descriptor import Descriptor
+from checkpoint.linux.descriptors import copy_of
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import Opened, OpenFile
+from checkpoint.resources.open_file import Opened, OpenFile
 from checkpoint.resources.rebuilding import number_of
 
 CAPABILITIES: Final = (

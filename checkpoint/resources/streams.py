@@ -16,7 +16,7 @@ from typing import Final
 
 from checkpoint.capability import Area, preserved
 from checkpoint.model import Resource
-from checkpoint.resources import OpenFile, Surroundings
+from checkpoint.resources.open_file import OpenFile, Surroundings
 
 KIND: Final = "streams"
 

@@ -37,10 +37,11 @@ from checkpoint.engine import NOTED, REFUSED, Finding
 from checkpoint.linux import connection_remains, tcp_repair
 from checkpoint.linux.call_table import CallTable
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings, elsewhere, internet_sockets, sockets
+from checkpoint.resources import elsewhere, internet_sockets, sockets
 from checkpoint.resources.internet_addresses import in_words, is_ours, size_of, sockaddr
 from checkpoint.resources.internet_sockets import CLOSED, LISTENING
 from checkpoint.resources.listings import Listings
+from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.resources.rebuilding import number_of
 
 KIND: Final = "tcp_connections"

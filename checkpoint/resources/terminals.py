@@ -33,9 +33,11 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError, CheckpointError
 from checkpoint.linux import procfs
 from checkpoint.linux.call_table import CallTable
-from checkpoint.linux.descriptors import Descriptor, copy_of
+from checkpoint.linux.descriptor import Descriptor
+from checkpoint.linux.descriptors import copy_of
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings, elsewhere, streams
+from checkpoint.resources import elsewhere, streams
+from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.resources.rebuilding import number_of
 
 KIND: Final = "terminals"

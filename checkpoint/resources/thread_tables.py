@@ -27,7 +27,8 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError
 from checkpoint.linux import abi, procfs
 from checkpoint.linux.call_table import CallTable
-from checkpoint.linux.descriptors import Descriptor, descriptor, descriptor_numbers
+from checkpoint.linux.descriptor import Descriptor
+from checkpoint.linux.descriptors import descriptor, descriptor_numbers
 from checkpoint.linux.tasks import thread_count, thread_ids
 from checkpoint.model import Fact, Resource
 from checkpoint.resources.rebuilding import number_of

@@ -19,7 +19,7 @@ from checkpoint.capability import Area, refused
 from checkpoint.linux import abi
 from checkpoint.linux.descriptors import descriptor
 from checkpoint.model import Fact
-from checkpoint.resources import Kin, Opened, OpenFile
+from checkpoint.resources.open_file import Kin, Lent, Opened, OpenFile
 
 if TYPE_CHECKING:
     from checkpoint.resources.sockets import Noted
@@ -42,17 +42,6 @@ KINDS: Final = (
 UNKNOWN: Final = -1
 OWNED: Final = ("locks", "owner", "signal")
 """Facts of open files that are about who holds them."""
-
-
-class Lent:
-    """A descriptor of ours that is closed when nobody looks at it any more."""
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-
-    def __del__(self) -> None:
-        with contextlib.suppress(OSError):
-            os.close(self.number)
 
 
 def number_of(opened: Opened, ours: int) -> int:

@@ -31,8 +31,9 @@ from checkpoint.linux import procfs
 from checkpoint.linux.call_table import AT_FDCWD, CallTable
 from checkpoint.linux.unix_sockets import ESTABLISHED, BoundFile, bound_file
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, moved_names
+from checkpoint.resources import moved_names
 from checkpoint.resources.moved_names import leads_to
+from checkpoint.resources.open_file import OpenFile
 from checkpoint.resources.rebuilding import number_of
 
 CAPABILITIES: Final = (

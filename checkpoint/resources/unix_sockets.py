@@ -28,7 +28,8 @@ from checkpoint.engine import REFUSED, Finding
 from checkpoint.errors import CaptureError
 from checkpoint.linux.unix_sockets import ESTABLISHED, UnixSocket, parsed
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import Opened, OpenFile, Surroundings, elsewhere, sockets, travelling, unix_makers, unix_names
+from checkpoint.resources import elsewhere, sockets, travelling, unix_makers, unix_names
+from checkpoint.resources.open_file import Opened, OpenFile, Surroundings
 from checkpoint.resources.rebuilding import number_of
 
 KIND: Final = "unix_sockets"

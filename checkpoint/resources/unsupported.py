@@ -19,7 +19,8 @@ from checkpoint.linux import confinement, procfs, vm_flags
 from checkpoint.linux.procfs import MapsLine, Status
 from checkpoint.linux.tracking import is_orphan
 from checkpoint.model import Resource
-from checkpoint.resources import OpenFile, Surroundings, kernel_files, refused_threads, seccomp, shared_objects, sockets
+from checkpoint.resources import kernel_files, refused_threads, seccomp, shared_objects, sockets
+from checkpoint.resources.open_file import OpenFile, Surroundings
 
 KIND: Final = "unsupported"
 

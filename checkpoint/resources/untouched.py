@@ -21,7 +21,7 @@ from checkpoint.linux.procfs import MapsLine
 from checkpoint.linux.tracking import NONE
 from checkpoint.model import Fact, Resource
 from checkpoint.pages import Words
-from checkpoint.resources import OpenFile
+from checkpoint.resources.open_file import OpenFile
 from checkpoint.resources.rebuilding import number_of
 
 KIND: Final = "untouched"

@@ -30,7 +30,8 @@ from checkpoint.linux import mounts, procfs
 from checkpoint.linux.call_table import CallTable
 from checkpoint.linux.descriptors import copy_of
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import OpenFile, Surroundings, elsewhere
+from checkpoint.resources import elsewhere
+from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.resources.rebuilding import Rebuilding, number_of
 
 KIND: Final = "watches"

@@ -12,8 +12,7 @@ from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 
 from failover.client.task import Task
-from failover.client.task_loop import FINISHED, Step
-from failover.client.task_rhythm import Activations
+from failover.client.task_rhythm import FINISHED, Activations, Step
 
 
 async def turns(task: Task, period_ns: int) -> AsyncIterator[int]:

@@ -2,31 +2,19 @@
 
 from __future__ import annotations
 
-import enum
 import inspect
 import signal
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 from typing import Final
 
 from failover.client.task import PROCESS, Task
-from failover.client.task_rhythm import Activations
+from failover.client.task_rhythm import FINISHED, Activations, Step
 from failover.errors import TaskError
 
-
-class Finished(enum.Enum):
-    """What a step returns when it was the last one."""
-
-    FINISHED = "finished"
-
-
-FINISHED: Final = Finished.FINISHED
-
 LONGEST_PERIOD_S: Final = 1e6
-
-Step = Callable[[], object]
 
 
 class _StopError(BaseException):

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import enum
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Final
 
 
 @dataclass(slots=True)
@@ -33,3 +36,15 @@ class Activations:
             self.overruns += late
             self._due += late
         return self.begin_ns + self._due * self.period_ns
+
+
+class Finished(enum.Enum):
+    """What a step returns when it was the last one."""
+
+    FINISHED = "finished"
+
+
+FINISHED: Final = Finished.FINISHED
+
+
+Step = Callable[[], object]

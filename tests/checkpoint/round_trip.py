@@ -21,7 +21,8 @@ import pytest
 
 from checkpoint import chain, format
 from checkpoint.device_rules import DeviceRule
-from checkpoint.engine import CaptureOrder, ProtectOrder, RestoreOptions, Session, Terms, engine_named
+from checkpoint.engine import CaptureOrder, ProtectOrder, RestoreOptions, Session, Terms
+from checkpoint.engines.registry import engine_named
 from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
 from checkpoint.linux import abi
 from checkpoint.linux.namespaces import prctl

@@ -13,7 +13,8 @@ import pytest
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines import restore_checks
 from checkpoint.errors import MismatchError, UnsupportedError
-from checkpoint.resources import OpenFile, unix_names
+from checkpoint.resources import unix_names
+from checkpoint.resources.open_file import OpenFile
 from tests.checkpoint.round_trip import (
     captured,
     captured_and_killed,

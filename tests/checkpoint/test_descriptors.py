@@ -25,9 +25,10 @@ from checkpoint.engine import CaptureOrder, ProtectOrder, RestoreOptions
 from checkpoint.engines import restore_checks
 from checkpoint.errors import CheckpointError, MismatchError, UnsupportedError
 from checkpoint.linux import mounts, procfs
-from checkpoint.linux.descriptors import Descriptor
+from checkpoint.linux.descriptor import Descriptor
 from checkpoint.linux.descriptors import descriptor as procfs_descriptor
-from checkpoint.resources import OpenFile, aio_rings, covered_files, eventfds, timerfds
+from checkpoint.resources import aio_rings, covered_files, eventfds, timerfds
+from checkpoint.resources.open_file import OpenFile
 from checkpoint.resources.rebuilding import number_of
 from tests.checkpoint.round_trip import (
     ENGINE,

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 
 from checkpoint import chain, pages
 from checkpoint.engine import CaptureOrder, RestoreOptions
-from checkpoint.engines import ready_copy, restore_memory, restore_threads
+from checkpoint.engines import lay_copy, restore_memory, restore_threads
 from checkpoint.engines.family_copy import FamilyCopy
 from checkpoint.engines.ptrace_restore import RestoredProgram
 from checkpoint.engines.restore_memory import KERNEL_NAMES
@@ -86,7 +86,7 @@ def laid(base: Snapshot, directory: Path) -> Iterator[Standby]:
     """A copy of a base; ended with the body, also when it has become the program."""
     born = vessel_for(base, directory)
     try:
-        copy = ready_copy.lay(born.pid, base, RestoreOptions())
+        copy = lay_copy.lay(born.pid, base, RestoreOptions())
         assert isinstance(copy, FamilyCopy)
         standby = Standby(born, copy, directory)
         try:
@@ -330,7 +330,7 @@ def killed_while_it_fills(vessel_pid: int, base: Snapshot, delta: Snapshot) -> l
     read_end, write_end = os.pipe()
     child = os.fork()
     if child == 0:
-        copy = ready_copy.lay(vessel_pid, base, RestoreOptions())
+        copy = lay_copy.lay(vessel_pid, base, RestoreOptions())
         assert isinstance(copy, FamilyCopy)
         os.write(write_end, " ".join(map(str, copy.pids())).encode())
         fill, filled = restore_memory.fill, []

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint.resources import OpenFile, Surroundings, files, gather
+from checkpoint.resources import files
+from checkpoint.resources.open_file import OpenFile, Surroundings
+from checkpoint.resources.survey import gather
 
 
 def test_a_file_that_is_deleted_between_two_looks_is_not_refused(tmp_path: Path) -> None:

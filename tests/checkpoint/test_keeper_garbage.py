@@ -25,7 +25,7 @@ class Tracer:
         weakref.finalize(one, print, "collected", flush=True)
         raise ProbeError("it may not")
 
-keeper.engine.engine_named = lambda name: Tracer()
+keeper.registry.engine_named = lambda name: Tracer()
 os._exit(keeper.main(["keeper", sys.argv[1]]))
 """
 
@@ -53,7 +53,7 @@ class Tracer:
         weakref.finalize(one, os.write, 1, b"let go\\n")
         fails(one)
 
-keeper.engine.engine_named = lambda name: Tracer()
+keeper.registry.engine_named = lambda name: Tracer()
 os._exit(keeper.main(["keeper", sys.argv[1]]))
 """
 

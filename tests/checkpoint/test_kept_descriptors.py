@@ -15,11 +15,13 @@ from pathlib import Path
 import msgspec.structs
 import pytest
 
-from checkpoint.linux import descriptors
-from checkpoint.linux.descriptors import Descriptor
+from checkpoint.linux import descriptor, descriptors
+from checkpoint.linux.descriptor import Descriptor
 from checkpoint.linux.kept_descriptors import TEXTS_KEPT, KeptTexts
-from checkpoint.resources import Kept, OpenFile, gather, grouping, with_contents
+from checkpoint.resources import grouping
+from checkpoint.resources.open_file import OpenFile
 from checkpoint.resources.recollection import Recollection
+from checkpoint.resources.survey import Kept, gather, with_contents
 
 
 @contextlib.contextmanager
@@ -140,7 +142,7 @@ def test_what_is_not_asked_of_sockets_and_pipes_is_what_the_kernel_would_answer(
         ours += [stack.enter_context(one).fileno() for one in (*socket.socketpair(), socket.socket())]
         ours.append(stack.enter_context(select.epoll()).fileno())
         quick = [told(number, None) for number in ours]
-        monkeypatch.setattr(descriptors, "_nameless", dict)
+        monkeypatch.setattr(descriptor, "_nameless", dict)
         asked = [told(number, None) for number in ours]
     quick, asked = ([msgspec.structs.replace(one, mtime_ns=0) for one in found] for found in (quick, asked))
     assert quick == asked

@@ -14,7 +14,8 @@ from typing import NoReturn
 import pytest
 
 from checkpoint.engine import CaptureOrder
-from checkpoint.resources import glance, sockets
+from checkpoint.resources import sockets
+from checkpoint.resources.survey import glance
 from tests.checkpoint.round_trip import Program, captured_at_last, ended, expect_ok, protected, start
 
 pytestmark = [pytest.mark.root]

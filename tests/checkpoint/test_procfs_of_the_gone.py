@@ -12,7 +12,8 @@ from checkpoint.engines import probe
 from checkpoint.errors import ProcessGoneError
 from checkpoint.linux import procfs
 from checkpoint.linux.descriptors import descriptor_numbers
-from checkpoint.resources import glance, unsupported
+from checkpoint.resources import unsupported
+from checkpoint.resources.survey import glance
 from tests.checkpoint.round_trip import as_nobody
 
 

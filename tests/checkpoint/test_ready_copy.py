@@ -17,7 +17,7 @@ import pytest
 
 from checkpoint import channel, format, room
 from checkpoint.engine import COPY_CLOCKS_AHEAD_NS, CaptureOrder, Copy, RestoreOptions, Session
-from checkpoint.engines import ready_copy, restore_memory
+from checkpoint.engines import lay_copy, ready_copy, restore_memory
 from checkpoint.engines.ready_copy import ReadyCopy
 from checkpoint.errors import CaptureError, ChainError, FormatError, RestoreError, UnsupportedError
 from checkpoint.linux.vessel import Birth, Born, discard, spawn_vessel
@@ -76,7 +76,7 @@ def laid(base: Snapshot, directory: Path) -> Iterator[Standby]:
     """A copy of a base, ended with the body unless it became the program."""
     born = vessel_for(base, directory)
     try:
-        yield Standby(born, ready_copy.lay(born.pid, base, RestoreOptions()), directory)
+        yield Standby(born, lay_copy.lay(born.pid, base, RestoreOptions()), directory)
     finally:
         discard(born)
 
@@ -200,7 +200,7 @@ def test_a_program_with_a_shared_file_can_have_none_and_is_told_why(compiled: Co
         born = vessel_for(base, tmp_path)
         try:
             with pytest.raises(UnsupportedError, match=r"maps .* shared"):
-                ready_copy.lay(born.pid, base, RestoreOptions())
+                lay_copy.lay(born.pid, base, RestoreOptions())
         finally:
             discard(born)
 
@@ -215,9 +215,9 @@ def test_none_is_laid_that_takes_more_than_half_of_what_is_free(
         try:
             monkeypatch.setattr(room, "free", lambda: 2 * held - 1)
             with pytest.raises(UnsupportedError, match="more than half of the"):
-                ready_copy.lay(born.pid, base, RestoreOptions())
+                lay_copy.lay(born.pid, base, RestoreOptions())
             monkeypatch.setattr(room, "free", lambda: 2 * held)
-            assert ready_copy.lay(born.pid, base, RestoreOptions()).position == base.position
+            assert lay_copy.lay(born.pid, base, RestoreOptions()).position == base.position
         finally:
             discard(born)
 

@@ -19,9 +19,11 @@ from checkpoint.arch import stubs
 from checkpoint.linux.descriptors import NOT_YET, Copier, lending
 from checkpoint.linux.socket_questions import SO_ATTACH_FILTER, WORTH_SHARING, Asking, Subject, Told
 from checkpoint.model import Fact
-from checkpoint.resources import Opened, OpenFile, gather, unix_sockets, with_contents
 from checkpoint.resources import sockets as kinds_of_sockets
+from checkpoint.resources import unix_sockets
+from checkpoint.resources.open_file import Opened, OpenFile
 from checkpoint.resources.recollection import Recollection
+from checkpoint.resources.survey import gather, with_contents
 from checkpoint.resources.tcp_connections import FIN_WAIT_2
 
 pytestmark = pytest.mark.root

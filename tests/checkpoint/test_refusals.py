@@ -18,7 +18,9 @@ from checkpoint import capabilities
 from checkpoint.capability import Verdict
 from checkpoint.engine import CaptureOrder, ProtectOrder
 from checkpoint.errors import ProbeError, ProcessGoneError, UnsupportedError
-from checkpoint.resources import Surroundings, files, gather
+from checkpoint.resources import files
+from checkpoint.resources.open_file import Surroundings
+from checkpoint.resources.survey import gather
 from tests.checkpoint.round_trip import (
     ENGINE,
     as_nobody,

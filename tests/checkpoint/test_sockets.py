@@ -15,7 +15,7 @@ from checkpoint.errors import CaptureError
 from checkpoint.linux import internet_sockets, procfs, sock_diag
 from checkpoint.linux.vessel import Birth, discard, spawn_vessel
 from checkpoint.model import Snapshot
-from checkpoint.resources import gather, with_contents
+from checkpoint.resources.survey import gather, with_contents
 from tests.checkpoint.round_trip import ENGINE, Program, captured_and_killed, ended, expect_ok, start_tracee
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]

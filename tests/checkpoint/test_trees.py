@@ -24,7 +24,8 @@ from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, Unsupp
 from checkpoint.linux import kinship, procfs
 from checkpoint.linux.vessel import Birth, spawn_vessel
 from checkpoint.model import ProcessState, Resource, Snapshot
-from checkpoint.resources import OpenFile, Surroundings, pidfds
+from checkpoint.resources import pidfds
+from checkpoint.resources.open_file import OpenFile, Surroundings
 from tests.checkpoint.round_trip import (
     ENGINE,
     Program,

@@ -18,8 +18,9 @@ import pytest
 
 from checkpoint import chain, format, pages
 from checkpoint.channel import memfd_holding
-from checkpoint.engine import CaptureOrder, ProtectOrder, Session, engine_named
+from checkpoint.engine import CaptureOrder, ProtectOrder, Session
 from checkpoint.engines.cooperative import CooperativeSession
+from checkpoint.engines.registry import engine_named
 from checkpoint.errors import ChainError, CheckpointError
 from checkpoint.model import Snapshot
 from checkpoint.pages import EMPTY_SUM

@@ -1,0 +1,23 @@
+"""The engines by their names."""
+
+from __future__ import annotations
+
+from checkpoint.engine import COOPERATIVE, PTRACE, Engine
+from checkpoint.errors import ProbeError
+
+
+def engine_named(name: str) -> Engine:
+    """Look an engine up.
+
+    Raises:
+        ProbeError: there is none of that name.
+    """
+    if name == COOPERATIVE:
+        from checkpoint.engines.guarded_task import CooperativeEngine
+
+        return CooperativeEngine()
+    if name != PTRACE:
+        raise ProbeError(f"no engine is called {name!r}: choose {PTRACE} or {COOPERATIVE}")
+    from checkpoint.engines.ptrace import PtraceEngine
+
+    return PtraceEngine()

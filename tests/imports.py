@@ -1,0 +1,117 @@
+"""``python -m tests.imports``: which folder imports which, and the circles of modules (there should be none).
+
+Every import counts, also one inside a function: a module that is loaded late depends no less.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import sys
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+LAYERS = ("checkpoint", "failover", "agent")
+
+Graph = Mapping[str, set[str]]
+"""Module → modules that it imports; both dotted."""
+
+
+def modules(root: Path = ROOT) -> dict[str, Path]:
+    """Every module of the product, by its dotted name; a package is named by itself."""
+    found = {}
+    for layer in LAYERS:
+        for path in sorted((root / layer).rglob("*.py")):
+            parts = path.relative_to(root).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def imported(tree: ast.AST, known: Iterable[str]) -> set[str]:
+    """The modules of the product that a source imports; ``from package import name`` may be a module."""
+    names, known = set(), set(known)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                names.add(inner if inner in known else node.module)
+    return names & known
+
+
+def graph(root: Path = ROOT) -> dict[str, set[str]]:
+    """The imports of all modules of the product."""
+    known = modules(root)
+    return {name: imported(ast.parse(path.read_text()), known) - {name} for name, path in known.items()}
+
+
+def circles(edges: Graph) -> list[list[str]]:
+    """Groups of modules that import one another, directly or by others: Tarjan's strongly connected components."""
+    order: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found = []
+
+    def visit(name: str) -> None:
+        order[name] = low[name] = len(order)
+        stack.append(name)
+        for other in edges.get(name, ()):
+            if other not in order:
+                visit(other)
+                low[name] = min(low[name], low[other])
+            elif other in stack:
+                low[name] = min(low[name], order[other])
+        if low[name] == order[name]:
+            group = stack[stack.index(name) :]
+            del stack[stack.index(name) :]
+            if len(group) > 1:
+                found.append(sorted(group))
+
+    sys.setrecursionlimit(10_000)
+    for name in edges:
+        if name not in order:
+            visit(name)
+    return found
+
+
+def folder_of(name: str, packages: set[str]) -> str:
+    """The folder in which a module lies."""
+    return name if name in packages else name.rpartition(".")[0]
+
+
+def folders(root: Path = ROOT) -> tuple[Counter[str], dict[str, Counter[str]]]:
+    """How many modules each folder holds, and how many imports lead from each to each other one."""
+    known = modules(root)
+    packages = {name for name, path in known.items() if path.name == "__init__.py"}
+    sizes = Counter(folder_of(name, packages) for name, path in known.items() if path.name != "__init__.py")
+    arrows: dict[str, Counter[str]] = defaultdict(Counter)
+    for name, others in graph(root).items():
+        for other in others:
+            here, there = folder_of(name, packages), folder_of(other, packages)
+            if here != there:
+                arrows[here][there] += 1
+    return sizes, arrows
+
+
+def main() -> int:
+    """Print the drawing; 1 if there is a circle."""
+    parser = argparse.ArgumentParser(prog="python -m tests.imports", description=__doc__)
+    parser.add_argument("--root", type=Path, default=ROOT, help="of another checkout")
+    root = parser.parse_args().root
+    sizes, arrows = folders(root)
+    for folder in sorted(sizes):
+        print(f"{folder}  ({sizes[folder]} modules)")
+        for other, count in sorted(arrows[folder].items()):
+            print(f"    → {other}  {count}")
+    found = circles(graph(root))
+    print(f"{sum(sizes.values())} modules in {len(sizes)} folders, the largest of {max(sizes.values())}; circles: {len(found)}")
+    for group in found:
+        print(f"    {len(group)}: {' '.join(group)}")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
