@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import sys
 
-from checkpoint import lean, quiet
+from checkpoint.runtime import early_interrupt, slim_imports
 
 
 def main() -> int:
     """Load and run the daemon's command line."""
-    quiet.begin()
-    lean.begin()
+    early_interrupt.begin()
+    slim_imports.begin()
     from agent.main import main as run
 
     return run()

@@ -13,15 +13,15 @@ from typing import Final, Literal
 from agent.errors import ConfigError
 from agent.hook_kinds import KINDS, check_told
 from checkpoint.arch import EVERY_LEVEL
-from checkpoint.carried import is_carriable
 from checkpoint.device_rules import RULES_MAX, DeviceRule, checked, rule_from
 from checkpoint.engine import contradiction
-from failover.client import strict_toml
-from failover.client import team as team_directory
-from failover.client.quantities import size_bytes, span_ms
-from failover.client.team import Robot, Team
-from failover.core.names import check_component
+from checkpoint.snapshot.carried_files import is_carriable
+from failover.config import strict_toml
+from failover.config import team as team_directory
+from failover.config.quantities import size_bytes, span_ms
+from failover.config.team import Robot, Team
 from failover.core.types import BEAT_MS_MAX, BEATS_IN_LEASE_MIN, COMPONENTS_MAX, PERIOD_MS_MAX
+from failover.core.wire.names import check_component
 from failover.errors import FailoverError, NameFormatError
 
 PATIENCE_S_MAX: Final = 86_400
@@ -36,7 +36,7 @@ HOOK_S_MAX: Final = 50
 
 @dataclass(frozen=True, slots=True)
 class HooksConfig:
-    """This robot's own commands around one component, see `agent.hooks`; () for none.
+    """This robot's own commands around one component, see `agent.worker.components.hooks`; () for none.
 
     Attributes:
         before_start: before it begins here.
@@ -143,7 +143,7 @@ class Config:
 
     Attributes:
         robot: this robot's name in the team file.
-        team_directory: see `failover.client.team`.
+        team_directory: see `failover.config.team`.
         state_directory: what survives a power cut: ballot, snapshots, streams.
         runtime_directory: sockets; gone after a reboot.
         insecure: run without keys: anybody on the network can read memory and start programs.

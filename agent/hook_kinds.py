@@ -1,4 +1,5 @@
-"""The occasions that a robot's operator may have commands for (`agent.hooks` runs them), and the signal that stands for one.
+"""The occasions that a robot's operator may have commands for (`agent.worker.components.hooks` runs them), and the signal that
+stands for one.
 
 The configuration is checked by this, in the heart too: what runs commands is not loaded there.
 """

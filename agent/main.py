@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from agent import config as configuration
-from agent import kernel
 from agent.errors import AgentError
-from agent.journal import set_up_log
-from agent.systemd import notifier
-from checkpoint import lean
+from agent.system import syscalls
+from agent.system.log_setup import set_up_log
+from agent.system.sd_notify import notifier
+from checkpoint.runtime import slim_imports
 from failover.errors import FailoverError
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def _wanted(arguments: list[str]) -> tuple[str, Path]:
 
 
 def _mend(settings: configuration.Settings, arguments: list[str]) -> int:
-    from agent.mending import mend
+    from agent.mend import mend
 
     wanted = command_line().parse_args(arguments)
     if not wanted.component or wanted.epoch is None:
@@ -81,10 +81,10 @@ def _mend(settings: configuration.Settings, arguments: list[str]) -> int:
 
 
 def _run(settings: configuration.Settings) -> int:
-    from agent.loop import beat
+    from agent.main_loop.loop import beat
 
     set_up_log(settings.config.log_level)
-    kernel.small_stacks()
+    syscalls.small_stacks()
     if settings.config.insecure:
         log.warning("%s", INSECURE)
     beat(settings, notifier())
@@ -94,7 +94,7 @@ def _run(settings: configuration.Settings) -> int:
 def _print_keys() -> int:
     import json
 
-    from agent.transport import new_keys
+    from agent.worker.network.replication_link import new_keys
 
     public, secret = new_keys()
     print(json.dumps({"public": public, "secret": secret}))
@@ -127,5 +127,5 @@ def command_line() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    lean.begin()
+    slim_imports.begin()
     sys.exit(main())

@@ -45,7 +45,7 @@ from benchmarks import (
 from benchmarks.figures import Absent, Findings
 from benchmarks.running import BenchmarkError
 from checkpoint.errors import CheckpointError
-from failover.client.quantities import span_ms
+from failover.config.quantities import span_ms
 from failover.errors import FailoverError
 
 HERE: Final = Path(__file__).parent

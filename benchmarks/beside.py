@@ -17,8 +17,8 @@ from benchmarks import alternatives, engine, machine
 from benchmarks.alternatives import Alternative, Criu
 from benchmarks.figures import OURS, Absent, Figure, Findings
 from benchmarks.running import Running, running
-from checkpoint import channel
-from failover.cli.keeper import Keeper
+from checkpoint.keeper import messages
+from failover.cli.keeper_client import Keeper
 
 SIZES_MB: Final = (10, 100, 500)
 DIRTY_KB: Final = 400
@@ -99,14 +99,14 @@ def _ours(program: Running, count: int, megabytes: int) -> list[Figure]:
     first, further = Observed(), Observed()
     case = f"{megabytes} MB"
     with Keeper.spawn() as keeper:
-        keeper.ask(channel.Protect(program.pid, "/benchmark"), channel.Protected)
+        keeper.ask(messages.Protect(program.pid, "/benchmark"), messages.Protected)
         machine.touch_memory(engine.ROOM * megabytes)
         for sequence in range(1, count + 2):
             seen = further if sequence > 1 else first
             time.sleep(engine.PERIOD_S)
             captured = _watched(program, seen, lambda: engine.capture(keeper, base=sequence == 1, sequence=sequence).told)  # noqa: B023
             seen.sizes_mb.append(captured.size / 1e6)
-        keeper.ask(channel.Release(), channel.Released)
+        keeper.ask(messages.Release(), messages.Released)
     return further.figures(case, OURS) + first.figures(case, FIRST_BASE)
 
 

@@ -12,11 +12,11 @@ from pathlib import Path
 
 from benchmarks import engine, machine
 from benchmarks.figures import Figure, Findings
-from checkpoint import channel
-from checkpoint.linux import vessel
-from checkpoint.linux.vessel import Birth
-from checkpoint.store import open_store
-from failover.cli.keeper import Keeper
+from checkpoint.keeper import messages
+from checkpoint.linux.spawn import vessel
+from checkpoint.linux.spawn.vessel import Birth
+from checkpoint.store.store import open_store
+from failover.cli.keeper_client import Keeper
 
 MEGABYTES = 500
 DELTAS = 64
@@ -35,11 +35,11 @@ def chains(quick: bool, directory: Path) -> Findings:
     few = files[:RESTORED]
 
     def restored(keeper: Keeper, born: int) -> None:
-        keeper.ask(channel.Restore(born, "/benchmark", follow=False), channel.Restored, few)
-        keeper.ask(channel.Resume(), channel.Resumed)
+        keeper.ask(messages.Restore(born, "/benchmark", follow=False), messages.Restored, few)
+        keeper.ask(messages.Resume(), messages.Resumed)
 
     def laid(keeper: Keeper, born: int) -> None:
-        keeper.ask(channel.Lay(born, "/benchmark"), channel.Laid, few)
+        keeper.ask(messages.Lay(born, "/benchmark"), messages.Laid, few)
 
     for what, obey in (("restore", restored), ("laying of a ready copy", laid)):
         found = [_measured(obey, pid, megabytes) for _ in range(2 if quick else COUNT)]
@@ -65,11 +65,11 @@ def _chain(megabytes: int, directory: Path) -> tuple[int, tuple[int, ...]]:
     """The PID of a program that has been killed, and its snapshots: a base first."""
     files = []
     with engine.resident(megabytes, 400, directory) as pid, Keeper.spawn() as keeper:
-        keeper.ask(channel.Protect(pid, "/benchmark"), channel.Protected)
+        keeper.ask(messages.Protect(pid, "/benchmark"), messages.Protected)
         for sequence in range(1, DELTAS + 2):
-            order = channel.Capture(base=sequence == 1, generation=1, sequence=sequence, xor_cache=XOR_CACHE)
-            captured, (content,) = keeper.ask(order, channel.Captured)
-            keeper.tell(channel.Acknowledge(captured.position))
+            order = messages.Capture(base=sequence == 1, generation=1, sequence=sequence, xor_cache=XOR_CACHE)
+            captured, (content,) = keeper.ask(order, messages.Captured)
+            keeper.tell(messages.Acknowledge(captured.position))
             files.append(content)
             time.sleep(engine.PERIOD_S)
         os.kill(pid, signal.SIGKILL)

@@ -32,7 +32,12 @@ IDLE_S: Final = 60.0
 QUICK_IDLE_S: Final = 3.0
 
 TICKS_A_SECOND: Final = os.sysconf("SC_CLK_TCK")
-PARTS: Final = {"agent.main": "heart", "agent.lanes": "lanes", "agent.guard": "guard", "checkpoint keeper": "keeper"}
+PARTS: Final = {
+    "agent.main": "heart",
+    "agent.worker.process": "lanes",
+    "agent.guard.server": "guard",
+    "checkpoint keeper": "keeper",
+}
 """By what stands in their command line."""
 
 

@@ -10,9 +10,9 @@ from typing import Final
 from benchmarks.engine import PERIOD_S, capture
 from benchmarks.figures import Figure
 from benchmarks.running import running
-from checkpoint import channel
 from checkpoint.engine import NO_TERMS, Carry, Terms
-from failover.cli.keeper import Keeper
+from checkpoint.keeper import messages
+from failover.cli.keeper_client import Keeper
 
 KINDS: Final = ("thread", "file", "end of a pipe", "eventfd", "epoll", "unix socket", "UDP socket", "TCP socket")
 """In the order of `benchmarks.programs.crowded`."""
@@ -44,11 +44,11 @@ def _freezes_us(kind: int, count: int, directory: Path, terms: Terms = NO_TERMS)
     """Of deltas, by the keeper's own account."""
     found: list[float] = []
     with running("crowded", kind, count, directory=directory) as program, Keeper.spawn() as keeper:
-        keeper.ask(channel.Protect(program.pid, "/benchmark", terms=terms), channel.Protected)
+        keeper.ask(messages.Protect(program.pid, "/benchmark", terms=terms), messages.Protected)
         capture(keeper, base=True, sequence=1)
         for sequence in range(2, DELTAS + 2):
             time.sleep(PERIOD_S)
             captured = capture(keeper, base=False, sequence=sequence).told
             found.append(float(captured.freeze_us))
-        keeper.ask(channel.Release(), channel.Released)
+        keeper.ask(messages.Release(), messages.Released)
     return found

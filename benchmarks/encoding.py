@@ -23,9 +23,10 @@ from benchmarks import engine
 from benchmarks.figures import OURS, Absent, Figure, Findings
 from benchmarks.programs import heap
 from benchmarks.running import running
-from checkpoint import channel, format
+from checkpoint.keeper import messages
 from checkpoint.model import Snapshot
-from failover.cli.keeper import Keeper
+from checkpoint.snapshot import format
+from failover.cli.keeper_client import Keeper
 
 CELLS: Final = 60_000
 CHANGES: Final = 300
@@ -82,21 +83,21 @@ def _snapshots(cells: int, directory: Path) -> tuple[Snapshot, Snapshot, Pages]:
     """A base, the last of some deltas, and what the delta's pages held before it."""
     pages: Pages = {}
     with running("heap", cells, CHANGES, directory=directory) as program, Keeper.spawn() as keeper:
-        keeper.ask(channel.Protect(program.pid, "/benchmark"), channel.Protected)
+        keeper.ask(messages.Protect(program.pid, "/benchmark"), messages.Protected)
         base = newest = _captured(keeper, 1)
         for sequence in range(2, DELTAS + 2):
             pages.update(_pages_of(newest))
             time.sleep(engine.PERIOD_S)
             newest = _captured(keeper, sequence)
-        keeper.ask(channel.Release(), channel.Released)
+        keeper.ask(messages.Release(), messages.Released)
     zeros = bytes(newest.machine.page_size)
     return base, newest, {address: pages.get(address, zeros) for address in _pages_of(newest)}
 
 
 def _captured(keeper: Keeper, sequence: int) -> Snapshot:
-    asked = channel.Capture(base=sequence == 1, generation=1, sequence=sequence)
-    captured, (content,) = keeper.ask(asked, channel.Captured)
-    keeper.tell(channel.Acknowledge(captured.position))
+    asked = messages.Capture(base=sequence == 1, generation=1, sequence=sequence)
+    captured, (content,) = keeper.ask(asked, messages.Captured)
+    keeper.tell(messages.Acknowledge(captured.position))
     try:
         return format.decode(content)
     finally:

@@ -13,10 +13,10 @@ from pathlib import Path
 from benchmarks import machine
 from benchmarks.figures import Figure
 from benchmarks.running import running
-from checkpoint import channel
-from checkpoint.linux import vessel
-from checkpoint.linux.vessel import Birth
-from failover.cli.keeper import Keeper
+from checkpoint.keeper import messages
+from checkpoint.linux.spawn import vessel
+from checkpoint.linux.spawn.vessel import Birth
+from failover.cli.keeper_client import Keeper
 
 SIZES_MB = (10, 100, 500, 1000)
 CASES: tuple[tuple[int, int, int], ...] = (
@@ -49,7 +49,7 @@ def _freeze_of(megabytes: int, dirty_kb: int, count: int, directory: Path) -> li
     walls: list[float] = []
     dirty: list[float] = []
     with resident(megabytes, dirty_kb, directory) as pid, Keeper.spawn() as keeper:
-        keeper.ask(channel.Protect(pid, "/benchmark"), channel.Protected)
+        keeper.ask(messages.Protect(pid, "/benchmark"), messages.Protected)
         base = capture(keeper, base=True, sequence=1).told
         for sequence in range(2, count + 2):
             time.sleep(PERIOD_S)
@@ -57,7 +57,7 @@ def _freeze_of(megabytes: int, dirty_kb: int, count: int, directory: Path) -> li
             freezes.append(taken.told.freeze_us / 1000)
             walls.append(taken.wall_ms)
             dirty.append(taken.told.dirty_bytes / 1e6)
-        keeper.ask(channel.Release(), channel.Released)
+        keeper.ask(messages.Release(), messages.Released)
     return [
         Figure("freeze of the first base", case, "ms", (base.freeze_us / 1000,)),
         Figure("freeze of a delta", case, "ms", tuple(freezes)),
@@ -87,7 +87,7 @@ class Taken:
         size: encoded, in bytes.
     """
 
-    told: channel.Captured
+    told: messages.Captured
     wall_ms: float
     size: int
 
@@ -95,11 +95,11 @@ class Taken:
 def capture(keeper: Keeper, base: bool, sequence: int) -> Taken:
     """One snapshot, acknowledged at once."""
     began = time.perf_counter()
-    captured, (content,) = keeper.ask(channel.Capture(base=base, generation=1, sequence=sequence), channel.Captured)
+    captured, (content,) = keeper.ask(messages.Capture(base=base, generation=1, sequence=sequence), messages.Captured)
     wall_ms = (time.perf_counter() - began) * 1000
     size = os.fstat(content).st_size
     os.close(content)
-    keeper.tell(channel.Acknowledge(captured.position))
+    keeper.tell(messages.Acknowledge(captured.position))
     return Taken(captured, wall_ms, size)
 
 
@@ -113,8 +113,8 @@ def restore(quick: bool, directory: Path) -> list[Figure]:
 
 def _restores_of(megabytes: int, count: int, directory: Path) -> list[Figure]:
     with resident(megabytes, 40, directory) as pid, Keeper.spawn() as keeper:
-        keeper.ask(channel.Protect(pid, "/benchmark"), channel.Protected)
-        _, (content,) = keeper.ask(channel.Capture(base=True, generation=1, sequence=1, hold=True), channel.Captured)
+        keeper.ask(messages.Protect(pid, "/benchmark"), messages.Protected)
+        _, (content,) = keeper.ask(messages.Capture(base=True, generation=1, sequence=1, hold=True), messages.Captured)
         os.kill(pid, signal.SIGKILL)
     whole = tuple(_restored_once(content, pid, megabytes) for _ in range(count))
     ready, again = zip(*(_taken_over_once(content, pid) for _ in range(count)), strict=True)
@@ -132,10 +132,10 @@ def _taken_over_once(content: int, pid: int) -> tuple[float, float]:
     with Keeper.spawn() as keeper:
         born = vessel.spawn_vessel(Birth(pid))
         try:
-            laid, _ = keeper.ask(channel.Lay(born.pid, "/benchmark"), channel.Laid, (content,))
+            laid, _ = keeper.ask(messages.Lay(born.pid, "/benchmark"), messages.Laid, (content,))
             began_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
-            keeper.ask(channel.Finish(channel.Restore(born.pid, "/benchmark"), laid.position), channel.Restored)
-            resumed, _ = keeper.ask(channel.Resume(), channel.Resumed)
+            keeper.ask(messages.Finish(messages.Restore(born.pid, "/benchmark"), laid.position), messages.Restored)
+            resumed, _ = keeper.ask(messages.Resume(), messages.Resumed)
             return (resumed.let_go_ns - began_ns) / 1e6, (time.clock_gettime_ns(time.CLOCK_BOOTTIME) - began_ns) / 1e6
         finally:
             vessel.discard(born)
@@ -148,8 +148,8 @@ def _restored_once(content: int, pid: int, megabytes: int) -> float:
         began_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         born = vessel.spawn_vessel(Birth(pid))
         try:
-            keeper.ask(channel.Restore(born.pid, "/benchmark"), channel.Restored, (content,))
-            resumed, _ = keeper.ask(channel.Resume(), channel.Resumed)
+            keeper.ask(messages.Restore(born.pid, "/benchmark"), messages.Restored, (content,))
+            resumed, _ = keeper.ask(messages.Resume(), messages.Resumed)
             return (resumed.let_go_ns - began_ns) / 1e6
         finally:
             vessel.discard(born)
@@ -157,4 +157,4 @@ def _restored_once(content: int, pid: int, megabytes: int) -> float:
 
 def wait_until_ready(keeper: Keeper) -> None:
     """A standby's keeper runs already when it is needed: the interpreter's start is not part of a restore."""
-    keeper.ask(channel.Probe(os.getpid()), channel.Probed)
+    keeper.ask(messages.Probe(os.getpid()), messages.Probed)

@@ -10,10 +10,10 @@ from pathlib import Path
 from benchmarks import engine, machine
 from benchmarks.figures import Figure, Findings
 from benchmarks.running import running
-from checkpoint import channel
-from checkpoint.linux import vessel
-from checkpoint.linux.vessel import Birth
-from failover.cli.keeper import Keeper
+from checkpoint.keeper import messages
+from checkpoint.linux.spawn import vessel
+from checkpoint.linux.spawn.vessel import Birth
+from failover.cli.keeper_client import Keeper
 
 
 def families(quick: bool, directory: Path) -> Findings:
@@ -31,8 +31,8 @@ def families(quick: bool, directory: Path) -> Findings:
 
 def _of(megabytes: int, count: int, directory: Path) -> list[Figure]:
     with running("family", megabytes, 40, directory=directory) as program, Keeper.spawn() as keeper:
-        keeper.ask(channel.Protect(program.pid, "/benchmark"), channel.Protected)
-        _, (content,) = keeper.ask(channel.Capture(base=True, generation=1, sequence=1, hold=True), channel.Captured)
+        keeper.ask(messages.Protect(program.pid, "/benchmark"), messages.Protected)
+        _, (content,) = keeper.ask(messages.Capture(base=True, generation=1, sequence=1, hold=True), messages.Captured)
         os.kill(program.pid, signal.SIGKILL)
     whole = tuple(_back_once(content, program.pid, megabytes, from_copy=False) for _ in range(count))
     ready = tuple(_back_once(content, program.pid, megabytes, from_copy=True) for _ in range(count))
@@ -44,20 +44,20 @@ def _of(megabytes: int, count: int, directory: Path) -> list[Figure]:
 def _back_once(content: int, pid: int, megabytes: int, *, from_copy: bool) -> float:
     """Milliseconds from the order to the last one's being let go."""
     with Keeper.spawn() as keeper:
-        keeper.ask(channel.Probe(os.getpid()), channel.Probed)  # a standby's keeper runs already
+        keeper.ask(messages.Probe(os.getpid()), messages.Probed)  # a standby's keeper runs already
         machine.touch_memory(engine.ROOM * megabytes)
         began_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         born = vessel.spawn_vessel(Birth(pid, isolate=True))
-        order = channel.Restore(born.pid, "/benchmark")
+        order = messages.Restore(born.pid, "/benchmark")
         try:
             if from_copy:
-                laid, _ = keeper.ask(channel.Lay(born.pid, "/benchmark"), channel.Laid, (content,))
+                laid, _ = keeper.ask(messages.Lay(born.pid, "/benchmark"), messages.Laid, (content,))
                 began_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
-                keeper.ask(channel.Finish(order, laid.position), channel.Restored)
+                keeper.ask(messages.Finish(order, laid.position), messages.Restored)
             else:
-                keeper.ask(order, channel.Restored, (content,))
-            resumed, _ = keeper.ask(channel.Resume(), channel.Resumed)
+                keeper.ask(order, messages.Restored, (content,))
+            resumed, _ = keeper.ask(messages.Resume(), messages.Resumed)
             return (resumed.let_go_ns - began_ns) / 1e6
         finally:
-            keeper.ask(channel.Release(), channel.Released)
+            keeper.ask(messages.Release(), messages.Released)
             vessel.discard(born)

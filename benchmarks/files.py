@@ -15,11 +15,12 @@ from benchmarks.alternatives import Criu, call
 from benchmarks.beside import fresh, images
 from benchmarks.figures import OURS, Absent, Figure, Findings
 from benchmarks.running import wait_until_gone
-from checkpoint import channel, format
-from checkpoint.linux import vessel
-from checkpoint.linux.vessel import Born
-from failover.cli import oneshot
-from failover.cli.keeper import Keeper
+from checkpoint.keeper import messages
+from checkpoint.linux.spawn import vessel
+from checkpoint.linux.spawn.vessel import Born
+from checkpoint.snapshot import format
+from failover.cli.keeper_client import Keeper
+from failover.cli.verbs import one_shot
 
 SIZES_MB: Final = (100, 500)
 COUNT: Final = 8
@@ -94,10 +95,10 @@ def _ready(pid: int, image: Path) -> Times:
 
 
 def _to_file(keeper: Keeper, pid: int, file: Path) -> None:
-    keeper.ask(channel.Protect(pid, "/benchmark"), channel.Protected)
+    keeper.ask(messages.Protect(pid, "/benchmark"), messages.Protected)
     with open(file, "xb", buffering=0) as target:
-        order = channel.Capture(base=True, generation=1, sequence=1, hold=True)
-        keeper.ask(order, channel.Captured, (target.fileno(),))
+        order = messages.Capture(base=True, generation=1, sequence=1, hold=True)
+        keeper.ask(order, messages.Captured, (target.fileno(),))
         os.fsync(target.fileno())
     os.kill(pid, signal.SIGKILL)
     keeper.release()
@@ -107,9 +108,9 @@ def _to_file(keeper: Keeper, pid: int, file: Path) -> None:
 def _back(keeper: Keeper, file: Path) -> Born:
     descriptor = os.open(file, os.O_RDONLY | os.O_CLOEXEC)
     state = format.read_state(descriptor)
-    born = vessel.spawn_vessel(oneshot.birth_of(state, 0, own_session=True))
-    keeper.ask(channel.Restore(born.pid, state.component, follow=False), channel.Restored, (descriptor,))
-    keeper.ask(channel.Resume(), channel.Resumed)
+    born = vessel.spawn_vessel(one_shot.birth_of(state, 0, own_session=True))
+    keeper.ask(messages.Restore(born.pid, state.component, follow=False), messages.Restored, (descriptor,))
+    keeper.ask(messages.Resume(), messages.Resumed)
     keeper.release()
     os.close(descriptor)
     return born

@@ -11,10 +11,10 @@ from typing import Final
 
 from benchmarks.engine import PERIOD_S, capture, resident
 from benchmarks.figures import Figure, Findings
-from checkpoint import channel
-from checkpoint.linux import procfs
-from checkpoint.linux.memory import Memory, ranges_of
-from failover.cli.keeper import Keeper
+from checkpoint.keeper import messages
+from checkpoint.linux.memory.remote_memory import Memory, ranges_of
+from checkpoint.linux.procfs import procfs
+from failover.cli.keeper_client import Keeper
 
 SIZES_MB: Final = (10, 50, 200, 500)
 WRITTEN_MB: Final = (0.0, 0.04, 0.1, 0.4, 1.0, 4.0, 10.0)
@@ -60,7 +60,7 @@ def _deltas(megabytes: int, dirty_kb: int, count: int, directory: Path) -> tuple
     """Of deltas: KB sent, ms of freeze; and KB sent for the base."""
     sent, still = [], []
     with resident(megabytes, dirty_kb, directory, by_chance=True) as pid, Keeper.spawn() as keeper:
-        keeper.ask(channel.Protect(pid, "/benchmark"), channel.Protected)
+        keeper.ask(messages.Protect(pid, "/benchmark"), messages.Protected)
         base = capture(keeper, base=True, sequence=1).size
         capture(keeper, base=False, sequence=2)  # what the program wrote while the base was taken
         for sequence in range(3, count + 3):
@@ -68,7 +68,7 @@ def _deltas(megabytes: int, dirty_kb: int, count: int, directory: Path) -> tuple
             taken = capture(keeper, base=False, sequence=sequence)
             sent.append(taken.size / 1000)
             still.append(taken.told.freeze_us / 1000)
-        keeper.ask(channel.Release(), channel.Released)
+        keeper.ask(messages.Release(), messages.Released)
     return tuple(sent), tuple(still), base / 1000
 
 

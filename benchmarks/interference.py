@@ -16,7 +16,7 @@ from benchmarks.figures import OURS, Absent, Figure, Findings
 from benchmarks.running import BenchmarkError, Running, running
 from failover.cli.demo.robots import Means as Allowed
 from failover.cli.demo.robots import RobotMachine, Stage
-from failover.client import team
+from failover.config import team
 
 NAME: Final = "/demo/robot1/measured"
 RESIDENT_MB: Final = 100

@@ -38,7 +38,12 @@ MEMORY_GROWTH: Final = "memory, growth an hour"
 DESCRIPTOR_GROWTH: Final = "descriptors, growth an hour"
 WHEN: Final = "minutes since all were protected"
 
-PARTS: Final = {"agent.main": "heart", "agent.lanes": "lanes", "agent.guard": "guards", "checkpoint keeper": "keeper"}
+PARTS: Final = {
+    "agent.main": "heart",
+    "agent.worker.process": "lanes",
+    "agent.guard.server": "guards",
+    "checkpoint keeper": "keeper",
+}
 """By what stands in their command line."""
 OTHER_KEEPERS: Final = "keepers that wait or have a ready copy"
 

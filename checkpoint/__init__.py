@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from checkpoint.engine import Report
     from checkpoint.engines.registry import engine_named
     from checkpoint.errors import CheckpointError
-    from checkpoint.format import decode, encode
     from checkpoint.model import Position, Snapshot
-    from checkpoint.store import Store, open_store
+    from checkpoint.snapshot.format import decode, encode
+    from checkpoint.store.store import Store, open_store
 
 __all__ = ["CheckpointError", "Position", "Report", "Snapshot", "Store", "decode", "encode", "engine_named", "open_store"]
 
@@ -28,11 +28,11 @@ _HOMES = {
     "Position": "checkpoint.model",
     "Report": "checkpoint.engine",
     "Snapshot": "checkpoint.model",
-    "Store": "checkpoint.store",
-    "decode": "checkpoint.format",
-    "encode": "checkpoint.format",
+    "Store": "checkpoint.store.store",
+    "decode": "checkpoint.snapshot.format",
+    "encode": "checkpoint.snapshot.format",
     "engine_named": "checkpoint.engines.registry",
-    "open_store": "checkpoint.store",
+    "open_store": "checkpoint.store.store",
 }
 
 

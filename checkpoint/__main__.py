@@ -1,30 +1,30 @@
-"""The entry of the keeper: ``python -m checkpoint keeper``, see `checkpoint.keeper`."""
+"""The entry of the keeper: ``python -m checkpoint keeper``, see `checkpoint.keeper.server`."""
 
 from __future__ import annotations
 
 import gc
 import sys
 
-from checkpoint import quiet
+from checkpoint.runtime import early_interrupt
 
 
 def main() -> int:
     """Load and run what the words of this process say."""
-    quiet.begin()
-    return quiet.left(run(sys.argv[1:]))
+    early_interrupt.begin()
+    return early_interrupt.left(run(sys.argv[1:]))
 
 
 def run(words: list[str]) -> int:
     """Load and run the keeper."""
     gc.disable()  # of what is loaded nothing is rubbish, and what captures make is freed by counting
-    from checkpoint import allocator, lean
+    from checkpoint.runtime import allocator, slim_imports
 
     allocator.be_frugal()
-    lean.begin()
-    lean.load_numpy()
-    from checkpoint import keeper
+    slim_imports.begin()
+    slim_imports.load_numpy()
+    from checkpoint.keeper import server
 
-    return keeper.main(words)
+    return server.main(words)
 
 
 if __name__ == "__main__":

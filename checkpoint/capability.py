@@ -1,4 +1,5 @@
-"""One row of the table of what comes back: each file of ``resources`` carries its own, `checkpoint.capabilities` gathers them.
+"""One row of the table of what comes back: each file of ``resources`` carries its own, `checkpoint.engines.capability_table`
+gathers them.
 
 A row is about one kind of thing that a program may hold. The table in docs/capabilities.md is written from these rows
 (``./run table``), and tests hold it and every refusal in the code against them.

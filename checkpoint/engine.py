@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Final, Protocol
 from msgspec import Struct
 
 from checkpoint.device_rules import DeviceRule
-from checkpoint.digests_of_files import DigestOf
 from checkpoint.errors import RestoreError
 from checkpoint.model import Position, Snapshot
-from checkpoint.rights import Owner
+from checkpoint.snapshot.credentials import Owner
+from checkpoint.store.digest_cache import DigestOf
 
 if TYPE_CHECKING:
-    from checkpoint.stored_base import StoredBase
-    from checkpoint.unread_base import UnreadBase
+    from checkpoint.store.base_in_process import UnreadBase
+    from checkpoint.store.base_on_disk import StoredBase
 
 PTRACE: Final = "ptrace"
 COOPERATIVE: Final = "cooperative"
@@ -150,8 +150,8 @@ class ProtectOrder(Struct, frozen=True):
     Attributes:
         component: its name.
         streams: the guard's ends of its standard streams, if it lives under a guard; the session owns them from now on.
-        names: of somebody who keeps the program's files by content (`checkpoint.contents`): the paths by which the program
-            knows those that it has from there; snapshots name them so. None: nobody keeps them.
+        names: of somebody who keeps the program's files by content (`checkpoint.store.content_store`): the paths by which the
+            program knows those that it has from there; snapshots name them so. None: nobody keeps them.
     """
 
     component: str
@@ -202,11 +202,11 @@ class RestoreOptions(Struct, frozen=True):
         epoch: of the primacy under which it goes on; a program that was born with one finds it in its environment. 0: none.
         terms: this robot's, for its devices; its carried files have been named as they are laid down here.
         own_eyes: open its files with its own user's rights, not with ours: that user could have put other files in their place.
-        contents: directory of files that were brought along (`checkpoint.contents`), for what this machine lacks or has in
-            another version; "": there are none.
+        contents: directory of files that were brought along (`checkpoint.store.content_store`), for what this machine lacks or
+            has in another version; "": there are none.
         stood_still: nothing of it has run since the capture, so that TCP connections that were taken along can be taken up.
-        bound: whose rights it gets at most, whatever it asks for (`checkpoint.rights.bounded`); None: what it asks for.
-            The vessel is that user's already, so that the kernel keeps to it, too.
+        bound: whose rights it gets at most, whatever it asks for (`checkpoint.snapshot.credentials.bounded`); None: what it asks
+            for. The vessel is that user's already, so that the kernel keeps to it, too.
     """
 
     elapsed_ns: int = 0
@@ -375,8 +375,8 @@ class Engine(Protocol):
         """What this machine lacks of what a program needs that runs elsewhere, one sentence each; without touching anything.
 
         Args:
-            outline: of its newest snapshot (`checkpoint.format.read_outline`).
-            digest_of: tells what files of this machine contain (`checkpoint.digests_of_files`).
+            outline: of its newest snapshot (`checkpoint.snapshot.format.read_outline`).
+            digest_of: tells what files of this machine contain (`checkpoint.store.digest_cache`).
         """
         ...
 

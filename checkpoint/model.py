@@ -29,7 +29,7 @@ class VmaKind(enum.StrEnum):
     VVAR = "vvar"
     VSYSCALL = "vsyscall"
     CARRIED_FILE = "carried_file"
-    """None of the process's: the content of a file that travels with it, see `checkpoint.carried`."""
+    """None of the process's: the content of a file that travels with it, see `checkpoint.snapshot.carried_files`."""
 
 
 class FileIdentity(Struct, frozen=True):
@@ -238,7 +238,7 @@ class ProcessState(Struct, frozen=True):
         pid: as the program itself sees it (innermost PID namespace).
         ppid, pgid, sid: likewise; 0 where they lie outside its namespace.
         limits: RLIMIT number → (soft, hard); -1 is infinity.
-        switches: calls of prctl(2) that set again what it has switched, see `checkpoint.engines.switches`.
+        switches: calls of prctl(2) that set again what it has switched, see `checkpoint.engines.ptrace.facts.prctl_state`.
         coredump_filter: which mappings a core dump holds (core(5)); -1 where the kernel makes none.
         pending: signals pending for the process, each a whole siginfo (128 bytes).
         isolated: it lives in PID and time namespaces of its own.

@@ -24,14 +24,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from failover.client.control import Control
-    from failover.client.epoch import epoch
-    from failover.client.gateway import Gateway
-    from failover.client.scratch import scratch
-    from failover.client.task import Resumed, activations, commit, resume, resumed, transaction, wait_committed
-    from failover.client.task_component import component, kept, run
-    from failover.client.task_loop import every
-    from failover.client.task_resumable import resumable
-    from failover.client.task_rhythm import FINISHED
     from failover.errors import (
         AgentRefusedError,
         FailoverError,
@@ -43,27 +35,35 @@ if TYPE_CHECKING:
         StateTakenError,
         TaskError,
     )
+    from failover.fencing.epoch import epoch
+    from failover.fencing.gateway import Gateway
+    from failover.task.api import Resumed, activations, commit, resume, resumed, transaction, wait_committed
+    from failover.task.component import component, kept, run
+    from failover.task.loop import every
+    from failover.task.period import FINISHED
+    from failover.task.resumable import resumable
+    from failover.task.scratch import scratch
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "Control": "failover.client.control",
-    "Resumed": "failover.client.task",
-    "activations": "failover.client.task",
-    "commit": "failover.client.task",
-    "epoch": "failover.client.epoch",
-    "Gateway": "failover.client.gateway",
-    "resume": "failover.client.task",
-    "resumed": "failover.client.task",
-    "transaction": "failover.client.task",
-    "wait_committed": "failover.client.task",
-    "component": "failover.client.task_component",
-    "kept": "failover.client.task_component",
-    "run": "failover.client.task_component",
-    "FINISHED": "failover.client.task_rhythm",
-    "every": "failover.client.task_loop",
-    "resumable": "failover.client.task_resumable",
-    "scratch": "failover.client.scratch",
+    "Resumed": "failover.task.api",
+    "activations": "failover.task.api",
+    "commit": "failover.task.api",
+    "epoch": "failover.fencing.epoch",
+    "Gateway": "failover.fencing.gateway",
+    "resume": "failover.task.api",
+    "resumed": "failover.task.api",
+    "transaction": "failover.task.api",
+    "wait_committed": "failover.task.api",
+    "component": "failover.task.component",
+    "kept": "failover.task.component",
+    "run": "failover.task.component",
+    "FINISHED": "failover.task.period",
+    "every": "failover.task.loop",
+    "resumable": "failover.task.resumable",
+    "scratch": "failover.task.scratch",
     "AgentRefusedError": "failover.errors",
     "FailoverError": "failover.errors",
     "GatewayError": "failover.errors",

@@ -5,22 +5,22 @@ from __future__ import annotations
 import gc
 import sys
 
-from checkpoint import quiet
+from checkpoint.runtime import early_interrupt
 
 
 def main() -> int:
     """Load and run the command line."""
-    quiet.begin()
-    from failover.cli import ahead
+    early_interrupt.begin()
+    from failover.cli import keeper_prestart
 
-    ahead.start_for(sys.argv[1:])
+    keeper_prestart.start_for(sys.argv[1:])
     gc.disable()  # until the verb is loaded: nothing of that is rubbish
-    from checkpoint import lean
+    from checkpoint.runtime import slim_imports
 
-    lean.begin()
+    slim_imports.begin()
     from failover.cli.main import main as run
 
-    return quiet.left(run())
+    return early_interrupt.left(run())
 
 
 if __name__ == "__main__":

@@ -464,7 +464,7 @@ static inline void failover_on_resume(failover_callback *called, void *context)
     failover_the_task_.context = context;
 }
 
-/* The epoch that these digits tell, read in their order (checkpoint/epoch_variable.py); 0 where they are none. */
+/* The epoch that these digits tell, read in their order (checkpoint/program/epoch_variable.py); 0 where they are none. */
 static inline uint64_t failover_token_(const volatile char *digits)
 {
     uint64_t told = 0;

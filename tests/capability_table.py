@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from checkpoint import capabilities
 from checkpoint.capability import Capability
+from checkpoint.engines import capability_table
 
 PAGE = Path(__file__).parent.parent / "docs" / "capabilities.md"
 BEGIN, END = "<!-- capabilities:begin (written by ./run table) -->\n", "<!-- capabilities:end -->\n"
@@ -23,7 +23,7 @@ def line_of(row: Capability) -> str:
 def whole() -> str:
     """Every row, a table for each area."""
     parts = []
-    for area, rows in capabilities.by_area().items():
+    for area, rows in capability_table.by_area().items():
         lines = "\n".join(line_of(row) for row in rows)
         parts.append(f"## {area.value[0].upper()}{area.value[1:]}\n\n{HEAD}{lines}\n")
     return "\n".join(parts)

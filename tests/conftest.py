@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from hypothesis import settings
 
-from checkpoint.engines import entering
-from checkpoint.linux import abi, dirty
-from checkpoint.linux.tracking import Tracker
-from checkpoint.linux.write_protection import PagemapTracker
+from checkpoint.engines.ptrace.capture import enter
+from checkpoint.linux import abi
+from checkpoint.linux.memory import choose_tracker
+from checkpoint.linux.memory.tracker import Tracker
+from checkpoint.linux.memory.write_protect import PagemapTracker
 
 if TYPE_CHECKING:
     from xdist.scheduler import LoadScopeScheduling
@@ -98,15 +99,15 @@ def _tracking(request: pytest.FixtureRequest) -> Iterator[None]:
     wanted = request.config.getoption("--tracking")
     with pytest.MonkeyPatch.context() as patched:
         if wanted:
-            patched.setattr(entering, "PagemapTracker", _no_write_protection)
+            patched.setattr(enter, "PagemapTracker", _no_write_protection)
         if wanted == "digest":
-            patched.setattr(dirty, "has_soft_dirty", lambda: False)
+            patched.setattr(choose_tracker, "has_soft_dirty", lambda: False)
         yield
 
 
 def tracking_of(config: pytest.Config) -> str:
     """How written pages are found in these tests."""
-    return str(config.getoption("--tracking") or dirty.best_tracking())
+    return str(config.getoption("--tracking") or choose_tracker.best_tracking())
 
 
 def _no_write_protection(pid: int, faults: int) -> Tracker:
@@ -126,7 +127,7 @@ def _machine(request: pytest.FixtureRequest, record_testsuite_property: Callable
 
 # --- Side by side ----------------------------------------------------------------------------------------------------
 
-SEGMENTS = ("tests/checkpoint/test_memory_kinds.py", "tests/checkpoint/test_refusals.py")
+SEGMENTS = ("tests/checkpoint/engines/ptrace/restore/test_memory_kinds.py", "tests/checkpoint/resources/test_refusals.py")
 """They make System V segments, or look at all that there are on the machine."""
 
 

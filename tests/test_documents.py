@@ -15,11 +15,11 @@ import agent.errors
 import agent.main
 import checkpoint.errors
 import failover.errors
-from agent import view
 from agent.config import ComponentConfig, Config, HooksConfig
-from agent.transport import LinkState
+from agent.worker.control import status_view
+from agent.worker.network.replication_link import LinkState
 from failover.cli import parser
-from failover.client.team import Robot
+from failover.config.team import Robot
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = sorted(path for floor in ("", "*/", "*/*/") for path in ROOT.glob(f"{floor}*.md") if ".venv" not in path.parts)
@@ -148,7 +148,7 @@ def test_every_class_of_error_has_its_cause_and_cure() -> None:
 
 def test_every_word_of_the_status_is_told() -> None:
     text = (ROOT / "docs" / "guide.md").read_text().split("## 5.")[1].split("## 6.")[0]
-    of_components = set(view.STATES.values()) - {"absent", "released"}  # these are not shown
+    of_components = set(status_view.STATES.values()) - {"absent", "released"}  # these are not shown
     of_robots = {"unknown", "live", "suspect", "dead"}
     words = of_components | of_robots | {"degraded"} | {str(state) for state in LinkState}
     assert [word for word in sorted(words) if not re.search(rf"\*{word}\b", text)] == []

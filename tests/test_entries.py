@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint import quiet
+from checkpoint.runtime import early_interrupt
 
 BIN = Path(sys.executable).parent
 IMPORTS = [sys.executable, "-X", "importtime"]
@@ -30,13 +30,13 @@ def test_ctrl_c_while_a_command_loads_ends_it_quietly(entry: str, later: int) ->
     with subprocess.Popen(ENTRIES[entry], stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True) as command:
         assert command.stderr is not None
         for line in command.stderr:
-            if line.endswith(" checkpoint.quiet\n"):
+            if line.endswith(" checkpoint.runtime.early_interrupt\n"):
                 break
         for _ in range(later):
             assert "import time:" in command.stderr.readline(), "still loading"
         command.send_signal(signal.SIGINT)
         rest = command.stderr.read()
-    assert (command.returncode, "Traceback" in rest) == (quiet.INTERRUPTED, False), rest[-2000:]
+    assert (command.returncode, "Traceback" in rest) == (early_interrupt.INTERRUPTED, False), rest[-2000:]
 
 
 def test_an_interruption_that_was_to_be_ignored_stays_ignored() -> None:

@@ -61,7 +61,7 @@ def number_of(call: str) -> int | None:
 def why_unsupported() -> str:
     """Why programs that nobody prepared cannot be kept on this kind of processor; "": they can.
 
-    What this machine's has besides is asked by `checkpoint.linux.processor`.
+    What this machine's has besides is asked by `checkpoint.linux.spawn.cpuid`.
     """
     if _MACHINE in SUPPORTED:
         return ""

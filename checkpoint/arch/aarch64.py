@@ -155,7 +155,7 @@ REMAINING_TIME: Final[Mapping[str, tuple[int, int]]] = {"nanosleep": (0, 1), "cl
 ERESTARTNOHAND: Final = -514
 """What a stopped call returns when it is to be made again, unless a signal handler comes first: that makes it EINTR."""
 FORGETS_CALLS: Final = True
-"""Whether the registers of a stop inside a call do not say that it is one: see `checkpoint.linux.entered_calls`."""
+"""Whether the registers of a stop inside a call do not say that it is one: see `checkpoint.linux.trace.syscall_reentry`."""
 
 _RECEIVING: Final = Timeout(0, SOCKET, -errno.EAGAIN, 20)
 _SENDING: Final = Timeout(0, SOCKET, -errno.EAGAIN, 21)
@@ -219,7 +219,7 @@ def recalled(registers: Registers, number: int, first_argument: int) -> Register
 
 
 def made_again(registers: Registers, mark: int) -> Registers:
-    """Have a call made again that has ended with EINTR: see `checkpoint.linux.entered_calls` for signals that come first.
+    """Have a call made again that has ended with EINTR: see `checkpoint.linux.trace.syscall_reentry` for signals that come first.
 
     Args:
         registers: as `recalled`.

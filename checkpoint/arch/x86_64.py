@@ -146,7 +146,7 @@ REMAINING_TIME: Final[Mapping[str, tuple[int, int]]] = {"nanosleep": (0, 1), "cl
 ERESTARTNOHAND: Final = -514
 """What a stopped call returns when it is to be made again, unless a signal handler comes first: that makes it EINTR."""
 FORGETS_CALLS: Final = False
-"""Whether the registers of a stop inside a call do not say that it is one: see `checkpoint.linux.entered_calls`."""
+"""Whether the registers of a stop inside a call do not say that it is one: see `checkpoint.linux.trace.syscall_reentry`."""
 
 _RECEIVING: Final = Timeout(0, SOCKET, -errno.EAGAIN, 20)
 _SENDING: Final = Timeout(0, SOCKET, -errno.EAGAIN, 21)

@@ -13,11 +13,11 @@ def engine_named(name: str) -> Engine:
         ProbeError: there is none of that name.
     """
     if name == COOPERATIVE:
-        from checkpoint.engines.guarded_task import CooperativeEngine
+        from checkpoint.engines.cooperative.engine import CooperativeEngine
 
         return CooperativeEngine()
     if name != PTRACE:
         raise ProbeError(f"no engine is called {name!r}: choose {PTRACE} or {COOPERATIVE}")
-    from checkpoint.engines.ptrace import PtraceEngine
+    from checkpoint.engines.ptrace.engine import PtraceEngine
 
     return PtraceEngine()

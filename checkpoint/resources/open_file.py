@@ -13,12 +13,12 @@ from msgspec.structs import astuple, replace
 
 from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import REFUSED, Finding
-from checkpoint.linux.descriptor import Descriptor
+from checkpoint.linux.procfs.descriptor import Descriptor
 from checkpoint.model import Fact, Resource
-from checkpoint.resources.listings import Listings
+from checkpoint.resources.kernel_listings import Listings
 
 Owners = set[tuple[int, int]]
-"""Number and inode of the open files that had an owner at the last look; see `checkpoint.resources.owners`."""
+"""Number and inode of the open files that had an owner at the last look; see `checkpoint.resources.signal_owners`."""
 
 
 class Kin(Struct, frozen=True):

@@ -21,55 +21,42 @@ from typing import Final
 
 from msgspec import Struct
 
-from checkpoint import rights
 from checkpoint.engine import RestoreOptions
 from checkpoint.errors import RestoreError
-from checkpoint.linux import procfs
 from checkpoint.linux.abi import PAGE_SIZE
-from checkpoint.linux.call_table import CallTable
+from checkpoint.linux.procfs import procfs
+from checkpoint.linux.trace.call_table import CallTable
 from checkpoint.model import Fact, Resource, Snapshot
-from checkpoint.resources import (
-    attached_devices,
-    covered_files,
-    deadlines,
-    death_signals,
-    devices,
-    epolls,
-    eventfds,
-    fifos,
-    files,
-    internet_sockets,
-    joint,
-    kernel_files,
+from checkpoint.resources import shared_open_file
+from checkpoint.resources.devices import by_rule, stateless
+from checkpoint.resources.events import epoll, eventfd, fd_signals, inotify, pidfd, signalfd, timerfd
+from checkpoint.resources.files import (
+    clean_private_pages,
     locks,
-    logins,
-    memory_files,
-    memory_locks,
-    nameless,
-    namespace_files,
-    netlink_sockets,
-    packet_sockets,
-    pidfds,
-    pipes,
-    seccomp,
-    shared,
-    signalfds,
-    signalling,
-    stops,
-    streams,
-    system_v_memory,
-    tcp_connections,
-    terminals,
-    thread_tables,
-    timerfds,
-    unix_names,
-    unix_sockets,
-    untouched,
-    watches,
+    memfd,
+    namespaces,
+    overmounted,
+    proc_and_sys,
+    regular,
+    unlinked,
 )
-from checkpoint.resources.rebuilding import Rebuilding, number_of
-from checkpoint.resources.unix_makers import Disguise
-from checkpoint.resources.unix_rebuild import Work
+from checkpoint.resources.ipc import fifos, pipes, pseudo_terminals, standard_streams, system_v_memory
+from checkpoint.resources.process import (
+    audit_login,
+    job_control,
+    mlockall,
+    parent_death_signals,
+    scheduling,
+    seccomp,
+    shared_with_parent,
+    unshared_threads,
+)
+from checkpoint.resources.restore_context import Rebuilding, number_of
+from checkpoint.resources.sockets import inet, netlink, packet, tcp, unix_names
+from checkpoint.resources.sockets import unix as unix_sockets
+from checkpoint.resources.sockets.peer_credentials import Disguise
+from checkpoint.resources.sockets.unix_rebuild import Work
+from checkpoint.snapshot import credentials
 
 NS_PER_S: Final = 1_000_000_000
 UTIME_OMIT: Final = (1 << 30) - 2
@@ -86,52 +73,61 @@ ENTRIES_SIZE: Final = 1024
 """Bytes that hold the first entries of a directory, whatever their names."""
 STREAMS: Final = (0, 1, 2)
 MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
-    eventfds.KIND: eventfds.rebuild,
-    timerfds.KIND: timerfds.rebuild,
-    signalfds.KIND: signalfds.rebuild,
-    pidfds.KIND: pidfds.rebuild,
-    namespace_files.KIND: namespace_files.rebuild,
-    epolls.KIND: epolls.rebuild,
-    watches.KIND: watches.rebuild,
-    devices.KIND: devices.rebuild,
+    eventfd.KIND: eventfd.rebuild,
+    timerfd.KIND: timerfd.rebuild,
+    signalfd.KIND: signalfd.rebuild,
+    pidfd.KIND: pidfd.rebuild,
+    namespaces.KIND: namespaces.rebuild,
+    epoll.KIND: epoll.rebuild,
+    inotify.KIND: inotify.rebuild,
+    stateless.KIND: stateless.rebuild,
     fifos.KIND: fifos.rebuild,
-    kernel_files.KIND: kernel_files.rebuild,
-    memory_files.KIND: memory_files.rebuild,
-    covered_files.KIND: covered_files.rebuild,
-    attached_devices.KIND: attached_devices.rebuild,
+    proc_and_sys.KIND: proc_and_sys.rebuild,
+    memfd.KIND: memfd.rebuild,
+    overmounted.KIND: overmounted.rebuild,
+    by_rule.KIND: by_rule.rebuild,
 }
 """Kinds that are made anew: each adds its calls and answers with a descriptor."""
 NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
     fifos.KIND: fifos.mismatches,
-    watches.KIND: watches.mismatches,
+    inotify.KIND: inotify.mismatches,
     unix_sockets.KIND: unix_names.mismatches,
-    kernel_files.KIND: kernel_files.mismatches,
-    covered_files.KIND: covered_files.mismatches,
-    internet_sockets.KIND: internet_sockets.mismatches,
-    packet_sockets.KIND: packet_sockets.mismatches,
+    proc_and_sys.KIND: proc_and_sys.mismatches,
+    overmounted.KIND: overmounted.mismatches,
+    inet.KIND: inet.mismatches,
+    packet.KIND: packet.mismatches,
     system_v_memory.KIND: system_v_memory.mismatches,
     seccomp.KIND: seccomp.mismatches,
-    thread_tables.KIND: thread_tables.mismatches,
+    unshared_threads.KIND: unshared_threads.mismatches,
 }
 """Kinds that need something of this machine: why it does not have that, one sentence each."""
-OF_KERNEL: Final = {netlink_sockets.KIND: netlink_sockets.prepare, packet_sockets.KIND: packet_sockets.prepare}
+OF_KERNEL: Final = {netlink.KIND: netlink.prepare, packet.KIND: packet.prepare}
 """Sockets that lead to the kernel or an interface alone."""
-SOCKETS: Final = (unix_sockets.KIND, tcp_connections.KIND, internet_sockets.KIND, *OF_KERNEL)
+SOCKETS: Final = (unix_sockets.KIND, tcp.KIND, inet.KIND, *OF_KERNEL)
 NOT_OPEN: Final = (
-    memory_locks.KIND,
+    mlockall.KIND,
     system_v_memory.KIND,
-    rights.KIND,
-    deadlines.KIND,
-    death_signals.KIND,
-    stops.KIND,
-    logins.KIND,
+    credentials.KIND,
+    scheduling.KIND,
+    parent_death_signals.KIND,
+    job_control.KIND,
+    audit_login.KIND,
     seccomp.KIND,
-    joint.KIND,
-    untouched.KIND,
-    thread_tables.KIND,
+    shared_with_parent.KIND,
+    clean_private_pages.KIND,
+    unshared_threads.KIND,
 )
 """Kinds of what no descriptor stands for."""
-KINDS: Final = (files.KIND, streams.KIND, shared.KIND, pipes.KIND, terminals.KIND, *NOT_OPEN, *MADE, *SOCKETS)
+KINDS: Final = (
+    regular.KIND,
+    standard_streams.KIND,
+    shared_open_file.KIND,
+    pipes.KIND,
+    pseudo_terminals.KIND,
+    *NOT_OPEN,
+    *MADE,
+    *SOCKETS,
+)
 
 
 class Wanted(Struct, frozen=True):
@@ -179,8 +175,8 @@ def rebuild_all(
     disguise = Disguise(procfs.status(vessel_pid), state.process, options.own_eyes, inner_pid)
     unix, connected = _prepare_sockets(table, state, moved[-1] + 1 + len(piped), given, disguise)
     last = max((moved[-1] + len(piped), unix.end, *connected.values()))
-    lines = terminals.prepare(
-        table, [held for held in state.resources if _is_own(held, given, terminals.KIND)], last + 1, vessel_pid
+    lines = pseudo_terminals.prepare(
+        table, [held for held in state.resources if _is_own(held, given, pseudo_terminals.KIND)], last + 1, vessel_pid
     )
     rebuilding = Rebuilding(options, state.clocks, inner_pid, max((last, *lines.values())) + 1)
     for key, number in objects.items():
@@ -197,8 +193,8 @@ def rebuild_all(
             else:
                 _obtain(table, one, moved, piped, connected, rebuilding)
             holders[id(one.resource)] = one.number
-            signalling.rebuild(table, one.number, one.resource, inner_pid)
-    memory_files.seal(table, [held for held in state.resources if _is_own(held, given, memory_files.KIND)], rebuilding)
+            fd_signals.rebuild(table, one.number, one.resource, inner_pid)
+    memfd.seal(table, [held for held in state.resources if _is_own(held, given, memfd.KIND)], rebuilding)
     unix.fill()
     for number in (*moved, *piped.values(), *connected.values(), *lines.values(), *rebuilding.objects.values(), *inherited):
         table.close(number)
@@ -206,7 +202,7 @@ def rebuild_all(
     for one in wanted:
         if one.resource.facts.get("travelling"):  # it was sent, and is open no more
             table.close(one.number)
-    of_tcp = tcp_connections.notes([held for held in state.resources if _is_own(held, given, tcp_connections.KIND)])
+    of_tcp = tcp.notes([held for held in state.resources if _is_own(held, given, tcp.KIND)])
     return (*of_tcp, *unix.notes())
 
 
@@ -216,7 +212,7 @@ def deleted_directory(state: Snapshot) -> int | None:
     if not procfs.is_gone(directory):
         return None
     named = [one for one in descriptors_of(state) if one.resource.facts.get("path") == directory.removesuffix(procfs.DELETED)]
-    return next((one.number for one in named if one.resource.kind == files.KIND and one.resource.facts.get("deleted")), None)
+    return next((one.number for one in named if one.resource.kind == regular.KIND and one.resource.facts.get("deleted")), None)
 
 
 def _is_own(held: Resource, given: Mapping[int, int], kind: str) -> bool:
@@ -229,17 +225,17 @@ def _prepare_sockets(
 ) -> tuple[Work, dict[int, int]]:
     """Make all sockets at numbers from ``first`` on, in the working directory: names may be relative to it."""
     of_unix = [held for held in state.resources if _is_own(held, given, unix_sockets.KIND)]
-    of_internet = [held for held in state.resources if _is_own(held, given, internet_sockets.KIND)]
-    of_tcp = [held for held in state.resources if _is_own(held, given, tcp_connections.KIND)]
+    of_internet = [held for held in state.resources if _is_own(held, given, inet.KIND)]
+    of_tcp = [held for held in state.resources if _is_own(held, given, tcp.KIND)]
     if of_unix and not procfs.is_gone(state.process.working_directory):
         directory = state.process.working_directory
         table.call(f"enter the working directory {directory}", "chdir", table.place_path(directory))
     unix = Work(table, of_unix, first, disguise=disguise, working_directory=state.process.working_directory)
     made = dict(unix.run())
-    connected = tcp_connections.prepare(table, of_tcp, unix.end)
+    connected = tcp.prepare(table, of_tcp, unix.end)
     made |= connected
-    made |= internet_sockets.prepare(table, of_internet, unix.end + len(connected), disguise)
-    tcp_connections.settle(table, of_tcp, connected)
+    made |= inet.prepare(table, of_internet, unix.end + len(connected), disguise)
+    tcp.settle(table, of_tcp, connected)
     for kind, prepare in OF_KERNEL.items():
         of_kernel = [held for held in state.resources if _is_own(held, given, kind)]
         made |= prepare(table, of_kernel, max((unix.end - 1, *made.values())) + 1, disguise)
@@ -250,22 +246,22 @@ def _settle(table: CallTable, wanted: list[Wanted], holders: Mapping[int, int]) 
     """What refers to other descriptors: all of them are there now."""
     marked = frozenset(one.number for one in wanted if one.close_on_exec)
     for one in wanted:
-        if one.resource.kind == epolls.KIND and holders[id(one.resource)] == one.number:
-            epolls.settle(table, one.resource, one.number, marked, spare=wanted[-1].number + 1)
+        if one.resource.kind == epoll.KIND and holders[id(one.resource)] == one.number:
+            epoll.settle(table, one.resource, one.number, marked, spare=wanted[-1].number + 1)
 
 
 def rebuild_last(table: CallTable, state: Snapshot, inner_pid: int) -> None:
     """Add the calls that must come after everything else of a restore: watches would tell of it, locks would be lost."""
-    terminals.settle(table, state.resources, state.process.pid)
+    pseudo_terminals.settle(table, state.resources, state.process.pid)
     for held in state.resources:
         numbers = _pairs(held.facts["descriptors"])
         if not numbers:
             continue  # nothing that is open
         first = number_of(numbers[0][0])
         locks.settle(table, held, first, inner_pid)
-        signalling.settle(table, first, held)
-        if held.kind == watches.KIND:
-            watches.settle(table, held, first, state.process.root_directory)
+        fd_signals.settle(table, first, held)
+        if held.kind == inotify.KIND:
+            inotify.settle(table, held, first, state.process.root_directory)
 
 
 def descriptors_of(state: Snapshot) -> list[Wanted]:
@@ -383,10 +379,10 @@ def make_deleted(table: CallTable, held: Resource) -> int:
 def _empty(table: CallTable, held: Resource, mode: int) -> int:
     path = str(held.facts["path"])
     if stat.S_ISLNK(mode):
-        return nameless.make_link(table, path, str(held.facts["link"]))
+        return unlinked.make_link(table, path, str(held.facts["link"]))
     if stat.S_ISDIR(mode):
-        return nameless.make_directory(table, path, stat.S_IMODE(mode))
-    return nameless.make_file(table, path, stat.S_IMODE(mode), was_born_so=_was_born_so(number_of(held.facts["flags"])))
+        return unlinked.make_directory(table, path, stat.S_IMODE(mode))
+    return unlinked.make_file(table, path, stat.S_IMODE(mode), was_born_so=_was_born_so(number_of(held.facts["flags"])))
 
 
 def _was_born_so(flags: int) -> bool:

@@ -13,29 +13,22 @@ from msgspec.structs import replace
 from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import KEPT, REFUSED, Finding
 from checkpoint.errors import CaptureError
-from checkpoint.linux import entry
-from checkpoint.linux.descriptor import Descriptor
-from checkpoint.linux.descriptors import descriptors
-from checkpoint.linux.kept_descriptors import KeptTexts
+from checkpoint.linux.procfs.descriptor import Descriptor
+from checkpoint.linux.procfs.descriptor_cache import KeptTexts
+from checkpoint.linux.procfs.descriptors import descriptors
+from checkpoint.linux.trace import entry
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import (
-    attached_devices,
-    epolls,
-    files,
-    kinds,
-    locks,
-    owners,
-    pipes,
-    shared,
-    signalling,
-    sockets,
-    streams,
-    travelling,
-)
-from checkpoint.resources.grouping import Grouping
+from checkpoint.resources import registry, shared_open_file
+from checkpoint.resources import signal_owners as owners
+from checkpoint.resources.descriptor_groups import Grouping
+from checkpoint.resources.devices import by_rule
+from checkpoint.resources.events import epoll, fd_signals
+from checkpoint.resources.files import locks, regular
+from checkpoint.resources.ipc import pipes, standard_streams
 from checkpoint.resources.open_file import ALONE, Held, Kin, Opened, OpenFile, Owners, Surroundings
-from checkpoint.resources.recollection import Recollection
-from checkpoint.resources.sockets import Noted
+from checkpoint.resources.socket_cache import Recollection
+from checkpoint.resources.sockets import scm_rights, sockets
+from checkpoint.resources.sockets.sockets import Noted
 
 STREAM_NUMBERS: Final = (1, 2)
 GLANCES_MORE: Final = 3
@@ -96,7 +89,7 @@ def with_contents(
     """Add the content of every deleted file and of every pipe that is kept, and what else must be asked while it stands still.
 
     Args:
-        noted: see `checkpoint.resources.sockets.queue_of`; None for a process that runs.
+        noted: see `checkpoint.resources.sockets.sockets.queue_of`; None for a process that runs.
         rules: of devices; others are not asked.
         recollection: of a process that is looked at again and again.
 
@@ -112,12 +105,12 @@ def with_contents(
             held = empty[held.first.number]
         elif held.is_echo or held.observed:
             pass
-        elif rules and attached_devices.is_ruled(held.first, rules):
-            held = replace(held, observed=attached_devices.observe(held, opened))
-        elif observe := kinds.observer_of(held.first, noted):
+        elif rules and by_rule.is_ruled(held.first, rules):
+            held = replace(held, observed=by_rule.observe(held, opened))
+        elif observe := registry.observer_of(held.first, noted):
             held = replace(held, observed=observe(held, opened))
-        elif files.must_carry(held):
-            held = replace(held, observed=files.observe_deleted(held, opened))
+        elif regular.must_carry(held):
+            held = replace(held, observed=regular.observe_deleted(held, opened))
         elif pipes.is_pipe(held.first) and (held.both_ends or (_may_be_half(held) and pipes.is_half(held))):
             capacity, pieces = pipes.look_into(held)
             held = pipes.with_content(held, capacity, pieces)
@@ -133,7 +126,7 @@ def _is_plain(held: OpenFile) -> bool:
     if pipes.is_pipe(first):
         return not (held.both_ends or _may_be_half(held))
     is_known = stat.S_ISCHR(first.mode) or (stat.S_ISREG(first.mode) and first.links > 0)
-    return is_known and kinds.observer_of(first, None) is None
+    return is_known and registry.observer_of(first, None) is None
 
 
 def _with_travelling(opened: Opened, noted: Noted | None, recollection: Recollection | None = None) -> list[OpenFile]:
@@ -147,11 +140,11 @@ def _with_travelling(opened: Opened, noted: Noted | None, recollection: Recollec
     if recollection:
         recollection.remember(found, answers, opened)
     for held in opened.travelling:  # which grows meanwhile
-        found.append(_looked_into(held, opened, noted and travelling.unnoted))
-    is_hidden = travelling.may_hide(found, noted)
+        found.append(_looked_into(held, opened, noted and scm_rights.unnoted))
+    is_hidden = scm_rights.may_hide(found, noted)
     if not (opened.travelling or is_hidden):
         return found
-    whole = travelling.together(found)
+    whole = scm_rights.together(found)
     inodes = {held.first.inode for held in opened.travelling}
 
     def completed(held: OpenFile) -> OpenFile:
@@ -168,7 +161,7 @@ def _looked_into(held: OpenFile, opened: Opened, noted: Noted | None) -> OpenFil
     """A socket as it is observed now; as it was where it cannot be, of which whoever asks next is told."""
     if not held.is_echo and sockets.is_socket(held.first):
         with contextlib.suppress(CaptureError):
-            return replace(held, observed=kinds.observe_socket(held, opened, noted=noted))
+            return replace(held, observed=registry.observe_socket(held, opened, noted=noted))
     return held
 
 
@@ -187,7 +180,7 @@ def glance(pid: int, kin: Kin = ALONE) -> tuple[OpenFile, ...]:
     """
     found = _glanced(pid, kin)
     for _ in range(GLANCES_MORE):
-        if all(map(_is_still_there, found)) and not any(map(epolls.watches_what_is_gone, found)):
+        if all(map(_is_still_there, found)) and not any(map(epoll.watches_what_is_gone, found)):
             break
         found = _glanced(pid, kin)
     return tuple(filter(_is_still_there, found))
@@ -206,7 +199,7 @@ def _glanced(pid: int, kin: Kin) -> tuple[OpenFile, ...]:
     for held in _with_travelling(opened, None):
         if held.observed:
             pass
-        elif observe := kinds.observer_of(held.first, None):
+        elif observe := registry.observer_of(held.first, None):
             with contextlib.suppress(CaptureError):  # closed meanwhile
                 held = replace(held, observed=observe(held, opened))
         elif pipes.is_pipe(held.first) and not held.both_ends and pipes.is_half(held):
@@ -222,17 +215,17 @@ def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
     """
     resources, findings = [], []
     for held in opened:
-        of_any = locks.refuse(held) or (None if held.is_echo else signalling.refuse(held))
-        for kind in kinds.ASKED:
+        of_any = locks.refuse(held) or (None if held.is_echo else fd_signals.refuse(held))
+        for kind in registry.ASKED:
             if reason := kind.refuse(held, surroundings) or of_any:
                 findings.append(Finding(kind.KIND, held.name, REFUSED, reason))
                 break
             if resource := kind.describe(held, surroundings):
                 of_every = _of_every_kind(held, resource)
-                if reason := travelling.refuse(held, kind.KIND, of_every):
+                if reason := scm_rights.refuse(held, kind.KIND, of_every):
                     findings.append(Finding(kind.KIND, held.name, REFUSED, reason))
                     break
-                resources.append(replace(resource, facts={**resource.facts, **of_every, **travelling.describe(held)}))
+                resources.append(replace(resource, facts={**resource.facts, **of_every, **scm_rights.describe(held)}))
                 findings.append(Finding(kind.KIND, held.name, KEPT, f"{held.name} is {held.first.target}"))
                 break
     return Held(tuple(resources), tuple(findings))
@@ -240,7 +233,7 @@ def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
 
 def _of_every_kind(held: OpenFile, resource: Resource) -> dict[str, Fact]:
     """Facts that any kind may have."""
-    if resource.kind == shared.KIND:
+    if resource.kind == shared_open_file.KIND:
         return locks.describe(held, kinds=locks.OF_PROCESSES)
-    facts = {**signalling.describe(held), **locks.describe(held)}
-    return facts | ({"description": held.description} if held.description and resource.kind != streams.KIND else {})
+    facts = {**fd_signals.describe(held), **locks.describe(held)}
+    return facts | ({"description": held.description} if held.description and resource.kind != standard_streams.KIND else {})

@@ -10,8 +10,8 @@ import shlex
 from textwrap import dedent
 from typing import Any, Final
 
-from checkpoint import portable
-from failover.client.quantities import span_ms
+from checkpoint.program import cpu_baseline
+from failover.config.quantities import span_ms
 
 EXIT_STATUSES: Final = "Exit status: 0 healthy, 1 failed or degraded, 2 usage, 3 no agent."
 
@@ -89,12 +89,12 @@ def run(room: argparse.ArgumentParser) -> None:
     room.add_argument(
         "--portable",
         nargs="?",
-        choices=("no", *portable.LEVELS),
-        const=portable.DEFAULT,
+        choices=("no", *cpu_baseline.LEVELS),
+        const=cpu_baseline.DEFAULT,
         default="",
         metavar="LEVEL",
         help="have libraries choose code that every processor of a level can run, so that it can go on at robots with less: "
-        f"{', '.join(portable.LEVELS)}, or no (default: as agent.toml says; without LEVEL: {portable.DEFAULT})",
+        f"{', '.join(cpu_baseline.LEVELS)}, or no (default: as agent.toml says; without LEVEL: {cpu_baseline.DEFAULT})",
     )
     room.add_argument(
         "--output",
@@ -305,7 +305,7 @@ def team(room: argparse.ArgumentParser) -> None:
     _json(shared)
     create = _act(acts, "create", shared, "begin a team", CREATE_STORY)
     create.add_argument("name", metavar="TEAM", help="the team's name")
-    create.set_defaults(function="failover.cli.teams:create")
+    create.set_defaults(function="failover.cli.verbs.team:create")
     enrol = _act(acts, "enrol", shared, "add a robot, a server or a witness and make its key", ENROL_STORY)
     enrol.add_argument("name", metavar="ROBOT", help="the robot's name")
     enrol.add_argument(
@@ -321,9 +321,9 @@ def team(room: argparse.ArgumentParser) -> None:
     )
     enrol.add_argument("--public-key", metavar="KEY", help="the public half of a key made on the robot itself")
     enrol.add_argument("--replace", action="store_true", help="give a known robot new addresses and a new key")
-    enrol.set_defaults(function="failover.cli.teams:enrol")
+    enrol.set_defaults(function="failover.cli.verbs.team:enrol")
     show = _act(acts, "show", shared, "list the team", "Show every robot with its addresses and its public key.")
-    show.set_defaults(function="failover.cli.teams:show")
+    show.set_defaults(function="failover.cli.verbs.team:show")
 
 
 CREATE_STORY: Final = """

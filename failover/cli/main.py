@@ -10,9 +10,9 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final
 
-from checkpoint import quiet
 from checkpoint.errors import CheckpointError
-from failover.cli import ahead
+from checkpoint.runtime import early_interrupt
+from failover.cli import keeper_prestart
 from failover.errors import AgentRefusedError, FailoverError, NoAgentError
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return _main(argv)
     except KeyboardInterrupt:
-        return quiet.INTERRUPTED
+        return early_interrupt.INTERRUPTED
 
 
 def _main(argv: Sequence[str] | None) -> int:
@@ -44,7 +44,7 @@ def _main(argv: Sequence[str] | None) -> int:
 
         return _obeyed(parser.build(words[0] if words else "").parse_args(words))
     finally:
-        ahead.forsake()
+        keeper_prestart.forsake()
 
 
 def _obeyed(arguments: argparse.Namespace) -> int:
@@ -52,7 +52,7 @@ def _obeyed(arguments: argparse.Namespace) -> int:
         verb = verb_function(arguments.function)
         gc.freeze()
         gc.enable()
-        quiet.loaded()
+        early_interrupt.loaded()
         status = verb(arguments)
         sys.stdout.flush()
         return status

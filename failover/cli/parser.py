@@ -129,7 +129,7 @@ VERBS: Final = (
         so it is captured from outside, like a program that never does.
         """,
         arguments.run,
-        "failover.cli.components:run",
+        "failover.cli.verbs.components:run",
     ),
     Verb(
         "protect",
@@ -142,7 +142,7 @@ VERBS: Final = (
           failover protect 4711 --name /lab/robot1/mapper
         """,
         arguments.protect,
-        "failover.cli.components:protect",
+        "failover.cli.verbs.components:protect",
     ),
     Verb(
         "release",
@@ -154,7 +154,7 @@ VERBS: Final = (
           failover release /lab/robot1/mapper
         """,
         arguments.named,
-        "failover.cli.components:release",
+        "failover.cli.verbs.components:release",
     ),
     Verb(
         "stop",
@@ -167,7 +167,7 @@ VERBS: Final = (
           failover stop /lab/robot1/mapper --signal INT
         """,
         arguments.stop,
-        "failover.cli.components:stop",
+        "failover.cli.verbs.components:stop",
     ),
     Verb(
         "status",
@@ -183,7 +183,7 @@ VERBS: Final = (
           failover status --json | jq '.components[].lag_ms'
         """,
         arguments.status,
-        "failover.cli.status:status",
+        "failover.cli.verbs.status:status",
     ),
     Verb(
         "logs",
@@ -196,7 +196,7 @@ VERBS: Final = (
           failover logs --follow --stream 2 /lab/robot1/mapper
         """,
         arguments.logs,
-        "failover.cli.components:logs",
+        "failover.cli.verbs.components:logs",
     ),
     Verb(
         "why",
@@ -212,7 +212,7 @@ VERBS: Final = (
           failover why --robot robot2 --brief
         """,
         arguments.why,
-        "failover.cli.why:why",
+        "failover.cli.verbs.why:why",
     ),
     Verb(
         "handover",
@@ -225,7 +225,7 @@ VERBS: Final = (
           failover handover /lab/robot1/mapper --to robot2
         """,
         arguments.handover,
-        "failover.cli.components:handover",
+        "failover.cli.verbs.components:handover",
     ),
     Verb(
         "failback",
@@ -237,7 +237,7 @@ VERBS: Final = (
           failover failback /lab/robot1/mapper
         """,
         arguments.named,
-        "failover.cli.components:failback",
+        "failover.cli.verbs.components:failback",
     ),
     Verb(
         "promote",
@@ -254,7 +254,7 @@ VERBS: Final = (
           failover promote /lab/robot1/mapper --robot robot2 --yes
         """,
         arguments.promote,
-        "failover.cli.components:promote",
+        "failover.cli.verbs.components:promote",
     ),
     Verb(
         "prefer",
@@ -266,7 +266,7 @@ VERBS: Final = (
           failover prefer /lab/robot1/mapper robot1
         """,
         arguments.prefer,
-        "failover.cli.components:prefer",
+        "failover.cli.verbs.components:prefer",
     ),
     Verb(
         "team",
@@ -281,7 +281,7 @@ VERBS: Final = (
           failover team show
         """,
         arguments.team,
-        "failover.cli.teams:show",
+        "failover.cli.verbs.team:show",
     ),
     Verb(
         "check",
@@ -296,7 +296,7 @@ VERBS: Final = (
           failover check --table
         """,
         arguments.check,
-        "failover.cli.oneshot:check",
+        "failover.cli.verbs.one_shot:check",
     ),
     Verb(
         "capture",
@@ -309,7 +309,7 @@ VERBS: Final = (
           failover capture 4711 -o before.snapshot --leave-running
         """,
         arguments.capture,
-        "failover.cli.oneshot:capture",
+        "failover.cli.verbs.one_shot:capture",
     ),
     Verb(
         "restore",
@@ -326,7 +326,7 @@ VERBS: Final = (
           failover restore --wait mapper.snapshot && echo it ended well
         """,
         arguments.restore,
-        "failover.cli.oneshot:restore",
+        "failover.cli.verbs.one_shot:restore",
     ),
     Verb(
         "inspect",
@@ -338,7 +338,7 @@ VERBS: Final = (
           failover inspect --json mapper.snapshot | jq .position
         """,
         arguments.inspect,
-        "failover.cli.inspection:inspect",
+        "failover.cli.verbs.inspect_file:inspect",
     ),
     Verb(
         "completion",

@@ -44,7 +44,7 @@ from typing import Annotated, Any, Final
 import msgspec
 
 from checkpoint.errors import UNDECODABLE
-from checkpoint.linux.address import address_of
+from checkpoint.linux.unix_address import address_of
 from failover.errors import AgentRefusedError, LostAgentError, NoAgentError, RequestError
 
 STATUS: Final = """
@@ -57,7 +57,7 @@ memory: {agent, keepers, remembered, remembered_max}: bytes of private memory of
     that run here; remembered: of these, what pages are remembered in, of all components together, and its bound (xor_cache of
     agent.toml); None of a witness
 healthy: nothing is degraded, nothing has failed, nobody is silent, as far as this robot knows; with ``team`` as far as any robot
-    that answered knows, which is what the exit status of ``failover status`` says, too (`failover.client.verdict`)
+    that answered knows, which is what the exit status of ``failover status`` says, too (`failover.client.health`)
 notes: [sentence, …]: what is missing or degraded on this robot
 beats: {sent, heard, unsent, refused, late_us_max, gap_us_max, gaps}: of this life; refused: {reason: count}
 links: [{name, medium, because, carrier, addresses, snapshots, bytes_in, bytes_out}]: interfaces with an address of this robot

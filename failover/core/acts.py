@@ -9,9 +9,9 @@ from __future__ import annotations
 from msgspec import Struct
 
 from checkpoint.model import Position
-from failover.core.messages import Beat
-from failover.core.story import Decision
+from failover.core.event_log.decisions import Decision
 from failover.core.types import Ballot, ComponentSpec, Resumption
+from failover.core.wire.messages import Beat
 
 
 class Start(Struct, frozen=True):

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from failover.core import acts, handover, majority, promotion
+from failover.core import acts
 from failover.core.component import Cause, Component, Turn
-from failover.core.election import claim, drop, exhaustion, vacant
+from failover.core.election import majority
+from failover.core.election.pair import claim, drop, exhaustion, vacant
 from failover.core.events import Command, Failback, Handover, Prefer, Promote, Release, Run, Stop
+from failover.core.transitions import handover, promotion
 from failover.core.types import ENDED, State
 
 _RUNNING = frozenset({State.PRIMARY, State.FROZEN})

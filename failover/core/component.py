@@ -9,8 +9,8 @@ from msgspec import Struct, field
 
 from checkpoint.model import Position
 from failover.core.acts import Act
+from failover.core.event_log.decisions import Decision, Facts, Sighting
 from failover.core.membership import Membership
-from failover.core.story import Decision, Facts, Sighting
 from failover.core.types import (
     EPOCH_MAX,
     HISTORY_MAX,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from msgspec import Struct
 
 from checkpoint.model import Position
-from failover.core.messages import Beat
 from failover.core.types import ComponentSpec
+from failover.core.wire.messages import Beat
 
 
 class Tick(Struct, frozen=True):

@@ -12,9 +12,9 @@ from collections import deque
 
 from msgspec import Struct, field
 
-from failover.core.messages import RULES, Beat, Echo, Entry
-from failover.core.story import Sighting
+from failover.core.event_log.decisions import Sighting
 from failover.core.types import COMPONENTS_MAX, MS, Config, PeerView, State
+from failover.core.wire.messages import RULES, Beat, Echo, Entry
 
 ASKED_MAX = 512
 """Beats of ours whose instant of leaving is remembered; ten seconds of them at 20 ms."""

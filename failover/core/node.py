@@ -6,25 +6,11 @@ The agent feeds it one event at a time with the instant of its own clock and obe
 
 from __future__ import annotations
 
-from failover.core import (
-    acts,
-    archive,
-    commands,
-    contest,
-    election,
-    endings,
-    handover,
-    homecoming,
-    lease,
-    majority,
-    promise,
-    promotion,
-    replication,
-    view,
-    warmth,
-)
+from failover.core import acts, commands
 from failover.core.acts import Ready
+from failover.core.beat_builder import Speaker, entry_of
 from failover.core.component import Cause, Component, Turn
+from failover.core.election import lease, majority, pair, votes
 from failover.core.events import (
     ActFailed,
     Captured,
@@ -56,11 +42,13 @@ from failover.core.events import (
     Warmed,
 )
 from failover.core.membership import Membership
-from failover.core.messages import Beat, Entry
-from failover.core.speaker import Speaker, entry_of
-from failover.core.testimony import Testimony
+from failover.core.peer_claims import Testimony
+from failover.core.replication import servers, standby, warm_standby
+from failover.core.status import guarantee, view
+from failover.core.status.observations import Watch
+from failover.core.transitions import exits, failback, handover, promotion
 from failover.core.types import COMPONENTS_MAX, ENDED, MS, Ballot, Config, Found, Held, Resumption, State, StatusView
-from failover.core.watch import Watch
+from failover.core.wire.messages import Beat, Entry
 
 NS_PER_S = 1_000 * MS
 
@@ -174,15 +162,15 @@ class Node:
 
     def _note_promise(self, turn: Turn) -> None:
         """The journal has the team's promise at each change, and a component's while it differs from that."""
-        grounds = promise.grounds(turn)
+        grounds = guarantee.grounds(turn)
         if grounds != self._grounds:
             self._grounds = grounds
-            sentence = promise.team(turn)
+            sentence = guarantee.team(turn)
             if sentence != self._promise:
                 self._promise = sentence
                 turn.say_of_robot(sentence)
         for component in self._components.values():
-            sentence = promise.exception(component, turn)
+            sentence = guarantee.exception(component, turn)
             if sentence and sentence != component.promise:
                 component.promise = sentence
                 turn.say(component, sentence)
@@ -201,7 +189,7 @@ class Node:
                 component = self._components[one.component]
                 component.keeps_state = one.keeps_state
                 component.held = [position for position in one.positions if position.generation not in component.lost]
-                replication.remember(component, self._config)
+                standby.remember(component, self._config)
 
     def _begin(self, turn: Turn) -> None:
         """The first step of this life: take over what the last one left running, clear away what it should not have left."""
@@ -260,15 +248,15 @@ class Node:
         news = self._team.hear(beat, event.link, event.came_ns or turn.now_ns)
         if beat.sender in self._team.peers:
             self._team.peers[beat.sender].carried(event.copies)
-        rules = contest if self._config.by_majority else election
+        rules = votes if self._config.by_majority else pair
         touched = {name: component for name, component in self._components.items() if component.holding}
         for entry in news:
             component = None if entry.name in refused else self._known(entry.name, beat.sender)
             if component is None:
                 continue
             rules.heard(component, turn, beat.sender, entry)
-            election.heard_of_checkpoints(component, entry)
-            replication.acknowledged(component, turn, beat.sender, entry)
+            pair.heard_of_checkpoints(component, entry)
+            standby.acknowledged(component, turn, beat.sender, entry)
             touched[component.name] = component
         return list(touched.values())
 
@@ -339,9 +327,9 @@ def _take_up(component: Component, turn: Turn, found: Found | None) -> None:
     component.state = State.FROZEN
     component.stood = True
     component.standby = component.entrusted[0] if component.entrusted else ""
-    election.open_line(component, turn)
+    pair.open_line(component, turn)
     if not found.running:
-        endings.exited(component, turn, Exited(component.name, component.epoch, found.status))
+        exits.exited(component, turn, Exited(component.name, component.epoch, found.status))
     elif lease.on_lease(component, turn):
         turn.order(acts.Freeze(component.name, component.epoch))
         turn.say(component, f"{turn.me} is back and holds it still until it is heard, or knows that nobody else runs it")
@@ -354,30 +342,30 @@ def _tell(component: Component, turn: Turn, event: Event) -> None:
         case Started() | Restored():
             _runs(component, turn, event)
         case Captured():
-            replication.captured(component, turn, event)
+            standby.captured(component, turn, event)
         case Unchanged():
-            replication.unchanged(component, turn, event)
+            standby.unchanged(component, turn, event)
         case CaptureFailed():
-            replication.capture_failed(component, turn, event)
+            standby.capture_failed(component, turn, event)
         case NothingToCapture():
-            replication.nothing_to_capture(component, turn, event)
+            standby.nothing_to_capture(component, turn, event)
         case Committed():
-            replication.committed(component, turn, event)
+            standby.committed(component, turn, event)
         case ShipEnded():
-            replication.ship_ended(component, turn, event)
-            archive.ship_ended(component, turn, event)
+            standby.ship_ended(component, turn, event)
+            servers.ship_ended(component, turn, event)
         case Stored():
-            replication.stored(component, turn, event)
+            standby.stored(component, turn, event)
         case StoreFailed():
-            replication.store_failed(component, turn, event)
+            standby.store_failed(component, turn, event)
         case ActFailed():
-            endings.failed(component, turn, event)
+            exits.failed(component, turn, event)
         case Exited():
-            endings.exited(component, turn, event)
+            exits.exited(component, turn, event)
         case Warmed():
-            warmth.warmed(component, turn, event)
+            warm_standby.warmed(component, turn, event)
         case Inquired():
-            homecoming.inquired(component, turn, event)
+            failback.inquired(component, turn, event)
         case Stopped():
             if component.state is State.STOPPING:
                 component.move(Cause.CLEARED)
@@ -396,7 +384,7 @@ def _runs(component: Component, turn: Turn, event: Started | Restored) -> None:
     component.move(Cause.RUNS)
     component.resumption = Resumption.RESTARTED  # of what comes next, if that is here
     component.due_ns = turn.now_ns
-    component.return_ns = turn.now_ns + homecoming.PAUSE * turn.config.retry_ms * MS
+    component.return_ns = turn.now_ns + failback.PAUSE * turn.config.retry_ms * MS
     turn.say(component, f"{how} at {turn.me}, epoch {component.epoch}")
     if component.request:
         turn.order(acts.Answer(component.request, True, f"{component.name} runs at {turn.me}"))
@@ -405,40 +393,40 @@ def _runs(component: Component, turn: Turn, event: Started | Restored) -> None:
 
 def _review(component: Component, turn: Turn) -> None:
     """What the passing of time, or what was just heard, makes due for one component."""
-    endings.overdue(component, turn)
+    exits.overdue(component, turn)
     if component.wanted is not None:
         promotion.advance(component, turn)
     if turn.config.by_majority:
         majority.look(component, turn)
     if component.state in (State.ABSENT, State.STANDBY):
         _review_idle(component, turn)
-    replication.show(component, turn)
+    standby.show(component, turn)
     if component.state is State.CLAIMING:
-        (contest if turn.config.by_majority else election).advance(component, turn)
+        (votes if turn.config.by_majority else pair).advance(component, turn)
     if component.holding and component.state is not State.CLAIMING:
         _review_held(component, turn)
     if component.state in ENDED:
-        endings.report(component, turn)
-    warmth.review(component, turn)
+        exits.report(component, turn)
+    warm_standby.review(component, turn)
 
 
 def _review_idle(component: Component, turn: Turn) -> None:
-    endings.retry(component, turn)
-    archive.admit_a_return(component, turn)
-    (contest if turn.config.by_majority else election).consider(component, turn)
+    exits.retry(component, turn)
+    servers.admit_a_return(component, turn)
+    (votes if turn.config.by_majority else pair).consider(component, turn)
     if component.state in (State.ABSENT, State.STANDBY):
-        archive.give_back(component, turn)
+        servers.give_back(component, turn)
 
 
 def _review_held(component: Component, turn: Turn) -> None:
     lease.watch(component, turn)
     if component.crashed:
-        endings.crashed(component, turn, component.crashed)
-    replication.overdue(component, turn)
-    replication.confirm(component, turn)
+        exits.crashed(component, turn, component.crashed)
+    standby.overdue(component, turn)
+    standby.confirm(component, turn)
     if component.state is State.PRIMARY:
-        replication.choose_standby(component, turn)
-        replication.capture(component, turn)
-        archive.advance(component, turn)
-        homecoming.review(component, turn)
+        standby.choose_standby(component, turn)
+        standby.capture(component, turn)
+        servers.advance(component, turn)
+        failback.review(component, turn)
     handover.advance(component, turn)

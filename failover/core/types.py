@@ -72,7 +72,7 @@ class State(enum.StrEnum):
 
 
 class Resumption(enum.StrEnum):
-    """Why a program goes on from a checkpoint, in the words that it is told (``checkpoint/TASK.md``).
+    """Why a program goes on from a checkpoint, in the words that it is told (``checkpoint/segment/TASK.md``).
 
     It is told what became of the copy before it, not where the checkpoint was made: that may have been here all the same.
     """
@@ -130,9 +130,10 @@ class Launch(Struct, frozen=True):
         environment: (name, value) pairs.
         pid: of a running program to protect (``failover protect``), 0 otherwise; means something on its home robot only.
         isolate: PID and time namespaces of its own.
-        hooks: (occasion, command) pairs that came with the program and are run as its user, see `agent.hooks`.
+        hooks: (occasion, command) pairs that came with the program and are run as its user, see `agent.worker.components.hooks`.
         output: `IMMEDIATE` or `COMMITTED`: when what it writes is shown.
-        inheritance: whose rights, limits and priorities it gets, packed (`checkpoint.linux.inheritance`); b"": the agent's own.
+        inheritance: whose rights, limits and priorities it gets, packed (`checkpoint.linux.spawn.inherited_limits`); b"": the
+            agent's own.
         carry: files and folders that travel with it, as absolute paths.
         devices: (path, rule) of devices that it has open, where a robot has no rule of its own; see `checkpoint.device_rules`.
         connections: `RESET` or `CARRY`: what becomes of its TCP connections with others.

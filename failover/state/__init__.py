@@ -40,9 +40,9 @@ a former name; ``version`` and ``migrations`` change the rest, on plain values (
 
 from failover.state.declare import MISSING, Field, Formerly, Pickled
 from failover.state.kinds import Region
-from failover.state.opened import Labelled, PlainRecord
 from failover.state.pickled import Unread
 from failover.state.schema import Decoded, Encoded, Schema
+from failover.state.untyped import Labelled, PlainRecord
 
 __all__ = [
     "MISSING",

@@ -16,19 +16,19 @@ from typing import Any
 import numpy as np
 
 from failover.errors import SchemaError
-from failover.state import arrays, numbers, plain
+from failover.state import arrays, immutables, numbers
 from failover.state.advice import NO_FIELDS, advice_for, advice_for_annotation
-from failover.state.choices import AnyKind, EnumKind, FlagKind, LiteralKind, UnionKind
 from failover.state.containers import DequeKind, ListKind, MappingKind, SetKind, TupleKind
 from failover.state.declare import MISSING, Field, Formerly, Pickled
 from failover.state.dtypes import DtypeError, lower_dtype
 from failover.state.kinds import Kind
-from failover.state.opened import LabelledKind, PlainRecordKind
 from failover.state.pickled import PickledKind, UnreadKind
 from failover.state.random_numbers import GeneratorKind, RandomKind
+from failover.state.record_libraries import Components, Member, record_of
 from failover.state.records import RecordField, RecordKind
-from failover.state.styles import Components, Member, record_of
-from failover.state.typed import NumbersKind
+from failover.state.typed_arrays import NumbersKind
+from failover.state.unions import AnyKind, EnumKind, FlagKind, LiteralKind, UnionKind
+from failover.state.untyped import LabelledKind, PlainRecordKind
 
 _ATOMS: dict[Any, Kind] = {
     None: numbers.NONE,
@@ -44,7 +44,7 @@ _ATOMS: dict[Any, Kind] = {
     np.generic: arrays.ANY_SCALAR,
     array.array: NumbersKind(),
     random.Random: RandomKind(),
-    **plain.PLAIN_KINDS,
+    **immutables.PLAIN_KINDS,
 }
 
 _ABSTRACT: dict[Any, tuple[Any, ...]] = {

@@ -16,10 +16,10 @@ from msgspec import Struct
 
 from failover.errors import FitError, KeepError, SchemaError, StateError, StateFormatError
 from failover.state.annotations import Compiler, default_of
-from failover.state.choices import AnyKind
 from failover.state.declare import MISSING, Field
 from failover.state.kinds import Allocate, Build, Kind, Region, Walk, refuse_size
 from failover.state.records import RecordField
+from failover.state.unions import AnyKind
 from failover.state.wire import DATA_SIZE_MAX, FORMAT, INLINE_SIZE_MAX, REGION_COUNT_MAX, SAME, Place, Wire, root_place
 
 FINGERPRINT_SIZE = 16

@@ -14,9 +14,9 @@ from typing import Any, Final, TypeVar
 
 import msgspec
 
-from agent.guard_messages import Describe, Described, Event, Exited, FrozenByLease, Reply, Start, Started
-from checkpoint.channel import Channel, ChannelClosedError, close_all
-from checkpoint.linux.address import address_of
+from agent.guard.messages import Describe, Described, Event, Exited, FrozenByLease, Reply, Start, Started
+from checkpoint.keeper.messages import Channel, ChannelClosedError, close_all
+from checkpoint.linux.unix_address import address_of
 
 PATIENCE_S: Final = 30.0
 """A generous bound for whatever is waited for; the machine may be busy."""
@@ -107,7 +107,7 @@ class GuardProcess:
         self.directory = directory
         self.path = directory / "one.guard"
         self.logs = directory / "logs"
-        command = [*around, sys.executable, "-m", "agent.guard", str(self.path)]
+        command = [*around, sys.executable, "-m", "agent.guard.server", str(self.path)]
         self.process = subprocess.Popen(command, start_new_session=True)
         self._agents: list[Agent] = []
 

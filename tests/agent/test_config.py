@@ -12,12 +12,12 @@ import pytest
 
 from agent import config as configuration
 from agent.config import ComponentConfig, Config
+from agent.core_config import level_of, node_config, started_here
 from agent.errors import ConfigError
 from agent.main import main as agent_main
-from agent.rules import level_of, node_config, started_here
-from agent.transport import new_keys
-from failover.client import team
-from failover.client.team import Robot, Role, Team
+from agent.worker.network.replication_link import new_keys
+from failover.config import team
+from failover.config.team import Robot, Role, Team
 from failover.core.types import Launch, Rule
 
 DOCUMENTED = Path(__file__).parents[2] / "systemd" / "agent.toml"

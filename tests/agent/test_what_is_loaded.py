@@ -8,7 +8,7 @@ from typing import Final
 
 import pytest
 
-from checkpoint import lean
+from checkpoint.runtime import slim_imports
 
 LOADED: Final = """
 import sys
@@ -27,12 +27,12 @@ def loaded_by(*modules: str) -> set[str]:
 
 def seldom_used() -> set[str]:
     """What neither process needs; dataclasses ask inspect of every class from Python 3.12 on."""
-    return set(lean.SELDOM_USED) - ({"inspect"} if sys.version_info >= (3, 12) else set())
+    return set(slim_imports.SELDOM_USED) - ({"inspect"} if sys.version_info >= (3, 12) else set())
 
 
 def test_the_heart_loads_neither_asyncio_nor_what_reads_pages() -> None:
-    loaded = loaded_by("agent.main", "agent.loop")
-    assert "agent.loop" in loaded
+    loaded = loaded_by("agent.main", "agent.main_loop.loop")
+    assert "agent.main_loop.loop" in loaded
     assert not loaded & {
         "asyncio",
         "argparse",
@@ -47,7 +47,7 @@ def test_the_heart_loads_neither_asyncio_nor_what_reads_pages() -> None:
     }
 
 
-@pytest.mark.parametrize("lanes", ["agent.lanes", "agent.witness"])
+@pytest.mark.parametrize("lanes", ["agent.worker.process", "agent.worker.witness"])
 def test_the_lanes_load_no_numpy_before_a_snapshot_comes(lanes: str) -> None:
     loaded = loaded_by(lanes)
     assert lanes in loaded

@@ -329,7 +329,7 @@ def _programs(member: Member, name: str) -> Iterator[int]:
             words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
         except OSError:
             continue
-        if words[2:3] == [b"agent.guard"] or words[2:3] == [b"checkpoint"]:
+        if words[2:3] == [b"agent.guard.server"] or words[2:3] == [b"checkpoint"]:
             continue
         if name.encode() in words or f"name={name}".encode() in words:
             yield pid

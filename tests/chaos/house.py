@@ -21,11 +21,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from failover.cli import keys
+from failover.cli import key_pairs
 from failover.cli.demo.robots import RobotMachine, agent_command, cgroup_of, host_command, wait_for_network
-from failover.client import team
 from failover.client.control import Control
-from failover.client.team import Robot, Role, Team
+from failover.config import team
+from failover.config.team import Robot, Role, Team
 from failover.errors import AgentRefusedError, LostAgentError, NoAgentError
 from tests.chaos import actuator
 from tests.chaos.network import Network, address_of
@@ -61,7 +61,12 @@ STEP_MS: Final = 50
 """Between two commands of a program."""
 
 PROGRAMS: Final = Path(__file__).parent / "programs"
-MODULES: Final = {"heart": b"agent.main", "lanes": b"agent.lanes", "keeper": b"checkpoint", "guard": b"agent.guard"}
+MODULES: Final = {
+    "heart": b"agent.main",
+    "lanes": b"agent.worker.process",
+    "keeper": b"checkpoint",
+    "guard": b"agent.guard.server",
+}
 """Of each part of an agent: the third word of its command line, or the fourth."""
 
 AWAY: Final = (NoAgentError, LostAgentError)
@@ -253,7 +258,7 @@ class House:
     def _enrol(self) -> None:
         everybody = Team("house")
         for member in self.members:
-            public, secret = keys.new_pair()
+            public, secret = key_pairs.new_pair()
             place = member.directory / "team"
             place.mkdir(parents=True)
             team.write_secret_key(place, member.name, secret)

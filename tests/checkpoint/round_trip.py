@@ -19,17 +19,18 @@ from typing import NoReturn, TypeVar
 
 import pytest
 
-from checkpoint import chain, format
 from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import CaptureOrder, ProtectOrder, RestoreOptions, Session, Terms
 from checkpoint.engines.registry import engine_named
 from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
 from checkpoint.linux import abi
-from checkpoint.linux.namespaces import prctl
-from checkpoint.linux.vessel import Birth, Born, discard, spawn_program, spawn_vessel
-from checkpoint.linux.waking import waking
+from checkpoint.linux.signal_wakeup import waking
+from checkpoint.linux.spawn.namespaces import prctl
+from checkpoint.linux.spawn.vessel import Birth, Born, discard, spawn_program, spawn_vessel
 from checkpoint.model import Snapshot
-from checkpoint.stored_base import StoredBase, stored_base
+from checkpoint.snapshot import format
+from checkpoint.store import chain
+from checkpoint.store.base_on_disk import StoredBase, stored_base
 
 ENGINE = engine_named("ptrace")
 LIVES = 3

@@ -11,8 +11,8 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from checkpoint.segment import ARRAY, PAGE, STATE, Committed, Layout, numbered
-from checkpoint.segment_writer import SegmentWriter, Source
+from checkpoint.segment.layout import ARRAY, PAGE, STATE, Committed, Layout, numbered
+from checkpoint.segment.writer import SegmentWriter, Source
 
 LINEAGE = bytes(range(16))
 PAGES = 24

@@ -6,8 +6,6 @@ from collections.abc import Mapping
 
 from msgspec.structs import replace
 
-from checkpoint import pages, tree
-from checkpoint.chain import applied, position_of
 from checkpoint.model import (
     Clocks,
     Credentials,
@@ -26,6 +24,9 @@ from checkpoint.model import (
     VmaKind,
     Zombie,
 )
+from checkpoint.pages import page_set
+from checkpoint.snapshot import process_tree
+from checkpoint.store.chain import applied, position_of
 
 PAGE = 4096
 START = 0x10000000
@@ -66,7 +67,7 @@ def vma(first: int, count: int) -> Vma:
 def runs_of(numbers: Mapping[int, object] | set[int]) -> tuple[PageRun, ...]:
     """Page numbers as runs in address order."""
     addresses = sorted(START + number * PAGE for number in numbers)
-    return pages.page_runs(pages.extents(PageRun(address, address + PAGE) for address in addresses))
+    return page_set.page_runs(page_set.extents(PageRun(address, address + PAGE) for address in addresses))
 
 
 def snapshot(
@@ -88,7 +89,7 @@ def snapshot(
         carried: what this snapshot carries of it; all for a base.
     """
     carried = state if carried is None else carried
-    table = pages.PageTable.empty(PAGE).apply((), runs_of(state), _joined(state), vmas)
+    table = page_set.PageTable.empty(PAGE).apply((), runs_of(state), _joined(state), vmas)
     made = Snapshot(
         component=component,
         engine="ptrace",
@@ -118,7 +119,7 @@ def _joined(state: Pages) -> bytes:
 def family(count: int) -> list[Snapshot]:
     """A base and deltas of a program with a child, which has the same addresses, and one that has ended."""
     made: list[Snapshot] = []
-    table = pages.PageTable.empty(PAGE)
+    table = page_set.PageTable.empty(PAGE)
     for sequence in range(1, count + 1):
         alone = snapshot(
             {0: page("both"), 1: page(f"parent {sequence}")}, sequence=sequence, parent=made[-1].position if made else None
@@ -135,10 +136,10 @@ def family(count: int) -> list[Snapshot]:
             alone,
             members=(child,),
             zombies=(Zombie("mapper", 4, 2, 2, 2, 3 << 8, 17),),
-            runs=(*alone.runs, *tree.shifted_runs(alone.runs, 1)),
+            runs=(*alone.runs, *process_tree.shifted_runs(alone.runs, 1)),
             contents=b"".join((alone.contents, page("both"), page(f"child {sequence}"))),
         )
-        runs, contents, copies = tree.told_once(whole.runs, memoryview(whole.contents), PAGE)
+        runs, contents, copies = process_tree.told_once(whole.runs, memoryview(whole.contents), PAGE)
         whole = replace(whole, runs=runs, contents=bytes(contents), copies=copies)
         table = applied(table, whole)
         whole = replace(whole, page_sum=table.page_sum)

@@ -10,12 +10,15 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from checkpoint import arch, chain, format
+from checkpoint import arch
 from checkpoint.arch import extended
 from checkpoint.engine import ProtectOrder
 from checkpoint.errors import ChainError, CheckpointError, FormatError, ProbeError
-from checkpoint.linux import processor, procfs
+from checkpoint.linux.procfs import procfs
+from checkpoint.linux.spawn import cpuid
 from checkpoint.model import Resource, Snapshot
+from checkpoint.snapshot import format
+from checkpoint.store import chain
 from tests.checkpoint.round_trip import ENGINE, Program, captured_and_killed, ended, restored, start, start_tracee
 from tests.conftest import children
 
@@ -68,7 +71,7 @@ def test_registers_that_are_not_kept_are_said_so_before_anything_is_touched(
     compiled: Callable[..., Path], snapshot: Snapshot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with ended(start_tracee(compiled("heap", "-O2"), tmp_path)) as tracee:
-        monkeypatch.setattr(extended, "UNKEPT", {processor.features()[0]: "wide ones", "absent": "others"})
+        monkeypatch.setattr(extended, "UNKEPT", {cpuid.features()[0]: "wide ones", "absent": "others"})
         sentence = "the processor has wide ones, whose registers are not kept so far.*docs/decorator.md"
         for act in (lambda: ENGINE.probe(tracee.pid), lambda: ENGINE.protect(tracee.pid, ProtectOrder("/test/tracee"))):
             with pytest.raises(ProbeError, match=sentence):

@@ -19,6 +19,7 @@ import pytest
 from checkpoint.engine import CaptureOrder, ProtectOrder, Session
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.model import Snapshot
+from tests.checkpoint.linux.trace.test_threads import open_descriptors, states, tracers
 from tests.checkpoint.round_trip import (
     ENGINE,
     PATIENCE_S,
@@ -30,7 +31,6 @@ from tests.checkpoint.round_trip import (
     start_tracee,
     transported,
 )
-from tests.checkpoint.test_threads import open_descriptors, states, tracers
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root, pytest.mark.timeout(3600)]
 

@@ -14,9 +14,9 @@ from uuid import uuid4
 import pytest
 
 from checkpoint.model import Snapshot
+from tests.checkpoint.engines.ptrace.capture.test_trees import captured_and_ended, grown_by, three_lives
+from tests.checkpoint.linux.spawn.test_ids import let_nobody_in
 from tests.checkpoint.round_trip import Program, as_nobody, ended, expect_ok, restored, start, start_tracee
-from tests.checkpoint.test_ids import let_nobody_in
-from tests.checkpoint.test_trees import captured_and_ended, grown_by, three_lives
 
 pytestmark = pytest.mark.root
 

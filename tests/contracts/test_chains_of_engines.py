@@ -16,18 +16,20 @@ from typing import Protocol
 import numpy as np
 import pytest
 
-from checkpoint import chain, format, pages
-from checkpoint.channel import memfd_holding
 from checkpoint.engine import CaptureOrder, ProtectOrder, Session
-from checkpoint.engines.cooperative import CooperativeSession
+from checkpoint.engines.cooperative.session import CooperativeSession
 from checkpoint.engines.registry import engine_named
 from checkpoint.errors import ChainError, CheckpointError
+from checkpoint.keeper.messages import memfd_holding
 from checkpoint.model import Snapshot
-from checkpoint.pages import EMPTY_SUM
-from checkpoint.segment import PAGE
-from checkpoint.segment_reader import SegmentReader
-from checkpoint.segment_writer import SegmentWriter
-from checkpoint.store import open_store
+from checkpoint.pages import page_set
+from checkpoint.pages.page_set import EMPTY_SUM
+from checkpoint.segment.layout import PAGE
+from checkpoint.segment.reader import SegmentReader
+from checkpoint.segment.writer import SegmentWriter
+from checkpoint.snapshot import format
+from checkpoint.store import chain
+from checkpoint.store.store import open_store
 from tests.checkpoint.segments import layout, source
 
 PAGES = 16
@@ -141,7 +143,7 @@ def test_a_base_and_its_deltas_fold_to_the_state_that_was_captured(program: Prog
     assert MARK + 1 in values(base) and MARK + 2 not in values(base)
     folded = chain.fold((base, delta))
     assert {MARK + 1, MARK + 2} <= values(folded)
-    assert pages.total_size(pages.extents(delta.runs)) < pages.total_size(pages.extents(base.runs))
+    assert page_set.total_size(page_set.extents(delta.runs)) < page_set.total_size(page_set.extents(base.runs))
 
 
 def test_what_was_captured_and_never_acknowledged_is_in_the_next_delta(program: Program) -> None:

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from checkpoint.errors import ProcessGoneError
-from checkpoint.linux import maps_reader, procfs
-from checkpoint.linux.maps_reader import MapsReader
+from checkpoint.linux.procfs import maps_reader, procfs
+from checkpoint.linux.procfs.maps_reader import MapsReader
 
 PAGES = 64
 

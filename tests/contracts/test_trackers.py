@@ -17,16 +17,18 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from checkpoint import arch, pages
-from checkpoint.linux import abi, dirty, pagetables, write_protection
-from checkpoint.linux.digests import DigestTracker
-from checkpoint.linux.dirty import SoftDirtyTracker
-from checkpoint.linux.maps_reader import MapsReader
-from checkpoint.linux.memory import Memory
-from checkpoint.linux.pagetables import PageScanner
-from checkpoint.linux.procfs import MapsLine
-from checkpoint.linux.tracking import NONE, Scan, Tracker, extents_of
-from checkpoint.linux.write_protection import PagemapTracker
+from checkpoint import arch
+from checkpoint.linux import abi
+from checkpoint.linux.memory import choose_tracker, pagemap, write_protect
+from checkpoint.linux.memory.choose_tracker import SoftDirtyTracker
+from checkpoint.linux.memory.digest_tracker import DigestTracker
+from checkpoint.linux.memory.pagemap import PageScanner
+from checkpoint.linux.memory.remote_memory import Memory
+from checkpoint.linux.memory.tracker import NONE, Scan, Tracker, extents_of
+from checkpoint.linux.memory.write_protect import PagemapTracker
+from checkpoint.linux.procfs.maps_reader import MapsReader
+from checkpoint.linux.procfs.procfs import MapsLine
+from checkpoint.pages import page_set
 
 PAGE = abi.PAGE_SIZE
 COUNT = 256
@@ -130,16 +132,16 @@ class Child:
         """The lines of its mapping."""
         return [line for line in self.maps.lines if self.place <= line.start < self.place + COUNT * PAGE]
 
-    def numbers(self, found: pages.Words) -> set[int]:
+    def numbers(self, found: page_set.Words) -> set[int]:
         """Which of its pages a set holds."""
-        return {(address - self.place) // PAGE for address in pages.addresses_of(found, PAGE).tolist()}
+        return {(address - self.place) // PAGE for address in page_set.addresses_of(found, PAGE).tolist()}
 
 
 @pytest.fixture(params=["pagemap", "soft-dirty", "soft-dirty of an ordinary user", "digest"])
 def child(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Child]:
     """A child with pages 0 to 9 written, followed from then on."""
     if request.param.endswith("user"):
-        monkeypatch.setattr(pagetables, "zero_frame", lambda: 0)
+        monkeypatch.setattr(pagemap, "zero_frame", lambda: 0)
     words = [sys.executable, "-c", CHILD, str(COUNT), str(arch.number_of("userfaultfd"))]
     process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     tracker: Tracker | None = None
@@ -164,7 +166,7 @@ def _tracker(kind: str, pid: int, faults: int) -> Tracker:
     if kind == "digest":
         return DigestTracker(pid)
     if kind.startswith("soft-dirty"):
-        if not dirty.has_soft_dirty():
+        if not choose_tracker.has_soft_dirty():
             pytest.skip("this kernel has no soft-dirty bit (CONFIG_MEM_SOFT_DIRTY)")
         return SoftDirtyTracker(pid)
     if faults < 0:
@@ -364,7 +366,7 @@ def test_what_a_scan_that_broke_off_may_have_protected_is_told_by_the_next(child
     child.order("write 3 4")
     scanned = PageScanner.written_where_protected
 
-    def replaced_meanwhile(self: PageScanner, ranges: pages.Words) -> tuple[pages.Words, pages.Words]:
+    def replaced_meanwhile(self: PageScanner, ranges: page_set.Words) -> tuple[page_set.Words, page_set.Words]:
         monkeypatch.undo()
         child.order("replace 200 10")
         _, refused = scanned(self, ranges)
@@ -384,8 +386,8 @@ def test_what_a_scan_that_broke_off_may_have_protected_is_told_by_the_next(child
 @pytest.mark.parametrize("child", ["pagemap"], indirect=True)
 def test_what_is_written_while_newcomers_are_protected_is_told_by_the_next(child: Child, monkeypatch: pytest.MonkeyPatch) -> None:
     """A page written between the scan and the protection of windows around others is not protected along with them."""
-    monkeypatch.setattr(write_protection, "WHOLE_WINDOW", PAGE)  # as if the mapping were too large to be protected whole
-    monkeypatch.setattr(write_protection, "WINDOW", 16 * PAGE)
+    monkeypatch.setattr(write_protect, "WHOLE_WINDOW", PAGE)  # as if the mapping were too large to be protected whole
+    monkeypatch.setattr(write_protect, "WINDOW", 16 * PAGE)
     tracker, first = child.tracker, -(child.place // PAGE) % 16
     child.order("forget 0 10")
     child.order(f"write {first + 20}")
@@ -393,10 +395,10 @@ def test_what_is_written_while_newcomers_are_protected_is_told_by_the_next(child
     tracker.scan(child.lines(), changed=True)
     looked = PageScanner.existing
 
-    def written_meanwhile(self: PageScanner, ranges: pages.Words, *, own: bool = True) -> pages.Words:
+    def written_meanwhile(self: PageScanner, ranges: page_set.Words, *, own: bool = True) -> page_set.Words:
         monkeypatch.undo()
-        monkeypatch.setattr(write_protection, "WHOLE_WINDOW", PAGE)
-        monkeypatch.setattr(write_protection, "WINDOW", 16 * PAGE)
+        monkeypatch.setattr(write_protect, "WHOLE_WINDOW", PAGE)
+        monkeypatch.setattr(write_protect, "WINDOW", 16 * PAGE)
         child.order(f"write {first + 20}")
         return looked(self, ranges, own=own)
 
@@ -410,9 +412,9 @@ def test_what_is_written_while_newcomers_are_protected_is_told_by_the_next(child
 def test_large_mappings_are_protected_around_what_exists() -> None:
     line = MapsLine(0, 64 << 30, 3, False, 0, 0, 0, "")
     existing = np.array([[1 << 30, (1 << 30) + PAGE], [(1 << 30) + (4 << 20), (1 << 30) + (4 << 20) + PAGE]], dtype=np.uint64)
-    windows = write_protection.windows_of(line, existing)
-    assert pages.total_size(windows) <= 4 * write_protection.WINDOW + write_protection.WINDOW
-    assert not len(pages.difference(existing, windows))
+    windows = write_protect.windows_of(line, existing)
+    assert page_set.total_size(windows) <= 4 * write_protect.WINDOW + write_protect.WINDOW
+    assert not len(page_set.difference(existing, windows))
 
 
 @pytest.mark.parametrize(("inode", "is_whole"), [(0, False), (7, True)])
@@ -420,8 +422,8 @@ def test_the_stack_of_a_thread_is_protected_around_what_exists_and_a_library_who
     """Each hole that is protected takes a scan as long as a page; which pages of a file are copies takes longer to find."""
     line = MapsLine(8 << 20, 16 << 20, 3, False, 0, 0, inode, "")
     existing = np.array([[line.end - 2 * PAGE, line.end]], dtype=np.uint64)
-    windows = write_protection.windows_of(line, existing)
-    assert pages.total_size(windows) == (line.size if is_whole else write_protection.WINDOW)
+    windows = write_protect.windows_of(line, existing)
+    assert page_set.total_size(windows) == (line.size if is_whole else write_protect.WINDOW)
 
 
 def test_the_scan_structure_is_as_the_kernel_has_it() -> None:
@@ -447,7 +449,7 @@ def told(child: Child) -> Scan:
         return first
     then = child.scan()
     assert child.tracker.confirm()
-    return Scan(pages.union(first.written, then.written), pages.union(first.cleared, then.cleared))
+    return Scan(page_set.union(first.written, then.written), page_set.union(first.cleared, then.cleared))
 
 
 def test_a_private_copy_of_a_files_page_that_is_given_up_is_told(copies: Child) -> None:

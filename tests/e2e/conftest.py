@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from failover.cli import keys
+from failover.cli import key_pairs
 
 Pair = tuple[str, str]
 
@@ -20,7 +20,7 @@ def pairs_made() -> list[Pair]:
 @pytest.fixture(autouse=True)
 def _pairs_from_the_drawer(pairs_made: list[Pair], monkeypatch: pytest.MonkeyPatch) -> None:
     """No two robots of a test get the same pair; those of the next test get them again."""
-    new_pair, numbers = keys.new_pair, itertools.count()
+    new_pair, numbers = key_pairs.new_pair, itertools.count()
 
     def pair() -> Pair:
         number = next(numbers)
@@ -28,4 +28,4 @@ def _pairs_from_the_drawer(pairs_made: list[Pair], monkeypatch: pytest.MonkeyPat
             pairs_made.append(new_pair())
         return pairs_made[number]
 
-    monkeypatch.setattr(keys, "new_pair", pair)
+    monkeypatch.setattr(key_pairs, "new_pair", pair)

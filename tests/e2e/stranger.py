@@ -11,8 +11,8 @@ import sys
 from collections.abc import Sequence
 
 from failover.cli.demo.robots import RobotMachine
-from failover.client import team
-from failover.client.team import split_address
+from failover.config import team
+from failover.config.team import split_address
 from tests.e2e.robots import PATIENCE_S, has_cable
 
 RECORD = """

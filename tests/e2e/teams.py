@@ -9,10 +9,10 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from failover.cli import keys
+from failover.cli import key_pairs
 from failover.cli.demo.robots import RobotMachine, Stage, agent_command, free_ports, host_command
-from failover.client import team
-from failover.client.team import Robot, Role, Team
+from failover.config import team
+from failover.config.team import Robot, Role, Team
 from tests.e2e import robots
 
 ORDINARY_USER = ("/usr/bin/env", "unshare", "--user", "--map-user=1000", "--map-group=1000", "--")
@@ -67,7 +67,7 @@ class TeamStage(Stage):
         ports = free_ports(2 * len(self._roles))
         members = Team("demo")
         for index, (name, role) in enumerate(self._roles.items()):
-            public, secret = keys.new_pair()
+            public, secret = key_pairs.new_pair()
             directory = self.directory / name / "team"
             directory.mkdir(parents=True)
             team.write_secret_key(directory, name, secret)

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from checkpoint.linux import procfs
+from checkpoint.linux.procfs import procfs
 from failover.client.control import LENGTH, MESSAGE_LIMIT, REQUEST_LIMIT, Control, Refused, Request
 from failover.errors import AgentRefusedError, RequestError
 from tests.e2e import robots

@@ -11,11 +11,11 @@ from typing import Any
 import msgspec
 import pytest
 
-from agent.transport import new_keys
-from failover.client import team
-from failover.core import wire
-from failover.core.messages import Beat, Entry
-from failover.core.wire import Reason
+from agent.worker.network.replication_link import new_keys
+from failover.config import team
+from failover.core.wire import codec
+from failover.core.wire.codec import Reason
+from failover.core.wire.messages import Beat, Entry
 from tests.e2e import robots, stranger
 from tests.e2e.robots import RobotMachine
 
@@ -107,10 +107,10 @@ def claim(boot: int) -> Beat:
 
 def test_invented_beats_change_nothing_and_are_counted(pair: Pair) -> None:
     before, stood = refused(pair[0]), standing(pair)
-    own = wire.seal(claim(1 << 20), "demo", bytes(range(32)))
+    own = codec.seal(claim(1 << 20), "demo", bytes(range(32)))
     invented = {
         Reason.UNKNOWN_KEY: own,
-        Reason.TEAM: wire.seal(claim(1 << 20), "neighbours", bytes(range(32))),
+        Reason.TEAM: codec.seal(claim(1 << 20), "neighbours", bytes(range(32))),
         Reason.VERSION: own[:2] + b"\x07" + own[3:],
         Reason.NOT_OURS: b"GET / HTTP/1.1\r\n\r\n" * 3,
     }

@@ -16,7 +16,7 @@ import pytest
 from msgspec.structs import replace
 
 from failover.cli.demo.robots import RobotMachine, Stage
-from tests.checkpoint.test_carried_files import COUNTER
+from tests.checkpoint.resources.carried.test_carried_files import COUNTER
 from tests.e2e.robots import (
     LOG_LINES,
     component,

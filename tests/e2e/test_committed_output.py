@@ -21,7 +21,7 @@ from typing import Final
 import pytest
 from msgspec.structs import replace
 
-from agent.pump import HOLD_LIMIT, READ_SIZE
+from agent.guard.output_pump import HOLD_LIMIT, READ_SIZE
 from failover.cli.demo.robots import RobotMachine, Stage
 from tests.e2e import robots
 from tests.e2e.test_kept_state_killed import come_back

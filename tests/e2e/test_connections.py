@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from failover.cli.demo.robots import ip_inside
-from tests.checkpoint.test_carried_connections import PYTHON, TALKERS, run
+from tests.checkpoint.resources.sockets.test_tcp_handover import PYTHON, TALKERS, run
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 

@@ -32,7 +32,7 @@ SPREAD_S = 0.15
 RESTORE_S = 0.25
 """A handover, its restore included, takes about so long."""
 
-NAMES = {"heart": b"agent.main", "lanes": b"agent.lanes", "keeper": b"checkpoint", "guard": b"agent.guard"}
+NAMES = {"heart": b"agent.main", "lanes": b"agent.worker.process", "keeper": b"checkpoint", "guard": b"agent.guard.server"}
 """Module of each part of an agent: the third word of its command line."""
 
 WAYS = {

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.checkpoint.test_devices import DRIVER, told
+from tests.checkpoint.resources.devices.test_stateless import DRIVER, told
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 

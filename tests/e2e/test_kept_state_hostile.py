@@ -20,15 +20,15 @@ from typing import Any, Final
 import pytest
 from msgspec.structs import replace
 
-from checkpoint import format
-from checkpoint.chain import position_of
-from checkpoint.channel import memfd_holding
-from checkpoint.engines.cooperative import KIND
+from checkpoint.engines.cooperative.session import KIND
+from checkpoint.keeper.messages import memfd_holding
 from checkpoint.model import Snapshot
-from checkpoint.pages import PageTable
-from checkpoint.segment import PAGE
-from checkpoint.store import open_store
-from failover.core.endings import TRIES_MAX
+from checkpoint.pages.page_set import PageTable
+from checkpoint.segment.layout import PAGE
+from checkpoint.snapshot import format
+from checkpoint.store.chain import position_of
+from checkpoint.store.store import open_store
+from failover.core.transitions.exits import TRIES_MAX
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_cooperative import protected

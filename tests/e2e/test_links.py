@@ -1,7 +1,7 @@
 """Two links between two robots: snapshots keep to the wire, beats use both, a cable that is out degrades and moves nothing.
 
 This kernel has no radio to play with, so one of the two cables is declared to lead to one, as an operator would for a radio that
-stands behind an Ethernet port. What the kernel itself knows of real radios: ``tests/agent/test_links.py``.
+stands behind an Ethernet port. What the kernel itself knows of real radios: ``tests/agent/worker/network/test_links.py``.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from checkpoint.linux.address import PATH_SIZE_MAX
+from checkpoint.linux.unix_address import PATH_SIZE_MAX
 from tests.e2e import robots
 
 

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint import carried, format
 from checkpoint.errors import CheckpointError
+from checkpoint.snapshot import carried_files, format
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 
@@ -107,7 +107,7 @@ def stored(robot: RobotMachine) -> Iterator[bytes]:
                 snapshot = format.decode(path)
             except CheckpointError:
                 continue  # it is just being removed
-            for pieces in carried.pieces(snapshot).values():
+            for pieces in carried_files.pieces(snapshot).values():
                 yield from (bytes(content) for _, content in pieces)
 
 

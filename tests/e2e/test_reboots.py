@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from agent.transport import new_keys
-from failover.client import team
-from failover.client.team import Team
+from agent.worker.network.replication_link import new_keys
+from failover.config import team
+from failover.config.team import Team
 from failover.core.membership import UNREAD_NS
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine

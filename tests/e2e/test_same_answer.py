@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from agent import stalls
-from failover.cli import picture
+from agent.worker.components import stall_watchdog
+from failover.cli.output import team_tree
 from failover.client.control import Control
 from tests.e2e import robots
 from tests.e2e.robots import NO_ANSWER, RobotMachine
@@ -42,8 +42,8 @@ def answer(robot: RobotMachine) -> Answer:
             status = agent.ask("status", team=True)
     except NO_ANSWER:
         return shown.returncode, ()
-    rows = [row.cells[: len(SHOWN)] for row in picture.rows(status)]
-    assert status["healthy"] == picture.is_healthy(status)
+    rows = [row.cells[: len(SHOWN)] for row in team_tree.rows(status)]
+    assert status["healthy"] == team_tree.is_healthy(status)
     return shown.returncode, tuple(sorted((cells[0].lstrip("└├─ "), *cells[1:]) for cells in rows if "/" in cells[0]))
 
 
@@ -81,7 +81,7 @@ def test_both_robots_answer_the_same_after_an_end(pair: Pair) -> None:
 def test_both_robots_answer_the_same_after_a_part_was_killed(pair: Pair, part: str) -> None:
     (killed,) = parts_of_it(pair[0], part)
     os.kill(killed, signal.SIGKILL)
-    robots.until(lambda: stalls.activity(killed)[0] in ("", "Z"), f"the {part} to be gone")
+    robots.until(lambda: stall_watchdog.activity(killed)[0] in ("", "Z"), f"the {part} to be gone")
     until_both_say(pair, 0, "running")
 
 

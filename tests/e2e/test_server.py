@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint import format
+from checkpoint.snapshot import format
 from failover.cli.demo.robots import RobotMachine
 from tests.e2e import robots, teams
 from tests.e2e.test_full_disk import full

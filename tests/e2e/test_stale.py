@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from agent.stalls import activity
-from agent.streams import total_of
-from checkpoint import format
-from checkpoint.linux import procfs
+from agent.guard.output_logs import total_of
+from agent.worker.components.stall_watchdog import activity
+from checkpoint.linux.procfs import procfs
+from checkpoint.snapshot import format
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_deaths import COUNT, numbers, parts

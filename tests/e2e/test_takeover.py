@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from agent.loop import LANES_SILENCE_NS, NANOSECONDS_A_SECOND
-from checkpoint.linux import procfs
-from checkpoint.linux.tracee import Tracee
+from agent.main_loop.loop import LANES_SILENCE_NS, NANOSECONDS_A_SECOND
+from checkpoint.linux.procfs import procfs
+from checkpoint.linux.trace.tracee import Tracee
 from failover.cli.demo.robots import LEASE_MS
 from failover.core.types import MS
 from tests.e2e import robots, stillness

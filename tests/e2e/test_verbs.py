@@ -17,7 +17,8 @@ from typing import Any
 
 import pytest
 
-from failover.cli import main, status
+from failover.cli import main
+from failover.cli.verbs import status
 from failover.client.control import STATUS
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine

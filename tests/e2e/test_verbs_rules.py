@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint import portable
+from checkpoint.program import cpu_baseline
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 
@@ -105,4 +105,4 @@ def test_a_portable_program_stays_so_wherever_it_goes(pair: Pair) -> None:
 
 def level(robot: RobotMachine, name: str = "count") -> str:
     pid = robots.host_pid(robot, robots.component(robot, name)["pid"])
-    return portable.level_in(Path(f"/proc/{pid}/environ").read_bytes())
+    return cpu_baseline.level_in(Path(f"/proc/{pid}/environ").read_bytes())

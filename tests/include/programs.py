@@ -9,8 +9,8 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
-from checkpoint.segment import Committed
-from checkpoint.segment_reader import SegmentReader
+from checkpoint.segment.layout import Committed
+from checkpoint.segment.reader import SegmentReader
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]

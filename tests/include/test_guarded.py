@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from checkpoint.engines.cooperative import open_segment
-from checkpoint.segment import ARRAY, PENDING, Committed, Layout, Region, address_of
-from checkpoint.segment_writer import SegmentWriter, Source
+from checkpoint.engines.cooperative.session import open_segment
+from checkpoint.segment.layout import ARRAY, PENDING, Committed, Layout, Region, address_of
+from checkpoint.segment.writer import SegmentWriter, Source
 from tests.include.programs import environment, program
 
 pytestmark = pytest.mark.compiler

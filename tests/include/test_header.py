@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint.engines.cooperative import open_segment
+from checkpoint.engines.cooperative.session import open_segment
 from checkpoint.errors import CaptureError, SegmentError
-from checkpoint.segment_reader import SegmentReader
+from checkpoint.segment.reader import SegmentReader
 from tests.include.programs import (
     STRICT,
     STRICT_CC,

@@ -19,10 +19,10 @@ pytestmark = pytest.mark.timeout(7200)
 
 ENVIRONMENT = "PYTHONPATH=/opt/site:/root/failover"
 TESTS = (
-    ("tests/checkpoint/test_processors.py", ""),
+    ("tests/checkpoint/arch/test_processors.py", ""),
     ("tests/checkpoint/test_tracees.py", "heap or registers or mappings or advice or rseq or sigwait or sigsuspend"),
-    ("tests/checkpoint/test_entered_calls.py", ""),
-    ("tests/checkpoint/test_waits.py", "relative_sleep or epoll-thread or inline or bytes"),
+    ("tests/checkpoint/linux/trace/test_syscall_reentry.py", ""),
+    ("tests/checkpoint/engines/ptrace/capture/test_eintr_syscalls.py", "relative_sleep or epoll-thread or inline or bytes"),
     ("tests/checkpoint/test_programs.py", "computes_the_same and bc"),
 )
 """Of `checkpoint`, what is seen to pass there: file and names."""

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from checkpoint import format, layout
-from checkpoint.hot_pages import Sender
 from checkpoint.model import Snapshot
+from checkpoint.snapshot import format, layout
+from checkpoint.store.xor_cache import Sender
 from tests.checkpoint.snapshots import family, history, page, runs_of, snapshot
 
 SAMPLE = Path(__file__).parent / f"version-{layout.VERSION}.snapshot"

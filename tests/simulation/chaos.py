@@ -5,7 +5,7 @@ from __future__ import annotations
 from random import Random
 from unittest.mock import patch
 
-from failover.core import speaker
+from failover.core import beat_builder
 from failover.core.types import MS, ComponentSpec, Config, Launch, OnLoss, Rule, Rules, WhenAlone
 from tests.simulation.invariants import Broken, Invariants
 from tests.simulation.liars import LIES, ROBOTS_LIES
@@ -84,7 +84,7 @@ def life(
     if robots + servers + witnesses > 2:
         configs = elective(robots, specs, servers, witnesses, lease_ms=150 if seed % HARSH else LONG_LEASE_MS)
     narrow = NARROW_BODY_SIZE + ECHO_SIZE * (len(configs) - 2)
-    with patch.object(speaker, "BODY_SIZE_MAX", speaker.BODY_SIZE_MAX if seed % NARROW else narrow):
+    with patch.object(beat_builder, "BODY_SIZE_MAX", beat_builder.BODY_SIZE_MAX if seed % NARROW else narrow):
         return _live(seed, random, configs, specs, faults, liars=liars)
 
 

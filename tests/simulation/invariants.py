@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 from checkpoint.model import Position
 from failover.core import acts
-from failover.core.messages import ORDERED, Beat
 from failover.core.types import ENDED, MS, Ballot, ComponentView, OnLoss, Resumption, State, WhenAlone
+from failover.core.wire.messages import ORDERED, Beat
 from tests.simulation.deeds import epoch_of
 from tests.simulation.liars import INVENTED_NAME
 from tests.simulation.robots import NewDisk, ballot_of

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec.structs import replace
 
-from failover.core.consent import STATES
-from failover.core.messages import FREE, OPEN, ORDERED, STARTS, WANTS, Beat, Echo, Entry
+from failover.core.election.consent import STATES
 from failover.core.types import COMPONENTS_MAX, EPOCH_MAX, State
-from failover.core.wire import BODY_SIZE_MAX, beat_size
+from failover.core.wire.codec import BODY_SIZE_MAX, beat_size
+from failover.core.wire.messages import FREE, OPEN, ORDERED, STARTS, WANTS, Beat, Echo, Entry
 
 if TYPE_CHECKING:
     from tests.simulation.world import World

@@ -9,24 +9,14 @@ from unittest.mock import patch
 
 from msgspec.structs import replace
 
-from failover.core import (
-    acts,
-    archive,
-    contest,
-    election,
-    endings,
-    handover,
-    lease,
-    majority,
-    node,
-    replication,
-    testimony,
-    warmth,
-)
+from failover.core import acts, node, peer_claims
 from failover.core.component import Component, Turn
+from failover.core.election import lease, majority, pair, votes
 from failover.core.membership import UNREAD_NS, Membership, Peer
-from failover.core.messages import Entry
+from failover.core.replication import servers, standby, warm_standby
+from failover.core.transitions import exits, handover
 from failover.core.types import Config, State
+from failover.core.wire.messages import Entry
 
 Mutant = Callable[[], Any]
 
@@ -58,22 +48,22 @@ def forgetful_ballot() -> Any:
 
 def deaf_to_stale() -> Any:
     """A primary does not give up to a higher epoch."""
-    return patch.object(election, "stronger", lambda *_: False)
+    return patch.object(pair, "stronger", lambda *_: False)
 
 
 def everybody_yields() -> Any:
     """Of two claims both give up: nobody decides."""
-    return patch.object(election, "stronger", lambda *_: True)
+    return patch.object(pair, "stronger", lambda *_: True)
 
 
 def no_consent() -> Any:
     """A claim goes on without waiting for anybody."""
-    return patch.object(election, "_consented", lambda *_: True)
+    return patch.object(pair, "_consented", lambda *_: True)
 
 
 def nobody_needs_the_right() -> Any:
     """Under freeze anybody thinks that it may act alone."""
-    return patch.object(election, "_right_to_act_alone", lambda *_: True)
+    return patch.object(pair, "_right_to_act_alone", lambda *_: True)
 
 
 def secret_trust() -> Any:
@@ -88,42 +78,42 @@ def oldest_checkpoint() -> Any:
 
 def early_acknowledgement() -> Any:
     """The keeper is told of a checkpoint when it is sent, not when it is stored."""
-    honest = replication.captured
+    honest = standby.captured
 
     def hasty(component: Component, turn: Turn, event: Any) -> None:
         honest(component, turn, event)
         if component.flight is not None and component.flight.position == event.position:
             turn.order(acts.Acknowledge(component.name, component.epoch, event.position, True))
 
-    return patch.object(replication, "captured", hasty)
+    return patch.object(standby, "captured", hasty)
 
 
 def shown_when_stored() -> Any:
     """Readers see the output of a snapshot as soon as it is stored, whether or not the rules have accepted it."""
-    honest = replication.stored
+    honest = standby.stored
 
     def hasty(component: Component, turn: Turn, event: Any) -> None:
         turn.order(acts.Show(component.name, component.epoch, event.position))
         honest(component, turn, event)
 
-    return patch.object(replication, "stored", hasty)
+    return patch.object(standby, "stored", hasty)
 
 
 def shown_when_accepted() -> Any:
     """Under majority readers see what their robot has accepted, though the primary has not acknowledged it."""
-    honest = replication.stored
+    honest = standby.stored
 
     def hasty(component: Component, turn: Turn, event: Any) -> None:
         honest(component, turn, event)
         if event.position in component.held:
             component.vouched = event.position
 
-    return patch.object(replication, "stored", hasty)
+    return patch.object(standby, "stored", hasty)
 
 
 def no_base_for_the_lost() -> Any:
     """A delta is sent although the standby does not have its parent."""
-    honest = replication._standby_entry
+    honest = standby._standby_entry
 
     def blind(component: Component, turn: Turn) -> Entry | None:
         entry = honest(component, turn)
@@ -132,7 +122,7 @@ def no_base_for_the_lost() -> Any:
         parent = component.parent
         return Entry(entry.name, entry.state, entry.epoch, entry.primary, parent.generation, parent.sequence, parent.digest)
 
-    return patch.object(replication, "_standby_entry", blind)
+    return patch.object(standby, "_standby_entry", blind)
 
 
 def guard_unaware() -> Any:
@@ -142,29 +132,29 @@ def guard_unaware() -> Any:
 
 def same_epoch_again() -> Any:
     """A takeover does not open a new epoch."""
-    honest = election.claim
+    honest = pair.claim
 
     def claim(component: Component, turn: Turn, plan: Any, why: str, *, is_planned: bool = False) -> None:
         if component.epoch:
             component.epoch, component.seen = component.epoch - 1, 0
         honest(component, turn, plan, why, is_planned=is_planned)
 
-    return patch.object(election, "claim", claim), patch.object(contest, "claim", claim)
+    return patch.object(pair, "claim", claim), patch.object(votes, "claim", claim)
 
 
 def runs_the_finished() -> Any:
     """The standby does not take the record of an end."""
-    return patch.object(election, "heard_end", lambda *_: None), patch.object(contest, "heard_end", lambda *_: None)
+    return patch.object(pair, "heard_end", lambda *_: None), patch.object(votes, "heard_end", lambda *_: None)
 
 
 def crash_is_the_end() -> Any:
     """After a crash nobody resumes the program, and nobody says that it failed."""
-    return patch.object(endings, "_recover", lambda *_: None)
+    return patch.object(exits, "_recover", lambda *_: None)
 
 
 def rewinds_at_reunion() -> Any:
     """Of two copies that met again the one with the higher epoch stays, also where the other one never stopped acting."""
-    return patch.object(election, "_never_stopped", lambda *_: False)
+    return patch.object(pair, "_never_stopped", lambda *_: False)
 
 
 def never_stopped_though_it_stood() -> Any:
@@ -174,7 +164,7 @@ def never_stopped_though_it_stood() -> Any:
 
 def claims_at_boot() -> Any:
     """A robot that has just started claims what another one ran, though it has not heard that robot yet."""
-    return patch.object(election, "waits_after_boot_ns", lambda *_: 0)
+    return patch.object(pair, "waits_after_boot_ns", lambda *_: 0)
 
 
 def takes_the_unreadable_for_silence() -> Any:
@@ -200,13 +190,13 @@ def waits_in_spite_of_the_order() -> Any:
 
 def forgets_the_order() -> Any:
     """Where two copies meet again, that one of them was promoted counts for nothing."""
-    return patch.object(election, "_outlasts", election._never_stopped)
+    return patch.object(pair, "_outlasts", pair._never_stopped)
 
 
 def remembers_the_order_for_ever() -> Any:
     """A copy that was promoted once is not protected by having acted all the time."""
     return patch.object(
-        election, "_outlasts", lambda component, entry: not component.ordered and election._never_stopped(component, entry)
+        pair, "_outlasts", lambda component, entry: not component.ordered and pair._never_stopped(component, entry)
     )
 
 
@@ -222,39 +212,39 @@ def no_grace() -> Any:
 
 def blind_to_the_better() -> Any:
     """Whoever holds a checkpoint claims, although another robot holds a newer one."""
-    return patch.object(election, "living_entries", lambda *_: [])
+    return patch.object(pair, "living_entries", lambda *_: [])
 
 
 def loyal_to_the_lost() -> Any:
     """A standby that died is not replaced by another one."""
-    honest = replication.choose_standby
+    honest = standby.choose_standby
 
     def loyal(component: Component, turn: Turn) -> None:
         if not component.standby:
             honest(component, turn)
 
-    return patch.object(replication, "choose_standby", loyal)
+    return patch.object(standby, "choose_standby", loyal)
 
 
 def tireless_giver() -> Any:
     """A checkpoint that was not taken is offered again at once, and again."""
-    honest = replication.ship_ended
+    honest = standby.ship_ended
 
     def hasty(component: Component, turn: Turn, event: Any) -> None:
         honest(component, turn, event)
         component.due_ns = turn.now_ns
 
-    return patch.object(replication, "ship_ended", hasty)
+    return patch.object(standby, "ship_ended", hasty)
 
 
 def forgets_what_it_ran() -> Any:
     """A robot consents to another's claim of an epoch under which it has run the component, and the other does not notice."""
-    honest = election._may_switch
+    honest = pair._may_switch
 
     def generous(component: Component, turn: Turn, sender: str, entry: Entry) -> bool:
         return component.primary == turn.me or honest(component, turn, sender, entry)
 
-    return patch.object(election, "_may_switch", generous), patch.object(election, "_is_taken", lambda *_: False)
+    return patch.object(pair, "_may_switch", generous), patch.object(pair, "_is_taken", lambda *_: False)
 
 
 def waits_for_ever() -> Any:
@@ -264,13 +254,13 @@ def waits_for_ever() -> Any:
         if component.waiting is None:
             honest(component, turn)
 
-    honest = warmth.review
-    return patch.object(warmth, "review", stubborn)
+    honest = warm_standby.review
+    return patch.object(warm_standby, "review", stubborn)
 
 
 def waits_where_it_may_not_run() -> Any:
     """A program waits also where it was told to be held only, or where somebody else is entrusted."""
-    return patch.object(warmth, "_wanted", lambda component: component.spec)
+    return patch.object(warm_standby, "_wanted", lambda component: component.spec)
 
 
 # Mistakes in the rule ``majority``
@@ -314,14 +304,14 @@ def anybody_may_have_it() -> Any:
 
 def named_in_advance() -> Any:
     """A standby is named before it holds what was acknowledged."""
-    honest = replication.choose_standby
+    honest = standby.choose_standby
 
     def hasty(component: Component, turn: Turn) -> None:
         honest(component, turn)
         if component.standby:
             component.entrusted = (component.standby,)
 
-    return patch.object(replication, "choose_standby", hasty)
+    return patch.object(standby, "choose_standby", hasty)
 
 
 def best_lease_counts() -> Any:
@@ -374,17 +364,17 @@ def generous_lease() -> Any:
 
 def proud_primary() -> Any:
     """A primary without a lease gives up to nobody."""
-    return patch.object(contest, "lose", lambda *_: None)
+    return patch.object(votes, "lose", lambda *_: None)
 
 
 def humble_primary() -> Any:
     """A primary without a lease gives up to whoever has a later epoch, also to an old copy that nobody elected."""
-    return patch.object(contest, "_prevails", lambda component, turn, sender, entry: entry.epoch > component.epoch)
+    return patch.object(votes, "_prevails", lambda component, turn, sender, entry: entry.epoch > component.epoch)
 
 
 def claims_for_ever() -> Any:
     """A claim that was split is never withdrawn."""
-    return patch.object(contest, "withdraw", lambda *_: None)
+    return patch.object(votes, "withdraw", lambda *_: None)
 
 
 def forgotten_votes() -> Any:
@@ -400,7 +390,7 @@ def never_deaf() -> Any:
 
 def no_pre_vote() -> Any:
     """A robot claims without asking whether anybody would vote for it."""
-    return patch.object(majority, "may_claim", lambda *_: True), patch.object(contest, "vacant", lambda *_: True)
+    return patch.object(majority, "may_claim", lambda *_: True), patch.object(votes, "vacant", lambda *_: True)
 
 
 def unfinished_business() -> Any:
@@ -410,8 +400,8 @@ def unfinished_business() -> Any:
 
 def miserly_server() -> Any:
     """A server gives nothing back."""
-    honest = archive._heir
-    return patch.object(archive, "_heir", lambda component, turn: honest(component, turn) if turn.config.runs(turn.me) else "")
+    honest = servers._heir
+    return patch.object(servers, "_heir", lambda component, turn: honest(component, turn) if turn.config.runs(turn.me) else "")
 
 
 # Mistakes in whom to believe
@@ -424,37 +414,37 @@ def no_roles() -> Any:
 
 def believes_every_word() -> Any:
     """No entry is looked at before the rules see it."""
-    return patch.object(testimony.Testimony, "take", lambda _, beat, *__: (beat, frozenset()))
+    return patch.object(peer_claims.Testimony, "take", lambda _, beat, *__: (beat, frozenset()))
 
 
 def believes_any_epoch() -> Any:
     """The words of others raise an epoch without bound."""
-    return patch.object(testimony, "epoch_max", lambda *_: 1 << 62)
+    return patch.object(peer_claims, "epoch_max", lambda *_: 1 << 62)
 
 
 def deaf_to_denial() -> Any:
     """What is told of a robot counts, although that robot lives and says otherwise."""
-    return patch.object(testimony, "_denier", lambda *_: "")
+    return patch.object(peer_claims, "_denier", lambda *_: "")
 
 
 def gives_up_to_any_end() -> Any:
     """A copy that acts is stopped when anybody tells of an end."""
-    return patch.object(contest, "_heard_end", election.heard_end), patch.object(election, "_acted_all_along", lambda *_: False)
+    return patch.object(votes, "_heard_end", pair.heard_end), patch.object(pair, "_acted_all_along", lambda *_: False)
 
 
 def waits_for_every_server() -> Any:
     """A standby waits for what a server says to have, however long."""
-    return patch.object(contest, "_waits_for_a_server", lambda component, turn, mine, best: best is not None and mine < best)
+    return patch.object(votes, "_waits_for_a_server", lambda component, turn, mine, best: best is not None and mine < best)
 
 
 def never_mind_who_repeats() -> Any:
     """The word of a witness that something has ended keeps a majority from running it."""
-    return patch.object(election, "_is_not_ended", lambda *_: False)
+    return patch.object(pair, "_is_not_ended", lambda *_: False)
 
 
 def forgets_weeks() -> Any:
     """A robot that was away believes no more epochs than can have passed since it is back."""
-    return patch.object(testimony, "EPOCHS_AWAY_MAX", 0)
+    return patch.object(peer_claims, "EPOCHS_AWAY_MAX", 0)
 
 
 SPOILERS: tuple[tuple[Mutant, str], ...] = (

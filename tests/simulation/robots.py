@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from checkpoint.model import Position
-from failover.core import wire
-from failover.core.ballot import decode
+from failover.core.event_log.decisions import Decision
 from failover.core.events import Event
 from failover.core.node import Node
-from failover.core.story import Decision
 from failover.core.types import MS, Ballot, Config, Launch
+from failover.core.vote_record import decode
+from failover.core.wire import codec
 from tests.simulation.liars import Lie
 
 TEAM = "simulated"
@@ -91,7 +91,7 @@ class Robot:
     unheld: set[str] = field(default_factory=set)
     warm: dict[str, Launch] = field(default_factory=dict)
     inbox: list[Event] = field(default_factory=list)
-    receiver: wire.Receiver = field(default_factory=lambda: wire.Receiver(TEAM))
+    receiver: codec.Receiver = field(default_factory=lambda: codec.Receiver(TEAM))
     read: set[str] = field(default_factory=set)
     unread_ns: dict[str, int] = field(default_factory=dict)
     life: int = 0

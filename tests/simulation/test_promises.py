@@ -1,4 +1,4 @@
-"""Each sentence that ``failover status`` says of the rule in force (``failover/core/promise.py``), held against what happens."""
+"""Each promise that ``failover status`` states (``failover/core/status/guarantee.py``), held against what happens."""
 
 from __future__ import annotations
 

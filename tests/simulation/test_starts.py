@@ -8,8 +8,8 @@ from random import Random
 import pytest
 from msgspec.structs import replace
 
-from failover.core.names import weight
 from failover.core.types import MS, ComponentSpec, Config, Launch, Rule, State
+from failover.core.wire.names import weight
 from tests.simulation.invariants import Invariants, seen_at, state_at
 from tests.simulation.teams import elective, pair
 from tests.simulation.world import World

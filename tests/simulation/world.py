@@ -15,17 +15,12 @@ from random import Random
 from msgspec.structs import replace
 
 from checkpoint.model import Position
-from failover.core import acts, wire
-from failover.core.ballot import decode, encode
-from failover.core.events import (
-    Event,
-    Exited,
-    Received,
-    Tick,
-    Unread,
-)
+from failover.core import acts
+from failover.core.events import Event, Exited, Received, Tick, Unread
 from failover.core.node import Node
 from failover.core.types import MS, Ballot, Config, Found, Held
+from failover.core.vote_record import decode, encode
+from failover.core.wire import codec
 from tests.simulation.deeds import Deeds
 from tests.simulation.liars import fitting
 from tests.simulation.robots import KEEPS_STATE, KEY, TEAM, Clock, Network, NewDisk, Program, Robot
@@ -112,7 +107,7 @@ class World:
             return
         robot.boot += 1
         robot.life += 1
-        robot.inbox, robot.busy, robot.receiver = [], False, wire.Receiver(TEAM)
+        robot.inbox, robot.busy, robot.receiver = [], False, codec.Receiver(TEAM)
         robot.read.clear()
         robot.unread_ns.clear()
         robot.admitted.clear()
@@ -282,7 +277,7 @@ class World:
             for other in self.robots.values():
                 if other is not robot:
                     said = fitting(robot.lie(self, beat, other.name)) if robot.lie is not None else beat
-                    self._transmit(robot.name, other, wire.seal(said, TEAM, KEY + robot.name.encode()))
+                    self._transmit(robot.name, other, codec.seal(said, TEAM, KEY + robot.name.encode()))
         for act in ready.act:
             self._tell(robot.name, act)
             self._deeds.carry_out(robot, act)
@@ -321,6 +316,6 @@ class World:
             self.feed(robot, self._unread(sender, robot))
             return
         beat = robot.receiver.open(frame)
-        if not isinstance(beat, wire.Refused):
+        if not isinstance(beat, codec.Refused):
             robot.read.add(sender)
             self.feed(robot, Received(beat, "wire"))

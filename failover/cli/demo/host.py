@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NoReturn
 
-from checkpoint.linux import namespaces
+from checkpoint.linux.spawn import namespaces
 
 PR_SET_CHILD_SUBREAPER: Final = 36  # linux/prctl.h
 

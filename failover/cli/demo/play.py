@@ -14,13 +14,13 @@ from typing import Any, Final
 
 from msgspec import Struct, field
 
-from failover.cli import picture, render
 from failover.cli.demo import programs, robots
 from failover.cli.demo.interruption import Interruption
 from failover.cli.demo.programs import Program
 from failover.cli.demo.robots import RobotMachine, Stage
 from failover.cli.demo.screen import LiveScreen, PlainScreen
 from failover.cli.demo.watch import Watcher, whole_output
+from failover.cli.output import render, team_tree
 from failover.client.control import Control
 from failover.errors import FailoverError
 
@@ -209,8 +209,8 @@ class Play:
         """Every tenth snapshot is worth a line; the table shows them all."""
         if act.snapshots and act.snapshots >= self._told.get(act.program.name, 0):
             self._told[act.program.name] = act.snapshots - act.snapshots % 10 + 10
-            size, freeze = picture.size(component.get("snapshot_size")), picture.microseconds(component.get("freeze_us"))
-            lag = picture.milliseconds(component.get("lag_ms"))
+            size, freeze = team_tree.size(component.get("snapshot_size")), team_tree.microseconds(component.get("freeze_us"))
+            lag = team_tree.milliseconds(component.get("lag_ms"))
             what = f"snapshot {act.snapshots} of {act.program.title} has arrived at {self._standby.name}"
             self._screen.say(f"{what}: {size}, freeze {freeze}, lag {lag}")
 
@@ -270,7 +270,7 @@ class Play:
             act.size = len(output)
             act.equal = output == expected and act.exit_status == act.reference.returncode == 0
             verdict = "equal, byte for byte, to an undisturbed run" if act.equal else difference(output, expected, act)
-            ending = "–" if act.exit_status is None else picture.ending(act.exit_status)
+            ending = "–" if act.exit_status is None else team_tree.ending(act.exit_status)
             self._screen.say(f"{act.program.title} has ended ({ending}); its {act.size} bytes of output are {verdict}")
 
     def end_references(self) -> None:
@@ -301,9 +301,9 @@ class Play:
                     robot,
                     str(component.get("state") or ""),
                     str(act.snapshots),
-                    picture.milliseconds(component.get("lag_ms")),
-                    picture.microseconds(component.get("freeze_us")),
-                    picture.size(watcher.size),
+                    team_tree.milliseconds(component.get("lag_ms")),
+                    team_tree.microseconds(component.get("freeze_us")),
+                    team_tree.size(watcher.size),
                     watcher.last[:48],
                 )
             )
@@ -316,7 +316,7 @@ def _bear(act: Act, component: dict[str, Any]) -> None:
     Raises:
         FailoverError: it has failed, or has been degraded for longer than `DEGRADED_S`.
     """
-    if component["state"] not in picture.BAD_STATES:
+    if component["state"] not in team_tree.BAD_STATES:
         act.degraded_s = None
         return
     now = time.monotonic()
@@ -335,7 +335,7 @@ def _still_runs(act: Act, component: dict[str, Any], when: str) -> None:
         return
     status = component.get("exit_status")
     if status:
-        raise FailoverError(f"{act.program.name} came to an end {when}: {picture.ending(status)}")
+        raise FailoverError(f"{act.program.name} came to an end {when}: {team_tree.ending(status)}")
     raise EndedEarlyError(f"{act.program.title} came to its end {when}: {act.snapshots} snapshots of it had arrived")
 
 
@@ -375,10 +375,10 @@ def result_line(act: Act) -> tuple[str, ...]:
     freezes = list(act.freezes_us.values())
     return (
         act.program.title,
-        picture.milliseconds(act.outage_ms),
-        picture.milliseconds(act.lag_ms),
-        picture.microseconds(statistics.median(freezes) if freezes else None),
-        picture.microseconds(max(freezes, default=None)),
+        team_tree.milliseconds(act.outage_ms),
+        team_tree.milliseconds(act.lag_ms),
+        team_tree.microseconds(statistics.median(freezes) if freezes else None),
+        team_tree.microseconds(max(freezes, default=None)),
         f"{act.size} bytes",
         "yes" if act.equal else "NO",
     )

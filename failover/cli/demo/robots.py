@@ -21,12 +21,12 @@ from typing import Any, Final
 
 from msgspec import Struct
 
-from failover.cli import keys
+from failover.cli import key_pairs
 from failover.cli.demo.host import descendants
 from failover.cli.demo.interruption import Interruption
-from failover.client import team
 from failover.client.control import Control
-from failover.client.team import Robot, Team
+from failover.config import team
+from failover.config.team import Robot, Team
 from failover.errors import FailoverError, LostAgentError, NoAgentError
 
 NAMES: Final = ("robot1", "robot2")
@@ -53,7 +53,7 @@ LAST_LINES: Final = 5
 """Of an agent's log, shown when something goes wrong."""
 
 GUARDS_CGROUP: Final = "failover-"
-"""How the names of the guards' cgroups begin (`agent.freezer`)."""
+"""How the names of the guards' cgroups begin (`agent.guard.freezer`)."""
 
 GO: Final = b"g"
 """What a host waits for before it starts its agent."""
@@ -265,7 +265,7 @@ class Stage:
         ports = [7420, 7421, 7420, 7421] if self.means.own_network else free_ports(4)
         members = Team("demo")
         for index, name in enumerate(NAMES):
-            public, secret = keys.new_pair()
+            public, secret = key_pairs.new_pair()
             directory = self.directory / name / "team"
             directory.mkdir(parents=True)
             team.write_secret_key(directory, name, secret)
@@ -331,7 +331,7 @@ def ip_inside(robot: RobotMachine, *words: str) -> list[str]:
 
 def agent_command(config: Path) -> list[str]:
     """The command line of an agent."""
-    return [sys.executable, "-m", "agent.lean", "agent.main", "--config", str(config)]
+    return [sys.executable, "-m", "agent.system.child_main", "agent.main", "--config", str(config)]
 
 
 def wait_for_network(robot: RobotMachine) -> None:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from failover.cli import render
+from failover.cli.output import render
 
 COLUMNS: Final = ("program", "runs on", "state", "snapshots", "lag", "freeze", "output", "newest line")
 

@@ -26,21 +26,22 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from agent.bounds import check_rights
-from checkpoint import authors, format, rights
-from checkpoint.carried import Entry, Tree
-from checkpoint.chain import position_of
-from checkpoint.channel import Restore, Restored, Resume, Resumed
+from agent.worker.components.restore_limits import check_rights
 from checkpoint.errors import AuthorError, CheckpointError
-from checkpoint.linux import kinship, procfs
-from checkpoint.linux.inheritance import Inheritance
-from checkpoint.linux.vessel import Birth, discard, spawn_vessel
+from checkpoint.keeper.messages import Restore, Restored, Resume, Resumed
+from checkpoint.linux import file_author
+from checkpoint.linux.procfs import descendants, procfs
+from checkpoint.linux.spawn.inherited_limits import Inheritance
+from checkpoint.linux.spawn.vessel import Birth, discard, spawn_vessel
 from checkpoint.model import Credentials, Fact, Member, Resource, Snapshot
-from checkpoint.rights import Owner
-from checkpoint.state import decode_state, encode_state
-from failover.cli.keeper import Keeper
-from tests.failover.cli.test_oneshot import has_ended, wait_for
+from checkpoint.snapshot import credentials, format
+from checkpoint.snapshot.canonical_state import decode_state, encode_state
+from checkpoint.snapshot.carried_files import Entry, Tree
+from checkpoint.snapshot.credentials import Owner
+from checkpoint.store.chain import position_of
+from failover.cli.keeper_client import Keeper
 from tests.failover.cli.test_verbs import failover
+from tests.failover.cli.verbs.test_one_shot import has_ended, wait_for
 
 pytestmark = [pytest.mark.root, pytest.mark.command("sleep"), pytest.mark.command("setpriv")]
 
@@ -100,7 +101,7 @@ class Back:
 
     @property
     def pids(self) -> tuple[int, ...]:
-        return (self.pid, *kinship.component(self.pid)) if self.pid else ()
+        return (self.pid, *descendants.component(self.pid)) if self.pid else ()
 
     def end(self) -> None:
         for pid in reversed(self.pids):
@@ -237,7 +238,7 @@ ASKED: Mapping[str, tuple[Craft, str]] = {
     "rights of a thread": (
         lambda one: with_resource(
             ordinary(one),
-            rights.KIND,
+            credentials.KIND,
             threads=[[one.threads[0].tid, [0] * 4, [0] * 4, [0], list(CAPABLE), False]],
         ),
         "uid 0",
@@ -315,7 +316,7 @@ def test_an_ordinary_user_gets_by_no_file_more_than_he_has(field: str, honest: S
 
 
 ROOTS_TO_GIVE = ("nice", "policy", "an OOM score", "Max ", "the login")
-"""What root gives to ordinary programs while they run, and what an agent therefore gives back (`agent.bounds`)."""
+"""What root gives to ordinary programs while they run, and what an agent gives back (`restore_limits`)."""
 
 
 def given_by_an_agent(crafted: Snapshot, file: Path) -> list[str]:
@@ -366,11 +367,11 @@ def test_what_asks_for_no_more_than_its_owner_has_is_not_talked_about(honest: Sn
 
 def test_the_groups_are_those_of_the_owners_account(honest: Snapshot, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = replace(honest.process.credentials, gids=(6, 6, 6, 6), groups=(0, 6, 7))
-    left = rights.at_most(asked, Owner(OWNER, 5, (5, 6)))
+    left = credentials.at_most(asked, Owner(OWNER, 5, (5, 6)))
     assert (left.uids, left.gids, left.groups) == ((OWNER,) * 4, (6,) * 4, (6,))
-    assert rights.at_most(replace(asked, gids=(0,) * 4), Owner(OWNER, 5, (5, 6))).gids == (5,) * 4
-    assert authors.account_of(0).groups is not None
-    assert authors.account_of(OWNER) == Owner(OWNER, NO_GROUP, ())
+    assert credentials.at_most(replace(asked, gids=(0,) * 4), Owner(OWNER, 5, (5, 6))).gids == (5,) * 4
+    assert file_author.account_of(0).groups is not None
+    assert file_author.account_of(OWNER) == Owner(OWNER, NO_GROUP, ())
 
 
 @pytest.mark.parametrize("trusted", [False, True])
@@ -485,7 +486,7 @@ def judged(path: Path | str, file: Path | None = None) -> int | None:
     """
     descriptor = os.open(file or path, os.O_RDONLY)
     try:
-        owner = authors.author_of(descriptor, str(path)).owner
+        owner = file_author.author_of(descriptor, str(path)).owner
         return owner.uid if owner is not None else 0
     except AuthorError:
         return None
@@ -578,7 +579,7 @@ def test_what_has_no_owner_is_nobodys_word(place: Path, file: Path) -> None:
 
 
 def test_owners_on_a_mount_without_set_user_id_prove_nothing(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(authors.mounts, "type_of_mount", lambda pid, path: "fuse.sshfs")
+    monkeypatch.setattr(file_author.mounts, "type_of_mount", lambda pid, path: "fuse.sshfs")
     assert judged(file) == 0
     real = os.fstatvfs
 
@@ -587,7 +588,7 @@ def test_owners_on_a_mount_without_set_user_id_prove_nothing(file: Path, monkeyp
 
     monkeypatch.setattr(os, "fstatvfs", lambda descriptor: Seen() if descriptor else real(descriptor))
     assert judged(file) is None
-    monkeypatch.setattr(authors.mounts, "type_of_mount", lambda pid, path: "tmpfs")
+    monkeypatch.setattr(file_author.mounts, "type_of_mount", lambda pid, path: "tmpfs")
     assert judged(file) == 0
 
 
@@ -677,5 +678,5 @@ def test_whatever_a_peer_sends_an_agent_gives_no_more_than_the_owner_has(seed: i
 def with_sample_resources(honest: Snapshot) -> Snapshot:
     """With something of the kinds that have rights to tell of."""
     thread: list[Fact] = [honest.threads[0].tid, [0] * 4, [0] * 4, [0], list(CAPABLE), False]
-    told = with_resource(with_resource(honest, rights.KIND, threads=[thread]), "logins", user=OWNER, session=1)
+    told = with_resource(with_resource(honest, credentials.KIND, threads=[thread]), "logins", user=OWNER, session=1)
     return with_file(told, "/proc/self/status", os.O_RDONLY, "kernel_files")

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from failover.cli import components, main
+from failover.cli import main
+from failover.cli.verbs import components
 from failover.errors import NoAgentError
 
 

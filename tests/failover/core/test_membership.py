@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from failover.core.consent import STATES
+from failover.core.election.consent import STATES
 from failover.core.events import Received, Tick
 from failover.core.membership import UNSTEADY_BEATS, Membership
-from failover.core.messages import Beat, Entry
 from failover.core.node import Node
 from failover.core.types import MS, Ballot, Config, State
+from failover.core.wire.messages import Beat, Entry
 
 PAIR = Config("robot1", ("robot2",), beat_ms=10, lease_ms=100)
 LOYALTY_MS = PAIR.loyalty_ns // MS

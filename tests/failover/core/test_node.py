@@ -8,9 +8,9 @@ import pytest
 from msgspec.structs import replace
 
 from checkpoint.model import Position
-from failover.core import acts, ballot
+from failover.core import acts, vote_record
 from failover.core.component import TABLE, Cause
-from failover.core.consent import STATES
+from failover.core.election.consent import STATES
 from failover.core.events import (
     Captured,
     CaptureFailed,
@@ -31,9 +31,9 @@ from failover.core.events import (
     Unchanged,
 )
 from failover.core.membership import Peer
-from failover.core.messages import Beat, Echo, Entry
 from failover.core.node import Node
 from failover.core.types import MS, Ballot, ComponentSpec, Config, Held, Launch, OnUnsupported, Record, Rules, State
+from failover.core.wire.messages import Beat, Echo, Entry
 from failover.errors import RulesError
 
 SPEC = ComponentSpec("/lab/x", launch=Launch(("x",)))
@@ -59,10 +59,10 @@ def test_the_ballot_holds_the_claim_that_the_same_step_tells_of() -> None:
 
 def test_a_ballot_survives_its_bytes() -> None:
     written = Ballot((Record("/lab/x", 3, "robot1", State.PRIMARY, ("robot2",), spec=SPEC),))
-    assert ballot.decode(ballot.encode(written)) == written
-    assert ballot.decode(b"") == Ballot()
+    assert vote_record.decode(vote_record.encode(written)) == written
+    assert vote_record.decode(b"") == Ballot()
     with pytest.raises(RulesError, match="cannot read the ballot"):
-        ballot.decode(b"{")
+        vote_record.decode(b"{")
 
 
 def test_an_event_of_an_older_epoch_changes_nothing() -> None:

@@ -8,11 +8,11 @@ import pytest
 
 from checkpoint.model import Position
 from failover.core import acts
-from failover.core.consent import STATES
+from failover.core.election.consent import STATES
 from failover.core.events import Captured, CaptureFailed, Event, Received, Run, Started, Tick
-from failover.core.messages import Beat, Echo, Entry
 from failover.core.node import Node
 from failover.core.types import MS, Ballot, ComponentSpec, Config, Launch, State
+from failover.core.wire.messages import Beat, Echo, Entry
 
 PART = "/lab/x"
 BEAT_MS = 20

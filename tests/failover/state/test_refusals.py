@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from checkpoint import segment
+from checkpoint.segment import layout
 from failover.errors import FailoverError, FitError, KeepError, SchemaError, StateError, StateFormatError
 from failover.state import MISSING, Field, Formerly, Pickled, Schema
 from failover.state.wire import DATA_SIZE_MAX, DEPTH_MAX, NAME_SIZE_MAX, REGION_COUNT_MAX
@@ -266,13 +266,13 @@ def test_a_state_that_is_too_large_besides_its_arrays_is_refused() -> None:
 
 
 def test_too_many_arrays_are_refused() -> None:
-    assert REGION_COUNT_MAX == segment.MAX_REGIONS - 1
+    assert REGION_COUNT_MAX == layout.MAX_REGIONS - 1
     with pytest.raises(KeepError, match=rf"kept\[{REGION_COUNT_MAX}\]: more than {REGION_COUNT_MAX} arrays of 4096 bytes"):
         Schema.of(list[bytes], name="kept").encode([bytes(4096)] * (REGION_COUNT_MAX + 1))
 
 
 def test_an_array_at_too_long_a_path_is_refused_by_it() -> None:
-    assert NAME_SIZE_MAX == segment.MAX_NAME_SIZE
+    assert NAME_SIZE_MAX == layout.MAX_NAME_SIZE
     value: dict[str, Any] = {"x": np.zeros(1000)}
     for _ in range(50):
         value = {"x": value}

@@ -1,0 +1,114 @@
+"""From the operator's configuration to the core's: the two speak the same words in different types."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from msgspec.structs import replace
+
+from agent.config import ComponentConfig, Config, Settings
+from checkpoint.device_rules import arrived, merged
+from checkpoint.engine import Carry, Terms
+from checkpoint.program import cpu_baseline
+from checkpoint.store.retention import Retention
+from failover.config.quantities import size_bytes, span_ms
+from failover.core import types
+from failover.core.types import CARRY, Launch, OnCrash, OnLoss, OnUnsupported, Rule, Rules, WhenAlone
+
+NO_LEVEL: Final = "no"
+"""Of ``failover run --portable``: whatever this processor has, whatever the operator says."""
+
+
+def node_config(settings: Settings) -> types.Config:
+    """What the node is told at birth.
+
+    Raises:
+        RulesError: the values contradict each other.
+    """
+    config = settings.config
+    return types.Config(
+        robot=config.robot,
+        peers=tuple(sorted(settings.peers)),
+        beat_ms=config.beat_ms,
+        lease_ms=config.lease_ms,
+        rule=_rule(settings),
+        servers=_members(settings, "server"),
+        witnesses=_members(settings, "witness"),
+        patience_ms=config.patience_s * 1_000,
+        boot_patience_ms=config.boot_patience_s * 1_000,
+    )
+
+
+def retention(config: Config) -> Retention:
+    """What the store keeps for people."""
+    size_max = size_bytes(config.keep_size) if config.keep_size else 0
+    return Retention(config.keep_checkpoints, span_ms(config.keep_for) // 1_000, size_max)
+
+
+def _rule(settings: Settings) -> Rule:
+    if settings.config.rule == "auto":
+        return Rule.MAJORITY if len(settings.team.robots) > 2 else Rule.PAIR
+    return Rule(settings.config.rule)
+
+
+def _members(settings: Settings, role: str) -> tuple[str, ...]:
+    return tuple(sorted(name for name, member in settings.team.robots.items() if member.role == role))
+
+
+def rules_for(config: Config, component: ComponentConfig) -> Rules:
+    """The rules of one component: its own table, the agent's defaults behind it."""
+    return Rules(
+        period_ms=component.snapshot_period_ms or config.snapshot_period_ms,
+        on_loss=OnLoss(component.on_loss),
+        on_crash=OnCrash(component.on_crash),
+        when_alone=WhenAlone(config.when_alone),
+        on_unsupported=OnUnsupported(component.on_unsupported),
+        prefer=component.prefer,
+        standby=component.standby,
+    )
+
+
+def level_of(wanted: str, config: Config, component: ComponentConfig) -> str:
+    """The level of processors that a program is started for; "" for whatever this one has.
+
+    A level of another kind of processor means the usual one of this kind: a mixed team has the same words everywhere.
+
+    Args:
+        wanted: of ``failover run``: a level, "no", or "" for what this robot's operator says.
+    """
+    said: bool | str = wanted or (config.portable if component.portable == "" else component.portable)
+    if isinstance(said, bool):
+        return cpu_baseline.DEFAULT if said else ""
+    if said in ("", NO_LEVEL):
+        return ""
+    return said if said in cpu_baseline.LEVELS else cpu_baseline.DEFAULT
+
+
+def terms_here(launch: Launch | None, component: ComponentConfig) -> Terms:
+    """On which terms a component comes back on this robot: what travels with it, and this robot's own, which comes in its place.
+
+    Which files it carries its snapshots say.
+    """
+    carry = Carry(size_max=size_bytes(component.carry_limit), places=tuple(component.carry_at.items()))
+    budget_ns = round(component.freeze_budget_ms * 1_000_000)
+    if launch is None:
+        return Terms(carry, component.device_rules(), freeze_budget_ns=budget_ns, shared=component.shared)
+    devices = merged(arrived(launch.devices), component.device_rules())
+    shared = tuple(dict.fromkeys((*launch.shared, *component.shared)))
+    return Terms(carry, devices, launch.connections == CARRY, budget_ns, shared)
+
+
+def begun_on(launch: Launch, component: ComponentConfig) -> Terms:
+    """On which terms a component begins here."""
+    terms = terms_here(launch, component)
+    return replace(terms, carry=replace(terms.carry, paths=launch.carry))
+
+
+def started_here(launch: Launch, component: ComponentConfig) -> Launch:
+    """How this robot starts a program again that was first started on another: its own command line, if it has one."""
+    return replace(
+        launch,
+        argv=component.command or launch.argv,
+        directory=component.directory or launch.directory,
+        environment=tuple({**dict(launch.environment), **component.environment}.items()),
+    )

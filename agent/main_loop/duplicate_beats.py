@@ -1,0 +1,53 @@
+"""Each beat travels over every link of its sender; the first that comes is heard, the others show that their links carry.
+
+A copy says nothing about whether its sender lives: it proves a link, and only once. What comes a second time over one link is
+somebody's replay.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Final
+
+from failover.core.wire.codec import Reason, Refused
+from failover.core.wire.messages import Beat
+
+RECENT_BEATS: Final = 16
+"""A beat that was heard on one link may come over a slower one by so many beats later; an older copy is somebody's replay."""
+
+
+class Copies:
+    """Which links brought the newest beats of each sender."""
+
+    def __init__(self) -> None:
+        self._lives: dict[str, int] = {}
+        self._brought: dict[str, OrderedDict[int, set[str]]] = {}
+        self._carried: dict[str, dict[str, int]] = {}
+
+    def heard(self, beat: Beat, link: str) -> None:
+        """Note the first of a beat."""
+        if self._lives.get(beat.sender) != beat.boot:
+            self._lives[beat.sender] = beat.boot
+            self._brought[beat.sender] = OrderedDict()
+        brought = self._brought[beat.sender]
+        brought[beat.counter] = {link}
+        if len(brought) > RECENT_BEATS:
+            brought.popitem(last=False)
+
+    def admit(self, refused: Refused, link: str, now_ns: int) -> bool:
+        """Whether what was refused as seen before is a copy of a recent beat over a link that had not brought it yet.
+
+        Args:
+            link: the interface that it came over; one without a name is no proof of any.
+        """
+        brought = self._brought.get(refused.sender)
+        links = brought.get(refused.counter) if brought and refused.reason is Reason.REPLAYED else None
+        if not link or links is None or link in links:
+            return False
+        links.add(link)
+        self._carried.setdefault(refused.sender, {})[link] = now_ns
+        return True
+
+    def take(self, sender: str) -> tuple[tuple[str, int], ...]:
+        """(link, instant in ns) of the latest copy over each link since this was last asked."""
+        return tuple(self._carried.pop(sender, {}).items())

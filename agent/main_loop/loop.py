@@ -1,0 +1,439 @@
+"""The heart: the loop that beats and decides. Start reading the agent here.
+
+One thread, one process, nothing else in it. A turn is: sleep until something comes or the core's deadline, read the clock once,
+step the node, obey what it says: persist → send → act. Everything slow lives elsewhere: the disk in a thread
+(`agent.main_loop.vote_record_writer`), programs, snapshots and people in the lanes process. The same turn feeds systemd's
+watchdog, so the watchdog proves this loop and nothing beside it.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import os
+import select
+import signal
+import socket
+from collections import Counter
+from pathlib import Path
+from typing import Final
+
+from agent.config import Settings
+from agent.core_config import node_config
+from agent.errors import AgentError
+from agent.main_loop import messages, starvation
+from agent.main_loop import vote_record as ballot_file
+from agent.main_loop.beat_sockets import TURN_LIMIT, BeatLane
+from agent.main_loop.duplicate_beats import Copies
+from agent.main_loop.event_log_writer import Scribe
+from agent.main_loop.messages import (
+    Alive,
+    BeatCounts,
+    Farewell,
+    Happened,
+    HearKey,
+    Inventory,
+    Life,
+    SpeakKey,
+    ToHeart,
+    ToLanes,
+    Told,
+)
+from agent.main_loop.outbox import Due, Outbox
+from agent.main_loop.unauthenticated_beats import UnreadBeats
+from agent.main_loop.vote_record_writer import Persister
+from agent.main_loop.worker_process import LanesProcess
+from agent.system import clock, syscalls
+from agent.system.sd_notify import Notifier, watchdog_period_ns
+from checkpoint.keeper.messages import ChannelClosedError, ChannelError
+from failover.core import vote_record as core_ballot
+from failover.core.acts import Act
+from failover.core.events import Event, Received, Tick
+from failover.core.node import Node
+from failover.core.types import Ballot
+from failover.core.wire import codec
+from failover.core.wire.messages import Beat
+
+NANOSECONDS_A_SECOND: Final = 1_000_000_000
+SLEEP_LIMIT_S: Final = 0.5
+"""The loop turns at least so often, whatever the core's deadline."""
+
+PERSIST_PATIENCE_S: Final = 2.0
+"""How long an orderly end waits for the disk."""
+
+GAP_BEATS: Final = 3
+"""Periods of silence that count as a gap: one lost beat is none, and a lease is longer."""
+
+REST_SHARE: Final = 3
+"""While the heart rests it reads beats so often in a lease: its echoes are fresh enough for one to be granted at once."""
+
+LANES_SILENCE_NS: Final = 4 * NANOSECONDS_A_SECOND
+"""How long the lanes may say nothing; then another process takes their place. Meanwhile nobody renews the guards' leases."""
+
+LANES_LOOK_NS: Final = NANOSECONDS_A_SECOND
+"""Between two looks at lanes that say nothing: longer than between their signs of life, so that others are not looked at."""
+
+LANES_BIRTH_NS: Final = 30 * NANOSECONDS_A_SECOND
+"""The same before their first word: an interpreter starts."""
+
+LANES_TRIES: Final = 5
+"""Lanes processes that may die before their first word; then something is wrong that no restart cures."""
+
+STARTED: Final = "protecting this robot and its neighbours"
+
+OUTLIVED: Final = (
+    "%s remembers life %d of %s, and %s counts %d: its state directory is new, or an old copy. What it voted and kept since is "
+    "lost; it begins again as life %d"
+)
+
+log = logging.getLogger("failover.heart")
+
+
+class Heart:
+    """One life of one robot's agent."""
+
+    def __init__(self, settings: Settings, ballot: ballot_file.Ballot, notifier: Notifier) -> None:
+        """Bind the beat sockets; nothing runs yet.
+
+        Raises:
+            LaneError: a beat address cannot be had.
+        """
+        self._settings = settings
+        self._me = settings.config.robot
+        self._ballot = ballot
+        self._notifier = notifier
+        self._beats = BeatLane(settings.me, settings.peers)
+        self._hearing = codec.Receiver(settings.team.team)
+        self._unread = UnreadBeats({name: robot.beats for name, robot in settings.peers.items()})
+        self._keys: dict[str, bytes] = {}
+        self._lanes = LanesProcess(settings)
+        self._node: Node | None = None
+        durable = core_ballot.decode(ballot.record.core)
+        self._outbox = Outbox(durable, settings.config.beat_ms * NANOSECONDS_A_SECOND // 1_000)
+        self._persister = Persister(lambda wanted: ballot.keep(core_ballot.encode(wanted)))
+        self._scribe = Scribe(Path(settings.config.state_directory), self._me, ballot.record.boot)
+        self._poll = select.epoll()
+        self._wake, self._signalled = socket.socketpair(
+            socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
+        )
+        self._ending = self._rests = False
+        self._listens = True
+        self._deaf_until_ns = 0
+        self._read_ns, self._rest_ns = 0, settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000 // REST_SHARE
+        self._lanes_deaths = 0
+        self._turned_ns = clock.now_ns()
+        self._lanes_silent_ns = self._lanes_unseen_ns = 0
+        self._lanes_allowed_ns = LANES_BIRTH_NS
+        self._lanes_turns: starvation.Turns | None = None
+        self._refused: Counter[str] = Counter()
+        self._sent = self._heard = self._late_us_max = self._gap_us_max = self._gaps = 0
+        self._heard_at: dict[str, int] = {}
+        self._copies = Copies()
+        self._newest_beat: dict[str, tuple[int, int]] = {}
+        self._lost: Counter[str] = Counter()
+        self._notes: tuple[str, ...] = ()
+        self._remembered = 0
+
+    def run(self) -> int:
+        """Beat until SIGTERM or SIGINT. Components live on.
+
+        Returns:
+            0; or the life of this robot that the team remembers and its ballot does not: another one above it must begin.
+
+        Raises:
+            AgentError: the lanes cannot be started at all.
+        """
+        self._begin()
+        watchdog_ns = watchdog_period_ns()
+        fed_ns = clock.now_ns()
+        while not self._ending:
+            self._turn()
+            now_ns = clock.now_ns()
+            if watchdog_ns and now_ns - fed_ns >= watchdog_ns and self._node is not None:
+                self._notifier.alive()
+                fed_ns = now_ns
+        if not self._remembered:
+            self._notifier.stopping()
+        self._end()
+        return self._remembered
+
+    def _begin(self) -> None:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: None)
+        signal.set_wakeup_fd(self._signalled.fileno(), warn_on_full_buffer=False)
+        for descriptor in (self._beats.fileno(), self._persister.fileno(), self._wake.fileno()):
+            self._poll.register(descriptor, select.EPOLLIN)
+        gc.collect()
+        syscalls.give_back()  # before memory is locked: then it would stay
+        if self._settings.config.realtime:
+            self._notes = clock.become_realtime()
+        else:
+            self._notes = ("beats run at normal priority, as the configuration says",)
+        self._start_lanes()  # told what was refused
+        gc.freeze()
+        gc.disable()  # what a turn makes is freed by reference counts; a collection would be a pause of milliseconds
+
+    def _start_lanes(self) -> None:
+        """Start the other process; the node is born, or told what was lost, when its inventory comes."""
+        self._lanes.start()
+        self._expect_lanes()
+
+    def _expect_lanes(self) -> None:
+        self._lanes_spoke(LANES_BIRTH_NS << self._lanes_deaths)  # a machine so busy gets no busier
+        self._poll.register(self._lanes.fileno(), select.EPOLLIN | select.EPOLLHUP)
+        self._lanes.send(Life(self._ballot.record.boot, os.getpid(), self._notes))
+
+    def _turn(self) -> None:
+        """Sleep, then one round of everything that came, then the core's deadline."""
+        self._lanes.flush()
+        self._rest()
+        came = self._poll.poll(self._pause_s())
+        if self._rests and clock.now_ns() >= self._read_ns + self._rest_ns:
+            self._hear()
+        for descriptor, _ in came:
+            if descriptor == self._beats.fileno():
+                self._hear()
+            elif descriptor == self._lanes.fileno():
+                self._listen_to_lanes()
+            elif descriptor == self._persister.fileno():
+                self._note_persisted()
+            elif descriptor == self._wake.fileno():
+                self._ending = True
+        self._watch_lanes()
+        if self._node is not None:
+            late_ns = clock.now_ns() - self._node.next_deadline_ns()
+            if late_ns >= 0:
+                self._late_us_max = max(self._late_us_max, late_ns // 1_000)
+                self._step(Tick())
+
+    def _rest(self) -> None:
+        """While there is no component anywhere, what peers say is read a few times a lease only: half the turns, less in each.
+
+        In a flood of what is refused the heart leaves half of the time to others: it runs before all ordinary processes.
+        """
+        now_ns = clock.now_ns()
+        self._rests = self._node is not None and self._node.rests(now_ns)
+        listens = not self._rests and now_ns >= self._deaf_until_ns
+        if listens != self._listens:
+            self._listens = listens
+            self._poll.modify(self._beats.fileno(), select.EPOLLIN if listens else 0)
+
+    def _watch_lanes(self) -> None:
+        """Count how long the lanes say nothing.
+
+        A turn of our own that took long proves nothing about them, and neither does a time in which the kernel kept them from
+        running: the ones in their place would say as little.
+        """
+        now_ns = clock.now_ns()
+        self._lanes_unseen_ns += min(now_ns - self._turned_ns, int(SLEEP_LIMIT_S * NANOSECONDS_A_SECOND))
+        self._turned_ns = now_ns
+        if self._lanes_unseen_ns < LANES_LOOK_NS:
+            return
+        before, self._lanes_turns = self._lanes_turns, starvation.look(self._lanes.pid)
+        self._lanes_silent_ns += starvation.had_ns(before, self._lanes_turns, self._lanes_unseen_ns)
+        self._lanes_unseen_ns = 0
+        if self._lanes_silent_ns > self._lanes_allowed_ns:
+            self._replace_lanes(
+                f"it said nothing for {self._lanes_silent_ns / NANOSECONDS_A_SECOND:.0f} s in which it could have"
+            )
+
+    def _lanes_spoke(self, allowed_ns: int) -> None:
+        """Their silence counts from now on, and may last so long."""
+        self._lanes_silent_ns = self._lanes_unseen_ns = 0
+        self._lanes_turns, self._lanes_allowed_ns = None, allowed_ns
+
+    def _pause_s(self) -> float:
+        if self._node is None:
+            return SLEEP_LIMIT_S
+        now_ns = clock.now_ns()
+        left_ns = self._node.next_deadline_ns() - now_ns
+        if not self._listens and not self._rests:
+            left_ns = min(left_ns, self._deaf_until_ns - now_ns)
+        return min(max(left_ns / NANOSECONDS_A_SECOND, 0.0), SLEEP_LIMIT_S)
+
+    # --- events in ---
+
+    def _step(self, event: Event) -> None:
+        if self._node is not None:
+            now_ns = clock.now_ns()
+            ready = self._node.step(event, now_ns)
+            self._obey(self._outbox.take(ready, now_ns))
+            if ready.told:
+                self._scribe.note(ready.told)
+
+    def _hear(self) -> None:
+        self._read_ns = clock.now_ns()
+        taken = refused = 0
+        for frame, link, wall_ns, sender in self._beats.receive():
+            taken += 1
+            opened = self._hearing.open(frame)
+            if isinstance(opened, Beat):
+                came_ns = self._came_ns(wall_ns)
+                self._count(opened, came_ns or clock.now_ns())
+                self._mind_earlier_lives(opened)
+                self._copies.heard(opened, link)
+                self._step(Received(opened, link, self._copies.take(opened.sender), came_ns))
+            elif not self._copies.admit(opened, link, clock.now_ns()):
+                self._refused[str(opened.reason)] += 1
+                refused += 1
+                if sign := self._unread.of_beat(opened, sender, clock.now_ns()):
+                    self._step(sign)
+        if taken >= TURN_LIMIT and refused > taken // 2:
+            self._deaf_until_ns = 2 * clock.now_ns() - self._read_ns
+
+    def _came_ns(self, wall_ns: int) -> int:
+        """When a beat came that waited because this heart rests: its sender was not late. 0: now, or a stall of ours."""
+        if not self._rests or not wall_ns:
+            return 0
+        came_ns, now_ns = clock.of_wall_ns(wall_ns), clock.now_ns()
+        return came_ns if 0 <= now_ns - came_ns <= self._rest_ns + self._outbox.beat_ns else 0
+
+    def _mind_earlier_lives(self, beat: Beat) -> None:
+        """A peer that remembers a later life of ours believes none of our beats: begin one above that."""
+        life = self._node.outlived_by(beat) if self._node is not None else 0
+        if life:
+            told = (beat.sender, life, self._me, ballot_file.FILE_NAME, self._ballot.record.boot, life + 1)
+            log.warning(OUTLIVED, *told)
+            self._remembered, self._ending = life, True
+
+    def _count(self, beat: Beat, now_ns: int) -> None:
+        """Note how long the peer was silent before this beat, and how many were lost in between."""
+        peer = beat.sender
+        boot, counter = self._newest_beat.get(peer, (beat.boot, beat.counter - 1))
+        missing = beat.counter - counter - 1 if beat.boot == boot else 0
+        self._lost[peer] += max(missing, -1)  # one that comes late was counted as lost
+        if beat.boot != boot or missing >= 0:
+            self._newest_beat[peer] = (beat.boot, beat.counter)
+        gap_us = (now_ns - self._heard_at.get(peer, now_ns)) // 1_000
+        self._heard_at[peer] = now_ns
+        self._heard += 1
+        self._gap_us_max = max(self._gap_us_max, gap_us)
+        self._gaps += gap_us > GAP_BEATS * self._settings.config.beat_ms * 1_000
+
+    def _note_persisted(self) -> None:
+        for number, ballot in self._persister.finished():
+            self._obey(self._outbox.kept(number, ballot, clock.now_ns()))
+
+    def _listen_to_lanes(self) -> None:
+        try:
+            for message in self._lanes.receive():
+                self._lanes_spoke(LANES_SILENCE_NS)
+                self._heed(message)
+        except (ChannelClosedError, ChannelError) as error:
+            self._replace_lanes(str(error))
+
+    def _heed(self, message: ToHeart) -> None:
+        match message:
+            case Happened():
+                event = messages.event_of(message)
+                self._lanes.answered(event)
+                self._step(event)
+            case Inventory():
+                self._take_inventory(message)
+            case SpeakKey(peer, key):
+                self._keys[peer] = key
+            case HearKey(peer, key):
+                self._hearing.accept(peer, key)
+            case Alive():
+                pass
+            case _:
+                self._lanes.send(self._told(message))
+
+    def _take_inventory(self, inventory: Inventory) -> None:
+        """The node is born with what was found; a node that lives already is told what the old lanes took with them."""
+        self._lanes_deaths = 0
+        if self._node is not None:
+            for event in self._lanes.lost(inventory):
+                self._step(event)
+            return
+        self._lanes.ready()
+        boot = self._ballot.record.boot
+        config = node_config(self._settings)
+        durable = self._outbox.durable
+        self._node = Node(config, boot, durable, clock.now_ns(), inventory.held, inventory.found)
+        self._notifier.ready(STARTED)
+        log.info("robot %s beats, life %d", self._me, boot)
+
+    def _replace_lanes(self, why: str) -> None:
+        """Start another lanes process; one that never gets as far as an inventory is not tried for ever.
+
+        Raises:
+            AgentError: `LANES_TRIES` of them died at once.
+        """
+        self._lanes_deaths += 1
+        if self._lanes_deaths > LANES_TRIES:
+            raise AgentError(f"the lanes process ended {LANES_TRIES} times at once ({why}); what it said stands above")
+        log.error("the lanes process has gone (%s); guards and programs live on, another one starts", why)
+        self._poll.unregister(self._lanes.fileno())
+        self._lanes.replace()
+        self._expect_lanes()
+
+    # --- obligations out ---
+
+    def _obey(self, due: Due) -> None:
+        """Persist, send, act: what is due of each."""
+        if due.persist is not None:
+            self._persister.submit(*due.persist)
+        for beat in due.beats:
+            for peer, key in self._keys.items():
+                self._beats.send(peer, codec.seal(beat, self._settings.team.team, key))
+            self._sent += 1
+        for act in due.acts:
+            self._act(act)
+
+    def _act(self, act: Act) -> None:
+        self._lanes.order(act)
+
+    def _told(self, question: messages.Ask) -> ToLanes:
+        now_ns = clock.now_ns()
+        refused = Counter(self._refused)
+        refused[str(codec.Reason.NOT_OURS)] += self._beats.dropped()
+        counts = BeatCounts(
+            self._sent,
+            self._heard,
+            self._beats.unsent,
+            dict(+refused),
+            self._late_us_max,
+            self._gap_us_max,
+            self._gaps,
+            dict(self._lost),
+        )
+        troubles = tuple(filter(None, (self._persister.trouble, self._scribe.trouble)))
+        if question.what == "why":
+            return Told(question.number, now_ns, story=self._scribe.unwritten(), beats=counts, troubles=troubles)
+        status = self._node.status(now_ns) if self._node is not None else None
+        return Told(question.number, now_ns, status, beats=counts, troubles=troubles)
+
+    def _end(self) -> None:
+        self._lanes.send(Farewell())
+        self._lanes.flush()
+        self._persister.close(PERSIST_PATIENCE_S)
+        self._scribe.close(PERSIST_PATIENCE_S)
+        self._lanes.wait()
+        self._beats.close()
+        self._poll.close()
+        signal.set_wakeup_fd(-1)
+        log.info("robot %s ends; its components live on", self._me)
+
+
+def beat(settings: Settings, notifier: Notifier) -> None:
+    """Live one life, from the ballot to the farewell; and another, if the team remembers a later one than the ballot.
+
+    Raises:
+        AgentError: what is needed to begin cannot be had.
+    """
+    directory = Path(settings.config.state_directory)
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise AgentError(
+            f"cannot use the state directory {directory}: {error.strerror}; name another in state_directory"
+        ) from error
+    ballot = ballot_file.Ballot(directory, settings.config.robot)
+    ballot.open()
+    while remembered := Heart(settings, ballot, notifier).run():
+        ballot.outlive(remembered)
+        ballot.open()
+
+
+__all__ = ["Ballot", "Heart", "beat"]

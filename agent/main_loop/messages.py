@@ -1,0 +1,217 @@
+"""What the heart and the lanes say to each other, over a `checkpoint.keeper.messages` between the two processes.
+
+The core's acts and events are plain Structs; each travels as its class name and its msgpack.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, Literal
+
+import msgspec
+
+from agent.errors import AgentError
+from failover.core import acts, events
+from failover.core.acts import Act
+from failover.core.event_log.decisions import Line
+from failover.core.events import Event
+from failover.core.types import Found, Held, StatusView
+
+ACTS: Final[dict[str, Any]] = {
+    kind.__name__: kind
+    for kind in (
+        acts.Start,
+        acts.Restore,
+        acts.Capture,
+        acts.Ship,
+        acts.CancelShip,
+        acts.Accept,
+        acts.Discard,
+        acts.Show,
+        acts.Acknowledge,
+        acts.Admit,
+        acts.Freeze,
+        acts.Thaw,
+        acts.SetLease,
+        acts.KeepAside,
+        acts.Forget,
+        acts.End,
+        acts.Stop,
+        acts.LetGo,
+        acts.Warm,
+        acts.Cool,
+        acts.Inquire,
+        acts.Prune,
+        acts.Drop,
+        acts.ReportExit,
+        acts.Answer,
+    )
+}
+EVENTS: Final[dict[str, Any]] = {
+    kind.__name__: kind
+    for kind in (
+        events.Started,
+        events.Captured,
+        events.Unchanged,
+        events.CaptureFailed,
+        events.NothingToCapture,
+        events.Committed,
+        events.ShipEnded,
+        events.Stored,
+        events.StoreFailed,
+        events.Restored,
+        events.ActFailed,
+        events.Stopped,
+        events.Warmed,
+        events.Inquired,
+        events.Exited,
+        events.Noticed,
+        events.Unread,
+        events.Run,
+        events.Release,
+        events.Stop,
+        events.Failback,
+        events.Handover,
+        events.Promote,
+        events.Prefer,
+    )
+}
+
+_encoder = msgspec.msgpack.Encoder()
+_act_decoders = {name: msgspec.msgpack.Decoder(kind) for name, kind in ACTS.items()}
+_event_decoders = {name: msgspec.msgpack.Decoder(kind) for name, kind in EVENTS.items()}
+
+
+class Order(msgspec.Struct, frozen=True, tag=True):
+    """Heart to lanes: an act of the core, to be carried out."""
+
+    kind: str
+    body: bytes
+
+
+class Happened(msgspec.Struct, frozen=True, tag=True):
+    """Lanes to heart: an event for the core."""
+
+    kind: str
+    body: bytes
+
+
+class Life(msgspec.Struct, frozen=True, tag=True):
+    """Heart to lanes, first of all: which life of the agent this is, and what the heart was refused."""
+
+    boot: int
+    heart: int
+    notes: tuple[str, ...]
+
+
+class Inventory(msgspec.Struct, frozen=True, tag=True):
+    """Lanes to heart, first of all: what this robot's store holds and whose guards were found alive."""
+
+    held: tuple[Held, ...]
+    found: tuple[Found, ...]
+
+
+class SpeakKey(msgspec.Struct, frozen=True, tag=True):
+    """Lanes to heart: the peer has been told this key; seal beats to it with it."""
+
+    peer: str
+    key: bytes
+
+
+class Alive(msgspec.Struct, frozen=True, tag=True):
+    """Lanes to heart, from time to time: this process turns."""
+
+
+class HearKey(msgspec.Struct, frozen=True, tag=True):
+    """Lanes to heart: the peer says that it seals its beats to us with this key."""
+
+    peer: str
+    key: bytes
+
+
+class Ask(msgspec.Struct, frozen=True, tag=True):
+    """Lanes to heart: show me the team, or tell me the story. Answer: `Told`."""
+
+    number: int
+    what: Literal["status", "why"]
+
+
+class BeatCounts(msgspec.Struct, frozen=True):
+    """What the beat lane has seen.
+
+    Attributes:
+        refused: frames not believed, by reason.
+        late_us_max: the longest that a turn of the loop came after its deadline.
+        gap_us_max: the longest between two beats of one peer.
+        gaps: how many were longer than `agent.main_loop.loop.GAP_BEATS` periods.
+        lost: beats of each peer that did not arrive, in this life of ours.
+    """
+
+    sent: int = 0
+    heard: int = 0
+    unsent: int = 0
+    refused: dict[str, int] = {}
+    late_us_max: int = 0
+    gap_us_max: int = 0
+    gaps: int = 0
+    lost: dict[str, int] = {}
+
+
+class Told(msgspec.Struct, frozen=True, tag=True):
+    """Heart to lanes: the answer to `Ask`.
+
+    Attributes:
+        story: lines that are not on the disk yet; what is kept there the lanes read themselves.
+        troubles: sentences: why a ballot, or the story, cannot be written.
+    """
+
+    number: int
+    now_ns: int
+    status: StatusView | None = None
+    story: tuple[Line, ...] = ()
+    beats: BeatCounts = BeatCounts()
+    troubles: tuple[str, ...] = ()
+
+
+class Farewell(msgspec.Struct, frozen=True, tag=True):
+    """Heart to lanes: the agent ends; components live on."""
+
+
+ToLanes = Order | Life | Told | Farewell
+ToHeart = Happened | Inventory | SpeakKey | HearKey | Alive | Ask
+
+
+def order(act: Act) -> Order:
+    """An act, packed."""
+    return Order(type(act).__name__, _encoder.encode(act))
+
+
+def happened(event: Event) -> Happened:
+    """An event, packed."""
+    return Happened(type(event).__name__, _encoder.encode(event))
+
+
+def act_of(message: Order) -> Act:
+    """The act inside.
+
+    Raises:
+        AgentError: there is none; heart and lanes are of different versions.
+    """
+    return _unpacked(_act_decoders, message)  # type: ignore[no-any-return]
+
+
+def event_of(message: Happened) -> Event:
+    """The event inside.
+
+    Raises:
+        AgentError: there is none.
+    """
+    return _unpacked(_event_decoders, message)  # type: ignore[no-any-return]
+
+
+def _unpacked(decoders: dict[str, Any], message: Order | Happened) -> Any:
+    try:
+        return decoders[message.kind].decode(message.body)
+    except (KeyError, msgspec.MsgspecError) as error:
+        raise AgentError(
+            f"the two halves of the agent do not understand each other: {message.kind}: {error}; restart it"
+        ) from error

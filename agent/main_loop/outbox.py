@@ -1,0 +1,120 @@
+"""Persist → send → act, without letting a slow disk delay a beat.
+
+While a ballot is on its way to the disk, nothing that depends on it leaves: acts wait, and so does what beats say. But
+"I live" depends on nothing: a beat that is due meanwhile goes out stripped of its entries, with the ``settled`` of the
+last durable one, so that peers go on knowing exactly what they were told before. Echoes extend the leases of those who
+hear them; one is withheld from a robot whose primacy the waiting ballot gives up, because the vote that follows counts on
+that lease running out.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import msgspec
+from msgspec import Struct, field
+
+from failover.core.acts import Act, Ready, SetLease
+from failover.core.types import Ballot
+from failover.core.wire.messages import Beat
+
+
+class Due(Struct, frozen=True):
+    """What may leave now, in this order: ``persist`` to the disk, ``beats`` to the peers, ``acts`` to the lanes.
+
+    Attributes:
+        persist: (number, ballot); `Outbox.kept` is told the number once it is durable.
+    """
+
+    persist: tuple[int, Ballot] | None = None
+    beats: tuple[Beat, ...] = ()
+    acts: tuple[Act, ...] = ()
+
+
+class Outbox(Struct):
+    """The obligations of one node.
+
+    Attributes:
+        durable: the ballot that is on the disk.
+        beat_ns: period after which a beat is due whatever happens.
+
+    Invariant: acts leave in the order in which they were ordered, each after every ballot ordered before it.
+    """
+
+    durable: Ballot
+    beat_ns: int
+    _newest: Ballot | None = None
+    _ordered: int = 0
+    _kept: int = 0
+    _acts: deque[tuple[int, Act]] = field(default_factory=deque)
+    _withheld: Beat | None = None
+    _settled: int = 0
+    _beaten_ns: int = 0
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a ballot is on its way to the disk."""
+        return self._kept < self._ordered
+
+    def take(self, ready: Ready, now_ns: int) -> Due:
+        """Take in new obligations; what may leave now comes back."""
+        persist = None
+        if ready.persist is not None:
+            self._ordered += 1
+            self._newest = ready.persist
+            persist = (self._ordered, ready.persist)
+        for act in ready.act:
+            self._queue(act)
+        return Due(persist, self._beats(ready.send, now_ns), self._free_acts())
+
+    def kept(self, number: int, ballot: Ballot, now_ns: int) -> Due:
+        """The ballot of that number, and so every earlier one, is durable."""
+        self._kept, self.durable = max(self._kept, number), ballot
+        beat = self._withheld
+        if self.waiting or beat is None:
+            return Due(acts=self._free_acts())
+        return Due(beats=self._beats((beat,), now_ns), acts=self._free_acts())
+
+    def _queue(self, act: Act) -> None:
+        """Put an act last. Of the leases of one component only the newest waits: a disk may be full for a night."""
+        if self.waiting and isinstance(act, SetLease):
+            for one in list(self._acts):
+                if isinstance(one[1], SetLease) and one[1].component == act.component:
+                    self._acts.remove(one)
+        self._acts.append((self._ordered, act))
+
+    def _beats(self, beats: tuple[Beat, ...], now_ns: int) -> tuple[Beat, ...]:
+        if not self.waiting:
+            self._withheld = None
+            if beats:
+                self._settled, self._beaten_ns = beats[-1].settled, now_ns
+            return beats
+        if not beats:
+            return ()
+        if now_ns - self._beaten_ns < self.beat_ns:
+            self._withheld = beats[-1]
+            return ()
+        self._withheld, self._beaten_ns = None, now_ns
+        return (self._stripped(beats[-1]),)
+
+    def _stripped(self, beat: Beat) -> Beat:
+        given_up = abandoned(self.durable, self._newest or self.durable)
+        echoes = tuple(echo for echo in beat.echoes if echo.robot not in given_up)
+        return msgspec.structs.replace(beat, entries=(), echoes=echoes, settled=min(self._settled, beat.counter))
+
+    def _free_acts(self) -> tuple[Act, ...]:
+        free = []
+        while self._acts and self._acts[0][0] <= self._kept:
+            free.append(self._acts.popleft()[1])
+        return tuple(free)
+
+
+def abandoned(durable: Ballot, newest: Ballot) -> frozenset[str]:
+    """Robots whose primacy of some component is accepted by the one ballot and not, or not in the same epoch, by the other."""
+    now = {record.name: record for record in newest.records}
+    return frozenset(
+        record.primary
+        for record in durable.records
+        if record.primary
+        and (record.name not in now or (now[record.name].primary, now[record.name].epoch) != (record.primary, record.epoch))
+    )

@@ -1,0 +1,1 @@
+"""What every process of the agent asks of the machine: clock, permissions, system calls, systemd, network interfaces."""

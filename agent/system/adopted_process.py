@@ -1,0 +1,58 @@
+"""A process that was started by somebody else than us: named by its number, and told apart from a later one of that number.
+
+Under protection it does not end with its guard by itself, and must not run without one: without its guard nobody freezes it in
+time, and it is resumed from its checkpoint; then it would run twice.
+
+Source: pidfd_open(2), which polls as readable once the process has ended.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import signal
+
+from checkpoint.linux.spawn.inherited_limits import Inheritance
+
+log = logging.getLogger("failover.component")
+
+
+class Guest:
+    """One process, which cannot be mistaken for a later one of its number.
+
+    Attributes:
+        rights: user and groups that it had when a client named it; None: nobody asked.
+    """
+
+    def __init__(self, pid: int, rights: Inheritance | None = None) -> None:
+        """
+        Raises:
+            ProcessLookupError, OSError: it has ended, or there is no such process.
+        """
+        self.pid, self.rights = pid, rights
+        self._pidfd = os.pidfd_open(pid)
+
+    def fileno(self) -> int:
+        """Its pidfd, which stays this object's."""
+        return self._pidfd
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether its number may be another process's by now. While it says no, whatever was asked by that number is its own."""
+        watch = select.poll()
+        watch.register(self._pidfd, select.POLLIN)
+        return bool(watch.poll(0))
+
+    def end(self, component: str) -> None:
+        """End it, if we may: one of another user's than the agent's cannot be ended without a capability."""
+        try:
+            signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
+        except ProcessLookupError:
+            pass
+        except PermissionError:
+            log.error("%s: pid %d lost its guard and runs on beside its successor: end it by hand", component, self.pid)
+
+    def close(self) -> None:
+        """Think no more of it."""
+        os.close(self._pidfd)

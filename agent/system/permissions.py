@@ -1,0 +1,227 @@
+"""Who is at the other end of a control connection: as the kernel says, never as the client says.
+
+Sources: unix(7) (SO_PEERCRED), socket(7), asm-generic/socket.h (SO_PEERGROUPS).
+"""
+
+from __future__ import annotations
+
+import array
+import contextlib
+import os
+import pwd
+import select
+import socket
+import struct
+from collections.abc import Mapping
+from typing import Any, Final
+
+from msgspec import Struct
+
+from agent.errors import RefusedError
+from agent.system.adopted_process import Guest
+from checkpoint.errors import CheckpointError
+from checkpoint.linux import abi
+from checkpoint.linux.procfs import procfs
+from checkpoint.linux.spawn.inherited_limits import Inheritance
+
+SO_PEERGROUPS: Final = 59
+GROUPS_SIZE_MAX: Final = 1_024
+"""Bytes: what `socket.getsockopt` takes; somebody in more than 256 groups gets those that the system's lists name."""
+
+SCHED_DEADLINE: Final = 6
+"""Needs more than a priority to be set, and no child inherits it."""
+
+ROOT: Final = 0
+NOBODY: Final = -1
+"""For what a robot asks another one by itself: it may be told how things stand, and no more."""
+
+SAID: Final = "; it said: "
+"""Begins, at the end of a sentence of status or story, what a program wrote last."""
+
+_CREDENTIALS: Final = struct.Struct("3i")
+
+
+class Caller(Struct, frozen=True):
+    """One client.
+
+    Attributes:
+        uid, gid, groups: as they were when it connected.
+        inheritance: what its children would inherit, as far as it can be seen; a client from another PID namespace cannot be,
+            and its programs get what the guard has, with no more than ordinary priorities.
+    """
+
+    uid: int
+    gid: int
+    groups: tuple[int, ...]
+    inheritance: Inheritance
+
+
+def may(uid: int, owner: int | None) -> bool:
+    """The rule: root and the agent's own user may do everything, everybody else what concerns his own components.
+
+    Args:
+        owner: whose the component is; None: nobody knows.
+    """
+    return uid in (ROOT, os.geteuid()) or uid == owner
+
+
+def asking(uid: int) -> int | None:
+    """The user as the core's commands name him (``by``): None if he may give any order."""
+    return None if may(uid, None) else uid
+
+
+def check_right(uid: int, component: str, owner: int | None) -> None:
+    """Let a user act on a component.
+
+    Raises:
+        RefusedError: it is somebody else's.
+    """
+    if not may(uid, owner):
+        whose = f"belongs to uid {owner}" if owner is not None else "is not known well enough here to say whose it is"
+        raise RefusedError(f"{component} {whose}; its owner and root may give orders and read its output", "PermissionError")
+
+
+def without_output(told: Any) -> Any:
+    """The same without what programs said, in all of its sentences: for somebody who may not read their output."""
+    if isinstance(told, str):
+        sentence, said, _ = told.partition(SAID)
+        return f"{sentence}; what it said is shown to its owner and root" if said else told
+    if isinstance(told, Mapping):
+        return {key: without_output(value) for key, value in told.items()}
+    return [without_output(value) for value in told] if isinstance(told, list | tuple) else told
+
+
+def uid_of(connection: socket.socket) -> int:
+    """Whose the client is."""
+    return int(_CREDENTIALS.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))[1])
+
+
+def caller_of(connection: socket.socket) -> Caller:
+    """Ask the kernel who connected."""
+    pid, uid, gid = _CREDENTIALS.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
+    seen = _seen(pid, uid)
+    groups = _groups(connection, uid, gid)
+    return Caller(uid, gid, groups, (seen or Inheritance(uid, gid)).as_user(uid, gid, groups))
+
+
+def inheritance_for(caller: Caller, user: str) -> Inheritance:
+    """What a program inherits that this client wants to run.
+
+    Args:
+        user: name or number of the user that it is to run as; "" for the client's own.
+
+    Raises:
+        RefusedError: there is no such user, or it is not permitted.
+    """
+    ours = os.geteuid()
+    if ours != ROOT and caller.uid not in (ROOT, ours):
+        raise RefusedError(f"this agent has no root's rights: it runs programs of uid {ours} alone", "PermissionError")
+    wanted = _as_user(caller, user) if user else caller.inheritance
+    if ours == ROOT:
+        return wanted
+    if user and wanted.uid != ours:
+        raise RefusedError(f"this agent has no root's rights: it runs programs of uid {ours} alone", "PermissionError")
+    return wanted.as_user(ours, os.getegid(), tuple(os.getgroups()))
+
+
+def guest_of(pid: int, caller: Caller) -> Guest:
+    """A running process that somebody wants protected, held by a pidfd: what is asked of it later is asked of the same one.
+
+    A process that the system keeps from its own user (a set-user-id program, one that is not dumpable) is root's.
+    Its rights are those that it has now; they bound each capture (`agent.worker.components.restore_limits`), for it may execute
+    anything.
+
+    Raises:
+        RefusedError: there is no such process, or it is not the caller's: all of its users and groups must be.
+    """
+    gone = RefusedError(f"cannot protect pid {pid}: No such process", "ProcessGoneError")
+    try:
+        guest = Guest(pid)
+    except (OSError, ValueError, OverflowError):
+        raise gone from None
+    try:
+        owner, status = os.stat(f"/proc/{pid}/fd").st_uid, procfs.status(pid)  # /proc/PID itself is its user's, dumpable or not
+        if guest.has_ended:
+            raise gone
+        if not may(caller.uid, None):
+            _check_own(pid, caller, {owner, *status.uids}, {*status.gids, *status.groups})
+    except (OSError, CheckpointError):
+        guest.close()
+        raise gone from None
+    except RefusedError:
+        guest.close()
+        raise
+    guest.rights = Inheritance(status.uids[0], status.gids[0], status.groups)
+    return guest
+
+
+def _check_own(pid: int, caller: Caller, uids: set[int], gids: set[int]) -> None:
+    """Raises RefusedError: a process has a user or a group that the caller has not."""
+    if uids != {caller.uid}:
+        sentence = f"pid {pid} is not a process of uid {caller.uid}; its owner and root may protect it"
+        raise RefusedError(sentence, "PermissionError")
+    if others := sorted(gids - {caller.gid, *caller.groups}):
+        told = f"pid {pid} runs with gid {', '.join(map(str, others))}, which uid {caller.uid} has not where it asks"
+        raise RefusedError(f"{told}; give the order with that group (newgrp), or as root", "PermissionError")
+
+
+def _as_user(caller: Caller, name: str) -> Inheritance:
+    """What a program inherits that is to run as somebody else."""
+    if caller.uid != ROOT:
+        raise RefusedError(f"only root may choose a user; uid {caller.uid} runs programs as itself", "PermissionError")
+    try:
+        found = pwd.getpwuid(int(name)) if name.isdecimal() else pwd.getpwnam(name)
+    except KeyError:
+        raise RefusedError(f"this robot has no user {name!r}; see getent passwd") from None
+    return caller.inheritance.as_user(found.pw_uid, found.pw_gid, tuple(os.getgrouplist(found.pw_name, found.pw_gid)))
+
+
+def _seen(pid: int, uid: int) -> Inheritance | None:
+    """What the client's children would inherit; None where it cannot be seen, or is somebody else by now."""
+    try:
+        pidfd = os.pidfd_open(pid)
+    except (OSError, ValueError):
+        return None
+    try:
+        found = _inheritance_of(pid)
+    except (OSError, CheckpointError):
+        return None
+    finally:
+        watch = select.poll()
+        watch.register(pidfd, select.POLLIN)
+        over = bool(watch.poll(0))
+        os.close(pidfd)
+    return found if found.uid == uid and not over else None
+
+
+def _inheritance_of(pid: int) -> Inheritance:
+    status, stat = procfs.status(pid), procfs.stat(pid)
+    kept = os.sched_getscheduler(pid)
+    reset, policy = bool(kept & os.SCHED_RESET_ON_FORK), kept & ~os.SCHED_RESET_ON_FORK
+    realtime = policy in (os.SCHED_FIFO, os.SCHED_RR)
+    plain = policy == SCHED_DEADLINE or (reset and realtime)
+    return Inheritance(
+        uid=status.uids[1],
+        gid=status.gids[1],
+        groups=status.groups,
+        bounding=status.capabilities[3],
+        no_new_privs=status.no_new_privs,
+        limits=procfs.limits(pid),
+        nice=max(stat.nice, 0) if reset else stat.nice,
+        policy=os.SCHED_OTHER if plain else policy,
+        priority=os.sched_getparam(pid).sched_priority if realtime and not plain else 0,
+        affinity=tuple(sorted(os.sched_getaffinity(pid))),
+        io_priority=abi.io_priority(pid),
+        oom_score_adj=int(procfs.read_text(pid, "oom_score_adj")),
+    )
+
+
+def _groups(connection: socket.socket, uid: int, gid: int) -> tuple[int, ...]:
+    """The supplementary groups of the peer as it connected; where the kernel does not tell them, those of its user."""
+    found = array.array("I")
+    try:
+        found.frombytes(connection.getsockopt(socket.SOL_SOCKET, SO_PEERGROUPS, GROUPS_SIZE_MAX))
+    except OSError:
+        with contextlib.suppress(KeyError):
+            found.extend(os.getgrouplist(pwd.getpwuid(uid).pw_name, gid))
+    return tuple(found)

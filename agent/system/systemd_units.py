@@ -1,0 +1,71 @@
+"""Guards and keepers outlive the agent's service and inherit nothing from it: under systemd each gets a transient service.
+
+A child of ours would stand in the service's cgroup, and it, its program and every restored program would have what the service
+has: its limits, capability bounding set, group, score for the OOM killer, seccomp filters, view of the files. The parent of a
+transient service is systemd, which gives it what every service gets; the guard then gives the program what it would inherit from
+whoever asked for it (`checkpoint.linux.spawn.inherited_limits`).
+
+A shutdown ends the agent first and these services after it (``Before=`` orders ends the other way round, systemd.unit(5)).
+A program that exits cleanly because the machine tells it to is not done: nobody records an end, and its standby takes over.
+
+Where systemd did not start the agent, they are its children, born with what it was started with.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Final, Literal
+
+SLICE: Final = "failover.slice"
+STARTED: Final = "SYSTEMD_EXEC_PID"
+"""By it systemd (since version 248) names the process that it started; that process's children inherit the variable."""
+
+STOP_S: Final = 5
+"""How long a shutdown waits for a component to obey SIGTERM; one that is frozen never does, and the default is 90 s."""
+
+Kind = Literal["guard", "keeper", "hook"]
+
+PROPERTIES: Final[dict[Kind, tuple[str, ...]]] = {
+    "guard": ("Delegate=yes", f"TimeoutStopSec={STOP_S}s", "OOMScoreAdjust=-900", "UMask=0077"),
+    "keeper": (f"TimeoutStopSec={STOP_S}s", "LimitNOFILE=65536", "UMask=0077"),
+    "hook": (f"TimeoutStopSec={STOP_S}s", "KillSignal=SIGKILL"),
+}
+"""Without its guard a program ends, so memory is taken from others first; a keeper is replaced; of a hook nothing outlives its
+limit, for what comes after it begins then: asked to end first, it could go on for as long as a stop may take."""
+
+
+def starter() -> str:
+    """The command that asks systemd for a transient service; "" where systemd did not start our parent, or does not obey us.
+
+    Called by the lanes, whose parent is the service's main process. An agent that is merely a descendant of some service (of a CI
+    runner, of a desktop's terminal) may live in namespaces where systemd's services are strangers.
+    """
+    if os.geteuid() != 0 or os.environ.get(STARTED) != str(os.getppid()) or not os.path.isdir("/run/systemd/system"):
+        return ""
+    return shutil.which("systemd-run") or ""
+
+
+def in_a_unit(program: str, kind: Kind, name: str) -> list[str]:
+    """What to put before a command line so that it runs in a service ``failover-KIND-NAME.service`` of its own.
+
+    Args:
+        program: what `starter` found.
+    """
+    service = own_service(Path("/proc/self/cgroup").read_text(encoding="utf-8", errors="surrogateescape"))
+    order = (f"Before={service}",) if service else ()
+    properties = [f"--property={one}" for one in (*PROPERTIES[kind], *order)]
+    unit = f"--unit=failover-{kind}-{name}"
+    begun = "oneshot" if kind == "hook" else "exec"  # systemd-run waits until that has come about: the end of a hook
+    return [program, "--quiet", "--collect", f"--service-type={begun}", unit, f"--slice={SLICE}", *properties, "--"]
+
+
+def own_service(cgroups: str) -> str:
+    """The systemd service that a process belongs to, by its /proc/PID/cgroup; "" if none."""
+    for line in filter(None, cgroups.split("\n")):  # whoever names a group may have others in it
+        controllers, path = line.split(":", 2)[1:]
+        if controllers in ("", "name=systemd"):
+            units = [part for part in path.split("/") if part.endswith(".service")]
+            return units[-1] if units else ""
+    return ""

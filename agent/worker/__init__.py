@@ -1,0 +1,1 @@
+"""The process for all that may take its time: snapshots, programs, people. It starts at `process` or `witness`."""

@@ -1,0 +1,1 @@
+"""Components of this robot: started, captured, restored, kept ready, ended."""

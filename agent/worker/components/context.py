@@ -1,0 +1,56 @@
+"""What every component in this robot's charge is surrounded by, and what can go wrong with it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import msgspec
+from msgspec import Struct, field
+
+from agent.config import ComponentConfig
+from agent.worker.components.hooks import Hooks
+from agent.worker.components.launch import Program
+from agent.worker.components.paths import Places
+from agent.worker.components.run_records import Records
+from checkpoint.linux.spawn.inherited_limits import Inheritance
+from checkpoint.store.store import Store
+from failover.core.events import Event
+from failover.core.types import COMMITTED, Launch
+
+
+class Surroundings(Struct):
+    """What every charge works with.
+
+    Attributes:
+        tell: passes an event to the core.
+        silence_ns: how long the robot that the component is taken over from has been silent, as far as known; for the outage.
+        settled: returns once no snapshot of a component is being stored any more; given a position that it goes on from, with its
+            output in the logs.
+        here: what this robot's operator wants for a component.
+        hooks: runs his commands.
+    """
+
+    places: Places
+    store: Store
+    records: Records
+    tell: Callable[[Event], None]
+    silence_ns: Callable[[str], Coroutine[Any, Any, int]]
+    settled: Callable[..., Coroutine[Any, Any, None]]
+    here: Callable[[str], ComponentConfig]
+    hooks: Hooks = field(default_factory=Hooks)
+
+
+def program_of(launch: Launch) -> Program:
+    """What to start."""
+    return Program(
+        tuple(os.fsencode(argument) for argument in launch.argv),
+        tuple(os.fsencode(f"{name}={value}") for name, value in launch.environment),
+        os.fsencode(launch.directory),
+        launch.umask,
+        launch.isolate,
+        msgspec.msgpack.decode(launch.inheritance, type=Inheritance) if launch.inheritance else None,
+        launch.engine,
+        launch.output == COMMITTED,
+    )

@@ -1,0 +1,444 @@
+"""How a component of this robot comes to be: started afresh, taken in, restored from a checkpoint, or found again.
+
+component = await births.start("/lab/robot1/mapper", program, places)           # it runs, and is not protected yet
+component = await births.restore(name, chain_descriptors, places, outage_ns=…)  # stopped, whole, uncommitted: `resume` it
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from agent.errors import GuardError, GuardLostError, KeeperLostError
+from agent.guard import messages
+from agent.guard.output_logs import total_of
+from agent.system.adopted_process import Guest
+from agent.system.clock import Laps, now_ns
+from agent.system.permissions import ROOT
+from agent.worker.components.component import Component, Prepared
+from agent.worker.components.paths import Places, complete_logs, log_directory
+from agent.worker.components.process_pool import KeeperLink, connect
+from agent.worker.components.restore_limits import bound_of, check_rights
+from checkpoint.engine import COOPERATIVE, COPY_CLOCKS_AHEAD_NS, NO_TERMS, PTRACE, Terms, pid_taken
+from checkpoint.engines.cooperative.session import age_ns as commit_age_ns
+from checkpoint.errors import ChainError, CheckpointError, MismatchError
+from checkpoint.keeper import messages as channel
+from checkpoint.keeper.messages import Laid
+from checkpoint.linux.spawn.inherited_limits import Inheritance
+from checkpoint.model import Snapshot
+from checkpoint.program import epoch_variable
+from checkpoint.segment.task_messages import Origin
+from checkpoint.snapshot import format
+from checkpoint.snapshot.carried_files import paths_of
+from checkpoint.snapshot.credentials import Owner
+from checkpoint.snapshot.required_files import names_of_contents, needs
+
+
+class Program(Struct, frozen=True):
+    """What to start, as execve(2) wants it.
+
+    Attributes:
+        brought: its files that were brought here, for where its own are missing: (path, content, mode).
+    """
+
+    argv: tuple[bytes, ...]
+    environment: tuple[bytes, ...]
+    working_directory: bytes
+    umask: int = 0o022
+    isolate: bool = True
+    inheritance: Inheritance | None = None
+    engine: str = PTRACE
+    holds_output: bool = False
+    brought: tuple[tuple[str, str, int], ...] = ()
+
+
+async def start(name: str, program: Program, places: Places, epoch: int = 0, owner: int | None = None) -> Component:
+    """Start a guard and under it the program. It runs, and is not protected yet.
+
+    Args:
+        owner: user id of whose component it is; None: of the agent's own user.
+
+    Raises:
+        GuardError: it could not be started; nothing is left of it.
+    """
+    component = Component(name, await places.nursery.guard(), places)
+    try:
+        component.begin_output(os.geteuid() if owner is None else owner)
+    except OSError as error:
+        component.close()
+        raise GuardError(f"{name}: cannot begin its output anew in {error.filename}: {error.strerror}") from error
+    component.engine_wanted = program.engine
+    task = messages.Task(epoch, engine=program.engine) if program.engine != PTRACE else None
+    component.logs.hold(program.holds_output)
+    return await _born(component, _starting(name, under_epoch(program, epoch), places, task))
+
+
+def under_epoch(program: Program, epoch: int) -> Program:
+    """The program with the fencing token in its environment; 0 while it waits for one."""
+    others = tuple(one for one in program.environment if not one.startswith(epoch_variable.VARIABLE.encode() + b"="))
+    return replace(program, environment=(*others, epoch_variable.assignment(epoch)))
+
+
+def _starting(
+    name: str, program: Program, places: Places, task: messages.Task | None, totals: tuple[int, int] = (0, 0)
+) -> messages.Start:
+    return messages.Start(
+        component=name,
+        argv=program.argv,
+        environment=program.environment,
+        working_directory=program.working_directory,
+        umask=program.umask,
+        isolate=program.isolate,
+        log_directory=str(log_directory(name, places)),
+        cgroup=places.cgroup,
+        inheritance=program.inheritance,
+        task=task,
+        totals=totals,
+        brought=program.brought,
+    )
+
+
+async def watch(name: str, guest: Guest, places: Places) -> Component:
+    """Take a running process in: its guard is not its parent and does not own its streams.
+
+    Args:
+        guest: becomes the component's, whatever happens.
+
+    Raises:
+        GuardError: it has ended.
+    """
+    try:
+        component = Component(name, await places.nursery.guard(), places)
+    except (GuardError, OSError):
+        guest.close()
+        raise
+    component.guest = guest
+    component.pid = component.inner_pid = guest.pid
+    return await _born(component, messages.Watch(name, guest.pid), (guest.fileno(),))
+
+
+async def restore(
+    name: str,
+    chain: Sequence[int],
+    places: Places,
+    *,
+    outage_ns: int,
+    owner: int | None = None,
+    started: Inheritance | None = None,
+    laps: Laps | None = None,
+    task: messages.Task | None = None,
+    epoch: int = 0,
+    terms: Terms = NO_TERMS,
+    stood_still: bool = False,
+) -> Component:
+    """Rebuild a component from a chain (descriptors of encoded snapshots, oldest first), stopped, committed to nothing.
+
+    Whatever fails, and whoever dies before `resume`: nothing of it is left.
+
+    Args:
+        laps: told how long each stage took.
+        outage_ns: added to the program's monotonic and boot time: how long ago the newest snapshot was taken.
+        task: for a program that may still say that it keeps its state.
+        owner: uid; None: whoever it ran as. What is not root's opens its files with its owner's rights, and gets no others.
+        started: what it was started with; None: not known.
+        terms: this robot's.
+        stood_still: nothing of it has run since the newest snapshot.
+
+    Raises:
+        checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
+    """
+    laps = laps or Laps()
+    outline = await asyncio.to_thread(format.read_outline, chain[-1])
+    theirs = outline.process.credentials
+    owner = theirs.uids[0] if owner is None else owner
+    check_rights(name, outline, owner, started)
+    await asyncio.to_thread(complete_logs, log_directory(name, places), chain, owner=owner)
+    laps.lap("reading the newest")
+    component = Component(name, await places.nursery.guard(), places)
+    request = _vessel_for(name, outline, places, outage_ns, total_of(outline.output), task)
+    component.engine_wanted = task.engine if task is not None else PTRACE
+    component.keeper.terms = terms_of(outline, terms, bound_of(owner, started))
+    component.keeper.names = names_of_contents(needs(outline), places.contents)
+    try:
+        keeper = await component.keeper.give()
+        laps.lap("guard and keeper")
+        await _vessel(component, request, keeper)
+        laps.lap("vessel")
+        order = channel.Restore(
+            component.pid,
+            name,
+            outage_ns,
+            streams=True,
+            robot=places.robot,
+            own_eyes=owner != ROOT,
+            epoch=epoch,
+            contents=places.contents,
+            terms=component.keeper.terms,
+            stood_still=stood_still,
+        )
+        restored, _ = await component.keeper.ask(order, (*chain, *component.streams))
+        laps.lap("restore")
+    except (CheckpointError, GuardError, KeeperLostError):
+        await component.undo()
+        raise
+    component.notes = (*component.notes, *restored.notes)
+    return component
+
+
+def _vessel_for(
+    name: str,
+    outline: Snapshot,
+    places: Places,
+    elapsed_ns: int,
+    totals: tuple[int, int] | None,
+    task: messages.Task | None = None,
+    counted_ns: int = 0,
+) -> messages.MakeVessel:
+    theirs = outline.process.credentials
+    return messages.MakeVessel(
+        component=name,
+        inner_pid=outline.process.pid,
+        isolate=outline.process.isolated,
+        clocks=outline.clocks,
+        elapsed_ns=elapsed_ns,
+        totals=totals,
+        log_directory=str(log_directory(name, places)),
+        cgroup=places.cgroup,
+        user=(theirs.uids[1], theirs.gids[1]),
+        task=task,
+        counted_ns=counted_ns,
+    )
+
+
+async def lay(
+    name: str, chain: Sequence[int], places: Places, *, age_ns: int, owner: int, started: Inheritance | None, terms: Terms
+) -> tuple[Component, Laid]:
+    """Make a ready copy of a component from a chain: a vessel with its mappings and memory, which ends with this agent.
+
+    Args:
+        age_ns: of the newest snapshot.
+        started: what it was started with; None: not known.
+        terms: this robot's.
+
+    Raises:
+        checkpoint.errors.UnsupportedError: it can have none, with the reasons.
+        MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError: nothing of it is left.
+    """
+    counted_ns = now_ns()
+    outline = await asyncio.to_thread(format.read_outline, chain[-1])
+    check_rights(name, outline, owner, started)
+    component = Component(name, await places.nursery.guard(), places)
+    component.keeper.terms = terms_of(outline, terms, bound_of(owner, started))
+    request = _vessel_for(name, outline, places, age_ns + COPY_CLOCKS_AHEAD_NS, None, counted_ns=counted_ns)
+    try:
+        keeper = await component.keeper.give()
+        await _vessel(component, request, keeper)
+        if component.inner_pid != outline.process.pid:  # before all of it is read
+            raise pid_taken(outline.process.pid)
+        order = channel.Lay(component.pid, name, age_ns, owner != ROOT, places.contents, component.keeper.terms)
+        laid, _ = await component.keeper.ask(order, tuple(chain))
+    except (CheckpointError, GuardError, KeeperLostError):
+        await component.undo()
+        raise
+    return component, laid
+
+
+def stale(name: str) -> ChainError:
+    """A ready copy does not lead to what the store holds now: a base has come."""
+    return ChainError(f"the ready copy of {name} must be laid again: a new chain has begun")
+
+
+async def finish(
+    component: Component,
+    outline: Snapshot,
+    places: Places,
+    *,
+    outage_ns: int,
+    owner: int | None,
+    started: Inheritance | None,
+    task: messages.Task | None,
+    epoch: int,
+    terms: Terms,
+    stood_still: bool,
+) -> None:
+    """Make the program of its ready copy, stopped, committed to nothing; arguments as of `restore`.
+
+    Args:
+        outline: of the snapshot that it stands at.
+
+    Raises:
+        checkpoint.errors.MismatchError, RestoreError; GuardError, KeeperLostError: nothing of it is left.
+    """
+    name, theirs = component.name, outline.process.credentials
+    owner = theirs.uids[0] if owner is None else owner
+    try:
+        check_rights(name, outline, owner, started)
+        component.engine_wanted = task.engine if task is not None else PTRACE
+        component.keeper.terms = terms_of(outline, terms, bound_of(owner, started))
+        component.keeper.names = names_of_contents(needs(outline), places.contents)
+        order = channel.Restore(
+            component.pid,
+            name,
+            outage_ns,
+            robot=places.robot,
+            own_eyes=owner != ROOT,
+            epoch=epoch,
+            contents=places.contents,
+            terms=component.keeper.terms,
+            stood_still=stood_still,
+        )
+        restored, _ = await component.keeper.ask(channel.Finish(order, outline.position))
+    except (CheckpointError, GuardError, KeeperLostError):
+        await component.undo()
+        raise
+    component.commit = messages.Commit(total_of(outline.output), task)
+    component.notes = (*component.notes, *restored.notes)
+
+
+def terms_of(outline: Snapshot, here: Terms, owner: Owner | None) -> Terms:
+    """On which terms a component that comes back is followed on this robot: it carries what its snapshot says.
+
+    Args:
+        owner: whose rights bound it, see `agent.worker.components.restore_limits.bound_of`.
+    """
+    places = dict(here.carry.places)
+    paths = tuple(places.get(path, path) for path in paths_of(outline))
+    return replace(here, carry=replace(here.carry, paths=paths), owner=owner)
+
+
+async def begin_again(
+    name: str,
+    program: Program,
+    chain: Sequence[int],
+    places: Places,
+    *,
+    outage_ns: int,
+    owner: int,
+    epoch: int,
+    why: str,
+    waiting: Component | None = None,
+    terms: Terms = NO_TERMS,
+) -> Component:
+    """Prepare a program that keeps its state to go on from a chain of the cooperative engine; `resume` lets it.
+
+    Whatever fails, and whoever dies before `resume`: nothing of it is left.
+
+    Args:
+        why: one of `checkpoint.segment.task_messages.REASONS`.
+        waiting: the program, started to wait (`start_to_wait`); None: `resume` starts it.
+        terms: this robot's.
+
+    Raises:
+        checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
+    """
+    outline = await asyncio.to_thread(format.read_outline, chain[-1])
+    _check_owner(name, program, owner)
+    try:
+        check_rights(name, outline, owner, program.inheritance)  # its carried files are laid down with them
+    except CheckpointError:
+        if waiting is not None:
+            await waiting.undo()
+        raise
+    try:
+        await asyncio.to_thread(complete_logs, log_directory(name, places), chain, owner=owner)
+    except (CheckpointError, OSError):
+        if waiting is not None:
+            await waiting.undo()
+        raise
+    component = waiting or Component(name, await places.nursery.guard(), places)
+    component.engine_wanted = COOPERATIVE  # what another engine took before it says Hello would be older than its state
+    component.keeper.terms = terms_of(outline, terms, bound_of(owner, program.inheritance))
+    try:
+        await component.keeper.give()
+        filled, (segment,) = await component.keeper.ask(channel.Fill(name, owner != ROOT, terms.carry.places), tuple(chain))
+    except (CheckpointError, GuardError, KeeperLostError):
+        await component.undo()
+        raise
+    component.notes = (*component.notes, *filled.notes)
+    age_ns = outage_ns + commit_age_ns(outline)
+    origin = Origin(outline.machine.robot, filled.position.generation, why, age_ns)
+    totals = total_of(outline.output)
+    if waiting is not None:
+        component.prepared = Prepared(messages.BeginTask(epoch, origin, totals), segment, age_ns)
+    else:
+        start = _starting(name, under_epoch(program, epoch), places, messages.Task(epoch, origin), totals)
+        component.prepared = Prepared(start, segment, age_ns)
+    return component
+
+
+async def start_to_wait(name: str, program: Program, places: Places, owner: int) -> Component:
+    """Start a program that keeps its state in advance: it waits for `begin_again`, and ends with this agent until then.
+
+    Raises:
+        checkpoint.errors.MismatchError: it would run as somebody else than its owner.
+        GuardError: it could not be started; nothing is left of it.
+    """
+    _check_owner(name, program, owner)
+    component = Component(name, await places.nursery.guard(), places)
+    component.engine_wanted = COOPERATIVE
+    return await _born(component, _starting(name, under_epoch(program, 0), places, messages.Task(warm=True)))
+
+
+def _check_owner(name: str, program: Program, owner: int) -> None:
+    """Raises MismatchError: a program of this owner's would run as somebody else."""
+    inherited = program.inheritance.uid if program.inheritance is not None else os.geteuid()
+    if owner not in (ROOT, inherited):
+        reason = f"it is to run as uid {inherited}, which is not its owner, uid {owner}; start it as that user"
+        raise MismatchError(f"cannot restore {name}: {reason}", (reason,))
+
+
+async def reconnect(socket_path: Path, places: Places) -> Component:
+    """Find a component again after the agent was restarted.
+
+    Raises:
+        GuardLostError: nobody listens there any more; the left-over socket has been removed.
+    """
+    try:
+        guard = connect(socket_path)
+    except OSError as error:
+        with contextlib.suppress(FileNotFoundError):
+            socket_path.unlink()
+        raise GuardLostError(f"the guard of {socket_path.name} has gone: {error.strerror}") from error
+    guard.dialogue.heard = lambda message: isinstance(message, messages.Event)  # the end is told by the answer, too
+    described, streams = await guard.dialogue.ask(messages.Describe())
+    if described.state == "none":
+        guard.dialogue.close()
+        raise GuardLostError(f"the guard of {socket_path.name} guards nothing; it ends")
+    component = Component(described.component, guard, places)
+    component.take(described, streams)
+    if described.watched and described.state != "ended":
+        with contextlib.suppress(ProcessLookupError):
+            component.guest = Guest(described.pid)
+    if described.state == "ended" and not component.ended.done():
+        component.ended.set_result(described.exit_status)
+    return component
+
+
+async def _vessel(component: Component, request: messages.MakeVessel, keeper: KeeperLink) -> None:
+    """Have its guard make a vessel that ends with the keeper until it is committed to."""
+    pidfd = keeper.pidfd()
+    try:
+        await _born(component, request, (pidfd,))
+    finally:
+        os.close(pidfd)
+
+
+async def _born(component: Component, request: Any, descriptors: tuple[int, ...] = ()) -> Component:
+    """Have its guard begin it; a guard that refuses is hung up on, and ends."""
+    try:
+        born, streams = await component.ask_guard(request, descriptors)
+    except GuardError:
+        component.close()
+        raise
+    if isinstance(born, messages.Watching):
+        component.notes = born.notes
+    else:
+        component.take(born, streams)
+    return component

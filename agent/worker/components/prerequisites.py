@@ -1,0 +1,135 @@
+"""What this robot lacks of what a component needs to go on here: asked before it is moved here, and looked at while it stands by.
+
+Where it runs it is looked which of its files others hold open for writing: each of them can be captured, and the restore of the
+one that comes second is refused. Its newest checkpoint here tells what it needs. A keeper compares, for it knows how a restore
+would; nothing is started.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Mapping
+from contextlib import asynccontextmanager
+from typing import Final
+
+from agent.core_config import terms_here
+from agent.errors import TROUBLE, RefusedError
+from agent.system.permissions import ROOT
+from agent.worker.components.context import Surroundings, program_of
+from agent.worker.components.process_pool import KeeperLink
+from agent.worker.components.restore_limits import check_rights
+from agent.worker.components.supervisor import Charge
+from agent.worker.network.remote_orders import Errands
+from checkpoint.engine import COOPERATIVE
+from checkpoint.errors import CheckpointError, MismatchError, StoreError
+from checkpoint.keeper import messages
+from checkpoint.keeper.messages import Compared, Failed, close_all
+from checkpoint.snapshot import format
+
+PATIENCE_S: Final = 15.0
+"""How long another robot may take to look what it lacks: it reads files."""
+
+CLEARING_S: Final = 5.0
+"""How long is waited for a copy that is being ended here: what it holds, a name or a port, the next one does not lack."""
+
+log = logging.getLogger("failover.lacks")
+
+
+async def asked_of(errands: Errands, robot: str, name: str) -> tuple[str, ...]:
+    """What another robot lacks of what a component needs to go on there; nothing where it cannot be asked."""
+    try:
+        found = await errands.send(robot, "lacks", {"name": name}, patience_s=PATIENCE_S)
+    except RefusedError as untold:
+        log.warning("%s: whether it could go on at %s is not known: %s", name, robot, untold)
+        return ()
+    reasons = found.get("lacks")
+    return tuple(map(str, reasons)) if isinstance(reasons, list) else ()
+
+
+async def look(around: Surroundings, charges: Iterable[Charge]) -> Mapping[str, tuple[str, ...]]:
+    """What is lacking here for each of these, as sentences, by name; what cannot be looked at, or is not stored, is left out."""
+    return await _told_by_one_keeper(around, charges, _compared)
+
+
+async def contested(around: Surroundings, charges: Collection[Charge]) -> Mapping[str, tuple[str, ...]]:
+    """Which files of those that run here, and have a checkpoint, others hold open for writing; as `look`.
+
+    Args:
+        charges: all of this robot's, so that others are known by name.
+    """
+    components = {charge.name: charge.component.pid for charge in charges if charge.component is not None}
+    running = [charge for charge in charges if charge.name in components and charge.figures.snapshots]
+
+    async def compared(around: Surroundings, charge: Charge, keeper: KeeperLink) -> tuple[str, ...]:
+        component = charge.component
+        if component is None or not component.pid:
+            return ()  # it has just ended
+        terms, pid = component.keeper.terms, component.pid
+        order = messages.Compare(terms=terms, running=pid, components=components)
+        async with _newest(around, charge.name) as snapshot:
+            return (await _answer(keeper, order, snapshot)).lacks
+
+    return await _told_by_one_keeper(around, running, compared)
+
+
+@asynccontextmanager
+async def _newest(around: Surroundings, name: str) -> AsyncIterator[int]:
+    """Its newest checkpoint here, open for reading in the body. Raises StoreError: there is none, or no more."""
+    chain = await asyncio.to_thread(around.store.open_chain, name)
+    try:
+        yield chain[-1]
+    finally:
+        close_all(tuple(chain))
+
+
+async def _answer(keeper: KeeperLink, order: messages.Compare, snapshot: int) -> Compared:
+    reply, _ = await keeper.dialogue.ask(order, (snapshot,))
+    if isinstance(reply, Failed):
+        raise CheckpointError(reply.message)
+    assert isinstance(reply, Compared)
+    return reply
+
+
+async def _told_by_one_keeper(
+    around: Surroundings,
+    charges: Iterable[Charge],
+    compared: Callable[[Surroundings, Charge, KeeperLink], Awaitable[tuple[str, ...]]],
+) -> Mapping[str, tuple[str, ...]]:
+    found: dict[str, tuple[str, ...]] = {}
+    keeper: KeeperLink | None = None
+    try:
+        for charge in charges:
+            await charge.cleared(CLEARING_S)
+            keeper = keeper or await around.places.nursery.onlooker()
+            try:
+                found[charge.name] = await compared(around, charge, keeper)
+            except StoreError:
+                continue  # there is no checkpoint of it here yet, or no more
+            except (CheckpointError, OSError) as trouble:
+                log.warning("%s: cannot look whether it could go on here: %s", charge.name, trouble)
+    except TROUBLE as trouble:
+        log.warning("cannot look which components could go on here: %s", trouble)
+    finally:
+        if keeper is not None:
+            keeper.end()
+    return found
+
+
+async def _compared(around: Surroundings, charge: Charge, keeper: KeeperLink) -> tuple[str, ...]:
+    name, spec = charge.name, charge.figures.spec
+    async with _newest(around, name) as snapshot:
+        outline = await asyncio.to_thread(format.read_outline, snapshot)
+        if outline.engine == COOPERATIVE and around.here(name).command:
+            return ()  # it is started by that
+        terms = terms_here(spec.launch if spec is not None else None, around.here(name))
+        is_ordinary = spec is not None and spec.owner != ROOT
+        order = messages.Compare(around.places.contents, terms, charge.figures.digests, own_eyes=is_ordinary)
+        reply = await _answer(keeper, order, snapshot)
+    charge.figures.digests = reply.known
+    try:
+        if spec is not None:
+            check_rights(name, outline, spec.owner, program_of(spec.launch).inheritance)
+    except MismatchError as mismatch:
+        return (*mismatch.reasons, *reply.lacks)
+    return reply.lacks

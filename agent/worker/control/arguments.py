@@ -1,0 +1,155 @@
+"""What the verbs of the control socket take; their meaning: `failover.client.control`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final, Literal, TypeVar
+
+import msgspec
+
+from agent.errors import RefusedError
+from checkpoint.arch import EVERY_LEVEL
+
+SIGNAL_MAX: Final = 64
+"""The last real-time signal. Source: signal(7)."""
+
+PID_MAX: Final = (1 << 31) - 1
+"""What a pid_t holds."""
+
+Text = Annotated[str, msgspec.Meta(pattern=r"\A[^\0]*\Z")]
+"""What the kernel can be told: a string of C ends with a NUL."""
+
+Variable = Annotated[str, msgspec.Meta(pattern=r"\A[^\0=]+\Z")]
+"""A name in the environment."""
+
+Offset = Annotated[int, msgspec.Meta(ge=0)]
+"""Of a byte in a stream, from its beginning."""
+
+Age = Annotated[int, msgspec.Meta(ge=0, le=1 << 50)]
+"""Milliseconds since something happened; 0 for no limit."""
+
+HookName = Literal["before_capture", "before_resume", "after_resume"]
+"""Occasions for a command that comes with a program, see `agent.worker.components.hooks`."""
+
+Connections = Literal["", "reset", "carry"]
+"""What becomes of TCP connections; "" for what this robot's operator says."""
+
+T = TypeVar("T")
+
+
+def arguments_of(kind: type[T], verb: str, arguments: dict[str, Any]) -> T:
+    """A verb's arguments, checked.
+
+    Raises:
+        RefusedError: one is missing, unknown or of the wrong kind.
+    """
+    try:
+        return msgspec.convert(arguments, kind)
+    except msgspec.ValidationError as error:
+        raise RefusedError(f"{verb}: its arguments are not right: {error}") from error
+
+
+class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``run``."""
+
+    argv: list[Text]
+    name: str = ""
+    env: dict[Variable, Text] = {}
+    cwd: Text = "/"
+    umask: Annotated[int, msgspec.Meta(ge=0, le=0o777)] = 0o022
+    isolate: bool = True
+    wait: bool = True
+    user: str = ""
+    engine: Literal["auto", "ptrace", "cooperative"] = "auto"
+    output: Literal["immediate", "committed"] = "immediate"
+    portable: Annotated[str, msgspec.Meta(pattern=f"^(no|{'|'.join(EVERY_LEVEL)})?$")] = ""
+    hooks: dict[HookName, list[Text]] = {}
+    carry: list[Text] = []
+    shared: list[Text] = []
+    devices: dict[Text, Text] = {}
+    connections: Connections = ""
+
+
+class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``protect``."""
+
+    pid: Annotated[int, msgspec.Meta(ge=1, le=PID_MAX)]
+    name: str
+    carry: list[Text] = []
+    shared: list[Text] = []
+    devices: dict[Text, Text] = {}
+    connections: Connections = ""
+
+
+class StopArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``stop``."""
+
+    name: str
+    signal: Annotated[int, msgspec.Meta(ge=1, le=SIGNAL_MAX)] = 15
+
+
+class LogsArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``logs``."""
+
+    name: str
+    follow: bool = False
+    offsets: tuple[Offset, Offset] = (0, 0)
+
+
+class NameArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``release`` and ``failback``."""
+
+    name: str = ""
+
+
+class HandoverArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``handover``."""
+
+    name: str
+    to: str = ""
+
+
+class PromoteArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``promote``."""
+
+    name: str
+    robot: str = ""
+    sure: bool = False
+
+
+class PreferArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``prefer``."""
+
+    name: str
+    robot: str
+
+
+class StatusArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``status``."""
+
+    watch: bool = False
+    every_ms: Annotated[int, msgspec.Meta(ge=1, le=3_600_000)] = 500
+    team: bool = False
+
+
+class WhyArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``why``."""
+
+    name: str = ""
+    robot: str = ""
+    age_ms_max: Age = 0
+
+
+class PageArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``story``: what another robot asks for when it tells a story; ``before``: life and number of a line."""
+
+    name: str = ""
+    age_ms_max: Age = 0
+    before: tuple[int, int] = (0, 0)
+
+
+class PieceArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``piece``: what another robot asks for when it passes a stream on."""
+
+    name: str
+    stream: int
+    offset: Offset

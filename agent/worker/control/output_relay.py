@@ -1,0 +1,146 @@
+"""What a component wrote, passed on to whoever asks, from the robot that has it.
+
+While it runs, its standby has every byte that no takeover can take back, so it answers by itself. Its end, and whatever a robot
+without checkpoints is asked for, is read at the robot where it runs or ran, piece by piece.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any, Final, Protocol
+
+from agent.config import Settings
+from agent.errors import RefusedError
+from agent.guard.output_logs import STREAMS, OutputLogs
+from agent.main_loop.messages import Told
+from agent.system.permissions import check_right
+from agent.worker.components.paths import Places, log_directory
+from agent.worker.components.supervisor import Charge
+from agent.worker.control.arguments import PieceArguments, arguments_of
+from agent.worker.control.server import Conversation
+from agent.worker.network.remote_orders import Errands
+from checkpoint.model import OutputPiece
+from failover.core.types import ENDED, ComponentView, PeerView, State
+
+POLL_S: Final = 0.02
+"""How soon new output is passed on to whoever watches."""
+
+PIECE_SIZE: Final = 128 << 10
+"""Bytes read from another robot at a time: less than the lane's largest message."""
+
+LIVING: Final = ("alive", "suspect")
+
+
+class Lanes(Protocol):
+    """What of `agent.worker.process.Lanes` is needed here."""
+
+    settings: Settings
+    places: Places
+    charges: dict[str, Charge]
+    errands: Errands
+
+    async def ask(self, what: Any) -> Told: ...
+
+
+class Outflow:
+    """Reads streams, here or elsewhere."""
+
+    def __init__(self, lanes: Lanes) -> None:
+        self._lanes = lanes
+
+    async def pass_on(
+        self, say: Conversation, name: str, offsets: tuple[int, int], *, committed: bool, follow: bool
+    ) -> tuple[int, int]:
+        """Send the streams' bytes from the offsets on; with ``follow`` until the component's end is a record.
+
+        Args:
+            committed: only what no takeover can take back; all of it once it has ended.
+
+        Raises:
+            RefusedError: another robot has them, and went away.
+        """
+        at = dict(zip(STREAMS, offsets, strict=True))
+        while True:
+            over, elsewhere = await self._standing(name)
+            whole = over or not committed or (not follow and await self._has_ended(name))
+            sent = False
+            for stream in STREAMS:
+                piece = await self._read(name, elsewhere, stream, at[stream], not whole, say.caller.uid)
+                if piece.content:
+                    await say.output(stream, piece.offset, piece.content)
+                    at[stream] = piece.offset + len(piece.content)
+                    sent = True
+            if not sent and (over or not follow):
+                return at[1], at[2]
+            if not sent:
+                await asyncio.sleep(POLL_S)
+
+    async def piece(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
+        """A piece of a stream for another robot: what is committed here, all of it once the component has ended."""
+        wanted = arguments_of(PieceArguments, "piece", arguments)
+        if wanted.stream not in STREAMS:
+            raise RefusedError(f"piece: {wanted.stream} is no stream; 1 is standard output, 2 standard error")
+        view, _ = await self._view(wanted.name)
+        check_right(by, wanted.name, view.owner if view is not None else None)
+        piece = self._read_here(wanted.name, wanted.stream, wanted.offset, not await self._has_ended(wanted.name), by)
+        return {"offset": piece.offset, "content": piece.content}
+
+    async def _read(self, name: str, robot: str, stream: int, offset: int, committed: bool, by: int) -> OutputPiece:
+        if not robot:
+            return self._read_here(name, stream, offset, committed, by)
+        told = await self._lanes.errands.send(robot, "piece", {"name": name, "stream": stream, "offset": offset}, by)
+        return OutputPiece(stream, told["offset"], told["content"])
+
+    def _read_here(self, name: str, stream: int, offset: int, committed: bool, by: int) -> OutputPiece:
+        """Raises RefusedError: these are still the logs of another user's component, which had the name before."""
+        logs = OutputLogs(log_directory(name, self._lanes.places))
+        try:
+            if logs.owner is not None:
+                check_right(by, f"the output of {name} that is kept here", logs.owner)
+            return logs.read(stream, offset, PIECE_SIZE, committed=committed)
+        finally:
+            logs.close()
+
+    async def _standing(self, name: str) -> tuple[bool, str]:
+        """Whether the component's end is a record, and the robot to ask for what it wrote; "" for this one."""
+        charge = self._lanes.charges.get(name)
+        if charge is not None and charge.ended is not None and charge.ended.done():
+            return True, ""
+        if charge is not None and charge.component is not None:
+            return False, ""
+        view, peers = await self._view(name)
+        return (view.state in ENDED, _where(view, peers)) if view is not None else (False, "")
+
+    async def _has_ended(self, name: str) -> bool:
+        """The core's word: status shows it, and peers hear it, before it is written and our own charge is told.
+
+        Held output waits for the charge: then the end is on record at every robot that is heard.
+        """
+        view, _ = await self._view(name)
+        if view is None or view.state not in ENDED:
+            return False
+        if not self._is_held(name) or view.primary != self._lanes.settings.config.robot:
+            return True
+        charge = self._lanes.charges.get(name)
+        return charge is not None and charge.ended is not None and charge.ended.done()
+
+    def _is_held(self, name: str) -> bool:
+        logs = OutputLogs(log_directory(name, self._lanes.places))
+        try:
+            return logs.is_held
+        finally:
+            logs.close()
+
+    async def _view(self, name: str) -> tuple[ComponentView | None, tuple[PeerView, ...]]:
+        """The component as this robot's core sees it, and the peers."""
+        told = await self._lanes.ask("status")
+        if told.status is None:
+            return None, ()
+        return next((one for one in told.status.components if one.name == name), None), told.status.peers
+
+
+def _where(view: ComponentView, peers: tuple[PeerView, ...]) -> str:
+    """The living robot that has more of a component's output than this one; "" if there is none."""
+    living = {peer.robot for peer in peers if peer.state in LIVING}
+    holds = view.state is State.STANDBY and bool(view.positions)
+    return view.primary if view.primary in living and not holds else ""

@@ -1,0 +1,199 @@
+"""What every member answers: how things stand, and why.
+
+`agent.worker.control.verbs` adds the orders. A witness answers by this alone: nothing in here needs more than the core's view of
+the team.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Callable
+from typing import Any, Final, Protocol
+
+from agent.config import Settings
+from agent.errors import RefusedError
+from agent.main_loop.messages import Told
+from agent.system.permissions import may, without_output
+from agent.worker.control.arguments import NameArguments, StatusArguments, WhyArguments, arguments_of
+from agent.worker.control.server import Conversation, Verb
+from agent.worker.control.status_view import version
+from agent.worker.control.why_view import Telling
+from agent.worker.network.remote_orders import Errands, Order
+from failover.client.health import is_healthy
+from failover.core import acts, events
+from failover.core.types import State
+
+SIGHT_PATIENCE_S: Final = 2.0
+"""How long a status waits for the other robots' own: where no answer came from counts as not known, and busy robots are late."""
+
+LIVING: Final = ("live", "suspect")
+"""States of peers that are asked: on a busy machine three beats may be late at any time."""
+
+WORK: Final = ("run", "protect", "logs", "handover", "failback", "prefer", "promote", "release", "stop")
+"""What takes a program, its output, or a word that others obey."""
+
+QUESTIONS: Final = ("standing", "picture", "story")
+"""What any member may ask of another one. The rest are orders, and a witness's are refused: it may be anybody's process."""
+
+
+NOT_HERE: Final[dict[str, Any]] = {
+    "state": "absent",
+    "role": "none",
+    "epoch": 0,
+    "lacks": None,
+    "cold": "",
+    "unstored": "",
+    "notes": [],
+    "reasons": [],
+}
+"""Of a component that this robot has not heard of, in place of what another one says of itself."""
+
+
+class Lines(Protocol):
+    """What of `agent.worker.hub.Switchboard` is needed here."""
+
+    settings: Settings
+    errands: Errands
+
+    async def ask(self, what: Any) -> Told: ...
+    async def command(self, make: Callable[[int], events.Command]) -> acts.Answer: ...
+    def hindrance(self, peer: str) -> str: ...
+    def picture(self, told: Told) -> dict[str, Any]: ...
+
+
+class Questions:
+    """The verbs of the control socket that every member has."""
+
+    def __init__(self, lines: Lines) -> None:
+        self._lines = lines
+        self._telling = Telling(lines)
+
+    def table(self) -> dict[str, Verb]:
+        """By name, as the client says them."""
+        return {
+            "ping": self.ping,
+            "status": self.status,
+            "why": self.why,
+            **dict.fromkeys(WORK, self._no_work),
+        }
+
+    def errands(self) -> dict[str, Order]:
+        """What another robot may ask of this one: how things stand here."""
+        return {"standing": self.standing, "picture": self.picture, "story": self._telling.page}
+
+    async def _no_work(self, _say: Conversation, _arguments: dict[str, Any]) -> dict[str, Any]:
+        me = self._lines.settings.config.robot
+        raise RefusedError(f"{me} is a witness: it votes, and neither runs nor keeps nor orders anything; ask at a robot")
+
+    async def ping(self, _say: Conversation, _arguments: dict[str, Any]) -> dict[str, Any]:
+        """Who are you?"""
+        await self._lines.ask("status")
+        config = self._lines.settings.config
+        team = self._lines.settings.team.team
+        return {"robot": config.robot, "team": team, "pid": os.getppid(), "version": version(), "insecure": config.insecure}
+
+    async def status(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """How does the team stand?"""
+        wanted = arguments_of(StatusArguments, "status", arguments)
+        while wanted.watch:
+            await say.update(await self._sight(wanted.team, say.caller.uid))
+            await asyncio.sleep(max(wanted.every_ms, 10) / 1_000)
+        return await self._sight(wanted.team, say.caller.uid)
+
+    async def _sight(self, team: bool, uid: int) -> dict[str, Any]:
+        """This robot's picture, for a user; with ``team`` each component also as the other living robots see it."""
+        mine = self._lines.picture(await self._lines.ask("status"))
+        for component in mine["components"]:
+            component["elsewhere"] = {}
+        if team:
+            living = await self._reachable()
+            answers = await asyncio.gather(*(self._asked(peer, "picture", {}) for peer in living))
+            _join(mine, {robot: picture for robot, picture in zip(living, answers, strict=True) if picture})
+            mine["healthy"] = is_healthy(mine)
+        mine["components"] = [_shown_to(uid, one) for one in mine["components"]]
+        return mine
+
+    async def _reachable(self) -> list[str]:
+        """The robots that live and can be asked."""
+        peers = self._lines.picture(await self._lines.ask("status"))["peers"]
+        return [peer["name"] for peer in peers if peer["state"] in LIVING and not self._lines.hindrance(peer["name"])]
+
+    async def _asked(self, peer: str, question: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        """A peer's answer; empty when it does not come soon."""
+        try:
+            return await self._lines.errands.send(peer, question, arguments, patience_s=SIGHT_PATIENCE_S)
+        except RefusedError:
+            return {}
+
+    async def why(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """What was decided, when and by whom: the stories of all robots that answer, in one.
+
+        What programs said is left out but for root: a line does not tell whose component had the name then.
+        """
+        wanted = arguments_of(WhyArguments, "why", arguments)
+        name = await self._known(wanted.name) if wanted.name else ""
+        told = await self._telling.whole(name, wanted.robot, wanted.age_ms_max)
+        return told if may(say.caller.uid, None) else {**told, "story": without_output(told["story"])}
+
+    async def standing(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
+        """How one component stands on this robot; empty where it is unknown."""
+        return await self._view(arguments_of(NameArguments, "standing", arguments).name)
+
+    async def picture(self, _arguments: dict[str, Any], _by: int) -> dict[str, Any]:
+        """All of this robot's own sight, for another robot's status."""
+        return self._lines.picture(await self._lines.ask("status"))
+
+    # --- what verbs share ---
+
+    async def _view(self, name: str) -> dict[str, Any]:
+        """The component's part of the picture; empty when it is unknown."""
+        picture = self._lines.picture(await self._lines.ask("status"))
+        return next((one for one in picture["components"] if one["name"] == name), {})
+
+    async def _names(self) -> dict[str, State]:
+        """Every component that this robot has heard of, and how it stands here."""
+        told = await self._lines.ask("status")
+        return {one.name: one.state for one in told.status.components} if told.status else {}
+
+    async def _known(self, wanted: str) -> str:
+        """The component that a person means: its whole name, or an end of it that fits one alone.
+
+        Raises:
+            RefusedError: none, or more than one.
+        """
+        names = await self._names()
+        if wanted in names:
+            return wanted
+        fitting = [name for name in names if name.endswith("/" + wanted.lstrip("/"))]
+        if len(fitting) == 1:
+            return fitting[0]
+        if fitting:
+            raise RefusedError(f"{wanted!r} could be {', '.join(sorted(fitting))}; give the whole name", "UnknownComponentError")
+        known = ", ".join(sorted(name for name, state in names.items() if state is not State.RELEASED)) or "nothing"
+        raise RefusedError(f"no component is called {wanted!r}; this team protects {known}", "UnknownComponentError")
+
+
+def _shown_to(uid: int, one: dict[str, Any]) -> dict[str, Any]:
+    """A component as a user may see it; a name may be another user's at another robot, while that has not heard the news."""
+    elsewhere = {robot: _shown_to(uid, seen) for robot, seen in one.get("elsewhere", {}).items()}
+    seen = one if may(uid, one.get("owner")) else without_output(one)
+    return {**seen, "elsewhere": elsewhere} if "elsewhere" in one else seen
+
+
+def _join(mine: dict[str, Any], theirs: dict[str, dict[str, Any]]) -> None:
+    """Add to a robot's picture what the others say: of its components, of those that it does not know, and of their peers."""
+    known = {one["name"]: one for one in mine["components"]}
+    for robot, picture in theirs.items():
+        for one in picture.get("components", ()):
+            if one["name"] not in known:
+                known[one["name"]] = {**one, **NOT_HERE, "elsewhere": {}}
+                mine["components"].append(known[one["name"]])
+            known[one["name"]]["elsewhere"][robot] = one
+    mine["components"].sort(key=lambda one: str(one["name"]))
+    mine["doubted_elsewhere"] = {
+        robot: [peer["name"] for peer in picture.get("peers", ()) if peer.get("doubted")] for robot, picture in theirs.items()
+    }
+    mine["peers_elsewhere"] = {
+        robot: {peer["name"]: peer["state"] for peer in picture.get("peers", ())} for robot, picture in theirs.items()
+    }

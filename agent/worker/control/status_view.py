@@ -1,0 +1,294 @@
+"""What ``failover status`` shows: the core's view and what the lanes know. The fields: `failover.client.control`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from msgspec.structs import asdict
+
+from agent.config import Settings
+from agent.guard.output_pump import HOLD_LIMIT
+from agent.main_loop.messages import Life, Told
+from agent.system import clock
+from agent.worker.control import fencing_status
+from agent.worker.network.replication_link import Link, LinkState
+from checkpoint.device_rules import merged, missing
+from checkpoint.engine import COOPERATIVE, PTRACE
+from failover.core.types import COMMITTED, IMMEDIATE, ComponentView, PeerView, Protection, State
+
+if TYPE_CHECKING:  # a witness shows its status too, and has none of these
+    from agent.worker.components.statistics import Commits, Figures, Memory
+    from agent.worker.components.supervisor import Charge
+    from checkpoint.store.store import Kept, Store
+
+NANOSECONDS_A_MILLISECOND: Final = 1_000_000
+
+STATES: Final[dict[State, str]] = {
+    State.CLAIMING: "starting",
+    State.STARTING: "starting",
+    State.PRIMARY: "running",
+    State.FROZEN: "frozen",
+    State.HANDING_OVER: "running",
+    State.RECOVERING: "restoring",
+    State.TAKING_OVER: "restoring",
+    State.STOPPING: "ended",
+    State.STANDBY: "held",
+    State.FINISHED: "ended",
+    State.FAILED: "failed",
+    State.RELEASED: "released",
+    State.ABSENT: "absent",
+}
+PRIMARY_STATES: Final = frozenset(
+    {State.CLAIMING, State.STARTING, State.PRIMARY, State.FROZEN, State.HANDING_OVER, State.RECOVERING, State.TAKING_OVER}
+)
+PEER_STATES: Final = {"alive": "live", "unheard": "unknown"}
+
+
+@cache
+def version() -> str:
+    """Of the installed package: its record's name tells, and importlib.metadata would take 3 MB for as much."""
+    records = (path for place in sys.path for path in Path(place or ".").glob("failover-*.dist-info"))
+    return next((path.stem.partition("-")[2] for path in records), "unknown")
+
+
+def team_view(
+    settings: Settings,
+    life: Life,
+    told: Told,
+    charges: Mapping[str, Charge],
+    links: Mapping[str, Link],
+    notices: list[str],
+    interfaces: list[dict[str, object]],
+    store: Store | None,
+    memory: Memory | None = None,
+) -> dict[str, Any]:
+    """The whole picture."""
+    view = told.status
+    notes = [*life.notes, *notices, *told.troubles]
+    beats = told.beats
+    return {
+        "robot": settings.config.robot,
+        "team": settings.team.team,
+        "role": settings.me.role,
+        "pid": life.heart,
+        "version": version(),
+        "life": life.boot,
+        "insecure": settings.config.insecure,
+        "realtime": not life.notes,
+        "rule": view.rule if view else None,
+        "promise": view.promise if view else "not decided yet: the agent is starting",
+        "memory": asdict(memory) if memory is not None else None,
+        "fencing": fencing_status.sentence(fencing_status.watchdog()),
+        "healthy": view.healthy if view else False,
+        "notes": notes,
+        "links": interfaces,
+        "peers": [_peer(peer, links.get(peer.robot), told, settings) for peer in (view.peers if view else ())],
+        "components": [_component(one, charges.get(one.name), settings, store) for one in (view.components if view else ())],
+        "beats": {
+            "sent": beats.sent,
+            "heard": beats.heard,
+            "unsent": beats.unsent,
+            "refused": dict(beats.refused),
+            "late_us_max": beats.late_us_max,
+            "gap_us_max": beats.gap_us_max,
+            "gaps": beats.gaps,
+        },
+        "lanes_pid": os.getpid(),
+    }
+
+
+def _peer(peer: PeerView, link: Link | None, told: Told, settings: Settings) -> dict[str, Any]:
+    reason = list(dict.fromkeys(filter(None, (link.reason if link is not None else "", peer.unread, *peer.refused))))
+    return {
+        "name": peer.robot,
+        "role": settings.team.robots[peer.robot].role,
+        "state": PEER_STATES.get(peer.state, peer.state),
+        "last_heard_ms": peer.silent_ns // NANOSECONDS_A_MILLISECOND if peer.silent_ns >= 0 else None,
+        "hears_us": peer.hears_us,
+        "load": peer.load,
+        "links": list(peer.links),
+        "lane": str(link.state if link is not None else LinkState.DOWN),
+        "beats_lost": told.beats.lost.get(peer.robot, 0),
+        "doubted": peer.doubted,
+        "notes": reason,
+    }
+
+
+def _own_notes(view: ComponentView, figures: Figures | None) -> tuple[str, ...]:
+    """What this robot's own work on it found out."""
+    if figures is None:
+        return ()
+    return (*figures.notes, *_overdue(view, figures), *figures.hooks.values(), *figures.bringing.values())
+
+
+def _over_budget(view: ComponentView, figures: Figures | None, settings: Settings) -> tuple[str, ...]:
+    """Where its snapshots do not keep to what its operator allows them."""
+    budget_ms = settings.component(view.name).freeze_budget_ms
+    if figures is None or not budget_ms or view.state not in PRIMARY_STATES:
+        return ()
+    remark = figures.budget.remark(budget_ms)
+    return (remark,) if remark else ()
+
+
+def _lacks(view: ComponentView, figures: Figures | None) -> tuple[str, ...] | None:
+    """What this robot, a standby, would refuse in a takeover, while there is time to do something about it; None: not known."""
+    return figures.lacks if figures is not None and view.state is State.STANDBY else None
+
+
+def told_lacks(view: ComponentView, charge: Charge | None, robot: str) -> list[str]:
+    """The same for people; what a hook perhaps brings before the program goes on is no refusal yet."""
+    if charge is None:
+        return []
+    lacks = _lacks(view, charge.figures) or ()
+    if charge.is_prepared_first:
+        return [f"{robot} lacks now, and its hook before_resume is to bring: {lack}" for lack in lacks]
+    return [f"{robot} could not go on with it: {lack}" for lack in lacks]
+
+
+def _contested(view: ComponentView, figures: Figures | None) -> tuple[str, ...]:
+    """Which of its files others hold open for writing where it runs: a restore of it would be refused."""
+    return figures.contested if figures is not None and view.state in PRIMARY_STATES else ()
+
+
+def _hung_up_devices(view: ComponentView, figures: Figures | None, settings: Settings) -> tuple[str, ...]:
+    """Which devices a standby lacks that the program would find hung up there."""
+    if figures is None or view.state is not State.STANDBY:
+        return ()
+    wanted = {rule.path for rule in figures.devices}
+    rules = merged(figures.devices, settings.component(view.name).device_rules())
+    optional = (rule for rule in rules if rule.path in wanted and rule.optional)
+    return tuple(f"{settings.config.robot} {lack}" for lack in missing(optional))
+
+
+def _waiting_output(view: ComponentView, waiting: int) -> tuple[str, ...]:
+    """What becomes of held output while no checkpoint of it reaches another robot."""
+    if not waiting or view.protection is Protection.PROTECTED:
+        return ()
+    limit = f"at {HOLD_LIMIT >> 20} MiB of a stream the program waits in its next write"
+    return (
+        f"{waiting} bytes of its output are held back (--output=committed): no other robot holds a checkpoint of them; {limit}",
+    )
+
+
+def _component(view: ComponentView, charge: Charge | None, settings: Settings, store: Store | None) -> dict[str, Any]:
+    figures = charge.figures if charge is not None else None
+    running = charge.component if charge is not None else None
+    newest = view.positions[0] if view.positions else None
+    engine = running.engine if running is not None else figures.engine if figures is not None else PTRACE
+    held = running is not None and running.logs.is_held
+    waiting = running.logs.waiting() if running is not None and held else 0
+    degraded = view.protection in (Protection.DEGRADED, Protection.STOPPED) and view.state is State.PRIMARY
+    return {
+        "name": view.name,
+        "role": "primary" if view.state in PRIMARY_STATES else "standby" if view.state is State.STANDBY else "none",
+        "primary": view.primary,
+        "state": "degraded" if degraded else STATES[view.state],
+        "protection": str(view.protection),
+        "epoch": view.epoch,
+        "generation": newest.generation if newest else None,
+        "sequence": newest.sequence if newest else None,
+        "engine": engine,
+        "warm": view.warm if engine == COOPERATIVE else None,
+        "cold": view.cold,
+        "ready": view.warm if engine != COOPERATIVE and view.standby else None,
+        "ready_copy": _ready_copy(view, figures),
+        "pid": running.pid if running is not None else None,
+        "inner_pid": running.inner_pid if running is not None else None,
+        "isolated": running.isolated if running is not None else None,
+        "standby": view.standby,
+        "standby_sequence": newest.sequence if newest and view.standby else None,
+        "lag_ms": view.lag_ns / NANOSECONDS_A_MILLISECOND if view.lag_ns >= 0 else None,
+        "period_ms": view.period_ms,
+        **_commits(view, figures),
+        "freeze_us": figures.freeze_us if figures else view.freeze_us or None,
+        "freeze_us_max": figures.freeze_us_max if figures else None,
+        "freeze_budget_missed": figures.budget.missed if figures else 0,
+        "snapshot_size": figures.snapshot_size if figures else None,
+        "dirty_bytes": figures.dirty_bytes if figures else None,
+        "xor_hit_rate": figures.xor_hit_rate if figures else None,
+        "snapshots": figures.snapshots if figures else 0,
+        "restores": figures.restores if figures else 0,
+        "crashes": figures.crashes if figures else 0,
+        "outage_ms": figures.outage_ms if figures else None,
+        "exit_status": view.status if view.state is State.FINISHED else None,
+        "kept": _kept(store.kept(view.name) if store is not None else None),
+        "unstored": view.unstored,
+        "lacks": _lacks(view, figures),
+        "contested": list(_contested(view, figures)),
+        "prepared_first": charge is not None and charge.is_prepared_first,
+        "promise": view.promise,
+        "promise_differs": view.differs,
+        "home": view.home,
+        "prefer": view.prefer,
+        "owner": view.owner,
+        "output": COMMITTED if held else IMMEDIATE,
+        "output_waiting": waiting,
+        "reasons": list(figures.reasons) if figures else [],
+        "notes": [
+            *view.notes,
+            *told_lacks(view, charge, settings.config.robot),
+            *(f"NOT PROTECTED, a restore of it is refused: {reason}" for reason in _contested(view, figures)),
+            *_copy_notes(view, figures, settings.config.robot),
+            *_own_notes(view, figures),
+            *_over_budget(view, figures, settings),
+            *_hung_up_devices(view, figures, settings),
+            *_waiting_output(view, waiting),
+        ],
+    }
+
+
+def _ready_copy(view: ComponentView, figures: Figures | None) -> dict[str, Any] | None:
+    """Of the ready copy at this robot, where it stands by: its memory, where it stands, or why there is none."""
+    if figures is None or view.state is not State.STANDBY or figures.engine == COOPERATIVE:
+        return None
+    copy = figures.copy
+    position = {"generation": copy.position.generation, "sequence": copy.position.sequence} if copy.position else None
+    return {"ready": copy.ready, "wanted": copy.wanted, "size": copy.size, "position": position, "why": copy.why}
+
+
+def _copy_notes(view: ComponentView, figures: Figures | None, robot: str) -> tuple[str, ...]:
+    """The same as sentences."""
+    shown = _ready_copy(view, figures)
+    if shown is None or not (shown["ready"] or shown["why"]) or not shown["wanted"]:
+        return ()
+    if not shown["ready"]:
+        return (f"ready copy at {robot}: no, because {shown['why']}; a takeover restores it from its chain",)
+    size, position = shown["size"] / 1e6, shown["position"]
+    return (f"ready copy at {robot}: {size:.1f} MB of memory, at checkpoint {position['generation']}.{position['sequence']}",)
+
+
+def _kept(kept: Kept | None) -> dict[str, Any] | None:
+    """What this robot's store has of it."""
+    if kept is None:
+        return None
+    now_s = clock.wall_ns(clock.now_ns()) / 1e9
+    ages = {"newest_age_s": max(now_s - kept.newest_s, 0.0), "oldest_age_s": max(now_s - kept.oldest_s, 0.0)}
+    return {"checkpoints": kept.positions, "older": kept.olds, "size": kept.size, **ages}
+
+
+def _commits(view: ComponentView, figures: Figures | None) -> dict[str, Any]:
+    """Of a program that keeps its state and runs here: how old its newest commit is, and how often it used to commit."""
+    commits = _running_commits(view, figures)
+    if commits is None:
+        return {"commit_age_ms": None, "commit_usual_ms": None, "commit_overdue": False}
+    now_ns, usual_ns = clock.now_ns(), commits.usual_ns
+    return {
+        "commit_age_ms": (now_ns - commits.newest_ns) / NANOSECONDS_A_MILLISECOND,
+        "commit_usual_ms": usual_ns / NANOSECONDS_A_MILLISECOND if usual_ns is not None else None,
+        "commit_overdue": commits.is_overdue(now_ns),
+    }
+
+
+def _overdue(view: ComponentView, figures: Figures | None) -> list[str]:
+    commits, now_ns = _running_commits(view, figures), clock.now_ns()
+    return [commits.remark(now_ns)] if commits is not None and commits.is_overdue(now_ns) else []
+
+
+def _running_commits(view: ComponentView, figures: Figures | None) -> Commits | None:
+    runs = view.state in (State.PRIMARY, State.HANDING_OVER)
+    return figures.commits if runs and figures is not None and figures.commits.number else None

@@ -1,0 +1,449 @@
+"""What the agent does for a client of the control socket, verb by verb. What the core must decide goes to it as a command."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import logging
+import os
+from collections.abc import Callable, Iterable
+from typing import Any, Final, Protocol
+
+import msgspec
+
+from agent.core_config import level_of, rules_for
+from agent.errors import RefusedError
+from agent.hook_kinds import check_told
+from agent.system import clock
+from agent.system.adopted_process import Guest
+from agent.system.permissions import Caller, asking, check_right, guest_of, inheritance_for
+from agent.worker.components import prerequisites as lacks
+from agent.worker.components.paths import Places
+from agent.worker.components.supervisor import Charge
+from agent.worker.control.arguments import (
+    HandoverArguments,
+    LogsArguments,
+    NameArguments,
+    PreferArguments,
+    PromoteArguments,
+    ProtectArguments,
+    RunArguments,
+    StopArguments,
+    arguments_of,
+)
+from agent.worker.control.output_relay import Outflow
+from agent.worker.control.queries import Lines, Questions
+from agent.worker.control.quotas import check_components
+from agent.worker.control.server import Conversation, Verb
+from agent.worker.network.remote_orders import Order
+from checkpoint.device_rules import RULES_MAX, rule_from, travelling
+from checkpoint.engine import contradiction
+from checkpoint.program import cpu_baseline
+from checkpoint.snapshot.carried_files import is_carriable
+from failover.core import acts, events
+from failover.core.types import COMMITTED, ComponentSpec, Launch, State
+from failover.core.wire.names import check_component, weight
+from failover.errors import NameFormatError
+
+STANDING_POLL_S: Final = 0.01
+"""Between two questions to the robot that a component moves to: what an operator reads as the move's time."""
+
+START_PATIENCE_S: Final = 30.0
+"""How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
+
+log = logging.getLogger("failover.verbs")
+
+
+class Lanes(Lines, Protocol):
+    """What of `agent.worker.process.Lanes` is needed here."""
+
+    places: Places
+    charges: dict[str, Charge]
+
+    def charge(self, name: str) -> Charge: ...
+    async def lacking(self, name: str) -> tuple[str, ...]: ...
+
+
+class Verbs(Questions):
+    """Every verb of the control socket."""
+
+    def __init__(self, lanes: Lanes) -> None:
+        super().__init__(lanes)
+        self._lanes = lanes
+        self._outflow = Outflow(lanes)
+
+    def table(self) -> dict[str, Verb]:
+        """By name, as the client says them."""
+        return {
+            **super().table(),
+            "run": self.run,
+            "protect": self.protect,
+            "logs": self.logs,
+            "promote": self.promote,
+            **{name: functools.partial(self._order, name) for name in self.orders()},
+        }
+
+    def errands(self) -> dict[str, Order]:
+        """What another robot may ask of this one: the orders, and how things stand here."""
+        promoted = functools.partial(self._permitted, self._promoted)
+        return {**super().errands(), **self.orders(), "piece": self._outflow.piece, "promoted": promoted, "lacks": self.lacks}
+
+    def orders(self) -> dict[str, Order]:
+        """Those that are carried out where the component runs, wherever they are given."""
+        found: dict[str, Order] = {
+            "handover": self.handover,
+            "failback": self.failback,
+            "prefer": self.prefer,
+            "release": self.release,
+            "stop": self.stop,
+        }
+        return {name: functools.partial(self._permitted, act) for name, act in found.items()}
+
+    async def _permitted(self, order: Order, arguments: dict[str, Any], by: int) -> dict[str, Any]:
+        """Carry an order out here, if whoever gives it may give it."""
+        name = await self._known(str(arguments.get("name", "")))
+        await self._check_right(by, name)
+        return await order({**arguments, "name": name}, by)
+
+    async def _order(self, verb: str, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Carry an order out here, or have the robot do it where the component runs."""
+        name = await self._known(str(arguments.get("name", "")))
+        arguments = {**arguments, "name": name}
+        primary = (await self._view(name)).get("primary", "")
+        told = await self._lanes.ask("status")
+        living = {peer.robot for peer in told.status.peers if peer.state in ("alive", "suspect")} if told.status else set()
+        if primary in living:
+            return await self._lanes.errands.send(primary, verb, arguments, say.caller.uid)
+        return await self.orders()[verb](arguments, say.caller.uid)
+
+    async def run(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Start a program under protection; with ``wait`` pass its output on until it has ended."""
+        wanted = arguments_of(RunArguments, "run", arguments)
+        if not wanted.argv:
+            raise RefusedError("run needs a command: failover run -- COMMAND …")
+        try:
+            check_told(dict(wanted.hooks))
+        except ValueError as error:
+            raise RefusedError(f"run: {error}") from error
+        inheritance = inheritance_for(say.caller, wanted.user)
+        name = await self._fresh_name(wanted.name, wanted.argv[0], say.caller.uid)
+        launch = Launch(
+            tuple(wanted.argv),
+            tuple(self._environment(name, wanted).items()),
+            wanted.cwd,
+            wanted.umask,
+            isolate=wanted.isolate,
+            inheritance=msgspec.msgpack.encode(inheritance),
+            engine=wanted.engine,
+            output=wanted.output,
+            hooks=tuple((occasion, tuple(command)) for occasion, command in wanted.hooks.items() if command),
+            carry=self._carried(name, wanted.carry),
+            shared=self._shared(name, wanted.shared, wanted.carry),
+            devices=self._device_rules(name, wanted.devices),
+            connections=self._connections(name, wanted.connections),
+        )
+        charge = await self._begin(name, launch, inheritance.uid, say.caller.uid)
+        started: dict[str, Any] = {"name": name, "notes": list(charge.figures.notes), "reasons": list(charge.figures.reasons)}
+        if charge.component is not None:
+            component = charge.component
+            started |= {"pid": component.pid, "inner_pid": component.inner_pid, "isolated": component.isolated}
+            started["notes"] = [*component.notes, *charge.figures.notes]
+        if not wanted.wait:
+            return started
+        await say.update({"started": started})
+        await self._outflow.pass_on(say, name, (0, 0), committed=wanted.output == COMMITTED, follow=True)
+        if charge.ended is not None and charge.ended.done():
+            report = charge.ended.result()
+            return {"name": name, "exit_status": report.status, "failed": report.failed, "reason": report.reason}
+        view = await self._view(name)  # it ended on another robot
+        return {"name": name, "exit_status": view.get("exit_status"), "failed": view["state"] == "failed", "reason": ""}
+
+    def _environment(self, name: str, wanted: RunArguments) -> dict[str, str]:
+        """The program's variables, also those that have libraries choose code for a mixed fleet."""
+        settings = self._lanes.settings
+        level = level_of(wanted.portable, settings.config, settings.component(name))
+        return cpu_baseline.environment(wanted.env, level) if level else wanted.env
+
+    async def protect(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Take a running process under protection."""
+        wanted = arguments_of(ProtectArguments, "protect", arguments)
+        guest = guest_of(wanted.pid, say.caller)
+        try:
+            return await self._taken_in(wanted, guest, say.caller)
+        finally:
+            guest.close()
+
+    async def _taken_in(self, wanted: ProtectArguments, guest: Guest, caller: Caller) -> dict[str, Any]:
+        """Protect a process that is the caller's."""
+        assert guest.rights is not None, "it was asked whose it is"
+        for known in self._lanes.charges.values():
+            if known.component is not None and known.component.pid == wanted.pid:
+                raise RefusedError(f"pid {wanted.pid} is protected already, as {known.name}; failover release lets it go")
+        name = await self._fresh_name(wanted.name, "", caller.uid)
+        carried, devices = self._carried(name, wanted.carry), self._device_rules(name, wanted.devices)
+        connections = self._connections(name, wanted.connections)
+        shared = self._shared(name, wanted.shared, wanted.carry)
+        launch = Launch(
+            pid=wanted.pid,
+            inheritance=msgspec.msgpack.encode(guest.rights),
+            carry=carried,
+            devices=devices,
+            connections=connections,
+            shared=shared,
+        )
+        charge = await self._begin(name, launch, guest.rights.uid, caller.uid, guest)
+        return {"name": name, "pid": wanted.pid, "notes": list(charge.figures.notes)}
+
+    async def release(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
+        """Let a component run on unprotected; answers once its guard has been told, so that no later agent finds it again."""
+        name = await self._known(arguments_of(NameArguments, "release", arguments).name)
+        charge = self._lanes.charge(name)
+        pid = charge.component.pid if charge.component is not None else None
+        await self._command(lambda number: events.Release(number, name, asking(by)))
+        await charge.let_go()  # the order came before the answer
+        return {"name": name, "pid": pid}
+
+    async def stop(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
+        """End a component."""
+        wanted = arguments_of(StopArguments, "stop", arguments)
+        name = await self._known(wanted.name)
+        end = self._lanes.charge(name).end()
+        await self._command(lambda number: events.Stop(number, name, wanted.signal, asking(by)))
+        report = await asyncio.shield(end)
+        return {"name": name, "exit_status": report.status}
+
+    async def handover(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
+        """Move a component."""
+        wanted = arguments_of(HandoverArguments, "handover", arguments)
+        name = await self._known(wanted.name)
+        await self._check_fit(name, "hand over", wanted.to or (await self._view(name))["standby"])
+        return await self._moved(name, lambda number: events.Handover(number, name, wanted.to, asking(by)))
+
+    async def failback(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
+        """Move a component back to the robot that is preferred, or where it was started."""
+        name = await self._known(arguments_of(NameArguments, "failback", arguments).name)
+        view = await self._view(name)
+        await self._check_fit(name, "fail back", view["prefer"] or view["home"])
+        return await self._moved(name, lambda number: events.Failback(number, name, asking(by)))
+
+    async def lacks(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
+        """What this robot lacks of what a component needs to go on here."""
+        name = arguments_of(NameArguments, "lacks", arguments).name
+        return {"lacks": list(await self._lanes.lacking(name) if name in await self._names() else ())}
+
+    async def _check_fit(self, name: str, verb: str, robot: str) -> None:
+        """Ask the robot that a component is to move to whether it could go on there.
+
+        Where it cannot tell the core decides alone.
+
+        Raises:
+            RefusedError: it lacks something, all of it by name.
+        """
+        if robot not in await self._reachable():
+            return
+        if reasons := await lacks.asked_of(self._lanes.errands, robot, name):
+            sentence = f"cannot {verb} {name} to {robot}, where it could not go on: {'; '.join(reasons)}"
+            raise RefusedError(sentence, "MismatchError", reasons)
+
+    async def _moved(self, name: str, make: Callable[[int], events.Command]) -> dict[str, Any]:
+        began_ns, before = clock.now_ns(), await self._view(name)
+        answer = await self._command(make)
+        view = await self._view(name)
+        if view["primary"] != self._lanes.settings.config.robot:
+            view = await self._running_at(view["primary"], name)
+        took_ms = (clock.now_ns() - began_ns) / 1e6
+        told = {"name": name, "to": view["primary"], "epoch": view["epoch"], "took_ms": took_ms, "sentence": answer.sentence}
+        return {**told, "moved": view["primary"] != before["primary"]}
+
+    async def _running_at(self, robot: str, name: str) -> dict[str, Any]:
+        """Wait until the robot that took a component runs it; its view of it.
+
+        Raises:
+            RefusedError: it does not, or has not said so in time; the component stays the team's.
+        """
+        deadline_ns = clock.now_ns() + int(START_PATIENCE_S * 1e9)
+        while True:
+            view = await self._lanes.errands.send(robot, "standing", {"name": name})
+            if view.get("role") == "primary" and view["state"] in ("running", "degraded"):
+                return view
+            if view.get("state") in ("ended", "failed") or view.get("primary") not in (robot, None):
+                sentence = "; ".join((*view.get("reasons", ()), *view.get("notes", ()))) or "failover why tells the story"
+                raise RefusedError(f"{robot} took {name} and does not run it: {sentence}")
+            if clock.now_ns() > deadline_ns:
+                raise RefusedError(
+                    f"{robot} took {name} and has not begun to run it in {START_PATIENCE_S:.0f} s; see failover status"
+                )
+            await asyncio.sleep(STANDING_POLL_S)
+
+    async def prefer(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
+        """Say where a component should run."""
+        wanted = arguments_of(PreferArguments, "prefer", arguments)
+        name = await self._known(wanted.name)
+        await self._check_fit(name, "prefer", wanted.robot)
+        await self._command(lambda number: events.Prefer(number, name, wanted.robot, asking(by)))
+        return {"name": name, "robot": wanted.robot}
+
+    async def promote(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Have a robot run what nobody is heard to run; or, unless it is ``sure``, tell what that would risk."""
+        wanted = arguments_of(PromoteArguments, "promote", arguments)
+        name, me = await self._known(wanted.name), self._lanes.settings.config.robot
+        robot = wanted.robot or await self._newest_at(name)
+        if robot not in self._lanes.settings.team.robots:
+            known = ", ".join(sorted(self._lanes.settings.team.robots))
+            raise RefusedError(f"cannot promote {robot!r} for {name}: the team knows {known}")
+        order = {"name": name, "robot": robot, "sure": wanted.sure}
+        if robot == me:
+            return await self._permitted(self._promoted, order, say.caller.uid)
+        return await self._lanes.errands.send(robot, "promoted", order, say.caller.uid)
+
+    async def _promoted(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
+        """Promote this robot, or tell what that would risk."""
+        wanted = arguments_of(PromoteArguments, "promote", arguments)
+        answer = await self._command(lambda number: events.Promote(number, wanted.name, not wanted.sure, asking(by)))
+        view = await self._view(wanted.name)
+        told = {"name": wanted.name, "to": wanted.robot, "epoch": view["epoch"], "sentence": answer.sentence}
+        return {**told, "promoted": wanted.sure, "risks": list(answer.risks)}
+
+    async def _newest_at(self, name: str) -> str:
+        """The living robot with the newest checkpoint; this one, or the lesser name, of several."""
+        me, team = self._lanes.settings.config.robot, self._lanes.settings.team.robots
+        seen = [(me, await self._view(name))]
+        others = await self._reachable()
+        asked = (self._asked(peer, "standing", {"name": name}) for peer in others)
+        seen += zip(others, await asyncio.gather(*asked), strict=True)
+        able = [(robot, view) for robot, view in seen if team[robot].role == "robot" and view]
+        if not able:
+            raise RefusedError(f"no robot that is heard knows {name}; start one, or name it with --robot")
+        return min(able, key=lambda one: (_age_of(one[1]), one[0] != me, weight(one[0])))[0]
+
+    async def logs(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """The component's output as far as no takeover can take it back; all of it once it has ended."""
+        wanted = arguments_of(LogsArguments, "logs", arguments)
+        name = await self._known(wanted.name)
+        await self._check_right(say.caller.uid, name)
+        totals = await self._outflow.pass_on(say, name, wanted.offsets, committed=True, follow=wanted.follow)
+        view = await self._view(name)
+        return {"name": name, "totals": list(totals), "exit_status": view.get("exit_status")}
+
+    # --- what verbs share ---
+
+    def _carried(self, name: str, wanted: list[str]) -> tuple[str, ...]:
+        """What travels with a component: what was asked for, and what this robot's operator wants besides.
+
+        Raises:
+            RefusedError: it is no path that means the same on every robot.
+        """
+        return _named_whole("carry", (*wanted, *self._lanes.settings.component(name).carry))
+
+    def _shared(self, name: str, wanted: list[str], carried: list[str]) -> tuple[str, ...]:
+        """What others write to as well: what was asked for, and what this robot's operator rules besides.
+
+        Raises:
+            RefusedError: it is no path that means the same on every robot, or travels with the component.
+        """
+        paths = _named_whole("share", (*wanted, *self._lanes.settings.component(name).shared))
+        if both := contradiction(self._carried(name, carried), paths):
+            raise RefusedError(both)
+        return paths
+
+    def _connections(self, name: str, wanted: str) -> str:
+        """What becomes of a component's TCP connections: what was asked for, else what this robot's operator wants."""
+        return wanted or self._lanes.settings.component(name).connections
+
+    def _device_rules(self, name: str, wanted: dict[str, str]) -> tuple[tuple[str, str], ...]:
+        """What becomes of a component's devices on every robot: what was asked for, and what this robot's operator wants here.
+
+        Raises:
+            RefusedError: a rule is none.
+        """
+        if len(wanted) > RULES_MAX:
+            raise RefusedError(f"{len(wanted)} rules for devices; at most {RULES_MAX}")
+        try:
+            for path, said in wanted.items():
+                rule_from(path, said)
+        except ValueError as error:
+            raise RefusedError(str(error)) from error
+        own = travelling(self._lanes.settings.component(name).device_rules())
+        return tuple({**wanted, **dict(own)}.items())
+
+    async def _begin(self, name: str, launch: Launch, owner: int, by: int, guest: Guest | None = None) -> Charge:
+        """Have a component started or taken in, and wait until it is.
+
+        Args:
+            by: uid of the user who asks, also for another owner.
+            guest: the process that is to be taken in; stays the caller's.
+
+        Raises:
+            RefusedError: the core says no, or it could not be started; with the reasons.
+        """
+        config = self._lanes.settings.config
+        rules = rules_for(config, self._lanes.settings.component(name))
+        charge = self._lanes.charge(name)
+        charge.guest = guest
+        charge.started.clear()
+        charge.ended = None
+        end = charge.end()
+        try:
+            spec = ComponentSpec(name, config.robot, launch, rules, owner)
+            await self._command(lambda number: events.Run(number, spec, asking(by)))
+        except RefusedError as refusal:
+            raise RefusedError(str(refusal), refusal.kind, charge.figures.reasons) from refusal
+        begun = asyncio.ensure_future(charge.started.wait())
+        try:
+            both: set[asyncio.Future[Any]] = {begun, end}
+            await asyncio.wait(both, timeout=START_PATIENCE_S, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            begun.cancel()
+            charge.guest = None
+        if end.done() and end.result().failed:
+            raise RefusedError(f"cannot start {name}: {end.result().reason}", "RefusedError", charge.figures.reasons)
+        if not charge.started.is_set():
+            raise RefusedError(f"{name} has not begun in {START_PATIENCE_S:.0f} s; failover why {name} tells what it waits for")
+        return charge
+
+    async def _command(self, make: Callable[[int], events.Command]) -> acts.Answer:
+        answer = await self._lanes.command(make)
+        if not answer.ok:
+            raise RefusedError(answer.sentence)
+        return answer
+
+    async def _check_right(self, uid: int, name: str) -> None:
+        """Raises RefusedError: the component is somebody else's."""
+        check_right(uid, name, (await self._view(name)).get("owner"))
+
+    async def _fresh_name(self, wanted: str, command: str, uid: int) -> str:
+        """A name for something new: as given, under this robot's own path, or made from the command.
+
+        Raises:
+            RefusedError: it is no name, or one that somebody else has used and not released; or this user has too many.
+        """
+        own = f"/{self._lanes.settings.team.team}/{self._lanes.settings.config.robot}/"
+        told = await self._lanes.ask("status")
+        known = {one.name: one for one in told.status.components} if told.status else {}
+        if not wanted:
+            stem = own + (os.path.basename(command) or "program")
+            numbered = (stem, *(f"{stem}-{number}" for number in range(2, len(known) + 3)))
+            free = (State.RELEASED, uid)  # by the same user: what it wrote is another user's to read
+            wanted = next(name for name in numbered if name not in known or (known[name].state, known[name].owner) == free)
+        name = wanted if wanted.startswith("/") else own + wanted
+        check_components(uid, name, known.values(), self._lanes.settings.config.components_per_user)
+        if name in known and known[name].state not in (State.RELEASED, State.ABSENT):
+            check_right(uid, name, known[name].owner)
+        try:
+            return check_component(name)
+        except NameFormatError as error:
+            raise RefusedError(str(error), "NameFormatError") from error
+
+
+def _age_of(view: dict[str, Any]) -> tuple[int, int]:
+    """Of what a robot could go on from: the newest sorts first, nothing at all last."""
+    return -(view.get("generation") or 0), -(view.get("sequence") or 0)
+
+
+def _named_whole(verb: str, wanted: Iterable[str]) -> tuple[str, ...]:
+    """Each path once. Raises RefusedError: one of them does not mean the same on every robot."""
+    paths = tuple(dict.fromkeys(wanted))
+    for path in paths:
+        if not is_carriable(path):
+            raise RefusedError(f"cannot {verb} {path!r}: name the file or folder by its whole path, without . and ..")
+    return paths

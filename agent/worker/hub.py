@@ -1,0 +1,392 @@
+"""The other process's lines: to the heart of this robot, and to the other robots. Whoever keeps or starts something builds on it.
+
+`agent.worker.process` is a robot's or a server's, `agent.worker.witness` a witness's: that one imports this file and nothing
+that could read a snapshot or start a program.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import logging
+import os
+import signal
+import socket
+import sys
+from abc import abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from agent import config as configuration
+from agent.config import Settings
+from agent.errors import AgentError, LaneError
+from agent.main_loop import messages
+from agent.main_loop.messages import Alive, Ask, Farewell, HearKey, Life, Order, SpeakKey, ToLanes, Told
+from agent.system import syscalls
+from agent.system.log_setup import set_up_log
+from agent.worker.control.queries import QUESTIONS, Questions
+from agent.worker.control.server import ControlServer
+from agent.worker.network.connections import BULK, Ways
+from agent.worker.network.link_monitor import Wires
+from agent.worker.network.links import Facts, Links
+from agent.worker.network.remote_orders import Errands
+from agent.worker.network.replication_link import Keys, LinkState, public_key_of
+from checkpoint.errors import CheckpointError
+from checkpoint.keeper.messages import Channel, ChannelClosedError, ChannelError
+from checkpoint.runtime import allocator
+from failover.client.control import SOCKET_NAME
+from failover.core import acts, events
+from failover.core.events import Event
+from failover.core.wire.codec import KEY_SIZE_MIN
+from failover.core.wire.messages import VERSION, Bulk, Errand, ErrandDone, Goodbye, Hello
+
+ALIVE_S: Final = 0.5
+"""Between two signs of life to the heart."""
+
+ANSWER_PATIENCE_S: Final = 60.0
+"""How long an operator's command may take; a handover's own limit in the core is shorter."""
+
+MESSAGES_A_TURN: Final = 64
+
+SIGNS_MAX: Final = 256
+"""Kinds of them that are remembered: each names a key, and anybody has many keys."""
+
+SIGN_S: Final = 1.0
+"""Between two signs of one kind from a peer that cannot be authenticated: ZeroMQ tries twenty times a second."""
+
+UNFIT_KEY: Final = (
+    "this robot's secret key does not belong to its public key in team.toml: no other robot lets it in; failover team enrol "
+    "makes a fresh pair"
+)
+
+log = logging.getLogger("failover.lanes")
+
+
+class Switchboard:
+    """One life of the process, as far as it talks.
+
+    Attributes:
+        verbs: what people may ask of it.
+    """
+
+    verbs: Questions
+
+    def __init__(self, settings: Settings, heart: Channel[ToLanes]) -> None:
+        self.settings = settings
+        config = settings.config
+        self._runtime = Path(config.runtime_directory)
+        self._heart = heart
+        self._outgoing: asyncio.Queue[messages.ToHeart] = asyncio.Queue()
+        self._numbers = itertools.count(1)
+        self._questions: dict[int, asyncio.Future[Told]] = {}
+        self._commands: dict[int, asyncio.Future[acts.Answer]] = {}
+        self._life = Life(0, os.getppid(), ())
+        self._begun: asyncio.Future[Life] = asyncio.get_running_loop().create_future()
+        self._end: asyncio.Event = asyncio.Event()
+        self._incompatible: dict[str, str] = {}
+        self._own_troubles: list[str] = []
+        self._signs: dict[tuple[str, str], float] = {}
+        keys = Keys("", "", {})
+        if not config.insecure:
+            publics = {name: robot.public_key for name, robot in settings.team.robots.items()}
+            keys = Keys(public_key_of(settings.secret_key), settings.secret_key, publics)
+            if keys.public != settings.me.public_key:
+                self._own_troubles.append(UNFIT_KEY)
+        facts = Facts(frozenset(config.wireless))
+        self._links = Links(settings.me, facts, anywhere=config.snapshots_over == "any")
+        self._wires = Wires(self._links, self._links_changed)
+        self._ways = Ways(settings, keys, self._hear, self._way_changed, self._links, self._unread)
+        self._lane = self._ways.bulk
+
+    def connect(self, verbs: Questions) -> None:
+        """Have the orders of people and robots carried out by these."""
+        self.verbs = verbs
+        self.errands = Errands(self._ways.say, self.hindrance, verbs.errands())
+
+    # --- what builds on it ---
+
+    @abstractmethod
+    async def prepare(self) -> messages.Inventory:
+        """Have ready whatever is needed before anything can be asked; what the heart must know of it."""
+
+    @abstractmethod
+    def obeys(self, act: acts.Act) -> None:
+        """Carry an act of the core out."""
+
+    @abstractmethod
+    def picture(self, told: Told) -> dict[str, Any]:
+        """What ``status`` shows."""
+
+    async def stop_work(self) -> None:
+        """Give up what is under way, while the lanes still stand."""
+
+    async def close(self) -> None:
+        """Give back what is left, when nobody can ask for anything any more."""
+
+    def hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
+        """A word about a snapshot on the bulk lane."""
+
+    def lane_lost(self, peer: str) -> None:
+        """The bulk lane to a peer is gone, and every transfer on it."""
+
+    def lane_is_new(self, peer: str) -> None:
+        """A peer greets on a new bulk lane."""
+
+    async def run(self) -> None:
+        """From the heart's first word to its last.
+
+        Raises:
+            AgentError, CheckpointError: something needed to begin cannot be had.
+        """
+        loop = asyncio.get_running_loop()
+        make_directory(self._runtime)
+        loop.add_reader(self._heart.fileno(), self._listen_to_heart)
+        speaking = asyncio.create_task(self._speak_to_heart())
+        living = asyncio.create_task(self._show_life())
+        self._life = await self._begun
+        self._say(await self.prepare())
+        self._wires.watch()
+        self._ways.open()
+        server = ControlServer(self._runtime / SOCKET_NAME, self.settings.config.group, self.verbs.table())
+        await server.open()
+        syscalls.give_back()  # what the start has left
+        try:
+            await self._end.wait()
+        finally:
+            loop.remove_reader(self._heart.fileno())
+            await server.close()
+            self._wires.close()
+            await self.errands.close()
+            await self.stop_work()
+            await self._ways.close()
+            await self.close()
+            speaking.cancel()
+            living.cancel()
+
+    # --- the heart ---
+
+    def tell(self, event: Event) -> None:
+        """Pass an event to the core."""
+        self._say(messages.happened(event))
+
+    async def ask(self, what: Literal["status", "why"]) -> Told:
+        """Ask the heart for the core's view, or for what it has not written down yet."""
+        number = next(self._numbers)
+        answer: asyncio.Future[Told] = asyncio.get_running_loop().create_future()
+        self._questions[number] = answer
+        self._say(Ask(number, what))
+        try:
+            return await asyncio.wait_for(answer, ANSWER_PATIENCE_S)
+        except TimeoutError:
+            raise AgentError(f"the agent's heart did not answer for {ANSWER_PATIENCE_S:.0f} s; see its log") from None
+        finally:
+            self._questions.pop(number, None)
+
+    async def command(self, make: Callable[[int], events.Command]) -> acts.Answer:
+        """Have the core decide; its answer."""
+        number = next(self._numbers)
+        answer: asyncio.Future[acts.Answer] = asyncio.get_running_loop().create_future()
+        self._commands[number] = answer
+        self.tell(make(number))
+        try:
+            return await asyncio.wait_for(answer, ANSWER_PATIENCE_S)
+        except TimeoutError:
+            raise AgentError(f"no decision in {ANSWER_PATIENCE_S:.0f} s; failover why tells what it waits for") from None
+        finally:
+            self._commands.pop(number, None)
+
+    def _say(self, message: messages.ToHeart) -> None:
+        self._outgoing.put_nowait(message)
+
+    async def _show_life(self) -> None:
+        while True:
+            self._say(Alive())
+            await asyncio.sleep(ALIVE_S)
+
+    async def _speak_to_heart(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            message = await self._outgoing.get()
+            while True:
+                try:
+                    self._heart.send(message)
+                    break
+                except ChannelClosedError:
+                    self._end.set()
+                    return
+                except ChannelError:
+                    writable = asyncio.Event()
+                    loop.add_writer(self._heart.fileno(), writable.set)
+                    await writable.wait()
+                    loop.remove_writer(self._heart.fileno())
+
+    def _listen_to_heart(self) -> None:
+        try:
+            for _ in range(MESSAGES_A_TURN):
+                message, _descriptors = self._heart.receive()
+                self._heed(message)
+        except BlockingIOError:
+            return
+        except ChannelError:
+            asyncio.get_running_loop().remove_reader(self._heart.fileno())
+            self._end.set()
+
+    def _heed(self, message: ToLanes) -> None:
+        match message:
+            case Order():
+                self.obeys(messages.act_of(message))
+            case Told():
+                _resolve(self._questions, message.number, message)
+            case Life():
+                if not self._begun.done():
+                    self._begun.set_result(message)
+            case Farewell():
+                self._end.set()
+
+    def answered(self, act: acts.Answer) -> None:
+        """The core has decided about a command."""
+        _resolve(self._commands, act.request, act)
+
+    # --- peers ---
+
+    def _way_changed(self, way: int, peer: str, state: LinkState, reason: str) -> None:
+        """A connection stands: introduce ourselves. It is gone: so is every transfer on it, and every word that took it."""
+        lane = "bulk lane" if way == BULK else f"lane {way}"
+        log.info("%s to %s: %s%s", lane, peer, state, f": {reason}" if reason else "")
+        had_words = self._ways.carried_words(way, peer, state)
+        if state is LinkState.CONNECTED:
+            key = self._ways.beat_key(peer)
+            self._greet(way, peer, key)
+            self._say(SpeakKey(peer, key))
+            return
+        if way == BULK:
+            self.lane_lost(peer)
+        if had_words:
+            self.errands.lost(peer)
+
+    def _unread(self, peer: str, why: str) -> None:
+        """Something came from a peer, or from nobody known (""), that does not prove whose it is."""
+        now_s = asyncio.get_running_loop().time()
+        sign = (peer, why if peer else "")
+        if len(self._signs) > SIGNS_MAX:
+            self._signs.clear()
+        if now_s >= self._signs.get(sign, 0) + SIGN_S:
+            self._signs[sign] = now_s
+            self.tell(events.Unread(peer, why))
+
+    async def _links_changed(self, sentences: list[str]) -> None:
+        for sentence in sentences:
+            log.info("%s", sentence)
+            self.tell(events.Noticed("", sentence))
+        try:
+            await self._lane.hold_to_devices()
+        except LaneError as error:
+            log.critical("%s; the lanes begin anew", error)
+            self._end.set()
+
+    def hindrance(self, peer: str) -> str:
+        """Why nothing can be said to a peer now; "" when it can."""
+        return self._ways.hindrance(peer)
+
+    def _hear(self, way: int, peer: str, message: Bulk) -> None:
+        match message:
+            case Hello():
+                self._greeted(way, peer, message)
+            case Goodbye(reason):
+                self._ways.refuse(way, peer, reason)
+            case _ if peer in self._incompatible:
+                return
+            case Errand(verb=verb) if verb not in QUESTIONS and self.votes_only(peer):
+                self._ways.say(peer, ErrandDone(message.number, b"", f"{peer} is a witness: it votes, and gives no orders"))
+            case Errand():
+                self.errands.received(peer, message)
+            case ErrandDone():
+                self.errands.done(peer, message)
+            case _ if way == BULK:
+                self.hear_of_a_snapshot(peer, message)
+
+    def _greeted(self, way: int, peer: str, hello: Hello) -> None:
+        reason = ""
+        if hello.version != VERSION:
+            reason = f"{peer} speaks version {hello.version}, this robot {VERSION}; install the same release on both"
+        elif hello.team != self.settings.team.team:
+            reason = f"{peer} belongs to team {hello.team!r}, this robot to {self.settings.team.team!r}"
+        elif len(hello.beat_key) < KEY_SIZE_MIN:
+            reason = f"{peer} sent a beat key of {len(hello.beat_key)} bytes; install the same release on both"
+        if way == BULK and not hello.again:
+            self.lane_is_new(peer)  # a new connection: what was half here stays half
+        if reason:
+            self._incompatible[peer] = reason
+            self._unread(peer, reason)
+            self._ways.answer(way, peer, Goodbye(reason))
+            log.warning("%s", reason)
+            return
+        self._incompatible.pop(peer, None)
+        self._say(HearKey(peer, hello.beat_key))
+        if self._ways.is_new_key(way, peer, hello.beat_key) and self._ways.present_key(peer):
+            # Whoever lost its power ended no connection: ours to it seems to stand, and is refused at the first word.
+            self._greet(way, peer, self._ways.present_key(peer), again=True)
+
+    def _greet(self, way: int, peer: str, key: bytes, *, again: bool = False) -> None:
+        config = self.settings.config
+        self._ways.answer(way, peer, Hello(VERSION, self.settings.team.team, config.robot, self._life.boot, key, again))
+
+    def votes_only(self, peer: str) -> bool:
+        """Whether nothing that this peer says may start, end or overwrite anything."""
+        return self.settings.team.robots[peer].role == "witness"
+
+    def notices(self) -> list[str]:
+        """What is wrong with the lines, for the status."""
+        return [
+            *self._own_troubles,
+            *self._incompatible.values(),
+            *self._lane.troubles(),
+            *self._ways.troubles,
+            *self._links.notes(),
+        ]
+
+
+def make_directory(directory: Path) -> None:
+    """Have a directory for our eyes only.
+
+    Raises:
+        AgentError: it cannot be made.
+    """
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise AgentError(
+            f"cannot make {directory}: {error.strerror}; name directories that this user may write as state_directory "
+            "and runtime_directory"
+        ) from error
+
+
+def _resolve(waiting: dict[int, asyncio.Future[Any]], number: int, answer: Any) -> None:
+    future = waiting.pop(number, None)
+    if future is not None and not future.done():
+        future.set_result(answer)
+
+
+def live(kind: Callable[[Settings, Channel[ToLanes]], Switchboard]) -> int:
+    """Be the other process of the heart that started us with CONFIG and DESCRIPTOR; its signals are its own."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    allocator.be_frugal()
+    path, descriptor = Path(sys.argv[1]), int(sys.argv[2])
+    try:
+        settings = configuration.load(path)
+        set_up_log(settings.config.log_level)
+        with contextlib.suppress(asyncio.CancelledError):
+            asyncio.run(_live(kind, settings, descriptor))
+    except (AgentError, CheckpointError, OSError) as error:
+        log.critical("%s", error)
+        return 1
+    return 0
+
+
+async def _live(kind: Callable[[Settings, Channel[ToLanes]], Switchboard], settings: Settings, descriptor: int) -> None:
+    end = socket.socket(fileno=descriptor)
+    end.setblocking(False)
+    await kind(settings, Channel(end, ToLanes)).run()

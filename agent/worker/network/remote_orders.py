@@ -1,0 +1,135 @@
+"""Orders that are given on one robot and carried out on another: where the component runs.
+
+An order travels as an `Errand` on the bulk lane, which says who the sender is; every robot of the team may give one. It is
+carried out as if it had been given there, and its answer travels back. It is carried out once or not at all: when the connection
+is lost in between, whoever gave it is told that nobody knows.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import Awaitable, Callable
+from typing import Any, Final
+
+import msgspec
+
+from agent.errors import TROUBLE, RefusedError
+from agent.system.crash import end_lanes_on_mistake
+from agent.system.permissions import NOBODY
+from checkpoint.errors import UNDECODABLE
+from failover.core.wire.messages import CHUNK_SIZE_MAX, Bulk, Errand, ErrandDone
+from failover.errors import FailoverError
+
+PATIENCE_S: Final = 75.0
+"""How long an answer may take; the other robot gives its own orders up sooner."""
+
+UNDER_WAY_MAX: Final = 64
+"""Errands of one peer that are carried out at a time; more are refused."""
+
+CONTENT_MAX: Final = CHUNK_SIZE_MAX
+"""Bytes of an answer: the lane takes no larger message than a chunk of a snapshot."""
+
+Order = Callable[[dict[str, Any], int], Awaitable[dict[str, Any]]]
+"""Carries one verb out on this robot: its arguments, the uid of who gave it → its result."""
+
+
+class Errands:
+    """Both ends: what was sent from here, and what came from others. Lives in the lanes' loop."""
+
+    def __init__(self, say: Callable[[str, Bulk], object], hindrance: Callable[[str], str], orders: dict[str, Order]) -> None:
+        """
+        Args:
+            hindrance: why nothing can be said to a peer now; "" when it can.
+            orders: by name, those that another robot may give.
+        """
+        self._say = say
+        self._hindrance = hindrance
+        self._orders = orders
+        self._numbers = itertools.count(1)
+        self._waiting: dict[tuple[str, int], asyncio.Future[ErrandDone]] = {}
+        self._under_way: dict[str, set[asyncio.Task[None]]] = {}
+
+    async def send(
+        self, peer: str, verb: str, arguments: dict[str, Any], by: int = NOBODY, patience_s: float = PATIENCE_S
+    ) -> dict[str, Any]:
+        """Have a peer carry an order out, or answer a question.
+
+        Args:
+            by: uid of who gave the order.
+
+        Raises:
+            RefusedError: it cannot be reached; it refused, with its reasons; or its answer did not come.
+        """
+        if hindrance := self._hindrance(peer):
+            raise RefusedError(f"cannot ask {peer}: {hindrance}; ask there, or try again")
+        number = next(self._numbers)
+        answer: asyncio.Future[ErrandDone] = asyncio.get_running_loop().create_future()
+        self._waiting[peer, number] = answer
+        try:
+            self._say(peer, Errand(number, verb, msgspec.msgpack.encode(arguments), by))
+            done = await asyncio.wait_for(answer, patience_s)
+        except TimeoutError:
+            raise RefusedError(
+                f"{peer} did not answer to {verb} in {patience_s:g} s; failover status tells how it stands"
+            ) from None
+        finally:
+            self._waiting.pop((peer, number), None)
+        if done.refusal:
+            raise RefusedError(f"{peer}: {done.refusal}", done.kind, done.reasons)
+        try:
+            return msgspec.msgpack.decode(done.content, type=dict[str, Any])
+        except UNDECODABLE as error:
+            raise RefusedError(f"{peer} answered {verb} in a way not understood: {error}; same release there?") from error
+
+    def done(self, peer: str, message: ErrandDone) -> None:
+        """A peer has answered."""
+        waiting = self._waiting.get((peer, message.number))
+        if waiting is not None and not waiting.done():
+            waiting.set_result(message)
+
+    def lost(self, peer: str) -> None:
+        """The connection has gone: nobody knows whether the order arrived."""
+        for (robot, number), waiting in self._waiting.items():
+            if robot == peer and not waiting.done():
+                sentence = "the connection was lost before its answer; failover status tells whether it was done"
+                waiting.set_result(ErrandDone(number, b"", sentence))
+
+    def received(self, peer: str, message: Errand) -> None:
+        """A peer gives an order."""
+        under_way = self._under_way.setdefault(peer, set())
+        if len(under_way) >= UNDER_WAY_MAX:
+            self._say(peer, ErrandDone(message.number, b"", f"{UNDER_WAY_MAX} orders of {peer} are under way; wait for them"))
+            return
+        task = asyncio.create_task(self._carry_out(peer, message))
+        under_way.add(task)
+        task.add_done_callback(under_way.discard)
+        task.add_done_callback(end_lanes_on_mistake)
+
+    async def close(self) -> None:
+        """Give up what is under way."""
+        tasks = [task for under_way in self._under_way.values() for task in under_way]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _carry_out(self, peer: str, message: Errand) -> None:
+        try:
+            order = self._orders.get(message.verb)
+            if order is None:
+                raise RefusedError(f"no order {message.verb!r} can be given from another robot")
+            done = ErrandDone(message.number, msgspec.msgpack.encode(await order(_arguments(message), message.by)))
+        except RefusedError as refusal:
+            done = ErrandDone(message.number, b"", str(refusal), refusal.kind, tuple(refusal.reasons))
+        except (*TROUBLE, FailoverError) as trouble:
+            done = ErrandDone(message.number, b"", str(trouble) or type(trouble).__name__)
+        if len(done.content) > CONTENT_MAX:
+            done = ErrandDone(message.number, b"", f"its answer of {len(done.content)} bytes is too long to travel; ask there")
+        self._say(peer, done)
+
+
+def _arguments(message: Errand) -> dict[str, Any]:
+    try:
+        return msgspec.msgpack.decode(message.arguments, type=dict[str, Any])
+    except UNDECODABLE as error:
+        raise RefusedError(f"the arguments of {message.verb} were not understood: {error}; same release there?") from error

@@ -1,0 +1,570 @@
+"""The bulk lane: ZeroMQ between agents, authenticated and encrypted by CURVE. The only ``zmq`` import.
+
+One ROUTER socket hears everybody; one DEALER socket speaks to each peer. A connection carries one direction's messages, in
+order. What is queued for a connection is gone when the connection is: the core says again what still matters.
+
+Who speaks is known by key, not by claim: the ZAP answer below admits only public keys of the team file and names their owner.
+Source: rfc.zeromq.org/spec/25 (CURVE), /27 (ZAP); zmq_setsockopt(3), zmq_socket_monitor(3).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import enum
+import logging
+import socket
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Final, Protocol
+
+import zmq
+import zmq.asyncio
+from msgspec import Struct
+from zmq.utils import z85
+from zmq.utils.monitor import parse_monitor_message
+
+from agent.errors import LaneError
+from agent.system.connection_quota import Arrivals, plain
+from agent.system.crash import end_lanes_on_mistake
+from agent.system.rtnetlink import allow_absent
+from agent.worker.network.links import Device
+from failover.config.team import for_lookup, split_address
+from failover.core.wire.codec import decode_bulk, encode_bulk
+from failover.core.wire.messages import CHUNK_SIZE_MAX, Bulk, Chunk
+
+QUEUE_LIMIT: Final = 1_024
+"""Messages waiting for one peer, chunks not counted: a peer that takes none for so long has lost them anyway."""
+
+HIGH_WATER: Final = 6
+"""Messages inside ZeroMQ for one peer: what is in there can no longer be overtaken by a vote."""
+
+MESSAGE_LIMIT: Final = CHUNK_SIZE_MAX + (64 << 10)
+"""Bytes of one frame from a stranger; more closes the connection."""
+
+RECONNECT_FIRST_MS: Final = 50
+RECONNECT_MOST_MS: Final = 2_000
+"""ZeroMQ doubles the pause from first to most and adds a random part of its own."""
+
+RETRANSMIT_LIMIT_MS: Final = 3_000
+"""A connection whose bytes stay unacknowledged so long is dead (TCP_USER_TIMEOUT); the beats have known it much earlier."""
+
+HANDSHAKE_LIMIT_MS: Final = 5_000
+
+LISTEN_TRIES: Final = 100
+LISTEN_PAUSE_S: Final = 0.02
+
+BACKLOG: Final = 100
+"""Connections that wait to be accepted: more than a team has robots."""
+
+KEY_SIZE: Final = 32
+SHOWN: Final = 8
+"""Characters of a public key by which people tell it from another one."""
+
+MEND: Final = "bring the same team.toml to every robot, or enrol the robot whose key is another one again, and restart its agent"
+
+HANDSHAKE_FAILURES: Final = frozenset(
+    {zmq.EVENT_HANDSHAKE_FAILED_AUTH, zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL}
+)
+
+ZAP_ADDRESS: Final = "inproc://zeromq.zap.01"
+ZAP_DOMAIN: Final = b"failover"
+
+log = logging.getLogger("failover.lane")
+
+
+class LinkState(enum.StrEnum):
+    """How the connection *to* a peer stands."""
+
+    CONNECTING = "connecting"
+    CONNECTED = "connected"
+    REFUSED = "refused"
+    DOWN = "down"
+
+
+class Keys(Struct, frozen=True):
+    """This robot's pair and everybody's public keys by name; Z85. Empty strings: no encryption."""
+
+    public: str
+    secret: str
+    peers: Mapping[str, str]
+
+    @property
+    def present(self) -> bool:
+        """Whether the lane is authenticated and encrypted."""
+        return bool(self.secret)
+
+
+class Devices(Protocol):
+    """Which interfaces connections are held to; see `agent.worker.network.links.Links`."""
+
+    def device(self, host: str) -> Device | None:
+        """By which a connection to that host of a peer must leave; None for any."""
+
+    def listening(self, peers: Iterable[str]) -> Device | None:
+        """By which connections of the peers at those hosts must come; None for any."""
+
+
+class AnyDevice:
+    """Connections take whichever interface the kernel chooses."""
+
+    def device(self, _host: str) -> Device | None:
+        """Any."""
+        return None
+
+    def listening(self, _peers: Iterable[str]) -> Device | None:
+        """Any."""
+        return None
+
+
+ANY_DEVICE: Final = AnyDevice()
+
+Receive = Callable[[str, Bulk], None]
+"""Called with (peer, message)."""
+
+Changed = Callable[[str, LinkState, str], None]
+"""Called with (peer, state, reason) when a connection changed."""
+
+Unread = Callable[[str, str], None]
+"""Called with (peer, why) whenever something comes from a peer's address that does not prove to be its; "" for no peer's."""
+
+
+def new_keys() -> tuple[str, str]:
+    """A fresh (public, secret) pair, Z85."""
+    public, secret = zmq.curve_keypair()
+    return public.decode(), secret.decode()
+
+
+def public_key_of(secret: str) -> str:
+    """The public half of a secret key.
+
+    Raises:
+        LaneError: it is no key.
+    """
+    try:
+        return zmq.curve_public(secret.encode()).decode()
+    except (zmq.ZMQError, ValueError) as error:
+        raise LaneError("this robot's secret key is not a CURVE key of 40 characters; failover team enrol makes one") from error
+
+
+class Link:
+    """The way to one peer: a DEALER socket, what waits for it, and how its connection stands."""
+
+    def __init__(
+        self,
+        context: zmq.asyncio.Context,
+        me: str,
+        peer: str,
+        address: str,
+        keys: Keys,
+        changed: Changed,
+        unread: Unread,
+        device: Device | None = None,
+    ) -> None:
+        """
+        Args:
+            device: the interface that the connection is held to; None for whichever the kernel chooses.
+        """
+        self.peer = peer
+        self.device = device
+        self.state = LinkState.CONNECTING
+        self.reason = ""
+        self._changed = changed
+        self._unread = unread
+        self._own_key, self._their_key = shown(keys.public), shown(keys.peers.get(peer, ""))
+        self._words: deque[bytes] = deque(maxlen=QUEUE_LIMIT)
+        self._chunk: tuple[bytes, asyncio.Future[None]] | None = None
+        self._wake = asyncio.Event()
+        self._socket = context.socket(zmq.DEALER)
+        _limits(self._socket)
+        self._socket.setsockopt(zmq.IDENTITY, me.encode())
+        self._socket.setsockopt(zmq.IMMEDIATE, 1)
+        if device is not None:
+            self._socket.setsockopt(zmq.BINDTODEVICE, device.name.encode())
+        self._socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_FIRST_MS)
+        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MOST_MS)
+        self._socket.setsockopt(zmq.TCP_MAXRT, RETRANSMIT_LIMIT_MS)
+        if keys.present:
+            self._socket.curve_publickey = keys.public.encode()
+            self._socket.curve_secretkey = keys.secret.encode()
+            self._socket.curve_serverkey = keys.peers[peer].encode()
+        self._monitor = self._socket.get_monitor_socket()
+        self._address = f"tcp://{address}"
+        self._loop = asyncio.get_running_loop()
+        self._socket.connect(self._address)
+        self._tasks = (asyncio.create_task(self._watch()), asyncio.create_task(self._send()))
+        for task in self._tasks:
+            task.add_done_callback(end_lanes_on_mistake)
+
+    def say(self, message: Bulk) -> bool:
+        """Queue a small message; it overtakes chunks. False: there is no connection, it was dropped."""
+        if self.state is not LinkState.CONNECTED:
+            return False
+        self._words.append(encode_bulk(message))
+        self._wake.set()
+        return True
+
+    async def ship(self, chunk: Chunk) -> None:
+        """Send one chunk after all small messages; returns when ZeroMQ has taken it.
+
+        Raises:
+            LaneError: the connection is down, or went down meanwhile.
+        """
+        while self._chunk is not None and self.state is LinkState.CONNECTED:
+            with contextlib.suppress(LaneError):
+                await asyncio.shield(self._chunk[1])
+        if self.state is not LinkState.CONNECTED:
+            raise LaneError(f"the bulk lane to {self.peer} is down: {self.reason or self.state}")
+        done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._chunk = (encode_bulk(chunk), done)
+        self._wake.set()
+        await done
+
+    def refuse(self, reason: str) -> None:
+        """Talk no further with this peer until it connects anew: it broke the rules."""
+        self._enter(LinkState.REFUSED, reason)
+
+    async def close(self) -> None:
+        """Let the connection go; nothing lingers."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        self._socket.disable_monitor()
+        self._monitor.close(0)
+        self._socket.close(0)
+        self._fail_chunk("the agent ends")
+
+    async def _send(self) -> None:
+        """Whatever waits, small messages first, one at a time, so that little is committed to the socket's own queue."""
+        while True:
+            await self._wake.wait()
+            if self._words:
+                await self._socket.send(self._words.popleft())
+            elif self._chunk is not None:
+                body, done = self._chunk
+                await self._socket.send(body)
+                self._chunk = None if self._chunk and self._chunk[1] is done else self._chunk
+                if not done.done():
+                    done.set_result(None)
+            else:
+                self._wake.clear()
+
+    async def _watch(self) -> None:
+        """Follow the connection's events."""
+        while True:
+            event = parse_monitor_message(await self._monitor.recv_multipart())
+            kind = event["event"]
+            if kind == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                self._enter(LinkState.CONNECTED, "")
+            elif kind in HANDSHAKE_FAILURES:
+                reason = _refusal(self.peer, kind, self._own_key, self._their_key)
+                self._enter(LinkState.REFUSED, reason)
+                self._unread(self.peer, reason)
+                if kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+                    self._loop.call_later(RECONNECT_MOST_MS / 1_000, self._knock_again)
+            elif kind == zmq.EVENT_DISCONNECTED and self.state is not LinkState.REFUSED:
+                self._enter(LinkState.CONNECTING, "the connection was lost")
+            elif kind == zmq.EVENT_CLOSED and self.state is LinkState.CONNECTING:
+                self._enter(LinkState.CONNECTING, "nobody listens there")
+
+    def _knock_again(self) -> None:
+        """ZeroMQ does not by itself where a key was refused; and both robots are to know that the other one lives."""
+        if self.state is LinkState.REFUSED and not self._socket.closed:
+            with contextlib.suppress(zmq.ZMQError):
+                self._socket.disconnect(self._address)
+            self._socket.connect(self._address)
+
+    def _enter(self, state: LinkState, reason: str) -> None:
+        if (state, reason) == (self.state, self.reason):
+            return
+        self.state, self.reason = state, reason
+        if state is not LinkState.CONNECTED:
+            self._words.clear()
+            self._fail_chunk(reason)
+        self._changed(self.peer, state, reason)
+
+    def _fail_chunk(self, reason: str) -> None:
+        waiting, self._chunk = self._chunk, None
+        if waiting is not None and not waiting[1].done():
+            waiting[1].set_exception(LaneError(f"the bulk lane to {self.peer} went down: {reason}"))
+
+
+class BulkLane:
+    """All connections of this robot. Lives in one asyncio loop."""
+
+    def __init__(
+        self,
+        me: str,
+        bind: str,
+        peers: Mapping[str, str],
+        keys: Keys,
+        receive: Receive,
+        changed: Changed,
+        devices: Devices = ANY_DEVICE,
+        unread: Unread = lambda *_: None,
+    ) -> None:
+        """
+        Args:
+            bind: "host:port" to listen at.
+            peers: "host:port" by name.
+            devices: which interfaces connections are held to.
+        """
+        self._devices = devices
+        self._router: zmq.asyncio.Socket | None = None
+        self._listening: Device | None = None
+        self._me = me
+        self._bind = bind
+        self._peers = peers
+        self._keys = keys
+        self._receive = receive
+        self._changed = changed
+        self._unread = unread
+        self._context = zmq.asyncio.Context()
+        self._tasks: list[asyncio.Task[None]] = []
+        self.links: dict[str, Link] = {}
+        self.strangers = 0
+        self._stranger = ""
+        self._mismatch: dict[str, str] = {}
+        self._misunderstood: Counter[str] = Counter()
+        self._arrivals = Arrivals(split_address(bind, "bulk address")[1], self._hosts())
+
+    def open(self) -> None:
+        """Listen, and begin to connect to everybody.
+
+        Raises:
+            LaneError: the address cannot be had.
+        """
+        if self._keys.present:
+            gate = self._context.socket(zmq.REP)
+            gate.bind(ZAP_ADDRESS)
+            self._tasks.append(asyncio.create_task(self._admit(gate)))
+        router = self._context.socket(zmq.ROUTER)
+        _limits(router)
+        router.setsockopt(zmq.ROUTER_HANDOVER, 1)
+        if self._keys.present:
+            router.curve_server = True
+            router.curve_secretkey = self._keys.secret.encode()
+            router.zap_domain = ZAP_DOMAIN
+        self._router = router
+        monitor = router.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
+        try:
+            self._listen(router)
+        except LaneError:
+            router.disable_monitor()
+            monitor.close(0)
+            router.close(0)
+            raise
+        self._tasks.append(asyncio.create_task(self._hear(router)))
+        self._tasks.append(asyncio.create_task(self._watch(monitor)))
+        for task in self._tasks:
+            task.add_done_callback(end_lanes_on_mistake)
+        for peer in self._peers:
+            self._connect(peer)
+
+    def _listen(self, router: zmq.asyncio.Socket) -> None:
+        """Take connections by the interface that they must come by.
+
+        Raises:
+            LaneError: the address cannot be had.
+        """
+        self._listening = self._devices.listening(self._hosts())
+        try:
+            router.setsockopt(zmq.USE_FD, _listener(self._bind, self._listening))
+            router.bind(f"tcp://{self._bind}")
+        except (zmq.ZMQError, OSError) as error:
+            raise LaneError(
+                f"cannot listen for snapshots at {self._bind}: {error.strerror}; is another agent running, or is it not ours?"
+            ) from error
+
+    def _hosts(self) -> list[str]:
+        return [split_address(address, "bulk address")[0] for address in self._peers.values()]
+
+    async def hold_to_devices(self) -> None:
+        """Interfaces have come or gone: connect, or listen, anew where it must be by another one than before.
+
+        Where an interface has only gone, what was held to it waits for its return.
+
+        Raises:
+            LaneError: the address cannot be had any more.
+        """
+        wanted = self._devices.listening(self._hosts())
+        if self._router is not None and wanted not in (None, self._listening):
+            await self._listen_anew(self._router)
+        for peer, link in list(self.links.items()):
+            if self._device_to(peer) not in (None, link.device):
+                await link.close()
+                self._changed(peer, LinkState.CONNECTING, "its interface is another one now")
+                self._connect(peer)
+
+    async def _listen_anew(self, router: zmq.asyncio.Socket) -> None:
+        """ZeroMQ lets an address go some time after it was told to."""
+        with contextlib.suppress(zmq.ZMQError):
+            router.unbind(f"tcp://{self._bind}")
+        for _ in range(LISTEN_TRIES):
+            try:
+                self._listen(router)
+                return
+            except LaneError as error:
+                trouble = error
+                await asyncio.sleep(LISTEN_PAUSE_S)
+        raise trouble
+
+    def _connect(self, peer: str) -> None:
+        address, device = self._peers[peer], self._device_to(peer)
+        self.links[peer] = Link(self._context, self._me, peer, address, self._keys, self._changed, self._unread, device)
+
+    def _device_to(self, peer: str) -> Device | None:
+        return self._devices.device(split_address(self._peers[peer], "bulk address")[0])
+
+    def say(self, peer: str, message: Bulk) -> bool:
+        """Queue a small message to a peer; False: it is not connected, the message was dropped."""
+        return self.links[peer].say(message)
+
+    async def ship(self, peer: str, chunk: Chunk) -> None:
+        """Send one chunk; see `Link.ship`."""
+        await self.links[peer].ship(chunk)
+
+    def troubles(self) -> list[str]:
+        """What was refused in this life, for the status: a sentence each."""
+        told = [
+            f"{peer} sent {count} messages on the bulk lane that this robot does not understand; install the same release on both"
+            for peer, count in self._misunderstood.items()
+        ]
+        if trouble := self._arrivals.trouble():
+            told.append(trouble)
+        told.extend(self._mismatch.values())
+        if self.strangers:
+            told.append(
+                f"a key that is not in this robot's team.toml was refused on the bulk lane, {self.strangers} times, last from "
+                f"{self._stranger}; bring the same team.toml to every robot if it is one of yours"
+            )
+        return told
+
+    async def close(self) -> None:
+        """Close every socket and wait for the tasks."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.gather(*(link.close() for link in self.links.values()))
+        self._context.destroy(linger=0)
+
+    async def _hear(self, router: zmq.asyncio.Socket) -> None:
+        """Every message of every peer, in order; what is malformed or of a stranger is counted and dropped."""
+        try:
+            while True:
+                frames = await router.recv_multipart(copy=False)
+                peer = self._speaker(frames)
+                message = decode_bulk(frames[1].bytes) if peer and len(frames) == 2 else None
+                if message is not None:
+                    self._receive(peer, message)
+                elif peer:
+                    self._misunderstood[peer] += 1
+                else:
+                    self._refused("somebody under another's name")
+        finally:
+            router.close(0)
+
+    async def _watch(self, monitor: zmq.asyncio.Socket) -> None:
+        """Follow which connections come and go; what is too much is ended before it has said a word."""
+        try:
+            while True:
+                event = parse_monitor_message(await monitor.recv_multipart())
+                if event["event"] == zmq.EVENT_ACCEPTED:
+                    self._arrivals.accepted(event["value"])
+                else:
+                    self._arrivals.ended(event["value"])
+        finally:
+            monitor.close(0)
+
+    def _speaker(self, frames: list[Any]) -> str:
+        """The peer whose message this is, by its key; "" for a stranger or a peer under another's name."""
+        claimed = bytes(frames[0].bytes).decode(errors="replace")
+        if claimed not in self._peers:
+            return ""
+        if self._keys.present and frames[1].get("User-Id") != claimed:
+            return ""
+        return claimed
+
+    async def _admit(self, gate: zmq.asyncio.Socket) -> None:
+        """Answer ZeroMQ's question who may connect: the owners of the team's keys, by name."""
+        owners = {z85.decode(key.encode()): name for name, key in self._keys.peers.items() if key}
+        try:
+            while True:
+                version, request, _domain, address, _identity, mechanism, *credentials = await gate.recv_multipart()
+                owner = owners.get(credentials[0]) if mechanism == b"CURVE" and len(credentials) == 1 else None
+                if owner is None:
+                    self._refuse(address.decode(errors="replace"), credentials)
+                else:
+                    self._arrivals.is_of_member(address.decode(errors="replace"))
+                    self._mismatch.pop(owner, None)
+                status = (b"200", b"OK", owner.encode()) if owner else (b"400", b"not in the team", b"")
+                await gate.send_multipart([version, request, *status, b""])
+        finally:
+            gate.close(0)
+
+    def _refuse(self, address: str, credentials: list[bytes]) -> None:
+        """A key that is not in the team: of a member whose key, or whose entry in our team file, is an old one?"""
+        self._refused(address)
+        host = plain(address)
+        peers = [peer for peer, there in self._peers.items() if plain(split_address(there, "bulk address")[0]) == host]
+        key = shown(z85.encode(credentials[0]).decode()) if len(credentials) == 1 and len(credentials[0]) == KEY_SIZE else "none"
+        for peer in peers:
+            known = shown(self._keys.peers[peer])
+            self._mismatch[peer] = f"{peer} presents the key {key}, and team.toml here has {known} for it: {MEND}"
+            self._unread(peer, self._mismatch[peer])
+        if not peers:
+            self._unread("", f"one at {address} presents the key {key}")
+
+    def _refused(self, stranger: str) -> None:
+        """Count one that is not in the team; the log hears of it once, for it may knock for ever."""
+        self.strangers += 1
+        if stranger != self._stranger:
+            log.warning("refused a key that is not in team.toml on the bulk lane: %s", stranger)
+        self._stranger = stranger
+
+
+def _limits(socket: zmq.asyncio.Socket) -> None:
+    socket.setsockopt(zmq.LINGER, 0)
+    socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
+    socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
+    socket.setsockopt(zmq.MAXMSGSIZE, MESSAGE_LIMIT)
+    socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_LIMIT_MS)
+    socket.setsockopt(zmq.IPV6, 1)
+
+
+def _listener(address: str, device: Device | None) -> int:
+    """A descriptor that listens there, also where no interface has the address yet; it becomes ZeroMQ's.
+
+    Raises:
+        OSError: the address is taken, or is none.
+    """
+    host, port = split_address(address, "bulk address")
+    found = socket.getaddrinfo(for_lookup(host), port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    family, kind, protocol, _, where = found[0]
+    with socket.socket(family, kind | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC, protocol) as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        allow_absent(listener)
+        if device is not None:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, device.name.encode() + b"\0")
+        listener.bind(where)
+        listener.listen(BACKLOG)
+        return listener.detach()
+
+
+def shown(key: str) -> str:
+    """The beginning of a public key, by which a person tells it from another in team.toml."""
+    return f"{key[:SHOWN]}…" if key else "none"
+
+
+def _refusal(peer: str, kind: int, own: str, theirs: str) -> str:
+    if kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+        return f"{peer} does not know this robot's key, {own}: {MEND}"
+    if kind == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
+        return (
+            f"the handshake with {peer} broke off: its key is not {theirs}, which team.toml here has, or one side runs without "
+            f"keys: {MEND}"
+        )
+    return (
+        f"{peer} closed the connection during the handshake: wrong key, or no agent; if its agent runs, its key is not {theirs}, "
+        f"which team.toml here has: {MEND}"
+    )

@@ -1,0 +1,413 @@
+"""The lanes process: snapshots, programs and people; everything that may take its time.
+
+Started as `python -m agent.system.child_main agent.worker.process CONFIG DESCRIPTOR`. One asyncio loop at ordinary priority. The
+heart orders (`agent.main_loop.messages`), this carries out and answers. If it dies, the heart starts another; guards and
+programs live on and are found again by their sockets. If the heart dies, this ends.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+from collections.abc import Coroutine
+from pathlib import Path
+from typing import Any, Final
+
+from agent.config import Settings
+from agent.core_config import retention
+from agent.errors import TROUBLE, GuardLostError, LaneError
+from agent.main_loop.messages import Inventory, ToLanes, Told
+from agent.system.crash import end_lanes_on_mistake
+from agent.system.systemd_units import starter
+from agent.worker.components import launch, prerequisites
+from agent.worker.components.context import Surroundings
+from agent.worker.components.hooks import Hooks
+from agent.worker.components.paths import Places, guard_sockets
+from agent.worker.components.process_pool import Nursery
+from agent.worker.components.run_records import Records
+from agent.worker.components.snapshots import newest_of
+from agent.worker.components.statistics import Memory
+from agent.worker.components.supervisor import Charge
+from agent.worker.control.status_view import team_view
+from agent.worker.control.verbs import Verbs
+from agent.worker.hub import Switchboard, live, make_directory
+from agent.worker.replication.receive_files import Limits, Stock
+from agent.worker.replication.receive_snapshots import Deposit
+from agent.worker.replication.send_files import Bringing, Sources
+from agent.worker.replication.send_snapshots import Dispatch
+from agent.worker.replication.transfer import Receiver, Shipper
+from checkpoint.engine import COOPERATIVE
+from checkpoint.engines.ptrace.facts import memory_limits
+from checkpoint.errors import CheckpointError, StoreError
+from checkpoint.keeper import messages
+from checkpoint.keeper.messages import Channel
+from checkpoint.model import Snapshot
+from checkpoint.runtime import allocator
+from checkpoint.snapshot.required_files import Need, names_of_contents, needs
+from checkpoint.store.content_store import FOLDER as CONTENTS_FOLDER
+from checkpoint.store.store import Store, open_store
+from checkpoint.store.xor_cache_budget import PageBudget
+from failover.config.quantities import size_bytes
+from failover.core import acts, events
+from failover.core.types import HISTORY_MAX, Found, Held
+from failover.core.wire.messages import Belongings, Bulk, Cancel, Chunk, Content, Credit, Lacking, Offer, Refuse, Taken
+
+BYTES_A_MEGABIT: Final = 125_000
+TIDY_S: Final = 900.0
+"""Between two looks for brought files that nobody needs any more."""
+
+GIVE_BACK_S: Final = 20.0
+"""Between two times that free memory goes back to the kernel: a few milliseconds in a thread of its own."""
+
+LOOK_S: Final = 3.0
+"""Between two looks whether the files of running programs are still there."""
+
+LACKS_S: Final = 30.0
+"""Between two looks what this robot lacks of what its components need; each costs a keeper's start."""
+
+STORE_TRIES: Final = 50
+STORE_PAUSE_S: Final = 0.1
+"""Between two tries to have the store: it is also what keeps two lives of an agent apart."""
+
+log = logging.getLogger("failover.lanes")
+
+
+class Lanes(Switchboard):
+    """One life of the process."""
+
+    def __init__(self, settings: Settings, heart: Channel[ToLanes]) -> None:
+        super().__init__(settings, heart)
+        self.charges: dict[str, Charge] = {}
+        self._inquiries: set[str] = set()
+        config = settings.config
+        state, runtime = Path(config.state_directory), Path(config.runtime_directory)
+        self._store_path = state / "store"
+        sockets = runtime / "guards"
+        self._starter = starter()
+        self._nursery = Nursery(sockets, self._starter)
+        contents = str(self._store_path / CONTENTS_FOLDER) if config.bring else ""
+        self.places = Places(
+            sockets, state / "logs", self._nursery, "", config.robot, contents, PageBudget(config.xor_cache_size)
+        )
+        self._shipper = Shipper(self._lane, config.link_mbit_s * BYTES_A_MEGABIT)
+        self.connect(Verbs(self))
+
+    async def prepare(self) -> Inventory:
+        """Open the store, find what outlived the last agent."""
+        for directory in (self.places.sockets, self.places.logs):
+            make_directory(directory)
+        store = self._store = await self._open_store()
+        records = Records(self._runtime / "running")
+        hooks, here = Hooks(self._starter), self.settings.component
+        self._deposit = Deposit(store, self.places, self.tell, self._accepted, runs=self.settings.me.role == "robot", here=here)
+        settled = self._deposit.settled
+        self._around = Surroundings(self.places, store, records, self.tell, self._silence_ns, settled, here, hooks)
+        self._sources = Sources(store, self._from_program)
+        self._bringing = Bringing(self._shipper, self._lane.say, self._sources.open, self._note_bringing)
+        self._dispatch = Dispatch(
+            store, self._shipper, self.tell, self._links.hindrance, self._bringing, lambda name: here(name).bring_data
+        )
+        self._receiver = Receiver(self._lane, self._store_path, self._deposit)
+        self._stock = Stock(store, self._limits(), self.settings.config.robot, self._deposit.hindrance)
+        self._contents = Receiver(self._lane, self._store_path, self._stock)
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._new_here = asyncio.Event()
+        self._task(self._tidy_contents())
+        self._task(self._give_back())
+        if self.settings.me.role == "robot":
+            self._task(self._look_what_is_lacking())
+        if self.settings.config.bring:
+            self._task(self._keep_what_goes())
+        found = await self._find_guards(records)
+        await self._mend_logs(found)
+        if found:
+            self._nursery.begin()
+        return Inventory(_held(store), found)
+
+    async def stop_work(self) -> None:
+        """Give up what is under way; guards and programs live on."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._dispatch.close()
+        await self._bringing.close()
+        await asyncio.gather(*(charge.close() for charge in self.charges.values()))
+
+    async def close(self) -> None:
+        """Let another life have the store."""
+        await self._nursery.close()
+        self._store.close()
+
+    async def _open_store(self) -> Store:
+        """Have the store to ourselves; an earlier life of the agent that still ends is waited for."""
+        for _ in range(STORE_TRIES):
+            try:
+                kept = retention(self.settings.config)
+                return await asyncio.to_thread(open_store, self._store_path, None, kept, self.places.budget)
+            except StoreError as error:
+                trouble: StoreError = error
+                await asyncio.sleep(STORE_PAUSE_S)
+        raise trouble
+
+    def obeys(self, act: acts.Act) -> None:
+        """Carry an act of the core out."""
+        match act:
+            case acts.Answer():
+                self.answered(act)
+            case acts.Admit():
+                self._deposit.admit(act)
+            case acts.Accept():
+                self._deposit.accept(act)
+            case acts.Discard():
+                self._task(self._deposit.discard(act))
+            case acts.Show():
+                self._task(self._deposit.show(act))
+            case acts.Ship():
+                self._dispatch.ship(act)
+            case acts.CancelShip():
+                self._dispatch.cancel(act)
+            case acts.Inquire():
+                self._task(self._inquire(act))
+            case _:
+                self.charge(act.component).order(act)
+
+    def charge(self, name: str) -> Charge:
+        """The component of that name, known or new."""
+        if name not in self.charges:
+            self.charges[name] = Charge(name, self._around)
+            self.charges[name].begin()
+        return self.charges[name]
+
+    async def _find_guards(self, records: Records) -> tuple[Found, ...]:
+        """Take the guards that outlived the last agent into charge."""
+        found = []
+        for path in guard_sockets(self.places):
+            try:
+                component = await launch.reconnect(path, self.places)
+                standing = await component.describe()
+            except GuardLostError as error:
+                log.info("%s", error)
+                continue
+            epoch = records.epoch(component.name)
+            component.keeper.names = self._names_of_brought(component.name)
+            self.charge(component.name).adopt(component, epoch)
+            running = standing.state in ("running", "frozen")
+            found.append(Found(component.name, epoch, running, standing.exit_status or 0))
+            log.info("%s: found again, pid %d, %s", component.name, component.pid, standing.state)
+        return tuple(found)
+
+    def _names_of_brought(self, name: str) -> dict[str, str]:
+        """By which a program that was restored here knows its files: its newest snapshot says it."""
+        outline = newest_of(self._around.store, name)
+        return names_of_contents(needs(outline), self.places.contents) if outline is not None else {}
+
+    async def _mend_logs(self, found: tuple[Found, ...]) -> None:
+        try:
+            await asyncio.to_thread(self._deposit.mend_logs, {one.component for one in found})
+        except (CheckpointError, OSError) as error:
+            log.warning("the output of earlier checkpoints is not complete here: %s", error)
+
+    def hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
+        """A word about a snapshot on the bulk lane."""
+        match message:
+            case Offer() if self.votes_only(peer):
+                self._lane.say(peer, Refuse(message.transfer, f"{peer} is a witness: it votes, and keeps no snapshots"))
+            case Offer() if hindrance := self._links.hindrance():
+                self._lane.say(peer, Refuse(message.transfer, f"snapshots wait: at {self.settings.config.robot} {hindrance}"))
+            case Offer():
+                self._receiver.offered(peer, message)
+            case Belongings() | Content() if self.votes_only(peer):
+                return
+            case Belongings():
+                self._task(self._compare(peer, message))
+            case Lacking():
+                self._bringing.heard(peer, message)
+            case Content():
+                self._contents.offered(peer, message)
+            case Chunk():
+                self._receiver.chunk(peer, message)
+                self._contents.chunk(peer, message)
+            case Cancel():
+                self._receiver.cancelled(peer, message)
+                self._contents.cancelled(peer, message)
+            case Credit() | Taken() | Refuse():
+                self._shipper.heard(peer, message)
+
+    def lane_lost(self, peer: str) -> None:
+        """The bulk lane to a peer is gone, and every transfer on it."""
+        self._shipper.lost(peer)
+        self._bringing.lost(peer)
+
+    def lane_is_new(self, peer: str) -> None:
+        """A peer greets on a new bulk lane: what was half here stays half."""
+        self._receiver.lost(peer)
+        self._contents.lost(peer)
+        self._stock.lost(peer)
+
+    # --- files that programs bring along ---
+
+    def _limits(self) -> Limits:
+        config = self.settings.config
+        return Limits(config.bring, size_bytes(config.bring_size), runs=self.settings.me.role != "server")
+
+    async def _compare(self, peer: str, asked: Belongings) -> None:
+        self._lane.say(peer, await self._stock.compare(peer, asked))
+
+    async def _from_program(self, component: str, need: Need) -> int:
+        """A file that only the running program leads to, through its keeper."""
+        running = self.charge(component).component
+        if running is None:
+            raise LaneError(f"{need.path} is not here any more, and the program does not run here")
+        _, (descriptor,) = await running.keeper.ask(messages.OpenFile(need.path, need.digest))
+        return int(descriptor)
+
+    def _note_bringing(self, component: str, peer: str, sentence: str) -> None:
+        on_its_way = self.charge(component).figures.bringing
+        on_its_way.pop(peer, None)
+        if sentence:
+            on_its_way[peer] = sentence
+
+    async def _keep_what_goes(self) -> None:
+        """Now and then look whether the files of what runs here are still where they were; what is not is kept by content."""
+        said: dict[str, str] = {}
+        while True:
+            await asyncio.sleep(LOOK_S)
+            for name, charge in list(self.charges.items()):
+                if charge.component is None or charge.component.engine == COOPERATIVE:
+                    continue
+                outline = await asyncio.to_thread(newest_of, self._around.store, name)
+                try:
+                    await self._sources.keep_what_goes(name, needs(outline) if outline is not None else ())
+                except TROUBLE as error:
+                    if said.get(name) != str(error):
+                        log.warning("%s: %s", name, error)
+                    said[name] = str(error)
+
+    async def _tidy_contents(self) -> None:
+        """Now and then remove what no snapshot names any more."""
+        while True:
+            await asyncio.sleep(TIDY_S)
+            try:
+                freed = await asyncio.to_thread(self._around.store.collect_contents)
+            except (CheckpointError, OSError) as error:
+                log.warning("brought files are not tidied: %s", error)
+                continue
+            if freed:
+                log.info("removed %d bytes of brought files that no checkpoint needs", freed)
+
+    async def _give_back(self) -> None:
+        """Now and then let the kernel have what is free."""
+        while True:
+            await asyncio.sleep(GIVE_BACK_S)
+            await asyncio.to_thread(allocator.give_back)
+
+    def _task(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        task.add_done_callback(end_lanes_on_mistake)
+
+    def tell(self, event: events.Event) -> None:
+        """See `agent.worker.hub.Switchboard.tell`."""
+        if isinstance(event, events.Captured) and self.charge(event.component).figures.snapshots == 1:
+            self._new_here.set()  # the first one of it: look at once who else writes to its files
+        super().tell(event)
+
+    def _accepted(self, offer: Offer, snapshot: Snapshot) -> None:
+        figures = self.charge(offer.component).figures
+        if figures.spec is None:
+            self._new_here.set()  # the first one of it: look at once whether it could go on here
+        figures.stored(snapshot, offer.size, offer.spec)
+        self.charge(offer.component).copy.accepted(snapshot.position)
+
+    async def _look_what_is_lacking(self) -> None:
+        """Now and then, and when a component is new here: what this robot lacks of what it stands by for, and which files of what
+        runs here others write to."""
+        while True:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._new_here.wait(), LACKS_S)
+            self._new_here.clear()
+            waiting = [charge for charge in self.charges.values() if charge.component is None and charge.figures.spec is not None]
+            found = await prerequisites.look(self._around, waiting)
+            for charge in waiting:
+                charge.figures.lacks = found.get(charge.name)
+            contested = await prerequisites.contested(self._around, tuple(self.charges.values()))
+            for charge in self.charges.values():
+                charge.figures.contested = contested.get(charge.name, ())
+
+    async def lacking(self, name: str) -> tuple[str, ...]:
+        """What this robot lacks, now, of what a component needs to go on here; nothing where it holds no checkpoint of it.
+
+        Nor where a hook gets it ready first, which may bring what is lacking: then the restore itself tells.
+        """
+        charge = self.charge(name)
+        if charge.is_prepared_first:
+            return ()
+        found = (await prerequisites.look(self._around, (charge,))).get(name)
+        if charge.figures.spec is not None:
+            charge.figures.lacks = found
+        return found or ()
+
+    async def _inquire(self, act: acts.Inquire) -> None:
+        """Ask another robot what it lacks of what a component needs; where it cannot tell, the core decides alone."""
+        if act.component in self._inquiries:
+            return  # its answer is on its way, as late as it may be
+        self._inquiries.add(act.component)
+        try:
+            found = await prerequisites.asked_of(self.errands, act.to, act.component)
+        finally:
+            self._inquiries.discard(act.component)
+        self.tell(events.Inquired(act.component, act.epoch, act.to, found))
+
+    async def _silence_ns(self, component: str) -> int:
+        """For how long the robot that last sent this component's snapshots has been silent; 0 if there is none."""
+        sender = self._deposit.last_sender(component)
+        if not sender:
+            return 0
+        told = await self.ask("status")
+        peers = told.status.peers if told.status else ()
+        return max((peer.silent_ns for peer in peers if peer.robot == sender), default=0)
+
+    def picture(self, told: Told) -> dict[str, Any]:
+        """What ``status`` shows."""
+        notices = [*self.notices(), *self._around.store.notices[-NOTICES_SHOWN:]]
+        return team_view(
+            self.settings,
+            self._life,
+            told,
+            self.charges,
+            self._lane.links,
+            notices,
+            self._links.shown(),
+            self._around.store,
+            self._memory(),
+        )
+
+    def _memory(self) -> Memory:
+        keepers = {charge.component.keeper.pid for charge in self.charges.values() if charge.component is not None}
+        budget = self.places.budget
+        ours = (self._life.heart, os.getpid())
+        return Memory(
+            sum(map(memory_limits.held, ours)), sum(memory_limits.held(pid) for pid in keepers if pid), budget.held, budget.limit
+        )
+
+
+NOTICES_SHOWN: Final = 10
+"""Of the store's latest findings."""
+
+
+def _held(store: Store) -> tuple[Held, ...]:
+    return tuple(Held(name, store.positions(name)[-HISTORY_MAX:], _keeps_state(store, name)) for name in store.components())
+
+
+def _keeps_state(store: Store, name: str) -> bool:
+    """Whether the newest snapshot is of a program that keeps its state; False also where it cannot be read now."""
+    newest = newest_of(store, name)
+    return newest is not None and newest.engine == COOPERATIVE
+
+
+def main() -> int:
+    """Be the lanes of the heart that started us."""
+    return live(Lanes)

@@ -1,0 +1,110 @@
+"""Snapshots that leave this robot's store for another's: the acts Ship and CancelShip."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from collections.abc import Callable
+
+from agent.errors import AgentError, LaneError
+from agent.system.crash import end_lanes_on_mistake
+from agent.worker.replication.send_files import Bringing
+from agent.worker.replication.transfer import Shipper, digest_of
+from checkpoint.errors import CheckpointError
+from checkpoint.model import Position
+from checkpoint.snapshot.required_files import needs
+from checkpoint.store.index import Entry
+from checkpoint.store.store import Store
+from failover.core.acts import CancelShip, Ship
+from failover.core.events import Event, ShipEnded
+from failover.core.wire.messages import Offer
+
+log = logging.getLogger("failover.dispatch")
+
+
+class Dispatch:
+    """The transfers that the core ordered, each a task of its own."""
+
+    def __init__(
+        self,
+        store: Store,
+        shipper: Shipper,
+        tell: Callable[[Event], None],
+        hindrance: Callable[[], str] = lambda: "",
+        bringing: Bringing | None = None,
+        brings_data: Callable[[str], bool] = lambda component: False,
+    ) -> None:
+        """
+        Args:
+            hindrance: why no snapshot may leave this robot now; "" if they may.
+            bringing: sees that a peer has the files that a snapshot needs, before it is offered; None: they are there already.
+            brings_data: whether a component's files that are only read belong to them.
+        """
+        self._bringing = bringing
+        self._brings_data = brings_data
+        self._hindrance = hindrance
+        self._store = store
+        self._shipper = shipper
+        self._tell = tell
+        self._said = ""
+        self._tasks: dict[tuple[str, Position, str], asyncio.Task[None]] = {}
+
+    def ship(self, act: Ship) -> None:
+        """Begin a transfer. Its end is told, whichever it is."""
+        key = (act.component, act.position, act.to)
+        self.cancel(CancelShip(act.component, act.epoch, act.position, act.to))
+        task = self._tasks[key] = asyncio.create_task(self._ship(act))
+        task.add_done_callback(lambda done: self._tasks.pop(key, None) if self._tasks.get(key) is done else None)
+        task.add_done_callback(end_lanes_on_mistake)
+
+    def cancel(self, act: CancelShip) -> None:
+        """Give a transfer up; nothing is told."""
+        task = self._tasks.pop((act.component, act.position, act.to), None)
+        if task is not None:
+            task.cancel()
+
+    async def close(self) -> None:
+        """Give all of them up."""
+        tasks = list(self._tasks.values())
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _ship(self, act: Ship) -> None:
+        reason = ""
+        try:
+            await self._send(act)
+        except (AgentError, CheckpointError) as error:
+            reason = str(error)
+        except OSError as error:
+            reason = f"snapshot {act.position.sequence} of {act.component} cannot be read here: {error.strerror}"
+        if reason and reason != self._said:  # it may be tried again every second for days
+            log.info("%s", reason)
+        self._said = reason
+        self._tell(ShipEnded(act.component, act.epoch, act.position, act.to, not reason, reason))
+
+    async def _send(self, act: Ship) -> None:
+        if hindrance := self._hindrance():
+            raise LaneError(f"snapshots wait: {hindrance}")
+        entry = await asyncio.to_thread(self._entry, act)
+        descriptor = os.open(entry.path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            if self._bringing is not None:
+                outline = await asyncio.to_thread(self._store.outline, act.component, entry, descriptor)
+                await self._bringing.bring(act.to, act.component, needs(outline, opened=self._brings_data(act.component)))
+            digest = await asyncio.to_thread(digest_of, descriptor, entry.size)
+            offer = Offer(
+                0, act.component, entry.epoch, entry.position, entry.parent, entry.size, digest, act.spec, act.acknowledged
+            )
+            await self._shipper.ship(act.to, offer, descriptor)
+        finally:
+            os.close(descriptor)
+
+    def _entry(self, act: Ship) -> Entry:
+        """The file to send: a base where one is wanted, folded now if need be."""
+        entry = self._store.chain_of(act.component, act.position)[-1]
+        if (act.whole or act.parent is None) and entry.parent is not None:
+            self._store.fold(act.component, act.position)
+            entry = self._store.chain_of(act.component, act.position)[-1]
+        return entry

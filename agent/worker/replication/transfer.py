@@ -1,0 +1,350 @@
+"""Snapshots and the files of programs across the bulk lane: transfers under credit, from a file here into an unnamed one there.
+
+Nothing here knows what a snapshot is. Files give way to snapshots, so that bringing a program along delays no checkpoint. A
+transfer ends in one of two ways: the receiver has every byte, or nothing of it is kept on either side and both say why.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, Protocol, TypeVar
+
+import msgspec
+from blake3 import blake3
+from msgspec import Struct, field
+
+from agent.errors import LaneError
+from agent.system.crash import end_lanes_on_mistake
+from checkpoint.errors import StoreError
+from failover.core.wire.messages import (
+    CHUNK_SIZE_MAX,
+    SNAPSHOT_SIZE_MAX,
+    WINDOW_CHUNKS,
+    Bulk,
+    Cancel,
+    Chunk,
+    Content,
+    Credit,
+    Offer,
+    Refuse,
+    Taken,
+)
+
+PATIENCE_S: Final = 5.0
+"""A transfer in which the other side does nothing for so long is given up; the next snapshot begins afresh."""
+
+WINDOW: Final = WINDOW_CHUNKS * CHUNK_SIZE_MAX
+"""Bytes under way without credit for more: keeps a 1 Gbit/s link with 10 ms of delay busy."""
+
+STORED_S: Final = 60.0
+"""A file counts as taken once it is durable, and a slow disk may take its time for the last 256 MB of it."""
+
+GIVE_WAY_S: Final = 0.02
+"""How long a chunk of a file waits for snapshots at most: they have the link to themselves, and a file arrives all the same."""
+
+INCOMING_LIMIT: Final = 64
+"""Transfers that one peer may have open here: one a component is all that it needs."""
+
+
+class Lane(Protocol):
+    """What of `agent.worker.network.replication_link.BulkLane` is needed here."""
+
+    def say(self, peer: str, message: Bulk) -> bool: ...
+    async def ship(self, peer: str, chunk: Chunk) -> None: ...
+
+
+SNAPSHOT: Final = "snapshot"
+FILE: Final = "file"
+
+log = logging.getLogger("failover.lane")
+
+
+Offered = Offer | Content
+
+
+class _Outgoing(Struct):
+    """One transfer that leaves, as far as it has been taken."""
+
+    peer: str
+    what: str
+    until: int = 0
+    taken: bool = False
+    refused: str = ""
+    moved: asyncio.Event = field(default_factory=asyncio.Event)
+
+
+class Shipper:
+    """The transfers that leave this robot."""
+
+    def __init__(self, lane: Lane, bytes_a_second: float = 0.0) -> None:
+        """
+        Args:
+            bytes_a_second: cap on all transfers together; 0 for none.
+        """
+        self._lane = lane
+        self._pace = Pace(bytes_a_second)
+        self._numbers = itertools.count(time.monotonic_ns())
+        self._outgoing: dict[int, _Outgoing] = {}
+
+    async def ship(self, peer: str, offer: Offered, descriptor: int) -> None:
+        """Send ``offer.size`` bytes of a file to a peer; returns when the peer has all of them.
+
+        Args:
+            offer: its transfer number is chosen here.
+            descriptor: stays the caller's.
+
+        Raises:
+            LaneError: the connection went down, the peer refused, or it was silent for `PATIENCE_S`.
+        """
+        number = next(self._numbers)
+        transfer = self._outgoing[number] = _Outgoing(peer, SNAPSHOT if isinstance(offer, Offer) else FILE)
+        try:
+            if not self._lane.say(peer, msgspec.structs.replace(offer, transfer=number)):
+                raise LaneError(f"the bulk lane to {peer} is not connected")
+            for offset in range(0, offer.size, CHUNK_SIZE_MAX):
+                size = min(CHUNK_SIZE_MAX, offer.size - offset)
+                await self._until(transfer, lambda end=offset + size: transfer.until >= end)  # type: ignore[misc]
+                if isinstance(offer, Content):
+                    await self._give_way()
+                await self._pace.wait(size)
+                await self._lane.ship(peer, Chunk(number, offset, os.pread(descriptor, size, offset)))
+            await self._until(transfer, lambda: transfer.taken, PATIENCE_S if isinstance(offer, Offer) else STORED_S)
+        except (LaneError, asyncio.CancelledError):
+            self._lane.say(peer, Cancel(number))
+            raise
+        finally:
+            del self._outgoing[number]
+
+    def heard(self, peer: str, message: Credit | Taken | Refuse) -> None:
+        """Take the receiver's answer in; one for a transfer that has ended, or of another peer, is dropped."""
+        transfer = self._outgoing.get(message.transfer)
+        if transfer is None or transfer.peer != peer:
+            return
+        match message:
+            case Credit():
+                transfer.until = max(transfer.until, message.until)
+            case Taken():
+                transfer.taken = True
+            case Refuse():
+                transfer.refused = message.reason or "no reason given"
+        transfer.moved.set()
+
+    async def _give_way(self) -> None:
+        """Let the snapshots that are under way go first, as long as a file may wait."""
+        until = time.monotonic() + GIVE_WAY_S
+        while any(one.what is SNAPSHOT for one in self._outgoing.values()) and time.monotonic() < until:
+            await asyncio.sleep(GIVE_WAY_S / 10)
+
+    def lost(self, peer: str) -> None:
+        """The connection to the peer is gone, and with it every transfer on it."""
+        for transfer in self._outgoing.values():
+            if transfer.peer == peer:
+                transfer.refused = "the connection was lost"
+                transfer.moved.set()
+
+    async def _until(self, transfer: _Outgoing, reached: Callable[[], bool], patience_s: float | None = None) -> None:
+        patience_s = PATIENCE_S if patience_s is None else patience_s
+        while not transfer.refused and not reached():
+            transfer.moved.clear()
+            try:
+                await asyncio.wait_for(transfer.moved.wait(), patience_s)
+            except TimeoutError:
+                raise LaneError(
+                    f"{transfer.peer} took nothing for {patience_s:.0f} s in the middle of a {transfer.what}"
+                ) from None
+        if transfer.refused:
+            raise LaneError(f"{transfer.peer} gave the {transfer.what} back: {transfer.refused}")
+
+
+class Pace:
+    """A cap on a flow: whoever is ahead of it waits."""
+
+    def __init__(self, bytes_a_second: float) -> None:
+        self._rate = bytes_a_second
+        self._free_at = 0.0
+
+    async def wait(self, size: int) -> None:
+        """Return when ``size`` more bytes may go."""
+        if not self._rate:
+            return
+        now = time.monotonic()
+        self._free_at = max(self._free_at, now) + size / self._rate
+        await asyncio.sleep(self._free_at - now)
+
+
+class Refusal(Exception):
+    """A snapshot that is not wanted; ``needs_base``: only a base would help."""
+
+    def __init__(self, reason: str, *, needs_base: bool = False) -> None:
+        super().__init__(reason)
+        self.needs_base = needs_base
+
+
+Kind = TypeVar("Kind", Offer, Content, contravariant=True)
+"""What is offered: each kind has a receiver of its own."""
+
+
+class Desk(Protocol[Kind]):
+    """Who decides about what comes in."""
+
+    def admits(self, peer: str, offer: Kind) -> None:
+        """Raises `Refusal` when it is not wanted from this peer."""
+
+    async def take(self, peer: str, offer: Kind, descriptor: int) -> None:
+        """All bytes are in the file and their digest is right. The descriptor is closed afterwards.
+
+        Raises:
+            StoreError: the disk does not take a content; whoever sent it is told.
+        """
+
+    async def make_room(self, size: int) -> None:
+        """So many bytes are about to be written."""
+
+    def not_taken(self, peer: str, offer: Kind, why: str) -> None:
+        """They could not be written."""
+
+
+class _Incoming(Struct):
+    """One transfer that comes in, and the task that writes it."""
+
+    offer: Offered
+    chunks: asyncio.Queue[Chunk]
+    task: asyncio.Task[None] | None = None
+
+
+class Receiver:
+    """The transfers that come in to one desk.
+
+    Bytes are written by a thread, chunk by chunk; credit is given as they are written.
+    """
+
+    def __init__(self, lane: Lane, directory: Path, desk: Desk[Any]) -> None:
+        """
+        Args:
+            directory: on the store's file system, for the unnamed files.
+        """
+        self._lane = lane
+        self._directory = directory
+        self._desk = desk
+        self._incoming: dict[tuple[str, int], _Incoming] = {}
+
+    def offered(self, peer: str, offer: Offered) -> None:
+        """Begin to receive; an older transfer of the same component, or the same content, is dropped."""
+        for key, older in list(self._incoming.items()):
+            if key == (peer, offer.transfer) or (key[0] == peer and _of(older.offer) == _of(offer)):
+                self._drop(key)
+        try:
+            self._check(peer, offer)
+        except Refusal as refusal:
+            self._lane.say(peer, Refuse(offer.transfer, str(refusal), refusal.needs_base))
+            return
+        transfer = self._incoming[peer, offer.transfer] = _Incoming(offer, asyncio.Queue(WINDOW_CHUNKS))
+        transfer.task = asyncio.create_task(self._receive(peer, transfer))
+        transfer.task.add_done_callback(end_lanes_on_mistake)
+
+    def chunk(self, peer: str, chunk: Chunk) -> None:
+        """Take one chunk in; one without credit ends its transfer."""
+        transfer = self._incoming.get((peer, chunk.transfer))
+        if transfer is None:
+            return
+        try:
+            transfer.chunks.put_nowait(chunk)
+        except asyncio.QueueFull:
+            self._drop((peer, chunk.transfer))
+            self._lane.say(peer, Refuse(chunk.transfer, "a chunk came without credit"))
+
+    def cancelled(self, peer: str, message: Cancel) -> None:
+        """The sender gave up."""
+        self._drop((peer, message.transfer))
+
+    def lost(self, peer: str) -> None:
+        """The peer is gone: whatever it had begun leaves no trace."""
+        for key in [key for key in self._incoming if key[0] == peer]:
+            self._drop(key)
+
+    def _check(self, peer: str, offer: Offered) -> None:
+        least = 1 if isinstance(offer, Offer) else 0
+        if not least <= offer.size <= SNAPSHOT_SIZE_MAX:
+            raise Refusal(f"a size of {offer.size} bytes is outside the limits")
+        if sum(1 for key in self._incoming if key[0] == peer) >= INCOMING_LIMIT:
+            raise Refusal(f"{INCOMING_LIMIT} transfers of {peer} are under way already")
+        self._desk.admits(peer, offer)
+
+    def _drop(self, key: tuple[str, int]) -> None:
+        transfer = self._incoming.pop(key, None)
+        if transfer is not None and transfer.task is not None:
+            transfer.task.cancel()
+
+    async def _receive(self, peer: str, transfer: _Incoming) -> None:
+        """Fill an unnamed file, so that whatever happens nothing half is left, and hand it over."""
+        offer = transfer.offer
+        try:
+            await self._desk.make_room(offer.size)
+            descriptor = os.open(self._directory, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
+            try:
+                await self._fill(peer, transfer, descriptor)
+                if isinstance(offer, Offer):
+                    self._lane.say(peer, Taken(offer.transfer))  # that it is stored, and proved, is said by the beat
+                    self._incoming.pop((peer, offer.transfer), None)
+                await self._desk.take(peer, offer, descriptor)
+                if isinstance(offer, Content):
+                    self._lane.say(peer, Taken(offer.transfer))
+            finally:
+                os.close(descriptor)
+        except OSError as error:
+            why = f"cannot write it there: {error.strerror}"
+            log.warning("gave up %s from %s: %s", _named(offer), peer, why)
+            self._lane.say(peer, Refuse(offer.transfer, why))
+            self._desk.not_taken(peer, offer, why)
+        except (LaneError, StoreError) as error:
+            log.warning("gave up %s: %s", _named(offer), error)
+            self._lane.say(peer, Refuse(offer.transfer, str(error)))
+        finally:
+            self._incoming.pop((peer, offer.transfer), None)
+
+    async def _fill(self, peer: str, transfer: _Incoming, descriptor: int) -> None:
+        offer, digest, end = transfer.offer, blake3(), 0
+        what = SNAPSHOT if isinstance(offer, Offer) else FILE
+        self._lane.say(peer, Credit(offer.transfer, WINDOW))
+        while end < offer.size:
+            try:
+                chunk = await asyncio.wait_for(transfer.chunks.get(), PATIENCE_S)
+            except TimeoutError:
+                raise LaneError(f"{peer} was silent for {PATIENCE_S:.0f} s in the middle of a {what}") from None
+            if chunk.offset != end or len(chunk.content) != min(CHUNK_SIZE_MAX, offer.size - end):
+                raise LaneError(f"{peer} sent {len(chunk.content)} bytes at {chunk.offset} where {end} of {offer.size} was due")
+            await asyncio.to_thread(_keep, descriptor, chunk, digest)
+            end += len(chunk.content)
+            self._lane.say(peer, Credit(offer.transfer, end + WINDOW))
+        if digest.digest() != offer.digest:
+            raise LaneError(f"{peer} sent {offer.size} bytes that have not the promised digest")
+
+
+def _of(offer: Offered) -> str | bytes:
+    """What a newer offer takes the place of."""
+    return offer.component if isinstance(offer, Offer) else offer.digest
+
+
+def _named(offer: Offered) -> str:
+    if isinstance(offer, Offer):
+        return f"snapshot {offer.position.sequence} of {offer.component}"
+    return f"a file of {offer.size} bytes ({offer.digest.hex()[:16]}…)"
+
+
+def _keep(descriptor: int, chunk: Chunk, digest: blake3) -> None:
+    os.pwrite(descriptor, chunk.content, chunk.offset)
+    digest.update(chunk.content)
+
+
+def digest_of(descriptor: int, size: int) -> bytes:
+    """The blake3 digest of a file's first ``size`` bytes, for an `Offer`."""
+    digest = blake3()
+    for offset in range(0, size, CHUNK_SIZE_MAX):
+        digest.update(os.pread(descriptor, min(CHUNK_SIZE_MAX, size - offset), offset))
+    return digest.digest()

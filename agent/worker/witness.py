@@ -1,0 +1,55 @@
+"""A witness's other process: it hands over the keys of beats and answers people, and that is all.
+
+Started as `python -m agent.system.child_main agent.worker.witness CONFIG DESCRIPTOR` in place of `agent.worker.process`.
+There is no store, no nursery and no log of any
+output; nothing that could read a snapshot or start a program is even imported. It needs no right that an ordinary user has not.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from agent.config import Settings
+from agent.main_loop.messages import Inventory, ToLanes, Told
+from agent.worker.control.queries import Questions
+from agent.worker.control.status_view import team_view
+from agent.worker.hub import Switchboard, live
+from checkpoint.keeper.messages import Channel
+from failover.core import acts
+from failover.core.wire.messages import Bulk, Offer, Refuse
+
+log = logging.getLogger("failover.lanes")
+
+
+class Witness(Switchboard):
+    """One life of the process."""
+
+    def __init__(self, settings: Settings, heart: Channel[ToLanes]) -> None:
+        super().__init__(settings, heart)
+        self.connect(Questions(self))
+
+    async def prepare(self) -> Inventory:
+        """Nothing is kept here and nothing runs here."""
+        return Inventory((), ())
+
+    def obeys(self, act: acts.Act) -> None:
+        """Pass the core's answers on; it orders nothing else that would be carried out here."""
+        if isinstance(act, acts.Answer):
+            self.answered(act)
+        else:
+            log.debug("%s is nothing that a witness does", type(act).__name__)
+
+    def hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
+        """Nobody should offer one."""
+        if isinstance(message, Offer):
+            self._lane.say(peer, Refuse(message.transfer, f"{self.settings.config.robot} is a witness and keeps no snapshots"))
+
+    def picture(self, told: Told) -> dict[str, Any]:
+        """What ``status`` shows."""
+        return team_view(self.settings, self._life, told, {}, self._lane.links, self.notices(), self._links.shown(), None)
+
+
+def main() -> int:
+    """Be the other process of the witness's heart that started us."""
+    return live(Witness)

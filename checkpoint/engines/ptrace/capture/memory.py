@@ -1,0 +1,450 @@
+"""The memory of one captured process: which pages a snapshot must carry, and their bytes.
+
+Most of them are copied while the program runs (`MemoryCapture.copy_running`): for a base everything that exists, then, as long as
+much has been written meanwhile, what has. A pass *first* renews the protection and *then* reads, so that a page which is written
+while it is read, or later, is named by the next pass. The last pass is `MemoryCapture.take`, while the program stands still: it
+reads what was named since. A page's newest copy is its content.
+
+What a scan has found is remembered until a snapshot that holds it is acknowledged, whoever scanned and whatever became of the
+capture: its protection is renewed, so that nobody else will name it.
+
+While the program stands still sets of pages are worked with as little as can be: each step takes tens of µs.
+What is still to be copied is known before (`RunningCopy.owed`), and what a snapshot carries is worked out afterwards
+(`checkpoint.engines.ptrace.capture.memory_result`).
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from typing import Final
+
+import numpy as np
+from msgspec import Struct, field
+
+from checkpoint.engines.ptrace.capture.memory_result import Taken, Unacknowledged, joined, since, with_one_tail
+from checkpoint.errors import CaptureError, ProcessGoneError
+from checkpoint.linux import abi
+from checkpoint.linux.memory import digest_tracker, pagemap
+from checkpoint.linux.memory import tracker as tracking
+from checkpoint.linux.memory.digest_tracker import SharedPages
+from checkpoint.linux.memory.guard_pages import Guards
+from checkpoint.linux.memory.remote_memory import Memory
+from checkpoint.linux.memory.tracker import NONE, Scan, Tracker
+from checkpoint.linux.procfs.maps_reader import MapsReader
+from checkpoint.linux.procfs.procfs import MapsLine
+from checkpoint.linux.trace.remote_syscalls import BorrowedPages
+from checkpoint.model import Position
+from checkpoint.pages import page_set
+from checkpoint.pages.merge import Copy
+from checkpoint.pages.page_set import Words
+from checkpoint.resources.events import aio
+from checkpoint.resources.ipc import system_v_memory
+from checkpoint.runtime import parallel
+
+READ_CHUNK: Final = 8 << 20
+"""Bytes that are read at a time while the program runs."""
+BUFFER_SIZE: Final = 8 << 20
+"""Bytes that a freeze may copy without asking for memory first, where earlier ones copied as much."""
+BUFFER_SIZE_MIN: Final = 1 << 20
+ROOM_SIZE: Final = 64 << 10
+"""Bytes that a copy has room for behind its pages: of the vdso, and of what came since."""
+WORTH_COUNT: Final = 16
+"""Pages that are worth the first pass of a delta while the program runs."""
+LARGE_COUNT: Final = 256
+"""Pages that are worth another pass: they take 0.4 ms to copy, as long as everything else about them."""
+PASS_LIMIT: Final = 3
+"""Passes after the first: a program that writes faster than we copy is not caught up with by more of them."""
+BUDGET_PASS_LIMIT: Final = 12
+"""The same where what is left shall fit a budget."""
+CATCHING_UP: Final = 0.8
+"""Of what the pass before copied: a pass that copies more does not catch up."""
+VDSO: Final = "[vdso]"
+UNACKNOWLEDGED_LIMIT: Final = 64
+"""Scans that are remembered one by one. Beyond, the oldest two become one, and the older position can be acknowledged no more: a
+standby whose disk is full for a week must not make every freeze longer."""
+
+
+SharedPlaces = frozenset[tuple[int, int, int, int]]
+"""Parts of shared memory: device and inode number of the object, first and last offset of the part."""
+
+
+def _place_of(line: MapsLine) -> tuple[int, int, int, int]:
+    return line.device, line.inode, line.offset, line.offset + line.size
+
+
+def _is_within(line: MapsLine, places: SharedPlaces) -> bool:
+    device, inode, first, last = _place_of(line)
+    return any(place[:2] == (device, inode) and place[2] <= first and last <= place[3] for place in places)
+
+
+class RunningCopy(Struct):
+    """What was copied while the program ran.
+
+    Attributes:
+        copies: oldest first; of a page that several have, the newest counts.
+        valid: the pages of ``copies`` that no later scan has named.
+        owed: what the snapshot would carry besides, by what was known when the last pass was over.
+    """
+
+    copies: list[Copy] = field(default_factory=list)
+    valid: Words = field(default_factory=lambda: NONE)
+    owed: Words = field(default_factory=lambda: NONE)
+
+    def add(self, copy: Copy) -> None:
+        """Take in what was read since the last scan."""
+        self.copies.append(copy)
+        self.valid = page_set.union(self.valid, copy.pages)
+
+    def spoil(self, scan: Scan) -> None:
+        """Forget what a scan has named."""
+        self.valid = page_set.difference(page_set.difference(self.valid, scan.written), scan.cleared)
+
+
+class FreezeBuffer:
+    """Memory for what is copied while the program stands still, of all processes of a component; used again each time."""
+
+    def __init__(self) -> None:
+        self._content = bytearray()
+        self._wanted = 0
+
+    @property
+    def size(self) -> int:
+        """Bytes that it holds."""
+        return len(self._content)
+
+    def begin(self) -> None:
+        """Before a freeze: nothing of the last one is needed any more."""
+        wanted = min(max(self._wanted, BUFFER_SIZE_MIN), BUFFER_SIZE)
+        if wanted > len(self._content):
+            self._content = bytearray(min(-(-wanted // BUFFER_SIZE_MIN) * BUFFER_SIZE_MIN, BUFFER_SIZE))
+        self._wanted = 0
+
+    def piece(self, size: int) -> memoryview:
+        """So many bytes of it; of new memory where what is left does not do."""
+        begin = self._wanted
+        self._wanted += size
+        if self._wanted <= len(self._content):
+            return memoryview(self._content)[begin : self._wanted]
+        return memoryview(bytearray(size))
+
+
+class MemoryCapture:
+    """Follows the memory of one process.
+
+    Invariants: ``_unacknowledged`` holds every page that was named since the newest acknowledged position; its last entries alone
+    may be without position, of a capture that is not finished or was refused; they are made one when the program runs.
+
+    Attributes:
+        lines: the mappings when they were last read, without our own.
+        acknowledged: the newest acknowledged position; None if only a base can be captured.
+        borrowed: our own pages in the process, which belong to no snapshot.
+        has_rings: some of them are rings of asynchronous I/O.
+        has_segments: some of them are System V shared memory.
+        readers: threads that copy while the program runs; more than one takes processors from it.
+        buffer: the component's; where nothing else is said, this process is all of it.
+
+    Args:
+        tracker: owned from now on.
+    """
+
+    def __init__(self, memory: Memory, tracker: Tracker, borrowed: BorrowedPages) -> None:
+        self._memory = memory
+        self._tracker = tracker
+        self.borrowed = borrowed
+        self._shared = SharedPages(memory.pid)
+        try:
+            self._page_tables = pagemap.existence(memory.pid)
+        except BaseException:
+            self._shared.close()
+            raise
+        self._guards = Guards(self._page_tables.guards)
+        self._maps = MapsReader(memory.pid)
+        self._has_moved = False
+        self._private: list[MapsLine] = []
+        self._shared_lines: list[MapsLine] = []
+        self._told_elsewhere: SharedPlaces = frozenset()
+        self._had_shared = False
+        self._mapped: Words = NONE
+        self._vdso: Words = NONE
+        self._followed: Words = NONE
+        self.buffer = FreezeBuffer()
+        self._is_armed = False
+        self._unacknowledged: list[Unacknowledged] = []
+        self._left_out: Words = NONE
+        self.acknowledged: Position | None = None
+        self.lines: tuple[MapsLine, ...] = ()
+        self.has_rings = self.has_segments = False
+        self.readers = 1
+
+    def close(self) -> None:
+        """Stop following; the process is not changed."""
+        self._maps.close()
+        self._tracker.close()
+        self._shared.close()
+        self._page_tables.close()
+
+    def acknowledge(self, position: Position) -> bool:
+        """Forget what a position holds, for deltas are relative to it from now on; whether it was known."""
+        places = [index for index, held in enumerate(self._unacknowledged) if held.position == position]
+        if places:
+            del self._unacknowledged[: places[-1] + 1]
+            self.acknowledged = position
+        return bool(places)
+
+    def settle(self, position: Position) -> None:
+        """The last look has become the snapshot with this position."""
+        self._join()
+        last = self._unacknowledged[-1]
+        self._unacknowledged[-1] = Unacknowledged(position, last.written, last.cleared)
+
+    def positions(self) -> set[Position | None]:
+        """Those that are, or can still be, acknowledged."""
+        return {self.acknowledged, *(held.position for held in self._unacknowledged)}
+
+    def start_over(self) -> None:
+        """Follow from the beginning with the next base: what was written is not known any more."""
+        self._is_armed, self.acknowledged = False, None
+        self._guards.forget()
+        self._unacknowledged.clear()
+        self._left_out = NONE
+
+    # While the program runs
+
+    def copy_running(self, *, base: bool, enough: int = 0) -> RunningCopy:
+        """Copy beforehand what is worth it, so that little is left for the freeze.
+
+        Args:
+            enough: the pages that may be left, which are copied down to however many passes that takes as long as they catch up
+                with the program; 0: as few as is worth it.
+        """
+        self.refresh()
+        copied = RunningCopy()
+        if base:
+            self._copy_everything(copied)
+        last = 0
+        for turn in range(BUDGET_PASS_LIMIT if enough else PASS_LIMIT):
+            if not self._is_behind(copied, enough or (LARGE_COUNT if turn or base else WORTH_COUNT), base=base):
+                break
+            self._catch_up(copied)
+            missing = self._missing(copied, base=base)
+            self._read_into(copied, missing)
+            self._refresh_if_moved()
+            self._maps.prepare()
+            last, before = page_set.total_size(missing), last
+            if turn >= PASS_LIMIT and last >= CATCHING_UP * before:
+                break
+        copied.owed = page_set.difference(self._since_acknowledged(base=base)[0], copied.valid)
+        return copied
+
+    def _copy_everything(self, copied: RunningCopy) -> None:
+        """Copy all that exists. A page that cannot be read now has gone or is coming, and the next scan names it."""
+        if not self._is_armed or not self._tracker.sees_every_write:
+            self._tracker.arm(self._private)
+            self._is_armed = True
+        elif self._tracker.scans_running:
+            self._catch_up(copied)
+        self._shared.forget()
+        if self._tracker.sees_every_write:
+            self._read_into(copied, self._tracker.existing(self._private))
+
+    def _is_behind(self, copied: RunningCopy, count: int, *, base: bool) -> bool:
+        """Whether the freeze would have so many pages to copy, and a pass can change that."""
+        if not self._is_armed or not self._tracker.scans_running:
+            return False
+        if self._backlog(count) >= count:
+            return True
+        return bool(self._unacknowledged) and page_set.total_size(self._missing(copied, base=base)) >= count * abi.PAGE_SIZE
+
+    def _missing(self, copied: RunningCopy, *, base: bool) -> Words:
+        """Private pages that the snapshot would carry, and that are not copied. Shared ones are told by their digests: they may
+        be changed, copied, and changed back."""
+        return page_set.intersection(page_set.difference(self._since_acknowledged(base=base)[0], copied.valid), self._followed)
+
+    def _backlog(self, limit: int) -> int:
+        count = self._tracker.backlog(self._private, limit, changed=self._has_moved)
+        self._has_moved = False
+        return count
+
+    def _catch_up(self, copied: RunningCopy) -> None:
+        try:
+            scan = self._tracker.catch_up(self._private, changed=self._has_moved)
+        except CaptureError:
+            self.start_over()
+            raise
+        self._has_moved = False
+        self._remember(scan)
+        copied.spoil(scan)
+
+    def _read_into(self, copied: RunningCopy, wanted: Words) -> None:
+        """Read a set as far as it is there."""
+        buffer = np.empty(page_set.total_size(wanted) + ROOM_SIZE, dtype=np.uint8).data
+        found, filled = [], 0
+        chunks = page_set.cut(wanted, READ_CHUNK)
+        bounds = itertools.pairwise(itertools.accumulate(map(page_set.total_size, chunks), initial=0))
+        places = [(chunk, begin, end) for chunk, (begin, end) in zip(chunks, bounds, strict=True)]
+
+        def read(place: tuple[Words, int, int]) -> Words:
+            chunk, begin, end = place
+            return Memory(self._memory.pid).readable_pages_into(chunk, buffer[begin:end])
+
+        answers = parallel.in_order(read, places, self.readers if len(places) > 1 else 1)
+        for (_, begin, _), readable in zip(places, answers, strict=True):
+            size = page_set.total_size(readable)
+            if begin != filled:  # of one before it there was less than was wanted
+                buffer[filled : filled + size] = buffer[begin : begin + size]
+            found.append(readable)
+            filled += size
+        if found:
+            copied.add(Copy(pagemap.pages_joined(np.concatenate(found)), buffer[: filled + ROOM_SIZE]))
+
+    def rehearse(self) -> None:
+        """See ``checkpoint.engines.ptrace.capture.process``."""
+        self._maps.rehearse()
+        self._guards.rehearse()
+        self._tracker.rehearse()
+
+    # While it stands still
+
+    def take(self, copied: RunningCopy, *, base: bool) -> Taken:
+        """Copy what is not copied yet, or not any more. The program stands still."""
+        self._refresh_if_moved()
+        scan = self._scan(everywhere=base)
+        self._guards.named(scan)
+        self._unacknowledged.append(Unacknowledged(None, scan.written, scan.cleared))
+        try:
+            return self._taken(copied, scan, self._guards.found(self._mapped, self._tracker.watched), base=base)
+        except ProcessGoneError:
+            raise
+        except CaptureError:  # a page that has become a guard cannot be read
+            guards = self._guards.found_everywhere(self._mapped, self._tracker.watched)
+            return self._taken(copied, scan, guards, base=base)
+
+    def take_unread(self) -> Taken:
+        """All that exists, still to be read where it stands; what is followed, and since when, stays as it is."""
+        self._refresh_if_moved()
+        existing = page_set.union(self._tracker.existing(self._private), self._shared.existing(self._shared_lines))
+        guards = self._guards.found_everywhere(self._mapped, self._tracker.watched)
+        unread = page_set.union(page_set.difference(page_set.intersection(existing, self._mapped), guards), self._vdso)
+        return Taken(
+            lines=self.lines,
+            mapped=self._mapped,
+            is_base=True,
+            guards=guards,
+            scans=(),
+            valid=NONE,
+            copies=(),
+            unread=unread,
+            untouched=self._untouched(),
+        )
+
+    def confirm(self) -> bool:
+        """Whether the last look took everything; see `Tracker.confirm`."""
+        return self._tracker.confirm()
+
+    def _taken(self, copied: RunningCopy, scan: Scan, guards: Words, *, base: bool) -> Taken:
+        owed = page_set.intersection(page_set.difference(copied.owed, scan.cleared), self._mapped)
+        missing = page_set.difference(page_set.union(owed, scan.written), guards)
+        if base:
+            missing = page_set.union(missing, self._vdso)  # for a machine whose kernel has another one
+        began = time.perf_counter_ns()
+        content = self.buffer.piece(page_set.total_size(missing))
+        self._memory.read_pages_into(missing, content)
+        copy_ns = time.perf_counter_ns() - began
+        self._left_out = guards
+        return Taken(
+            lines=self.lines,
+            mapped=self._mapped,
+            is_base=base,
+            guards=guards,
+            scans=tuple(self._unacknowledged),
+            valid=copied.valid,
+            copies=(*copied.copies, Copy(missing, content)),
+            copy_ns=copy_ns,
+            untouched=self._untouched(),
+        )
+
+    def _untouched(self) -> Words:
+        """Pages of files without a name that the process has mapped for itself, and has no copy of."""
+        if not len(self._orphans):
+            return NONE
+        return page_set.difference(self._orphans, self._page_tables.existing(self._orphans))
+
+    def leave_out(self, places: SharedPlaces) -> None:
+        """Do not tell of shared memory that another process of the component tells of."""
+        if places != self._told_elsewhere:
+            self._told_elsewhere = places
+            self._sort_shared()
+
+    def shared_places(self) -> SharedPlaces:
+        """The shared memory that this process tells all of, as `leave_out` takes it."""
+        may_look = digest_tracker.may_look_into_mappings()  # of a file with a name each tells what it has in its page tables
+        told = (one for one in self.lines if tracking.is_shared_object(one) or (may_look and tracking.is_shared_anonymous(one)))
+        return frozenset(map(_place_of, told))
+
+    def _sort_shared(self) -> None:
+        self._shared_lines = [
+            line
+            for line in self.lines
+            if (tracking.is_shared(line) and not _is_within(line, self._told_elsewhere)) or tracking.is_orphan(line)
+        ]
+
+    def refresh(self) -> None:
+        """Read and sort the mappings; that they have changed is kept until the tracker has been told."""
+        if self._maps.refresh():
+            self._sort()
+        self._maps.prepare()
+
+    def _refresh_if_moved(self) -> None:
+        """As `refresh`, where only names may have changed since."""
+        if self._maps.refresh_if_moved():
+            self._sort()
+
+    def _sort(self) -> None:
+        self._has_moved = True
+        self.lines = tuple(line for line in self._maps.lines if not self.borrowed.holds(line.start))
+        self._private = [line for line in self.lines if tracking.is_private(line)]
+        self._sort_shared()
+        self.has_rings = any(map(aio.is_ring, self._shared_lines))
+        self.has_segments = any(map(system_v_memory.is_segment, self.lines))
+        self._followed = tracking.extents_of(self._private)
+        self._orphans = tracking.extents_of([line for line in self.lines if tracking.is_orphan(line)])
+        self._mapped = tracking.extents_of([line for line in self.lines if line.name not in tracking.NOT_CARRIED])
+        self._vdso = tracking.extents_of([line for line in self.lines if line.name == VDSO])
+
+    def _scan(self, *, everywhere: bool) -> Scan:
+        """What was written since the last scan. One that fails half-way has protected pages that it tells nobody of."""
+        try:
+            scan = self._tracker.scan(self._private, changed=self._has_moved, everywhere=everywhere)
+        except CaptureError:
+            self.start_over()
+            raise
+        self._has_moved = False
+        if not self._shared_lines and not self._had_shared:
+            return scan
+        self._had_shared = bool(self._shared_lines)
+        shared = self._shared.scan(self._shared_lines)
+        orphans = tracking.extents_of([line for line in self._shared_lines if tracking.is_orphan(line)])
+        # What the tracker says of orphans dates from before their file was deleted.
+        cleared = page_set.difference(scan.cleared, orphans)
+        return Scan(page_set.union(scan.written, shared.written), page_set.union(cleared, shared.cleared))
+
+    def _remember(self, scan: Scan) -> None:
+        """Keep what a scan found until it is acknowledged; one that has become no snapshot is joined with the next."""
+        self._guards.named(scan)
+        self._join()
+        self._unacknowledged.append(Unacknowledged(None, scan.written, scan.cleared))
+        self._join()
+
+    def _join(self) -> None:
+        """Make one of what has no position yet."""
+        left_out, self._left_out = self._left_out, NONE
+        self._unacknowledged = with_one_tail(self._unacknowledged, self._mapped, left_out)
+        if len(self._unacknowledged) > UNACKNOWLEDGED_LIMIT:
+            oldest, next_one, *rest = self._unacknowledged
+            self._unacknowledged = [joined(oldest, next_one), *rest]
+
+    def _since_acknowledged(self, *, base: bool) -> tuple[Words, Words]:
+        """What a delta must carry: the union of all scans since. A base needs what has become no snapshot yet."""
+        self._join()
+        return since(self._unacknowledged, self._mapped, is_base=base)

@@ -1,0 +1,327 @@
+"""One process of a component under protection: how it is entered, stopped, looked at and described.
+
+`ptrace_capture.PtraceSession` has one of these for each process of its component.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import operator
+from collections.abc import Collection, Iterable, Iterator
+
+from msgspec import Struct
+
+from checkpoint.arch import extended
+from checkpoint.engine import ProtectOrder
+from checkpoint.engines.ptrace.capture import eintr_syscalls, enter
+from checkpoint.engines.ptrace.capture.describe_process import process_state, thread_states
+from checkpoint.engines.ptrace.capture.enter import Entered
+from checkpoint.engines.ptrace.capture.exited_leader import EndedFirst
+from checkpoint.engines.ptrace.capture.frozen_process import Onlooker, Standing
+from checkpoint.engines.ptrace.capture.memory import MemoryCapture, RunningCopy, SharedPlaces
+from checkpoint.engines.ptrace.capture.memory_result import Taken
+from checkpoint.engines.ptrace.capture.syscall_restart import Interruptions
+from checkpoint.engines.ptrace.facts.file_identity import Identities
+from checkpoint.engines.stream_output import Outputs
+from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
+from checkpoint.linux.memory.tracker import NONE, NOT_CARRIED
+from checkpoint.linux.procfs import procfs
+from checkpoint.linux.procfs.live_thread import SPOKESMEN_MAX, spokesman_of
+from checkpoint.linux.procfs.procfs import MapsLine
+from checkpoint.linux.procfs.vm_flags import WATCHED, FlagsReader
+from checkpoint.linux.trace.threads import Threads
+from checkpoint.linux.trace.tracee import Tracee
+from checkpoint.model import Position, ProcessState, Resource, ThreadState, Vma
+from checkpoint.resources import refusals
+from checkpoint.resources.events import aio
+from checkpoint.resources.files import clean_private_pages
+from checkpoint.resources.ipc import system_v_memory
+from checkpoint.resources.open_file import Opened
+from checkpoint.resources.process import audit_login, job_control, mlockall, parent_death_signals, scheduling, seccomp
+from checkpoint.resources.survey import gather
+from checkpoint.runtime.identity_memo import Memo
+
+NOBODY: SharedPlaces = frozenset()
+
+
+class Look(Struct, frozen=True):
+    """Everything that one freeze brought home of one process; nothing in it needs the process any more."""
+
+    standing: Standing
+    taken: Taken
+
+    @property
+    def xstate_mask(self) -> int:
+        """Which parts of the processor's state any thread uses."""
+        readings = (self.standing.place.reading, *(one.reading for one in self.standing.others))
+        return functools.reduce(operator.or_, (extended.in_use(reading.xstate) for reading in readings))
+
+
+class Met(Struct, frozen=True):
+    """A process that was found, and may be stopped; whoever could not let go of it yet must keep this.
+
+    Attributes:
+        born: when it began, which tells it from a later process with its pid.
+    """
+
+    threads: Threads
+    interruptions: Interruptions
+    born: int
+
+    @classmethod
+    def of(cls, pid: int) -> Met:
+        """Nothing is touched.
+
+        Raises:
+            ProcessGoneError: it has ended.
+        """
+        interruptions = Interruptions(makes_again=eintr_syscalls.makes_calls_again(pid))
+        return cls(Threads(Tracee(pid), interruptions.mend), interruptions, procfs.stat(pid).start_time)
+
+    @classmethod
+    def by_its_spokesman(cls, pid: int) -> Met:
+        """As `of`, also where the first thread has ended and others live."""
+        spokesman = spokesman_of(pid)
+        interruptions = Interruptions(makes_again=eintr_syscalls.makes_calls_again(spokesman))
+        threads = Threads(Tracee(spokesman), interruptions.mend, process=pid)
+        return cls(threads, interruptions, procfs.stat(spokesman).start_time)
+
+
+class CapturedProcess:
+    """One process, followed from the entering to `close`.
+
+    Attributes:
+        pid: by which it is looked at: its own, or its spokesman's, where its first thread has ended.
+        ended_first: who tells of that; None where the first thread lives.
+        slot: see ``checkpoint.tree``.
+        born: when it began, which tells it from a later process with its pid.
+        is_new: no snapshot tells of it yet.
+    """
+
+    def __init__(self, threads: Threads, entered: Entered, order: ProtectOrder, slot: int = 0, born: int = 0) -> None:
+        self.pid = threads.pid
+        self.slot = slot
+        self.threads = threads
+        self.ended_first = EndedFirst(threads.process, self.pid, threads.leader.memory) if self.pid != threads.process else None
+        self.notes = entered.notes
+        self.born = born
+        self.is_new = True
+        self.order = order
+        self.onlooker = Onlooker(threads, entered, order.terms.devices)
+        try:
+            self.memory = MemoryCapture(threads.leader.memory, entered.tracker, entered.pages)
+        except BaseException:
+            entered.tracker.close()
+            raise
+        self.identities = Identities(self.pid, order.names or {})
+        self._flags = FlagsReader(self.pid)
+        self._of_mappings = Memo[tuple[str, ...]]()
+
+    @classmethod
+    def entered(cls, met: Met, order: ProtectOrder, slot: int = 0) -> CapturedProcess:
+        """Enter a process that runs."""
+        try:
+            return cls(met.threads, enter.enter(met.threads, met.interruptions), order, slot, met.born)
+        except BaseException:
+            met.threads.close()
+            raise
+
+    @classmethod
+    def entered_first(cls, pid: int, order: ProtectOrder) -> CapturedProcess:
+        """Enter the first process of a component; by another thread, where its first one has ended, or does so meanwhile."""
+        for _ in range(SPOKESMEN_MAX):
+            met = Met.by_its_spokesman(pid)
+            try:
+                return cls.entered(met, order)
+            except ProcessGoneError:
+                if spokesman_of(pid) == met.threads.pid:
+                    raise
+        raise CaptureError(f"cannot enter pid {pid}: its threads end while it is looked at; try again")
+
+    def has_lost_its_voice(self) -> bool:
+        """Whether the thread by which it is looked at has ended, and another lives by which it could be.
+
+        Where the first thread lives again, a spokesman has executed another program under its process's id.
+
+        Raises:
+            ProcessGoneError: all of it has ended.
+        """
+        return not self._is_there() and spokesman_of(self.threads.process) not in (self.pid, self.threads.process)
+
+    def _is_there(self) -> bool:
+        try:
+            return procfs.thread_stat(self.threads.process, self.pid).state not in "ZX"  # its id may be a stranger's by now
+        except ProcessGoneError:
+            return False
+
+    @classmethod
+    def entered_standing(cls, met: Met, order: ProtectOrder, slot: int) -> CapturedProcess:
+        """Enter one that stands still for us."""
+        return cls(met.threads, enter.enter_standing(met.threads, met.interruptions), order, slot, met.born)
+
+    def close(self) -> None:
+        """Let go; the process is not changed."""
+        self.memory.close()
+        self.onlooker.close()
+        self.threads.close()
+
+    def settle(self, position: Position) -> None:
+        """The last look has become part of the snapshot with this position."""
+        self.memory.settle(position)
+        self.is_new = False
+
+    @property
+    def files_kept(self) -> bool:
+        """Whether somebody keeps its program files by content."""
+        return self.order.names is not None
+
+    def is_still(self, born: int) -> bool:
+        """Whether a process with our pid is ours."""
+        return self.born == born
+
+    # Before the freeze
+
+    def prepare(self, *, base: bool) -> None:
+        """Look at what is asked again while it stands still; for a base at the files, too, for that takes long."""
+        self.onlooker.prepare()
+        if base:
+            self.memory.refresh()
+            self._flags.refresh(self.memory.lines, anew=True)
+            self.identities.vmas(self.memory.lines, self._flags.flags, NONE)
+
+    def copy_running(self, *, base: bool, enough: int = 0) -> RunningCopy:
+        """As `MemoryCapture.copy_running`, with what is prepared before."""
+        self.prepare(base=base)
+        copied = self.memory.copy_running(base=base, enough=enough)
+        if base:  # which takes long: a thread may have confined itself since
+            self.onlooker.rights.prepare()
+            self.onlooker.tables.prepare()
+        return copied
+
+    def rehearse(self) -> None:
+        """Ask, as far as that changes nothing, what `look` is going to ask, and forget the answers.
+
+        What the processor has at hand, of our code, of the kernel's and of the page tables, it need not fetch while the program
+        stands still; between two captures it has done other things.
+        """
+        with contextlib.suppress(CheckpointError, OSError):  # whoever asks in earnest says why not
+            self.onlooker.rehearse()
+            self.memory.rehearse()
+
+    # While it stands still
+
+    def look(self, copied: RunningCopy | None, outputs: Outputs | None, *, base: bool, opened: Opened | None = None) -> Look:
+        """Everything that needs it to stand still.
+
+        Args:
+            copied: None: nothing is, and nothing will be before the look is over (`MemoryCapture.take_unread`).
+            opened: see `Onlooker.ask`.
+
+        Raises:
+            CaptureError: it does not, in some way; it may at the next attempt.
+        """
+        place = self.onlooker.place()
+        is_awaited = self.memory.has_rings
+        if is_awaited:
+            aio.await_requests(self.order.component, gather(self.pid) if opened is None else opened)
+        taken = self.memory.take(copied, base=base) if copied is not None else self.memory.take_unread()
+        if self.memory.has_rings and not is_awaited:
+            raise CaptureError(f"cannot capture {self.order.component}: it has just made a ring of asynchronous I/O; try again")
+        return Look(self.onlooker.ask(place, outputs, opened), taken)
+
+    # Afterwards
+
+    def process(self, look: Look) -> ProcessState:
+        """The process as a whole."""
+        return process_state(self.pid, look.standing, self.identities)
+
+    def thread_states(self, look: Look) -> tuple[ThreadState, ...]:
+        """Its threads, the first one first."""
+        living = thread_states(self.pid, look.standing)
+        if self.ended_first is None:
+            return living
+        return (self.ended_first.state(living[0], look.standing.status.tgids[-1], look.taken.lines), *living)
+
+    def mappings(self, look: Look, kin: frozenset[int] = frozenset()) -> tuple[Vma, ...]:
+        """Its mappings.
+
+        Args:
+            kin: see `Identities`.
+        """
+        if kin != self.identities.kin:
+            self.identities.kin = kin
+        return self.identities.vmas(look.taken.lines, self._flags.flags, look.taken.guards)
+
+    def reasons(self, look: Look, kin: Collection[int] = ()) -> tuple[str, ...]:
+        """Why what it has turned into cannot be captured."""
+        try:
+            self._flags.refresh(self.memory.lines)
+            lines = look.taken.lines
+            of_mappings = self._of_mappings.of(lines, self._flags.flags, make=lambda: self._refused(lines))
+            of_process = refusals.refuse_process(self.pid, look.standing.status, kin, files_kept=self.files_kept, lines=lines)
+            of_rings = aio.refuse(look.standing.opened) if self.memory.has_rings else ()
+            return (
+                *of_process,
+                *of_mappings,
+                *of_rings,
+            )
+        except ProcessGoneError:
+            return ()  # the picture was taken before it ended
+
+    def _refused(self, lines: tuple[MapsLine, ...]) -> tuple[str, ...]:
+        """Why mappings cannot be captured."""
+        reasons = (refusals.refuse_mapping(line, self._foreign_flags(line)) for line in lines)
+        return tuple(reason for reason in reasons if reason)
+
+    def known(self, resources: Iterable[Resource]) -> tuple[Resource, ...]:
+        """What it has open, by the names that it knows."""
+        return tuple(map(self.identities.as_known, resources))
+
+    def stopped(self) -> tuple[Resource, ...]:
+        """That it is stopped, of the first process at the last look; who waits for it is somebody else."""
+        return job_control.describe(0 if self.order.is_guarded else self.threads.leader.stopped_by, 0)
+
+    def unopened(self, look: Look) -> tuple[Resource, ...]:
+        """What no descriptor stands for: locks on what it will map, System V shared memory, what its threads may.
+
+        Raises:
+            CaptureError: one of its threads has just changed its rights.
+        """
+        told = self._flags.flags
+        ours = [codes for start, codes in told.items() if self.memory.borrowed.holds(start)]
+        of_program = (told.get(line.start, ()) for line in look.taken.lines if line.name not in NOT_CARRIED)
+        return (
+            *mlockall.describe(of_program, ours),
+            *system_v_memory.describe(look.taken.lines),
+            *clean_private_pages.describe(look.taken.lines, look.taken.untouched, look.standing.opened),
+            *self._limits(look.standing),
+            *scheduling.describe(self.pid),
+            *parent_death_signals.describe(self._death_signals(look.standing)),
+            *audit_login.describe(self.pid),
+            *self.onlooker.tables.describe(),
+        )
+
+    def _death_signals(self, standing: Standing) -> Iterator[tuple[int, int]]:
+        """By thread, of those besides the first."""
+        if self.ended_first is not None:  # another one speaks for it
+            yield standing.status.pids[-1], standing.told.parent_death_signal
+        yield from ((other.place.inner_tid, other.death_signal) for other in standing.others)
+
+    def _limits(self, standing: Standing) -> tuple[Resource, ...]:
+        """What its threads may, and what they are confined to.
+
+        Raises:
+            CaptureError: one of them has just changed that.
+        """
+        place, first = standing.place, standing.status.pids
+        confined = [other.tracee.pid for other in place.others if other.confinement]
+        threads = [(other.inner_tid, other.confinement) for other in place.others]
+        return (
+            *self.onlooker.rights.describe({*confined, self.pid}),
+            *seccomp.describe([(first[-1], place.confinement), *threads]),
+        )
+
+    def _foreign_flags(self, line: MapsLine) -> tuple[str, ...]:
+        """VmFlags without those that our own write protection sets."""
+        return tuple(flag for flag in self._flags.flags.get(line.start, ()) if flag not in WATCHED)

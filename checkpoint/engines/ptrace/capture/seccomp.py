@@ -1,0 +1,80 @@
+"""What the threads of one process are confined to (seccomp), over many freezes; and how they go on in spite of ours.
+
+Filters are only ever added, so of a thread that was seen before one question is enough. They cost the freeze of a program that
+has none nothing.
+
+A thread that we have stopped in a call with a timeout goes on by restart_syscall(2). A filter that does not know that call would
+end it: such a thread makes its own call again instead (`Interruption.begins_anew`), which was let through before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from checkpoint.arch import cpu as arch
+from checkpoint.engines.ptrace.capture.syscall_restart import Interruptions
+from checkpoint.errors import CheckpointError, UnsupportedError
+from checkpoint.linux.spawn import bpf
+from checkpoint.linux.trace import seccomp as confinement
+from checkpoint.linux.trace.seccomp import FILTERED, FREE, STRICT, Confinement
+from checkpoint.linux.trace.tracee import Tracee
+from checkpoint.resources.process import seccomp
+
+Life = tuple[int, int]
+"""A thread for all its life: its id as we see it, and when it began."""
+
+
+class Confinements:
+    """Of one process."""
+
+    def __init__(self, pid: int, interruptions: Interruptions) -> None:
+        self._pid = pid
+        self._interruptions = interruptions
+        self._known: dict[Life, Confinement] = {}
+
+    def keep_only(self, lives: Collection[Life]) -> None:
+        """Forget threads that have ended."""
+        self._known = {life: known for life, known in self._known.items() if life in lives}
+
+    def suspended(self, tracee: Tracee, mode: int, life: Life) -> Confinement:
+        """Have nothing judge the calls of a thread until it is let go; what it is confined to.
+
+        Args:
+            mode: of seccomp(2), or `FILTERED` where that is not known.
+
+        Raises:
+            UnsupportedError: we may not, or it is confined to something that cannot be kept.
+        """
+        if not mode:
+            return FREE
+        if why := confinement.why_not():
+            raise _unsupported(tracee.pid, seccomp.not_ours(why))
+        tracee.suspend_filters()
+        before = self._known.get(life)
+        found = self._looked_at(tracee, mode, before or FREE)
+        if found != before:
+            self._known[life] = found
+            self._interruptions.of(tracee).begins_anew = found.is_strict or not _goes_on(found)
+        return found
+
+    def _looked_at(self, tracee: Tracee, mode: int, before: Confinement) -> Confinement:
+        if mode == STRICT:
+            return Confinement(is_strict=True)
+        try:
+            fresh = confinement.newer(tracee, len(before.filters)) if mode == FILTERED else ()
+        except CheckpointError as error:
+            raise _unsupported(tracee.pid, seccomp.untold(str(error))) from error
+        for one in fresh:
+            if confinement.asks_another(one):
+                raise _unsupported(tracee.pid, seccomp.ASKS_ANOTHER)
+        return Confinement(filters=(*before.filters, *fresh))
+
+
+def _goes_on(found: Confinement) -> bool:
+    """Whether its filters let restart_syscall(2) through, whatever the registers hold."""
+    programs = [one.instructions for one in found.filters]
+    return bpf.allows(programs, arch.SYSCALLS["restart_syscall"], arch.AUDIT_ARCHITECTURE, (0,) * 6)
+
+
+def _unsupported(pid: int, reason: str) -> UnsupportedError:
+    return UnsupportedError(f"cannot capture pid {pid}: {reason}", (reason,))

@@ -1,0 +1,1 @@
+"""What capture and restore both ask of a process, and how both tell it."""

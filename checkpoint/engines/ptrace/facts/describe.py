@@ -1,0 +1,82 @@
+"""What a snapshot says of a process besides its pages, read from /proc and from what the process told: while it runs on."""
+
+from __future__ import annotations
+
+import functools
+import os
+import socket
+
+from blake3 import blake3
+
+from checkpoint.engines.ptrace.facts.remote_queries import Told
+from checkpoint.errors import ProbeError
+from checkpoint.linux import abi
+from checkpoint.linux.memory.remote_memory import Memory
+from checkpoint.linux.procfs import procfs
+from checkpoint.linux.procfs.procfs import Stat, Status
+from checkpoint.linux.spawn import cpuid
+from checkpoint.model import Credentials, Machine, MemoryLayout
+
+
+def layout(stat: Stat, told: Told, auxv: bytes) -> MemoryLayout:
+    """Where code, data, heap, stack, arguments and environment lie."""
+    return MemoryLayout(
+        start_code=stat.start_code,
+        end_code=stat.end_code,
+        start_data=stat.start_data,
+        end_data=stat.end_data,
+        start_brk=stat.start_brk,
+        brk=told.brk,
+        start_stack=stat.start_stack,
+        arg_start=stat.arg_start,
+        arg_end=stat.arg_end,
+        env_start=stat.env_start,
+        env_end=stat.env_end,
+        auxv=auxv,
+    )
+
+
+def credentials(status: Status, told: Told) -> Credentials:
+    """Whose rights it has."""
+    return Credentials(
+        uids=status.uids,
+        gids=status.gids,
+        groups=status.groups,
+        capabilities=status.capabilities,
+        no_new_privs=status.no_new_privs,
+        securebits=told.securebits,
+    )
+
+
+def coredump_filter(pid: int) -> int:
+    """Source: core(5); the file is empty for a process without memory, and missing where the kernel makes no core dumps."""
+    try:
+        return int(procfs.read_text(pid, "coredump_filter"), 16)
+    except (ProbeError, ValueError):
+        return -1
+
+
+def this_machine() -> Machine:
+    """Where we run; ``robot`` and ``xstate_mask`` are left to the capture."""
+    about = os.uname()
+    with open("/proc/sys/kernel/random/boot_id") as file:
+        boot_id = file.read().strip()
+    return Machine(
+        architecture=about.machine,
+        page_size=abi.PAGE_SIZE,
+        kernel=about.release,
+        boot_id=boot_id,
+        hostname=socket.gethostname(),
+        features=cpuid.features(),
+        vdso_digest=_vdso_digest(),
+    )
+
+
+@functools.cache
+def _vdso_digest() -> bytes:
+    """Of our own, which stays the same as long as we live; a restore asks for it three times a process."""
+    own = os.getpid()
+    for line in procfs.parse_maps(procfs.read_text(own, "maps")):
+        if line.name == "[vdso]":
+            return blake3(Memory(own).read(line.start, line.size)).digest()
+    return b""

@@ -1,0 +1,91 @@
+"""The thread by whose id a process is looked at: its first one, or, where that has ended, another that speaks for it.
+
+A first thread that ends before the others (pthread_exit in main) stays as a zombie that keeps the process's id. It has no
+memory, maps or descriptors any more, cannot be traced, and nothing can be asked of it. But whatever /proc and the kernel's calls
+tell of a process they tell by the id of any of its threads; only the list of /proc does not name those. So who looks at a
+process takes the id of its spokesman, and what others call the process stays its own
+(`checkpoint.linux.procfs.procfs.Status.tgid`).
+
+Source: proc_pid(5), pid_namespaces(7); proc_pid_lookup() in fs/proc/base.c; PIDFD_THREAD of pidfd_open(2), since Linux 6.9.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+from collections.abc import Callable
+from typing import Final, TypeVar
+
+from checkpoint.errors import CheckpointError, ProbeError, ProcessGoneError
+from checkpoint.linux.procfs import procfs
+from checkpoint.linux.procfs.tasks import thread_ids
+
+Answer = TypeVar("Answer")
+PIDFD_THREAD: Final = os.O_EXCL
+SPOKESMEN_MAX: Final = 8
+"""How many threads may end, one after the other, by which a process is looked at in one look."""
+_NOT_A_PROCESS: Final = (errno.EINVAL, errno.ENOENT)
+"""What pidfd_open(2) answers to a thread that is not the first one."""
+
+
+def spokesman_of(pid: int) -> int:
+    """The id by which a process is looked at; its own as long as its first thread lives, and once all of it has ended.
+
+    Raises:
+        ProcessGoneError: it has ended, and its parent has taken note.
+    """
+    if not _ends(procfs.stat(pid)):
+        return pid
+    for tid in thread_ids(pid):
+        with contextlib.suppress(ProcessGoneError):
+            if tid != pid and not _ends(procfs.thread_stat(pid, tid)):
+                return tid
+    return pid
+
+
+def told_by_spokesman(pid: int, question: Callable[[int], Answer]) -> Answer:
+    """What a process answers that is looked at by the id of its spokesman; asked again where that ends meanwhile.
+
+    Raises:
+        CheckpointError: what the question does.
+        ProbeError: one spokesman ends after the other.
+    """
+    for _ in range(SPOKESMEN_MAX):
+        spokesman = spokesman_of(pid)
+        try:
+            answer = question(spokesman)
+        except CheckpointError:
+            if spokesman_of(pid) == spokesman:
+                raise
+        else:
+            if spokesman_of(pid) == spokesman:
+                return answer
+    raise ProbeError(f"cannot look at pid {pid}: its threads end while it is looked at; try again")
+
+
+def _ends(stat: procfs.Stat) -> bool:
+    return stat.state in "ZX" or bool(stat.flags & procfs.PF_EXITING)
+
+
+def pidfd_of(tid: int) -> int:
+    """A pidfd of a process, by which its descriptors can be had; of a spokesman too.
+
+    Raises:
+        OSError: it has ended; or, of a spokesman, this kernel has none (Linux 6.9 has).
+    """
+    try:
+        return os.pidfd_open(tid)
+    except OSError as error:
+        if error.errno not in _NOT_A_PROCESS:
+            raise
+    return os.pidfd_open(tid, PIDFD_THREAD)
+
+
+def can_look_through(tid: int) -> bool:
+    """Whether this kernel lends the descriptors of a process whose spokesman is not its first thread."""
+    try:
+        os.close(pidfd_of(tid))
+    except OSError as error:
+        return error.errno not in _NOT_A_PROCESS
+    return True

@@ -1,0 +1,62 @@
+"""Our thread before all ordinary ones while a program stands still for it: whoever takes the processor from us prolongs that.
+
+What others wait for must be short: after a look that used the processor for long the next one is made at ordinary priority, and
+so is the first, of which nobody knows. Nothing may wait without sleeping meanwhile (`checkpoint.linux.trace.tracee.rest`): the
+program, which has an ordinary priority, makes calls for us, perhaps on the same processor.
+
+Source: sched(7), sched_setscheduler(2).
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import time
+from collections.abc import Callable
+from typing import Final
+
+PRIORITY: Final = 1
+"""The lowest there is: beats, guards and whatever else is in real time on this machine come first."""
+LONG_S: Final = 0.01
+"""After a look that used the processor for longer the next one is not given precedence."""
+
+
+class Precedence:
+    """Taken and given back by one thread; where the system does not allow it, nothing happens.
+
+    Args:
+        clock: of the time that this thread has used the processor, in seconds: waiting takes nothing from others.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.thread_time) -> None:
+        self._clock = clock
+        self._is_taken = False
+        self._is_refused = False
+        self._was_long = True
+        self._began = 0.0
+        self._before = os.SCHED_OTHER
+
+    def take(self) -> None:
+        """Come before all ordinary threads from now on; one that has a real-time priority already keeps it."""
+        self._began = self._clock()
+        if self._is_taken or self._is_refused or self._was_long:
+            return
+        try:
+            before = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+            if before in (os.SCHED_OTHER, os.SCHED_BATCH) and not _ends_us():
+                os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
+                self._is_taken, self._before = True, before
+        except OSError:  # an ordinary user, or a container
+            self._is_refused = True
+
+    def give_back(self) -> None:
+        """Be an ordinary thread again; also after a `take` that changed nothing."""
+        self._was_long = self._clock() - self._began > LONG_S
+        if self._is_taken:
+            self._is_taken = False
+            os.sched_setscheduler(0, self._before | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+
+
+def _ends_us() -> bool:
+    """Whether the kernel ends who is in real time for long (RLIMIT_RTTIME, by SIGXCPU): a program stands still for us."""
+    return resource.getrlimit(resource.RLIMIT_RTTIME)[0] != resource.RLIM_INFINITY

@@ -1,0 +1,108 @@
+"""The call that a stop has just ended with EINTR, where the registers do not say which that was (`FORGETS_CALLS` of a processor).
+
+There the result has taken the place of the first argument, and the kernel tells no number of a call any more. But it still knows
+the argument: it tells that of whatever call it is told the thread stands in. So for a moment it is told the number that the
+program has called by, which is in a register still.
+
+Newer kernels (6.12.117, not 6.12.95) tell the result there instead. So each thread is looked at just before it is stopped, too:
+who waits in a call then, and has come out of the very same one, stack and all other arguments alike, was in that.
+
+What looks alike and is not: a thread that has just come back from the handler of a signal which had ended the call. It is known
+by the argument, which is that of the return from a handler, and hardly ever fits the call.
+
+Source: syscall_get_arguments() in asm/syscall.h and system_call_set() in ptrace.c of arch/arm64; proc_pid_syscall(5).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import struct
+from typing import Final
+
+from checkpoint.arch import cpu as arch
+from checkpoint.arch.calls import Registers
+from checkpoint.errors import CaptureError, CheckpointError
+from checkpoint.linux.procfs import procfs
+from checkpoint.linux.trace.tracee import Tracee
+
+_NUMBER: Final = struct.Struct("<i")
+_WORDS: Final = 9
+"""Of /proc/PID/syscall for one that waits in a call: number, six arguments, stack and instruction pointer."""
+EPOLL: Final = "anon_inode:[eventpoll]"
+"""What a descriptor of epoll_create(2) is called in /proc/PID/fd."""
+
+
+def look(tracee: Tracee) -> None:
+    """Note in what a thread waits that is about to be stopped; one that runs, has ended or may not be looked at is in nothing."""
+    try:
+        tracee.waited_in = procfs.read_text(tracee.pid, "syscall")
+    except CheckpointError:
+        tracee.waited_in = ""
+
+
+def told(tracee: Tracee, registers: Registers) -> Registers:
+    """The registers with what they do not say of a call that has just ended with EINTR; as they are if it is not that.
+
+    Args:
+        tracee: stands where it has come to by itself, if anything is to be found out.
+
+    Raises:
+        ProcessGoneError: it has ended.
+    """
+    if not tracee.is_as_found or ctypes.c_int64(registers[arch.RESULT]).value != -errno.EINTR:
+        return registers
+    number = registers[arch.NUMBER] & 0xFFFFFFFF
+    name = arch.SYSCALL_NAMES.get(number, "")
+    if name not in arch.ENDED_BY_A_STOP and name not in arch.SOCKET_TIMEOUT:
+        return registers
+    before = registers[arch.INSTRUCTION_POINTER] - len(arch.SYSCALL)
+    if not _holds(tracee, before, arch.SYSCALL):
+        return registers
+    first = _first_argument(tracee, number)
+    if first == registers[arch.RESULT]:
+        first = _first_before(tracee, number, registers)
+    if first is None:
+        return registers
+    found = arch.recalled(registers, number, first)
+    return found if _fits(tracee, name, found[arch.ENDED_ARGUMENTS[0]]) else registers
+
+
+def _first_argument(tracee: Tracee, number: int) -> int | None:
+    """That of the last call that a thread has made, unsigned; None where the kernel does not tell."""
+    assert arch.CALL_SET is not None
+    known = tracee.register_set(arch.CALL_SET)
+    tracee.set_register_set(arch.CALL_SET, _NUMBER.pack(number))
+    try:
+        words = procfs.read_text(tracee.pid, "syscall").split()
+    finally:
+        tracee.set_register_set(arch.CALL_SET, known)
+    return int(words[1], 16) if len(words) > 2 and words[0] == str(number) else None
+
+
+def _first_before(tracee: Tracee, number: int, registers: Registers) -> int | None:
+    """The first argument of the call that it waited in before the stop; None if that was another one."""
+    words = tracee.waited_in.split()
+    if len(words) != _WORDS or words[0] != str(number):
+        return None
+    first, *others = (int(word, 16) for word in words[1:])
+    same = (*arch.ARGUMENTS[1:], arch.STACK_POINTER, arch.INSTRUCTION_POINTER)
+    return first if others == [registers[name] for name in same] else None
+
+
+def _fits(tracee: Tracee, name: str, first: int) -> bool:
+    """Whether a call can have had this first argument, without its mark."""
+    if name.startswith("epoll"):
+        try:
+            return procfs.read_link(tracee.pid, f"fd/{first}") == EPOLL
+        except CheckpointError:
+            return False
+    return name != "rt_sigtimedwait" or _holds(tracee, first)
+
+
+def _holds(tracee: Tracee, address: int, content: bytes = b"") -> bool:
+    """Whether there is such content at an address; without one, whether there is memory."""
+    try:
+        return tracee.memory.read(address, len(content) or 1).startswith(content)
+    except CaptureError:
+        return False

@@ -1,0 +1,48 @@
+"""Reports of stops, kept for whoever waits for one: it sleeps, and is woken when a thread of a program has stopped for us.
+
+Looking again and again is not enough. Whoever has precedence (`checkpoint.linux.realtime_boost`) keeps the processor while it
+looks, and the thread that is to stop may be waiting for just that processor; and a sleep for a set time is too long most of the
+time.
+
+The signal that tells of a stop is one for many, and another thread of ours may take it. A stop of which none has told is found
+by looking again, so all that is lost then is a little time.
+
+Source: do_notify_parent_cldstop() and complete_signal() in kernel/signal.c.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from typing import Final
+
+REPORT: Final = signal.SIGCHLD
+
+
+class Reports:
+    """Kept and given back by one thread."""
+
+    def __init__(self) -> None:
+        self._before: set[int] | None = None
+
+    def keep(self) -> None:
+        """Have `sleep_until_report` hear of every stop from now on."""
+        if self._before is None:
+            self._before = set(signal.pthread_sigmask(signal.SIG_BLOCK, (REPORT,)))
+
+    def give_back(self) -> None:
+        """As before; also after no `keep`. Whoever has a handler for that signal hears it now, for it tells of others, too."""
+        before, self._before = self._before, None
+        if before is None or REPORT in before:
+            return
+        if signal.getsignal(REPORT) not in (signal.SIG_DFL, signal.SIG_IGN):
+            signal.raise_signal(REPORT)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, (REPORT,))
+
+
+def sleep_until_report(seconds: float) -> None:
+    """Sleep for so long, or until a thread has stopped for us, if reports are kept."""
+    if REPORT in signal.pthread_sigmask(signal.SIG_BLOCK, ()):
+        signal.sigtimedwait((REPORT,), seconds)
+    else:  # it would be taken from whoever has a handler
+        time.sleep(seconds)

@@ -1,0 +1,96 @@
+"""Pages that a delta tells as their difference from what the parent's state holds there: the XOR of the two. Pure.
+
+A page that a program writes again is mostly what it was, so that the difference is mostly zeros and compresses several times
+better than the page. Who makes a delta must have the parent's content at hand, and so must who takes it in on its own; a whole
+chain (`checkpoint.store.chain.fold`) explains itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Final, TypeAlias
+
+from msgspec.structs import replace
+
+from checkpoint.model import PageRun, Snapshot
+from checkpoint.pages import page_set
+from checkpoint.pages.page_set import Buffer, Flags, Words
+from checkpoint.runtime.lazy_numpy import NDArray, np
+
+Rows: TypeAlias = "NDArray[np.uint8]"
+"""Bytes of pages, one row a page."""
+
+Reference = Callable[[Words], Rows]
+"""What a state holds at these addresses, which are in order; raises ChainError where there is no page."""
+
+CHANGED_LIMIT: Final = 1 / 2
+"""A page of which more than this part has changed is told whole: it compresses better by itself."""
+
+
+def rows_of(contents: Buffer, page_size: int) -> Rows:
+    """A buffer of pages, one row each, not copied."""
+    return np.frombuffer(contents, dtype=np.uint8).reshape(-1, page_size)
+
+
+def addresses_of(runs: Iterable[PageRun], page_size: int) -> Words:
+    """The address of every page, in order."""
+    return page_set.addresses_of(page_set.extents(runs), page_size)
+
+
+def are_worth_it(differences: Rows) -> Flags:
+    """Which pages are better told by these differences."""
+    words = differences.view(np.uint64)
+    changed: Flags = np.count_nonzero(words, axis=1) <= words.shape[1] * CHANGED_LIMIT
+    return changed
+
+
+def tellable(delta: Snapshot) -> Words:
+    """The pages of a delta that may be told as differences: what was there before is there still, and no copy is of them.
+
+    Returns:
+        Their addresses, in order.
+    """
+    sources = [PageRun(copy.source, copy.source + copy.size) for copy in delta.copies]
+    carried = addresses_of(delta.runs, delta.machine.page_size)
+    return carried[~page_set.covered(page_set.extents((*delta.cleared, *sources)), carried)]
+
+
+def told(delta: Snapshot, known: Words, contents: Rows) -> Snapshot:
+    """The same delta, with those pages told as differences for which that is worth it.
+
+    Args:
+        delta: tells all of its pages whole.
+        known: some of its `tellable` pages.
+        contents: what the parent's state holds there.
+    """
+    page_size = delta.machine.page_size
+    if not len(known):
+        return delta
+    whole = rows_of(delta.contents, page_size)
+    places = np.searchsorted(addresses_of(delta.runs, page_size), known)
+    differences = whole[places] ^ contents
+    worth = are_worth_it(differences)
+    if not worth.any():
+        return delta
+    changed = whole.copy()
+    changed[places[worth]] = differences[worth]
+    runs = page_set.page_runs(page_set.extents_of_addresses(known[worth], page_size))
+    return replace(delta, contents=changed.reshape(-1).data.toreadonly(), differences=runs)
+
+
+def resolved(delta: Snapshot, reference: Reference) -> Snapshot:
+    """The same delta with all of its pages told whole.
+
+    Args:
+        reference: of its parent's state.
+
+    Raises:
+        ChainError: from ``reference``.
+    """
+    if not delta.differences:
+        return delta
+    page_size = delta.machine.page_size
+    wanted = addresses_of(delta.differences, page_size)
+    whole = rows_of(delta.contents, page_size).copy()
+    whole[np.searchsorted(addresses_of(delta.runs, page_size), wanted)] ^= reference(wanted)
+    return replace(delta, contents=whole.reshape(-1).data.toreadonly(), differences=())

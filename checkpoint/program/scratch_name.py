@@ -1,0 +1,11 @@
+"""The name by which memory is told from all other that need not come back: see `failover.task.scratch`."""
+
+from __future__ import annotations
+
+from typing import Final
+
+NAME: Final = "failover-scratch"
+"""Of a memory file (memfd_create(2)) that is mapped shared: it is mapped again where the program goes on, and holds zeros."""
+
+MAPPED: Final = f"/memfd:{NAME} (deleted)"
+"""What the kernel calls it in /proc/PID/maps and /proc/PID/fd."""

@@ -1,0 +1,1 @@
+"""Descriptors that tell of events: epoll, eventfd, inotify, pidfd, signalfd, timerfd; asynchronous I/O."""

@@ -1,0 +1,1 @@
+"""Pipes, named pipes, pseudo-terminals, standard streams, POSIX and System V shared memory."""

@@ -1,0 +1,214 @@
+"""Unix sockets: pairs of which the program has both ends, its connections with itself, listeners, and sockets for datagrams.
+
+What waits in them comes back, in the same messages, from the same names; so do connections that wait to be accepted. A socket for
+datagrams that was connected to a name outside (``/dev/log``) is connected to that name again. How they are made again stands in
+``unix_rebuild``.
+
+Facts besides those of every socket, of ``unix_names`` and of ``unix_makers``: ``state`` of `checkpoint.linux.net.unix_diag`;
+``name``; ``peer``: inode number of its other end, 0 when that is gone; ``peer_name``; ``backlog``; ``shutdown``; ``clients``:
+whose connections wait to be accepted, inode numbers in their order; ``passed``: of each message in the queue the descriptors
+that came with it, as numbers of the program's own, or of ``travelling``; no list if none has any; ``too_long``: the queue;
+``urgent``: an out-of-band byte waits; ``reset``: its peer has gone without reading all, of which it has not been told yet
+(ECONNRESET); ``sources``: of each message in the queue the name of its sender; no list if none has
+any; ``not_accepted``: of one whose connection waits itself, how much of what it sent is unread, -1 of any other.
+
+Source: unix(7).
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from typing import Final
+
+from checkpoint.capability import Area, preserved, refused
+from checkpoint.engine import REFUSED, Finding
+from checkpoint.errors import CaptureError
+from checkpoint.linux.net.unix_diag import ESTABLISHED, UnixSocket, parsed
+from checkpoint.model import Fact, Resource
+from checkpoint.resources import other_holders
+from checkpoint.resources.open_file import Opened, OpenFile, Surroundings
+from checkpoint.resources.restore_context import number_of
+from checkpoint.resources.sockets import peer_credentials, scm_rights, sockets, unix_names
+
+KIND: Final = "unix_sockets"
+
+CAPABILITIES: Final = (
+    preserved(
+        Area.SOCKETS,
+        "unix sockets that only the program has",
+        "pairs and connections with the data in them, descriptors on their way included",
+    ),
+    preserved(
+        Area.SOCKETS,
+        "unix listeners, and unix sockets for datagrams",
+        "bound to their names again, or connected to the same names again",
+    ),
+    refused(
+        Area.SOCKETS,
+        "a unix socket that is connected to another process",
+        "open it only for a moment, then close it: failover captures in between",
+        "connected to another process",
+        "connected to a socket of another process",
+    ),
+    refused(
+        Area.SOCKETS,
+        "a unix socket with descriptors on their way between several processes, with an out-of-band byte, or with over 4 "
+        "MiB of data that waits",
+        "wait: failover captures it as soon as the program has taken them",
+        "in which an out-of-band byte waits (MSG_OOB): it",
+        "with descriptors on their way",
+        "MiB wait: it is kept as soon as",
+    ),
+    refused(
+        Area.SOCKETS,
+        "a unix listener where a connection of another process waits, or a connection with data in it, or of a client "
+        "that has gone",
+        "wait: failover captures it as soon as the program has accepted the connection",
+        "waits to be accepted",
+    ),
+)
+
+BOTH_DIRECTIONS: Final = 3
+NOT_WAITING: Final = -1
+_ACCEPTED: Final = "it is kept as soon as the program has accepted it"
+_ALONE: Final = "protect the program while it has no such connection"
+
+
+def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: sockets.Noted | None) -> dict[str, Fact]:
+    """Its state, its peer and what waits in it.
+
+    Args:
+        noted: see `sockets.queue_of`.
+
+    Raises:
+        OSError: it cannot be looked into.
+        CaptureError: the kernel does not tell.
+    """
+    answer = opened.listings.unix_answer(held.first.inode)
+    if (told := parsed(answer)) is None:
+        raise CaptureError(f"cannot ask the kernel about the unix socket {held.name} (sock_diag): load the module unix_diag")
+    facts = sockets.general_facts(held, looked, opened)
+    has_queue = told.state == ESTABLISHED or told.type == socket.SOCK_DGRAM
+    identify = partial(scm_rights.number_of, opened)
+    queue = sockets.queue_of(looked, held.first.number, noted, identify) if has_queue else sockets.NOTHING
+    return (
+        facts
+        | unix_names.observe(held, looked, told.name, told.file)
+        | peer_credentials.observe(looked)
+        | {
+            "state": told.state,
+            "name": told.name,
+            "peer": told.peer,
+            "peer_is_ours": _is_ours(told.peer, held, opened),
+            "peer_name": _peer_name(looked),
+            "backlog": told.backlog,
+            "shutdown": told.shutdown,
+            "clients": list(told.clients),
+            "not_accepted": sockets.unsent(looked) if _waits(told) else NOT_WAITING,
+            "queue": list(queue.messages),
+            "passed": [list(numbers) for numbers in queue.passed] if any(queue.passed) else [],
+            "too_long": queue.too_long,
+            "urgent": queue.urgent,
+            "reset": queue.reset,
+            "sources": list(map(_packed_name, queue.sources)) if told.type == socket.SOCK_DGRAM and any(queue.sources) else [],
+        }
+    )
+
+
+def again(held: OpenFile, facts: Mapping[str, Fact], opened: Opened) -> Mapping[str, Fact]:
+    """Facts of a socket that answers as before, and of what they say of others: its peer, and the file that is its name.
+
+    Raises:
+        OSError: it was closed meanwhile.
+    """
+    found: dict[str, Fact] = {**facts, "peer_is_ours": _is_ours(number_of(facts["peer"]), held, opened)}
+    name = facts["name"]
+    assert isinstance(name, bytes)
+    if name and name[:1] != b"\0":
+        told = parsed(opened.listings.unix_answer(held.first.inode))
+        with sockets.looked_into(held.pid, held.first.number) as looked:
+            found |= unix_names.observe(held, looked, name, told.file if told else None)
+    return found if found != facts else facts
+
+
+def _is_ours(peer: int, held: OpenFile, opened: Opened) -> bool:
+    return peer in opened.inodes or peer in held.kin.sockets
+
+
+def _waits(told: UnixSocket) -> bool:
+    """Whether a socket is connected and waits to be accepted: its other end has no number yet."""
+    return told.state == ESTABLISHED and told.type != socket.SOCK_DGRAM and not told.peer and told.shutdown != BOTH_DIRECTIONS
+
+
+def _packed_name(source: object) -> bytes:
+    """A sender's name as bind(2) was told it, without the address's head; b"" for none."""
+    if not source:
+        return b""
+    return source if isinstance(source, bytes) else os.fsencode(str(source)) + b"\0"
+
+
+def _peer_name(looked: socket.socket) -> bytes:
+    try:
+        name = looked.getpeername()
+    except OSError:
+        return b""
+    return name if isinstance(name, bytes) else os.fsencode(name)
+
+
+def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
+    """The socket as it was observed."""
+    if held.observed.get("family") != socket.AF_UNIX:
+        return None
+    facts: dict[str, Fact] = {"descriptors": held.numbers, "flags": held.first.flags & ~os.O_CLOEXEC, **held.observed}
+    return Resource(KIND, held.name, facts | {"maker": peer_credentials.by_its_own_number(facts["maker"])})
+
+
+def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
+    """Why a unix socket cannot be kept."""
+    seen = held.observed
+    if seen.get("family") != socket.AF_UNIX:
+        return None
+    what = f"{held.name} is a unix socket"
+    leads_outside = bool(seen["peer"]) and not seen["peer_is_ours"] and seen["peer"] not in held.kin.sockets
+    if leads_outside and seen["type"] != socket.SOCK_DGRAM:
+        return f"{what} connected to another process, which stays behind: protect the program while it has no such connection"
+    if leads_outside and not seen["peer_name"]:
+        return f"{what} connected to a socket of another process that has no name: protect the program while it has none"
+    if any(isinstance(numbers, list) and sockets.UNKNOWN in numbers for numbers in _list(seen["passed"])):
+        return (
+            f"{what} with descriptors on their way in it (SCM_RIGHTS) that cannot be looked at: it is kept as soon as they arrive"
+        )
+    if seen["passed"] and held.kin.pids and held.lent is None:
+        return f"{what} with descriptors on their way in it between several processes: it is kept as soon as they are received"
+    if 0 in _list(seen["clients"]):
+        return f"{what} where a connection waits to be accepted whose client has gone: {_ACCEPTED}"
+    if number_of(seen["not_accepted"]) > 0:
+        return f"{what} whose connection waits to be accepted with data in it, which nobody can look at: {_ACCEPTED}"
+    if seen["urgent"]:
+        return f"{what} in which an out-of-band byte waits (MSG_OOB): it is kept as soon as that is read"
+    if seen["too_long"]:
+        return f"{what} in which more than {sockets.QUEUE_LIMIT >> 20} MiB wait: it is kept as soon as they are read"
+    return unix_names.refuse(held) or sockets.refuse_filter(held) or other_holders.refuse(held, "a unix socket")
+
+
+def findings(held: Sequence[Resource]) -> Iterator[Finding]:
+    """What can be told only of all sockets together: connections that wait to be accepted by others, or of others."""
+    ours = [one for one in held if one.kind == KIND]
+    clients = {number_of(one.facts["socket"]) for one in ours if one.facts["not_accepted"] != NOT_WAITING}
+    awaited = {number_of(inode) for one in ours for inode in _list(one.facts["clients"])}
+    for one in ours:
+        text = ""
+        if one.facts["not_accepted"] != NOT_WAITING and number_of(one.facts["socket"]) not in awaited:
+            text = f"{one.name} is a unix socket connected to another process, where it waits to be accepted: {_ALONE}"
+        elif not clients.issuperset(map(number_of, _list(one.facts["clients"]))):
+            text = f"{one.name} is a unix socket where a connection of another process waits to be accepted: {_ACCEPTED}"
+        if text:
+            yield Finding(KIND, one.name, REFUSED, text)
+
+
+def _list(fact: Fact) -> list[Fact]:
+    assert isinstance(fact, list)
+    return fact

@@ -1,0 +1,329 @@
+"""What a snapshot says besides its pages, as canonical bytes: the same state always gives the same bytes.
+
+The header is what a listing needs; the state is what a restore needs and what the state digest covers. Both are
+msgpack maps in field order with sorted dictionary keys. A reader encodes again what it decoded and refuses bytes that differ,
+so unknown fields, doubled keys and other spellings of the same value do not pass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any, TypeVar
+
+import msgspec
+from blake3 import blake3
+from msgspec.structs import replace
+
+from checkpoint.errors import FormatError
+from checkpoint.model import (
+    Clocks,
+    Machine,
+    Member,
+    OutputPiece,
+    Position,
+    ProcessState,
+    Resource,
+    Snapshot,
+    ThreadState,
+    Vma,
+    Zombie,
+)
+from checkpoint.snapshot.process_tree import every_mapping
+
+_Value = TypeVar("_Value")
+
+STATE_DIGEST_SIZE = 16
+"""Bytes of a position's digest."""
+
+MAX_FACT_DEPTH = 8
+"""How deep the facts of a resource may be nested."""
+
+
+class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a listing shows of a snapshot. Fields are those of ``Snapshot``; counts are of its lists.
+
+    Attributes:
+        contents_size: bytes of page contents before compression.
+        output_size: bytes of stream output that it carries.
+    """
+
+    component: str
+    engine: str
+    epoch: int
+    position: Position
+    parent: Position | None
+    machine: Machine
+    page_sum: bytes
+    contents_size: int
+    run_count: int
+    cleared_count: int
+    vma_count: int
+    thread_count: int
+    output_size: int
+    freeze_us: int
+    notes: tuple[str, ...]
+
+    @property
+    def is_base(self) -> bool:
+        """Whether it stands alone."""
+        return self.parent is None
+
+
+class _ResourceRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A ``Resource``; its facts are of a type that msgspec cannot name."""
+
+    kind: str
+    name: str
+    facts: dict[str, Any]
+
+
+class _State(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Everything that a restore needs besides the pages."""
+
+    component: str
+    engine: str
+    epoch: int
+    machine: Machine
+    clocks: Clocks
+    process: ProcessState
+    threads: tuple[ThreadState, ...]
+    vmas: tuple[Vma, ...]
+    resources: tuple[_ResourceRecord, ...]
+
+
+class _MemberRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A ``Member``; see `_ResourceRecord`."""
+
+    slot: int
+    exit_signal: int
+    process: ProcessState
+    threads: tuple[ThreadState, ...]
+    vmas: tuple[Vma, ...]
+    resources: tuple[_ResourceRecord, ...]
+
+
+class _TreeState(_State, frozen=True, forbid_unknown_fields=True):
+    """The same of several processes: what version 2 holds."""
+
+    members: tuple[_MemberRecord, ...]
+    zombies: tuple[Zombie, ...]
+
+
+class State(msgspec.Struct, frozen=True):
+    """The decoded state section: the fields of ``Snapshot`` with the same names."""
+
+    component: str
+    engine: str
+    epoch: int
+    machine: Machine
+    clocks: Clocks
+    process: ProcessState
+    threads: tuple[ThreadState, ...]
+    vmas: tuple[Vma, ...]
+    resources: tuple[Resource, ...]
+    members: tuple[Member, ...] = ()
+    zombies: tuple[Zombie, ...] = ()
+
+
+def header_of(snapshot: Snapshot) -> Header:
+    """The header that describes a snapshot."""
+    return Header(
+        component=snapshot.component,
+        engine=snapshot.engine,
+        epoch=snapshot.epoch,
+        position=snapshot.position,
+        parent=snapshot.parent,
+        machine=snapshot.machine,
+        page_sum=snapshot.page_sum,
+        contents_size=sum(run.size for run in snapshot.runs),
+        run_count=len(snapshot.runs),
+        cleared_count=len(snapshot.cleared),
+        vma_count=len(every_mapping(snapshot)),
+        thread_count=len(snapshot.threads) + sum(len(member.threads) for member in snapshot.members),
+        output_size=sum(len(piece.content) for piece in snapshot.output),
+        freeze_us=snapshot.freeze_us,
+        notes=snapshot.notes,
+    )
+
+
+def encode_header(header: Header) -> bytes:
+    """Canonical bytes of a header."""
+    return _encoded(header, "header")
+
+
+def decode_header(packed: bytes | memoryview) -> Header:
+    """The header in these bytes.
+
+    Raises:
+        FormatError: not a header, or not in canonical form.
+    """
+    return _decoded(packed, Header, "header")
+
+
+def encode_state(snapshot: Snapshot) -> bytes:
+    """Canonical bytes of everything that a restore needs besides the pages.
+
+    Raises:
+        FormatError: a value has no place in msgpack (text that is not UTF-8, an integer beyond 64 bits).
+    """
+    state = _State(
+        component=snapshot.component,
+        engine=snapshot.engine,
+        epoch=snapshot.epoch,
+        machine=snapshot.machine,
+        clocks=snapshot.clocks,
+        process=_canonical_process(snapshot.process),
+        threads=_canonical_threads(snapshot.threads),
+        vmas=snapshot.vmas,
+        resources=_records(snapshot.resources),
+    )
+    if snapshot.is_tree:
+        members = tuple(map(_member_record, snapshot.members))
+        state = _TreeState(**msgspec.structs.asdict(state), members=members, zombies=snapshot.zombies)
+    return _encoded(state, "state")
+
+
+def _member_record(member: Member) -> _MemberRecord:
+    return _MemberRecord(
+        slot=member.slot,
+        exit_signal=member.exit_signal,
+        process=_canonical_process(member.process),
+        threads=_canonical_threads(member.threads),
+        vmas=member.vmas,
+        resources=_records(member.resources),
+    )
+
+
+def _canonical_process(process: ProcessState) -> ProcessState:
+    return replace(process, limits=_sorted(process.limits))
+
+
+def _canonical_threads(threads: tuple[ThreadState, ...]) -> tuple[ThreadState, ...]:
+    return tuple(replace(thread, registers=_sorted(thread.registers)) for thread in threads)
+
+
+def _records(resources: tuple[Resource, ...]) -> tuple[_ResourceRecord, ...]:
+    return tuple(_ResourceRecord(held.kind, held.name, _sorted(held.facts)) for held in resources)
+
+
+def decode_state(packed: bytes | memoryview, *, is_tree: bool = False) -> State:
+    """The state in these bytes.
+
+    Args:
+        is_tree: of several processes.
+
+    Raises:
+        FormatError: not a state, or not in canonical form; names the field.
+    """
+    state: _State = _decoded(packed, _TreeState if is_tree else _State, "state")
+    members = state.members if isinstance(state, _TreeState) else ()
+    _check_canonical(state)
+    for record in members:
+        _check_canonical(record)
+    return State(
+        component=state.component,
+        engine=state.engine,
+        epoch=state.epoch,
+        machine=state.machine,
+        clocks=state.clocks,
+        process=state.process,
+        threads=state.threads,
+        vmas=state.vmas,
+        resources=_resources(state.resources),
+        members=tuple(map(_member, members)),
+        zombies=state.zombies if isinstance(state, _TreeState) else (),
+    )
+
+
+def _check_canonical(state: _State | _MemberRecord) -> None:
+    """Refuse facts that cannot be, and keys that are out of order."""
+    for record in state.resources:
+        _check_fact(record.facts, f"state: facts of {record.kind} {record.name!r}", MAX_FACT_DEPTH)
+    mappings = (state.process.limits, *(thread.registers for thread in state.threads), *(held.facts for held in state.resources))
+    if not all(map(_is_sorted, mappings)):
+        raise FormatError("state: not in canonical form (keys out of order)")
+
+
+def _resources(records: tuple[_ResourceRecord, ...]) -> tuple[Resource, ...]:
+    return tuple(Resource(record.kind, record.name, record.facts) for record in records)
+
+
+def _member(record: _MemberRecord) -> Member:
+    return Member(
+        slot=record.slot,
+        exit_signal=record.exit_signal,
+        process=record.process,
+        threads=record.threads,
+        vmas=record.vmas,
+        resources=_resources(record.resources),
+    )
+
+
+def encode_output(output: tuple[OutputPiece, ...]) -> bytes:
+    """Canonical bytes of the pieces of stream output."""
+    return _encoded(output, "output")
+
+
+def decode_output(packed: bytes | memoryview) -> tuple[OutputPiece, ...]:
+    """The pieces of output in these bytes.
+
+    Raises:
+        FormatError: not pieces of output, or not in canonical form.
+    """
+    return _decoded(packed, tuple[OutputPiece, ...], "output")
+
+
+def state_digest(snapshot: Snapshot) -> bytes:
+    """What a position's digest must be: the first 16 bytes of blake3(page sum ‖ blake3(state bytes))."""
+    return blake3(snapshot.page_sum + blake3(encode_state(snapshot)).digest()).digest(length=STATE_DIGEST_SIZE)
+
+
+def _encoded(value: object, what: str) -> bytes:
+    try:
+        return msgspec.msgpack.encode(value)
+    except (UnicodeEncodeError, OverflowError, TypeError, RecursionError) as error:
+        raise FormatError(f"cannot encode the {what} of a snapshot: {error}") from error
+
+
+def _sorted(value: Any) -> Any:
+    """The same value with the keys of every mapping in order."""
+    if isinstance(value, Mapping):
+        return {key: _sorted(value[key]) for key in sorted(value)}
+    if isinstance(value, list | tuple):
+        return [_sorted(inner) for inner in value]
+    return value
+
+
+def _is_sorted(value: Any) -> bool:
+    """Whether the keys of every mapping in it, as msgpack decodes it, are in order."""
+    if isinstance(value, dict):
+        return all(earlier < later for earlier, later in pairwise(value)) and all(map(_is_sorted, value.values()))
+    return not isinstance(value, list) or all(map(_is_sorted, value))
+
+
+def _decoded(packed: bytes | memoryview, kind: type[_Value], what: str) -> _Value:
+    try:
+        value = msgspec.msgpack.decode(packed, type=kind)
+        again = msgspec.msgpack.encode(value)
+    except (msgspec.MsgspecError, UnicodeError, OverflowError, TypeError, ValueError, RecursionError) as error:
+        raise FormatError(f"{what}: {error}") from error
+    if again != packed:
+        raise FormatError(f"{what}: not in canonical form (unknown or doubled keys, or another spelling of a value)")
+    return value
+
+
+def _check_fact(fact: object, where: str, depth: int) -> None:
+    """Refuse what a fact cannot be: extension types, keys that are not text, endless nesting."""
+    if depth == 0:
+        raise FormatError(f"{where}: nested deeper than {MAX_FACT_DEPTH}")
+    if isinstance(fact, dict):
+        for key, inner in fact.items():
+            if not isinstance(key, str):
+                raise FormatError(f"{where}: a key is not text")
+            _check_fact(inner, where, depth - 1)
+    elif isinstance(fact, list):
+        for inner in fact:
+            _check_fact(inner, where, depth - 1)
+    elif not (fact is None or isinstance(fact, int | str | bytes | bool | float)):
+        raise FormatError(f"{where}: {type(fact).__name__} is not a type of fact")

@@ -1,0 +1,138 @@
+"""What a store holds of one component, as values: which files, which chains they make, which positions can be restored.
+
+Pure: ``store`` reads and writes the files, this says what they mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from urllib.parse import quote
+
+from blake3 import blake3
+from msgspec import Struct
+
+from checkpoint.model import Position
+from checkpoint.snapshot.canonical_state import Header
+
+BASE_SUFFIX = ".base"
+DELTA_SUFFIX = ".delta"
+
+FOLDER_PREFIX = "@"
+"""Begins the name of a component's folder, so that no component is called "..", "lock" or "aside"."""
+
+MAX_NAME_SIZE = 160
+"""Bytes of a folder's name; a component whose encoded path is longer is cut and told apart by a digest."""
+
+
+class Entry(Struct, frozen=True):
+    """One snapshot file.
+
+    Attributes:
+        size: bytes of the file; ``stored_s``: when it came, in seconds since 1970.
+    """
+
+    path: Path
+    position: Position
+    parent: Position | None
+    epoch: int
+    size: int
+    stored_s: float = 0.0
+
+    @property
+    def order(self) -> tuple[int, int, int]:
+        """Later is greater: a later primacy counts before a later capture."""
+        return self.epoch, self.position.generation, self.position.sequence
+
+
+class Shelf(Struct, frozen=True):
+    """The intact files of one component, in no particular order."""
+
+    component: str
+    entries: tuple[Entry, ...] = ()
+
+    def with_entry(self, entry: Entry) -> Shelf:
+        """The shelf after a file came."""
+        return Shelf(self.component, (*self.entries, entry))
+
+    def without(self, gone: Iterable[Entry]) -> Shelf:
+        """The shelf after files went."""
+        removed = set(gone)
+        return Shelf(self.component, tuple(entry for entry in self.entries if entry not in removed))
+
+    def positions(self) -> tuple[Position, ...]:
+        """What can be restored, oldest first."""
+        return tuple(entry.position for entry in self._restorable())
+
+    def newest(self) -> Position | None:
+        """The newest position that can be restored."""
+        return max(self._restorable(), key=lambda entry: entry.order).position if self._restorable() else None
+
+    def chain_to(self, position: Position) -> tuple[Entry, ...]:
+        """The files that lead to a position, a base first; empty where the chain is not whole."""
+        return _chain(self._by_position(), position)
+
+    def unneeded_for(self, oldest: Position) -> tuple[Entry, ...]:
+        """Files without which ``oldest`` and everything later can still be restored; none if it cannot be restored itself."""
+        floor = self.order_of(oldest)
+        if floor is None:
+            return ()
+        needed = {entry for kept in self._restorable() if kept.order >= floor for entry in self.chain_to(kept.position)}
+        return tuple(entry for entry in self.entries if entry not in needed)
+
+    def order_of(self, position: Position) -> tuple[int, int, int] | None:
+        """Where a position stands in the order of the files; None if it cannot be restored."""
+        return next((entry.order for entry in self._restorable() if entry.position == position), None)
+
+    def _restorable(self) -> list[Entry]:
+        """One file for every position whose chain is whole, oldest first."""
+        best = self._by_position()
+        return sorted((entry for entry in best.values() if _chain(best, entry.position)), key=lambda entry: entry.order)
+
+    def _by_position(self) -> dict[Position, Entry]:
+        """The best file for each position: a base before a delta."""
+        best: dict[Position, Entry] = {}
+        for entry in self.entries:
+            known = best.get(entry.position)
+            if known is None or (known.parent is not None and entry.parent is None):
+                best[entry.position] = entry
+        return best
+
+
+def _chain(best: dict[Position, Entry], position: Position) -> tuple[Entry, ...]:
+    """Follow parents to a base. A parent is before its child in every file (``validity``), so this ends."""
+    chain: list[Entry] = []
+    wanted: Position | None = position
+    while wanted is not None:
+        entry = best.get(wanted)
+        if entry is None:
+            return ()
+        chain.append(entry)
+        wanted = entry.parent
+    return tuple(reversed(chain))
+
+
+def folder_name(component: str) -> str:
+    """A component's path as one safe file name, which begins with ``FOLDER_PREFIX``."""
+    name = FOLDER_PREFIX + quote(component, safe="")
+    if len(name) <= MAX_NAME_SIZE:
+        return name
+    digest = blake3(component.encode()).hexdigest(length=16)
+    return f"{name[: MAX_NAME_SIZE - len(digest) - 1]}~{digest}"
+
+
+def file_name(header: Header) -> str:
+    """The name of a snapshot's file: sorts by age, says which position it is and whether it stands alone."""
+    position = header.position
+    suffix = BASE_SUFFIX if header.is_base else DELTA_SUFFIX
+    return f"{header.epoch:016x}-{position.generation:016x}-{position.sequence:016x}-{position.digest.hex()}{suffix}"
+
+
+def order_of_name(name: str) -> tuple[int, int, int] | None:
+    """``Entry.order`` as a file's name says it, for a file whose content cannot be believed; None if it is no such name."""
+    parts = name.split("-")
+    try:
+        epoch, generation, sequence = (int(part, 16) for part in parts[:3])
+    except ValueError:
+        return None
+    return epoch, generation, sequence

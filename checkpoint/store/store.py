@@ -1,0 +1,641 @@
+"""A directory of snapshots that survives power loss at any point.
+
+``ROOT/lock``, and one folder for each component with a file for each snapshot. A file appears under its name only when it is
+whole and on the disk: written aside, synced, renamed, folder synced. What was acknowledged is therefore always
+there, and what did not arrive whole leaves nothing but a temporary that the next opening removes.
+
+Two kinds of lock, taken in this order: one a component for whoever changes what is held of it, for as long as that takes (a base
+may be gigabytes), and one for what is known of all, held for moments only. Who reads waits for the second alone: a takeover never
+stands behind a snapshot that is being written, proved or folded.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import stat
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from itertools import accumulate
+from pathlib import Path
+from typing import TypeVar
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from checkpoint.errors import ChainError, FormatError, StoreError
+from checkpoint.model import OutputPiece, Position, Snapshot
+from checkpoint.snapshot import format
+from checkpoint.snapshot.canonical_state import header_of
+from checkpoint.snapshot.required_files import needs
+from checkpoint.snapshot.validity import place
+from checkpoint.store import chain
+from checkpoint.store.atomic_files import TEMPORARY_PREFIX, WholeFiles, disk_trouble
+from checkpoint.store.base_on_disk import stored_chain
+from checkpoint.store.content_store import Contents
+from checkpoint.store.disk import Disk, DiskFile, lock_exclusively
+from checkpoint.store.folding import Folding
+from checkpoint.store.index import BASE_SUFFIX, DELTA_SUFFIX, FOLDER_PREFIX, Entry, Shelf, file_name, folder_name, order_of_name
+from checkpoint.store.retention import HISTORY_FOLDER, History, Retention
+from checkpoint.store.verify import Proofs
+from checkpoint.store.xor_cache import CACHE_SIZE
+from checkpoint.store.xor_cache_budget import PageBudget
+
+log = logging.getLogger("failover.store")
+
+SUFFIXES = (BASE_SUFFIX, DELTA_SUFFIX)
+
+ASIDE_FOLDER = "aside"
+"""Holds what is kept for inspection only."""
+
+ASIDE_LIMIT = 4
+"""Files of one component that are kept for inspection; the oldest goes when another comes, or a bad cable would fill the disk."""
+
+LOCK_NAME = "lock"
+
+FOLD_DELTA_COUNT = 64
+"""A chain to the oldest wanted position with more deltas than this is folded: a restore reads them all, about 3 ms each."""
+
+CHEAP_BASE_SIZE = 16 << 20
+CHEAP_DELTA_COUNT = 12
+"""…and where the base is no larger than this, with more deltas than that: writing it again is cheaper than a slow takeover."""
+
+FOLD_DELTA_PART = 0.5
+"""…and one whose deltas together take more than this part of its base: otherwise the store would grow without end."""
+
+NOTICES_KEPT = 100
+"""Of what was found damaged or left over."""
+
+FOLDED_AT_ONCE_SIZE = 64 << 20
+"""Bytes of the pages of deltas that a fold holds in memory; a chain with more is folded in several steps. Of a large base, which
+takes long to write again, half as much as its own."""
+
+NOTHING_OLD = Retention()
+
+FOLDED_OUTPUT_SIZE = 1 << 20
+"""Bytes of output of each stream that a folded base keeps; the whole is in the component's logs."""
+
+
+A = TypeVar("A")
+
+
+class Kept(Struct, frozen=True):
+    """What the store has of one component, for people.
+
+    Attributes:
+        positions: that the rules may go back to; ``olds``: whole checkpoints besides, kept for people.
+        size: bytes of all files; ``newest_s``, ``oldest_s``: when the first and the last of them came, in seconds since 1970.
+    """
+
+    positions: int
+    olds: int
+    size: int
+    newest_s: float
+    oldest_s: float
+
+
+class Store:
+    """The snapshots on one machine. Methods may be called from any thread; one process at a time.
+
+    Made by ``open_store``. Every method raises StoreError when the disk fails; what the store already held is intact.
+    """
+
+    def __init__(self, root: Path, disk: Disk, lock: int, retention: Retention, budget: PageBudget) -> None:
+        self._root = root
+        self._files = WholeFiles(disk)
+        self.contents = Contents(root, self._files)
+        """Files that programs brought along."""
+        self._named: dict[Path, frozenset[bytes]] = {}
+        self._history = History(root, self._files, retention)
+        self._lock_descriptor = lock
+        self._lock = threading.RLock()
+        self._changing: dict[str, threading.RLock] = {}
+        self._shelves: dict[str, Shelf] = {}
+        self._proofs = Proofs(budget, self._decoded)
+        self._made_last: dict[str, tuple[Path, Snapshot]] = {}
+        """Of each component what was put last without a proof, without its pages and its output, and where."""
+        self.notices: list[str] = []
+        """What was found damaged or left over: one sentence each."""
+
+    # Asking
+
+    def components(self) -> tuple[str, ...]:
+        """Everything of which there is a position to return to, by name."""
+        with self._lock:
+            return tuple(sorted(name for name, shelf in self._shelves.items() if shelf.newest()))
+
+    def positions(self, component: str) -> tuple[Position, ...]:
+        """The positions that can be restored, oldest first."""
+        with self._lock:
+            return self._shelf(component).positions()
+
+    def newest(self, component: str) -> Position | None:
+        """The newest position that can be restored, None if there is none."""
+        with self._lock:
+            return self._shelf(component).newest()
+
+    def chain_of(self, component: str, position: Position | None = None) -> tuple[Entry, ...]:
+        """The files that lead to a position (the newest, if none is named), a base first.
+
+        Raises:
+            StoreError: there is no such position.
+        """
+        with self._lock:
+            shelf = self._shelf(component)
+            wanted = position or shelf.newest()
+            found = shelf.chain_to(wanted) if wanted else ()
+        if not found:
+            named = f"position {place(position)}" if position else "any snapshot"
+            raise StoreError(f"the store {self._root} does not hold {named} of {component}")
+        return found
+
+    def open_chain(self, component: str, position: Position | None = None) -> list[int]:
+        """Descriptors of the files that lead to a position, a base first; the caller closes them.
+
+        They stay readable whatever the store does with the files meanwhile.
+        """
+        opened: list[int] = []
+        try:
+            with self._lock, disk_trouble(f"open the chain of {component}"):
+                for entry in self.chain_of(component, position):
+                    opened.append(os.open(entry.path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW))
+                    if why := why_not_ours(os.fstat(opened[-1])):
+                        raise StoreError(
+                            f"cannot use {entry.path}: {why}; remove it, and see who may write to the store {self._root}"
+                        )
+        except StoreError:
+            for descriptor in opened:
+                os.close(descriptor)
+            raise
+        return opened
+
+    def outline(self, component: str, entry: Entry, source: int) -> Snapshot:
+        """A snapshot without its pages; where it was made here last it is known still, but neither runs nor output of it.
+
+        Args:
+            source: descriptor of its file, which may have been removed meanwhile.
+
+        Raises:
+            FormatError: not a whole, unaltered snapshot.
+        """
+        with self._lock:
+            path, outline = self._made_last.get(component, (None, None))
+        return outline if outline is not None and path == entry.path else format.read_outline(source)
+
+    def load(self, component: str, position: Position | None = None) -> Snapshot:
+        """The state at a position as one base, verified and proved.
+
+        Without a position: the newest that is intact. A damaged file on the way is set out of use and noted, and the next older
+        position is tried.
+
+        Raises:
+            StoreError: there is none, or the position that was asked for is damaged.
+        """
+        while True:
+            folded = self._try_fold(component, self.chain_of(component, position))
+            if folded is not None:
+                return folded
+            if position is not None:
+                raise StoreError(f"position {place(position)} of {component} cannot be restored: {self.notices[-1]}")
+
+    def _try_fold(self, component: str, entries: tuple[Entry, ...]) -> Snapshot | None:
+        """The folded chain, or None when a file of it had to be set out of use."""
+        snapshots = self._all_decoded(component, entries)
+        if snapshots is None:
+            return None
+        try:
+            return chain.fold(snapshots)
+        except ChainError as error:
+            self._set_out_of_use(component, entries[-1], str(error))
+            return None
+
+    def _all_decoded(self, component: str, entries: tuple[Entry, ...]) -> list[Snapshot] | None:
+        """All of these files, or None when one of them had to be set out of use."""
+        snapshots = []
+        for entry in entries:
+            try:
+                snapshots.append(format.decode(entry.path))
+            except FormatError as error:
+                self._set_out_of_use(component, entry, str(error))
+                return None
+        return snapshots
+
+    def kept(self, component: str) -> Kept | None:
+        """What is here of a component; None if nothing is."""
+        with self._lock:
+            shelf = self._shelf(component)
+        olds = self._history.of(folder_name(component))
+        times = [*(entry.stored_s for entry in shelf.entries), *(old.stored_s for old in olds)]
+        if not times:
+            return None
+        size = sum(entry.size for entry in shelf.entries) + sum(old.size for old in olds)
+        return Kept(len(shelf.positions()), len(olds), size, max(times), min(times))
+
+    # Keeping
+
+    def make_room(self, size: int) -> None:
+        """See that the disk has room for a snapshot of so many bytes, if what is kept for people can give it."""
+        self._history.make_room(size)
+
+    def put(self, source: int, *, prove: bool = True) -> Snapshot:
+        """Keep a snapshot; when this returns it survives a power cut.
+
+        Args:
+            source: descriptor of the whole file; it stays the caller's. An unnamed file (O_TMPFILE) on the same file system as
+                ``root`` is taken as it is, any other is copied.
+            prove: compare the state that it leads to with its digest. Not needed where the snapshot was made here.
+
+        Returns:
+            The snapshot without its pages: its position, its output.
+
+        Raises:
+            FormatError: not a whole, unaltered snapshot.
+            ChainError: it continues no position that the store holds, or does not lead to the state it names; ask for a base.
+            StoreError: the disk does not take it; nothing of it is left.
+        """
+        snapshot = format.decode(source) if prove else format.verified_outline(source)
+        with self._change_of(snapshot.component):
+            shelf = self._shelf(snapshot.component)
+            self._check_parent(shelf, snapshot)
+            proved = self._proofs.prove(shelf, snapshot) if prove else None
+            final = self._root / folder_name(snapshot.component) / file_name(header_of(snapshot))
+            if all(entry.path != final for entry in shelf.entries):
+                size = self._files.write(final, lambda file: file.copy_from(source), source)
+                self._add(snapshot.component, _entry_of(final, snapshot, size))
+            if proved is not None:
+                self._proofs.keep(snapshot.component, proved)
+            else:  # what comes from here is not proved: what was remembered while it came from elsewhere is of no use
+                self._proofs.forget(snapshot.component)
+            outline = replace(snapshot, runs=(), cleared=(), copies=(), differences=(), contents=b"")
+            with self._lock:
+                self._made_last.pop(snapshot.component, None)
+                if not prove:
+                    self._made_last[snapshot.component] = (final, replace(outline, output=()))
+        return outline
+
+    @contextmanager
+    def _change_of(self, component: str) -> Iterator[None]:
+        """Nobody else changes what is held of a component during the body; everybody may read it."""
+        with self._lock:
+            changing = self._changing.setdefault(component, threading.RLock())
+        with changing:
+            yield
+
+    def _add(self, component: str, entry: Entry) -> None:
+        with self._lock:
+            self._shelves[component] = self._shelf(component).with_entry(entry)
+
+    def _check_parent(self, shelf: Shelf, snapshot: Snapshot) -> None:
+        if snapshot.parent is not None and not shelf.chain_to(snapshot.parent):
+            held = shelf.newest()
+            ours = f"the newest position here is {place(held)}" if held else "nothing of it is here"
+            raise ChainError(
+                f"delta {place(snapshot.position)} of {snapshot.component} continues {place(snapshot.parent)}, "
+                f"which is not held with that digest: {ours}; ask for a base"
+            )
+
+    def _decoded(self, component: str, entry: Entry) -> Snapshot:
+        try:
+            return format.decode(entry.path)
+        except FormatError as error:
+            self._set_out_of_use(component, entry, str(error))
+            raise ChainError(
+                f"a snapshot of {component} that this delta needs is damaged here: {error}; ask for a base"
+            ) from error
+
+    # Forgetting
+
+    def prune(self, component: str, oldest: Position) -> None:
+        """Forget what is not needed to restore ``oldest`` or a later position; fold its chain where that has grown long.
+
+        Whole checkpoints among it are kept for people as the retention says. An ``oldest`` that is not held forgets nothing.
+        """
+        if self._fold_is_due(component, oldest):
+            self.fold(component, oldest)
+        with self._change_of(component):
+            shelf = self._shelf(component)
+            self._remove(component, shelf.unneeded_for(oldest), self._history.take)
+            floor = shelf.order_of(oldest)
+            if floor is not None:
+                self._remove_damaged(component, lambda path: (order_of_name(path.name) or floor) < floor)
+        self._history.thin(folder_name(component), time.time())
+        with self._lock:
+            needed = sum(entry.size for shelf in self._shelves.values() for entry in shelf.entries)
+        self._history.shrink(needed)
+
+    def discard(self, component: str, position: Position) -> None:
+        """Forget one position that nothing else here continues; one that is not held, or is continued, stays as it is.
+
+        Raises:
+            StoreError: the disk cannot remove it.
+        """
+        with self._change_of(component):
+            entries = self._shelf(component).entries
+            if all(entry.parent != position for entry in entries):
+                self._remove(component, tuple(entry for entry in entries if entry.position == position))
+                self._proofs.forget(component)
+
+    def keep_newest(self, component: str, positions: int) -> None:
+        """Forget all but the newest positions; as ``prune``."""
+        held = self.positions(component)[-positions:]
+        if held:
+            self.prune(component, held[0])
+
+    def fold(self, component: str, position: Position) -> None:
+        """Write the state at a position as a base of its own, so that what is older can go.
+
+        The long part holds no lock at all: snapshots are taken in meanwhile. Cut off anywhere, the old chain is whole.
+
+        Raises:
+            StoreError: the position cannot be loaded, or the disk does not take the base.
+            FormatError: see `_write_fold`.
+        """
+        is_there = False
+        while not is_there:
+            entries = _held_at_once(self.chain_of(component, position))
+            reached = entries[-1].position
+            is_there = reached == position
+            written = self._write_fold(component, entries)
+            if written is None:
+                raise StoreError(f"position {place(position)} of {component} cannot be restored: {self.notices[-1]}")
+            with self._change_of(component):
+                if self._shelf(component).order_of(reached) is None:  # dropped or set aside meanwhile
+                    self._files.remove(written.path)
+                    return
+                self._add(component, written)
+
+    def _write_fold(self, component: str, entries: tuple[Entry, ...]) -> Entry | None:
+        """Write a chain as one base, or answer None when a file of it had to be set out of use.
+
+        Raises:
+            FormatError: what it amounts to cannot be written; its files are not to blame, and stay.
+        """
+        deltas = self._all_decoded(component, entries[1:])
+        is_tree = self._read(component, entries, lambda: format.is_of_several_processes(entries[0].path))
+        if deltas is None or is_tree is None:
+            return None
+        if deltas and not is_tree and not any(delta.is_tree for delta in deltas):
+            return self._write_straight(component, entries, deltas)
+        whole = self._read(component, entries, lambda: chain.fold([format.decode(entries[0].path), *deltas]))
+        if whole is None:
+            return None
+        folded = replace(whole, output=_newest_output(whole.output))
+        return self._write_base(folded, lambda file: format.encode(folded, file))
+
+    def _write_straight(self, component: str, entries: tuple[Entry, ...], deltas: list[Snapshot]) -> Entry | None:
+        """The same of one process, frame by frame."""
+        with contextlib.ExitStack() as open_files:
+            stored = self._read(component, entries, lambda: open_files.enter_context(stored_chain(entries[0].path, deltas)))
+            if stored is None:
+                return None
+            folded = replace(stored.outline, output=_newest_output(stored.outline.output))
+            folding = Folding(stored, folded)
+            return self._read(component, entries, lambda: self._write_base(folded, folding.write))
+
+    def _read(self, component: str, entries: tuple[Entry, ...], act: Callable[[], A]) -> A | None:
+        """What an act answers that reads a chain's base, or None when a file had to be set out of use."""
+        try:
+            return act()
+        except FormatError as error:
+            self._set_out_of_use(component, entries[0], str(error))
+        except ChainError as error:
+            self._set_out_of_use(component, entries[-1], str(error))
+        return None
+
+    def _write_base(self, folded: Snapshot, write: Callable[[DiskFile], int]) -> Entry:
+        final = self._root / folder_name(folded.component) / file_name(header_of(folded))
+        return _entry_of(final, folded, self._files.write(final, write))
+
+    def _fold_is_due(self, component: str, oldest: Position) -> bool:
+        with self._lock:
+            entries = self._shelf(component).chain_to(oldest)
+        if not entries:
+            return False
+        base, deltas = entries[0], entries[1:]
+        most = CHEAP_DELTA_COUNT if base.size <= CHEAP_BASE_SIZE else FOLD_DELTA_COUNT
+        return len(deltas) > most or sum(entry.size for entry in deltas) > FOLD_DELTA_PART * base.size
+
+    def set_aside(self, component: str, generations: Iterable[int]) -> Path | None:
+        """Take generations out of the chain; their newest state is kept as one file for inspection.
+
+        Returns:
+            That file; None when nothing of these generations could be restored.
+        """
+        with self._change_of(component):
+            shelf = self._shelf(component)
+            chosen = set(generations)
+            gone = tuple(entry for entry in shelf.entries if entry.position.generation in chosen)
+            restorable = [position for position in shelf.positions() if position.generation in chosen]
+            kept = self._write_aside(component, restorable[-1]) if restorable else None
+            self._remove(component, gone)
+            return kept
+
+    def _write_aside(self, component: str, position: Position) -> Path:
+        folded = self.load(component, position)
+        final = self._root / ASIDE_FOLDER / f"{folder_name(component)}-{file_name(header_of(folded))}"
+        self._files.write(final, lambda file: format.encode(folded, file))
+        begin = f"{folder_name(component)}-"
+        with disk_trouble(f"remove what was set aside of {component}"):
+            names = (path.name for path in final.parent.iterdir())
+            ours = sorted(name for name in names if name.startswith(begin) and len(name) == len(final.name))
+            for name in ours[:-ASIDE_LIMIT]:
+                self._files.remove(final.parent / name)
+        return final
+
+    def drop(self, component: str) -> None:
+        """Forget everything of a component; what was set aside stays."""
+        with self._change_of(component), self._lock:
+            self._remove(component, self._shelf(component).entries)
+            self._remove_damaged(component, lambda _: True)
+            self._history.forget(folder_name(component))
+            self._shelves.pop(component, None)
+            self._made_last.pop(component, None)
+            self._proofs.forget(component)
+
+    def collect_contents(self) -> int:
+        """Remove the brought files that no snapshot here names any more; how many bytes that were.
+
+        As long as one of the snapshots cannot be read nothing is removed: perhaps it names them.
+        """
+        with disk_trouble(f"look through {self._root}"):
+            paths = [path for folder in self._snapshot_folders() for path in folder.iterdir() if path.suffix in SUFFIXES]
+        named: dict[Path, frozenset[bytes]] = {}
+        for path in paths:
+            try:
+                named[path] = self._named.get(path) or frozenset(need.digest for need in needs(format.read_outline(path)))
+            except FormatError as error:
+                if path.exists():
+                    log.info("brought files are not tidied: %s", error)
+                    return 0
+        self._named = named
+        return self.contents.collect(frozenset().union(*named.values()))
+
+    def _snapshot_folders(self) -> list[Path]:
+        """Wherever a whole snapshot may lie: of components, set aside, kept for people."""
+        history = self._root / HISTORY_FOLDER
+        parents = (self._root, history) if history.is_dir() else (self._root,)
+        return [one for parent in parents for one in parent.iterdir() if one.is_dir() and one != self.contents.folder]
+
+    def close(self) -> None:
+        """Let another process have the store; nothing else may be called afterwards."""
+        os.close(self._lock_descriptor)
+
+    # The disk
+
+    def _remove(self, component: str, entries: tuple[Entry, ...], taken: Callable[[Path], bool] = lambda _: False) -> None:
+        """Remove files, the youngest first: what is left at any instant is whole chains.
+
+        Args:
+            taken: whether somebody else has taken a whole checkpoint's file to keep it.
+        """
+        with disk_trouble(f"remove snapshots of {component}"):
+            for entry in sorted(entries, key=lambda entry: entry.order, reverse=True):
+                with self._lock:
+                    self._shelves[component] = self._shelf(component).without((entry,))
+                if entry.parent is None and taken(entry.path):
+                    continue
+                self._files.remove(entry.path)  # who opens a chain has opened it, or does not know this file any more
+
+    def _remove_damaged(self, component: str, is_old: Callable[[Path], bool]) -> None:
+        with disk_trouble(f"remove damaged snapshots of {component}"):
+            self._files.remove_damaged(self._root / folder_name(component), is_old)
+
+    def _set_out_of_use(self, component: str, entry: Entry, why: str) -> None:
+        """Never offer this file again; it stays where it is, for whoever wants to look, until it is pruned."""
+        with self._lock:
+            shelf = self._shelf(component)
+            if entry in shelf.entries:
+                self._files.set_out_of_use(entry.path)
+            self._shelves[component] = shelf.without((entry,))
+            self._proofs.forget(component)
+            newest = self.newest(component)
+            self._notice(f"{why}; going back to position {place(newest)}" if newest else f"{why}; nothing older is intact")
+
+    def _notice(self, sentence: str) -> None:
+        self.notices.append(sentence)
+        del self.notices[:-NOTICES_KEPT]
+        log.warning("%s", sentence)
+
+    def _shelf(self, component: str) -> Shelf:
+        return self._shelves.get(component) or Shelf(component)
+
+    # Opening
+
+    def read_folders(self) -> None:
+        """Find out what is there: remove leftovers, verify every file, keep what is intact."""
+        with disk_trouble(f"read the store {self._root}"):
+            for folder in sorted(self._root.iterdir()):
+                if folder.is_dir():
+                    self._read_folder(folder)
+            self._history.read()
+        self.contents.mend()
+
+    def _read_folder(self, folder: Path) -> None:
+        for path in sorted(folder.iterdir()):
+            if path.name.startswith(TEMPORARY_PREFIX):
+                self._files.remove(path)
+                self._notice(f"{path} had not arrived whole and was removed")
+            elif folder.name.startswith(FOLDER_PREFIX) and path.suffix in SUFFIXES:
+                self._read_file(path)
+
+    def _read_file(self, path: Path) -> None:
+        if why := why_not_ours(path.lstat()):
+            self._notice(f"{path}: {why}; it is not used")
+            return
+        try:
+            header = format.verify(path)
+        except FormatError as error:
+            self._files.set_out_of_use(path)
+            self._notice(f"{error}; it is not used")
+            return
+        if (path.parent.name, path.name) != (folder_name(header.component), file_name(header)):
+            self._notice(f"{path} holds {place(header.position)} of {header.component}, which is not its name; it is not used")
+            return
+        stored = path.stat()
+        entry = Entry(path, header.position, header.parent, header.epoch, stored.st_size, stored.st_mtime)
+        self._shelves[header.component] = self._shelf(header.component).with_entry(entry)
+
+
+def open_store(
+    root: Path, disk: Disk | None = None, retention: Retention = NOTHING_OLD, budget: PageBudget | None = None
+) -> Store:
+    """Open a store, or make an empty one; removes leftovers and verifies what is there.
+
+    Args:
+        retention: what is kept for people besides what is needed; nothing.
+        budget: for pages that are remembered to prove deltas by; others are read from the files.
+
+    Raises:
+        StoreError: another process has it open, or the folder cannot be used.
+    """
+    disk = disk or Disk()
+    try:
+        if not root.is_dir():
+            root.parent.mkdir(parents=True, exist_ok=True)
+            disk.make_folder(root)
+            disk.sync_folder(root.parent)
+        if why := why_not_ours(root.stat()):
+            raise StoreError(f"cannot open the store {root}: {why}; give it to this user alone (chown, chmod go-w)")
+        lock = lock_exclusively(root / LOCK_NAME)
+    except OSError as error:
+        raise StoreError(f"cannot open the store {root}: {error.strerror}; it must be a folder that we may write") from error
+    if lock is None:
+        raise StoreError(f"cannot open the store {root}: another process has it open; one agent uses one store")
+    store = Store(root, disk, lock, retention, budget or PageBudget(CACHE_SIZE))
+    try:
+        store.read_folders()
+    except StoreError:
+        store.close()
+        raise
+    return store
+
+
+def why_not_ours(about: os.stat_result) -> str:
+    """Why a file or folder of a store may be another user's word; "" if it is ours or root's alone.
+
+    A restore gives a program the rights that its snapshot says.
+    """
+    if about.st_uid not in (os.geteuid(), 0):
+        return f"it belongs to uid {about.st_uid}"
+    if stat.S_ISLNK(about.st_mode):
+        return "it is a symbolic link"
+    return f"others may write to it (mode {stat.S_IMODE(about.st_mode):o})" if about.st_mode & 0o022 else ""
+
+
+def _entry_of(path: Path, snapshot: Snapshot, size: int) -> Entry:
+    return Entry(path, snapshot.position, snapshot.parent, snapshot.epoch, size, time.time())
+
+
+def _held_at_once(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
+    """The beginning of a chain, with one delta at least, whose deltas' pages may be held together; files hold them compressed."""
+    sizes = [_pages_size(entry) for entry in entries]
+    limit = max(FOLDED_AT_ONCE_SIZE, int(FOLD_DELTA_PART * sizes[0]))
+    count = sum(total <= limit for total in accumulate(sizes[1:]))
+    return entries[: 1 + max(count, 1)]
+
+
+def _pages_size(entry: Entry) -> int:
+    """Bytes of the pages that a file tells; 0 where it is damaged, as whoever reads it will find."""
+    try:
+        return format.read_header(entry.path).contents_size
+    except FormatError:
+        return 0
+
+
+def _newest_output(output: tuple[OutputPiece, ...]) -> tuple[OutputPiece, ...]:
+    """The end of each stream, so that a base that was folded a thousand times does not carry all that was ever written."""
+    ends = {piece.stream: piece.offset + len(piece.content) for piece in output}
+    return tuple(
+        _cut(piece, ends[piece.stream] - FOLDED_OUTPUT_SIZE)
+        for piece in output
+        if piece.offset + len(piece.content) >= ends[piece.stream] - FOLDED_OUTPUT_SIZE
+    )
+
+
+def _cut(piece: OutputPiece, first: int) -> OutputPiece:
+    """The part of a piece from an offset of its stream on."""
+    skipped = max(0, first - piece.offset)
+    return replace(piece, offset=piece.offset + skipped, content=piece.content[skipped:])

@@ -1,0 +1,75 @@
+"""One bound for the memory in which all of a robot's streams remember pages (`checkpoint.store.xor_cache`), shared by need.
+
+Who needs little has all of it; what is left the others share equally. Nobody is given what another one still holds: who is to
+have less gives it up when its next snapshot comes, so that the whole never holds more than the bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from threading import Lock
+from typing import Final
+
+from msgspec import Struct
+
+PARTS: Final = 256
+"""Of the bound: shares are a number of these, for to change one is to copy it."""
+
+
+class _User(Struct):
+    """Bytes: ``wanted``, 0 as long as that is not known; ``granted``; ``held`` when it was told last."""
+
+    wanted: int = 0
+    granted: int = 0
+    held: int = 0
+
+
+class PageBudget:
+    """Who has how much. From any thread.
+
+    Args:
+        limit: bytes for all together.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self._grain = max(limit // PARTS, 1)
+        self._users: dict[str, _User] = {}
+        self._lock = Lock()
+
+    @property
+    def held(self) -> int:
+        """Bytes that are held now, by all."""
+        with self._lock:
+            return sum(user.held for user in self._users.values())
+
+    def share(self, name: str, wanted: int, held: int) -> int:
+        """How many bytes one may hold from now on.
+
+        Args:
+            wanted: what it would hold if it had room; 0: not known yet, then it has what is free, and takes from nobody.
+            held: what it holds.
+        """
+        with self._lock:
+            user = self._users.setdefault(name, _User())
+            user.held = held
+            user.wanted = 1 << (max(wanted, self._grain) - 1).bit_length() if wanted else 0  # few steps, so that shares stay
+            free = self.limit - sum(other.granted for other in self._users.values() if other is not user)
+            wants = {one: other.wanted for one, other in self._users.items()}
+            fair = shares(self.limit, wants)[name] if wanted else self.limit
+            user.granted = max(min(fair, free), 0) // self._grain * self._grain
+            return user.granted
+
+    def leave(self, name: str) -> None:
+        """It holds nothing any more."""
+        with self._lock:
+            self._users.pop(name, None)
+
+
+def shares(limit: int, wants: Mapping[str, int]) -> dict[str, int]:
+    """What each gets: all that it wants, or as much as everybody else who does not get that."""
+    left, given = limit, {}
+    for count, name in zip(range(len(wants), 0, -1), sorted(wants, key=lambda name: wants[name]), strict=True):
+        given[name] = min(wants[name], left // count)
+        left -= given[name]
+    return given

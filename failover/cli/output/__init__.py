@@ -1,0 +1,1 @@
+"""What commands print: tables, colours, the tree of the team."""

@@ -1,0 +1,201 @@
+"""Drawing on a terminal or into a pipe (the only rich import, loaded when something is drawn in colour)."""
+
+from __future__ import annotations
+
+import codecs
+import json
+import re
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from failover.cli.output import team_tree
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+COLOURS: Final = {"good": "green", "warning": "yellow", "bad": "bold red", "quiet": "dim"}
+
+PICTURE_WIDTH: Final = 108
+"""Columns of a terminal that is saved as a picture."""
+
+GAP: Final = "  "
+"""Between two columns of a plain table."""
+
+
+NARROW: Final = 80
+"""Columns of a terminal below which a table's cells would be torn apart; the tree is told line by line then."""
+
+ASCII: Final = str.maketrans({"└": "`", "├": "|", "─": "-", "–": "-", "…": "~"})
+"""For a terminal or a file that is not in UTF-8."""
+
+
+def spoken(text: str) -> str:
+    """The text in characters that standard output has."""
+    encoding = codecs.lookup(getattr(sys.stdout, "encoding", None) or "ascii").name
+    return text if encoding.startswith("utf") else text.translate(ASCII).encode(encoding, "replace").decode(encoding)
+
+
+def is_terminal() -> bool:
+    """Whether standard output is looked at by a person."""
+    return sys.stdout.isatty()
+
+
+def json_text(value: Any) -> str:
+    """One JSON object on one line; bytes as hexadecimal."""
+    return json.dumps(
+        value, ensure_ascii=False, default=lambda odd: odd.hex() if isinstance(odd, bytes | bytearray) else str(odd)
+    )
+
+
+def as_json(value: Any) -> None:
+    """Print one JSON object on a line of its own, at once."""
+    print(json_text(value), flush=True)
+
+
+def plain_table(columns: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """Columns aligned by spaces; a column that is empty throughout is left out."""
+    cells = [tuple(columns), *(tuple(line) for line in lines)]
+    kept = [index for index in range(len(columns)) if any(line[index] for line in cells[1:])]
+    widths = {index: max(len(line[index]) for line in cells) for index in kept}
+    return "\n".join(GAP.join(line[index].ljust(widths[index]) for index in kept).rstrip() for line in cells)
+
+
+def table(columns: Sequence[str], lines: Sequence[Sequence[str]], title: str = "") -> None:
+    """Print a table: framed on a terminal, aligned elsewhere."""
+    if is_terminal():
+        _console().print(_rich_table(columns, [(line, "") for line in lines], title))
+        return
+    if title:
+        print(title)
+    print(plain_table(columns, lines))
+
+
+def tree(status: dict[str, Any]) -> None:
+    """Print the team once."""
+    if is_terminal():
+        _console().print(_rich_tree(status))
+    else:
+        print(spoken(plain_tree(status)))
+
+
+def plain_tree(status: dict[str, Any]) -> str:
+    """The team as aligned text."""
+    lines = [plain_table(team_tree.COLUMNS, [row.cells for row in team_tree.rows(status)])]
+    lines += team_tree.promises(status)
+    lines += team_tree.kept(status)
+    lines += team_tree.memory(status)
+    if status.get("fencing"):
+        lines.append(f"fencing: {status['fencing']}")
+    return "\n".join([*lines, *(f"note: {line}" for line in team_tree.remarks(status))])
+
+
+def live_tree() -> AbstractContextManager[Callable[[dict[str, Any]], None]]:
+    """A picture that is drawn again and again: in place on a terminal, one below the other elsewhere."""
+    if is_terminal():
+        return _LiveTree()
+    return nullcontext(lambda status: print(spoken(plain_tree(status)), end="\n\n", flush=True))
+
+
+class _LiveTree:
+    """The team, redrawn in place."""
+
+    def __enter__(self) -> Callable[[dict[str, Any]], None]:
+        from rich.live import Live
+
+        self._live = Live(console=_console(), auto_refresh=False)
+        self._live.__enter__()
+        return lambda status: self._live.update(_rich_tree(status), refresh=True)
+
+    def __exit__(self, *reason: Any) -> None:
+        self._live.__exit__(*reason)
+
+
+class LiveBoard:
+    """A table and a progress bar that are redrawn in place, with lines of text that scroll above them. For terminals."""
+
+    def __enter__(self) -> LiveBoard:
+        from rich.live import Live
+
+        self._live = Live(console=_console(), auto_refresh=False, transient=True)
+        self._live.__enter__()
+        return self
+
+    def __exit__(self, *reason: Any) -> None:
+        self._live.__exit__(*reason)
+
+    def say(self, text: str) -> None:
+        """Let a line scroll by above the table."""
+        self._live.console.print(text, markup=False)
+
+    def draw(self, columns: Sequence[str], lines: Sequence[Sequence[str]], share: float, caption: str) -> None:
+        """Redraw; ``share`` is the part of the whole that is done, 0 to 1."""
+        from rich.console import Group
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+
+        bar = Table.grid(padding=(0, 1))
+        bar.add_row(ProgressBar(total=1.0, completed=min(share, 1.0), width=40), f"{min(share, 1.0):4.0%}", caption)
+        self._live.update(Group(_rich_table(columns, [(line, "") for line in lines]), bar), refresh=True)
+
+
+def save_picture(path: str, command: str, lines: Sequence[str], columns: Sequence[str], cells: Sequence[Sequence[str]]) -> None:
+    """Write what a terminal showed, some lines and a table, as an SVG picture."""
+    import io
+
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(record=True, file=io.StringIO(), width=PICTURE_WIDTH, force_terminal=True, highlight=False)
+    console.print(Text(f"$ {command}", style="bold"))
+    for line in lines:
+        console.print(Text(line))
+    console.print(_rich_table(columns, [(line, "") for line in cells]))
+    picture_text = re.sub(r"@font-face \{.*?\}\s*", "", console.export_svg(title=command), flags=re.DOTALL)  # no fonts from afar
+    Path(path).write_text(picture_text)
+
+
+def _console() -> Console:
+    from rich.console import Console
+
+    return Console(highlight=False)
+
+
+def _rich_tree(status: dict[str, Any]) -> Any:
+    from rich.console import Group
+    from rich.text import Text
+
+    lines = [(tuple(map(spoken, row.cells)), COLOURS[row.mood]) for row in team_tree.rows(status)]
+    if _console().width < NARROW:
+        parts: list[Any] = [Text(line, style=style) for cells, style in lines for line in _stacked(cells)]
+    else:
+        parts = [_rich_table(team_tree.COLUMNS, lines, f"team {status.get('team') or ''}".strip())]
+    parts += [Text(spoken(line), style="bold") for line in team_tree.promises(status)]
+    parts += [Text(spoken(line)) for line in team_tree.kept(status)]
+    parts += [Text(spoken(line), style="dim") for line in team_tree.memory(status)]
+    if status.get("fencing"):
+        parts.append(Text(spoken(f"fencing: {status['fencing']}"), style="dim"))
+    return Group(*parts, *(Text(spoken(line), style="yellow") for line in team_tree.remarks(status)))
+
+
+def _stacked(cells: Sequence[str]) -> list[str]:
+    """One row of the tree for a narrow terminal: its name, and below it what is known, with the columns' names."""
+    told = [f"{column} {cell}" for column, cell in zip(team_tree.COLUMNS[1:], cells[1:], strict=True) if cell.strip(" -–")]
+    return [cells[0], *([f"     {', '.join(told)}"] if told else [])]
+
+
+def _rich_table(columns: Sequence[str], lines: Sequence[tuple[Sequence[str], str]], title: str = "") -> Table:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    kept = [index for index in range(len(columns)) if any(line[index] for line, _ in lines)]
+    drawn = Table(title=title or None, title_justify="left", box=box.ROUNDED, border_style="dim", header_style="bold")
+    for index in kept:
+        drawn.add_column(columns[index], no_wrap=index == 0)
+    for line, style in lines:
+        drawn.add_row(*(Text(line[index], style=style) for index in kept))
+    return drawn

@@ -1,0 +1,248 @@
+"""The team as rows of a tree: what ``failover status`` shows, without saying how it is drawn.
+
+Pure: the agent's answer in (see `failover.client.control.STATUS`), rows of text out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, Literal
+
+from msgspec import Struct
+
+from failover.client.health import BAD_STATES as BAD_STATES
+from failover.client.health import OVER_STATES, is_lacking, is_unknown, is_unprotected, sight
+from failover.client.health import is_healthy as is_healthy
+
+Mood = Literal["good", "warning", "bad", "quiet"]
+
+COLUMNS: Final = ("", "role", "state", "engine", "epoch", "lag", "freeze", "standby", "links")
+
+UNSETTLED_STATES: Final = frozenset({"starting", "restoring", "held", "frozen"})
+
+
+class Row(Struct, frozen=True):
+    """One line of the tree; ``cells`` are in the order of `COLUMNS`."""
+
+    cells: tuple[str, ...]
+    mood: Mood
+
+
+def milliseconds(value: float | None) -> str:
+    """98 ms, 4.2 s, 7 min; "–" when it is not known."""
+    if value is None:
+        return "–"
+    if value < 1000:
+        return f"{value:.0f} ms"
+    return f"{value / 1000:.1f} s" if value < 120_000 else f"{value / 60_000:.0f} min"
+
+
+def ago(value: float | None) -> str:
+    """14 s ago."""
+    return f"{milliseconds(round(value, -3) if value and value >= 10_000 else value).replace('.0 s', ' s')} ago"
+
+
+def microseconds(value: float | None) -> str:
+    """A freeze time: always in milliseconds, to a hundredth."""
+    return "–" if value is None else f"{value / 1000:.2f} ms"
+
+
+def size(value: float | None) -> str:
+    """12 B, 3.4 KB, 105.0 MB (powers of ten)."""
+    if value is None:
+        return "–"
+    for unit in ("B", "KB", "MB"):
+        if value < 1000:
+            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
+        value /= 1000
+    return f"{value:.1f} GB"
+
+
+def rows(status: Mapping[str, Any]) -> tuple[Row, ...]:
+    """The team's tree, from one agent's answer: robots, below each the components that it is primary of."""
+    robots = [(status["robot"], None), *((peer["name"], peer) for peer in status["peers"])]
+    components = [seen for seen in map(sight, status["components"]) if seen.get("state") != "released"]
+    found: list[Row] = []
+    for name, peer in sorted(robots, key=lambda robot: robot[1] is not None):
+        found.append(_robot_row(status, name, peer))
+        own = [component for component in components if component.get("primary") == name]
+        found += _branch(own, "")
+    orphans = [component for component in components if component.get("primary") not in {name for name, _ in robots}]
+    if orphans:
+        found.append(Row(("nobody", *[""] * (len(COLUMNS) - 1)), "bad"))
+        found += _branch(orphans, "")
+    return tuple(found)
+
+
+def _robot_row(status: Mapping[str, Any], name: str, peer: Mapping[str, Any] | None) -> Row:
+    if peer is None:
+        return Row((f"{name} (here)", str(status.get("role") or ""), "live", "", "", "", "", "", _lanes(status)), "good")
+    state = peer["state"]
+    lost = peer.get("beats_lost")
+    links = ", ".join(part for part in (peer.get("lane") or "", f"{lost} beat{'s' * (lost > 1)} lost" if lost else "") if part)
+    mood: Mood = "good" if state == "live" else "bad" if state == "dead" else "warning"
+    return Row((name, str(peer.get("role") or ""), state, "", "", "", "", "", links), mood)
+
+
+def _lanes(status: Mapping[str, Any]) -> str:
+    peers = status["peers"]
+    connected = sum(peer.get("lane") == "connected" for peer in peers)
+    refused = sum((status.get("beats") or {}).get("refused", {}).values())
+    lanes = f"{connected} of {len(peers)} connected" if peers else "no peers"
+    return lanes + (f", {refused} beats refused" if refused else "")
+
+
+def _branch(components: Sequence[Mapping[str, Any]], indent: str) -> list[Row]:
+    ordered = sorted(components, key=lambda component: str(component["name"]))
+    return [_component_row(component, f"{indent}{'└─' if component is ordered[-1] else '├─'} ") for component in ordered]
+
+
+def _component_row(component: Mapping[str, Any], branch: str) -> Row:
+    is_frozen = component.get("engine") != "cooperative"
+    freeze = microseconds(component.get("freeze_us")) if is_frozen else "never"
+    worst = component.get("freeze_us_max")
+    if worst and is_frozen:
+        freeze += f" (max {worst / 1000:.2f})"
+    cells = (
+        branch + str(component["name"]),
+        str(component.get("role") or ""),
+        _state(component),
+        str(component.get("engine") or ""),
+        str(component.get("epoch") or ""),
+        milliseconds(component.get("lag_ms")),
+        freeze,
+        _standby(component),
+        "",
+    )
+    return Row(cells, mood_of(component))
+
+
+def _standby(component: Mapping[str, Any]) -> str:
+    """Who goes on with it; whether its program waits there already, where one can."""
+    standby, warm = component.get("standby"), component.get("warm")
+    if not standby or warm is None:
+        return f"{standby or 'none'}{', ready' if component.get('ready') else ''}"
+    return f"{standby}, {'warm' if warm else 'cold'}"
+
+
+def _state(component: Mapping[str, Any]) -> str:
+    status = component.get("exit_status")
+    if component.get("state") == "ended" and status is not None:
+        return f"ended ({ending(status)})"
+    if component.get("state") == "running" and is_unprotected(component):
+        return "running, unprotected"
+    if component.get("state") == "running" and component.get("commit_overdue"):
+        return f"running, last commit {ago(component.get('commit_age_ms'))}"
+    return str(component.get("state") or "")
+
+
+def ending(wait_status: int) -> str:
+    """A wait status in words: exit 0, signal 9."""
+    number = wait_status & 0x7F
+    return f"signal {number}" if number else f"exit {(wait_status >> 8) & 0xFF}"
+
+
+def mood_of(component: Mapping[str, Any]) -> Mood:
+    """How one component is doing."""
+    state = component.get("state")
+    if state in BAD_STATES:
+        return "bad"
+    if state in OVER_STATES:
+        return "quiet"
+    doubtful = not component.get("standby") or is_unprotected(component) or component.get("commit_overdue")
+    return "warning" if state in UNSETTLED_STATES or doubtful else "good"
+
+
+def promises(status: Mapping[str, Any]) -> tuple[str, ...]:
+    """What holds now: for the team, and for the components for which something else holds."""
+    found = [f"promise: {status['promise']}"] if status.get("promise") else []
+    for component in map(sight, status["components"]):
+        if component.get("promise_differs") and component.get("promise"):
+            found.append(f"promise for {component['name']}: {component['promise']}")
+    return tuple(found)
+
+
+def kept(status: Mapping[str, Any]) -> tuple[str, ...]:
+    """What a server keeps, for whom, how much, how old."""
+    if status.get("role") != "server":
+        return ()
+    return tuple(_kept_line(component) for component in status["components"] if component.get("kept"))
+
+
+def _kept_line(component: Mapping[str, Any]) -> str:
+    found = component["kept"]
+    older = f" and {found['older']} older" if found["older"] else ""
+    ages = f"{milliseconds(found['newest_age_s'] * 1_000)} to {span(found['oldest_age_s'])} old"
+    whose = component.get("primary") or "whoever can run it"
+    return f"kept for {whose}: {component['name']}, {found['checkpoints']} checkpoints{older}, {size(found['size'])}, {ages}"
+
+
+def span(seconds: float) -> str:
+    """98 ms, 4.2 s, 7 min, 5 h, 3 d."""
+    if seconds < HOURS_FROM_S:
+        return milliseconds(seconds * 1_000)
+    return f"{seconds / 3_600:.0f} h" if seconds < DAYS_FROM_S else f"{seconds / 86_400:.0f} d"
+
+
+HOURS_FROM_S: Final = 2 * 3_600
+DAYS_FROM_S: Final = 2 * 86_400
+
+
+def memory(status: Mapping[str, Any]) -> tuple[str, ...]:
+    """What the agent takes of this robot's memory, and what bounds that."""
+    found = status.get("memory")
+    if not found:
+        return ()
+    remembered = f"{size(found['remembered'])} of {size(found['remembered_max'])} remember pages (xor_cache)"
+    return (f"memory: agent {size(found['agent'])}, keepers {size(found['keepers'])}; of both {remembered}",)
+
+
+def remarks(status: Mapping[str, Any]) -> tuple[str, ...]:
+    """What stands below the tree: reasons, promises that do not hold, and notes, each a sentence said once."""
+    found: list[str] = []
+    for component in status["components"]:
+        if sight(component).get("state") != "released":
+            found += _remarks_on(component)
+    found += [f"{peer['name']}: {line}" for peer in status["peers"] for line in peer.get("notes") or ()]
+    forged = {reason: count for reason, count in (status.get("beats") or {}).get("refused", {}).items() if reason not in PASSING}
+    if forged:
+        found.append("beats were refused: " + ", ".join(f"{reason} ({count})" for reason, count in sorted(forged.items())))
+    if status.get("insecure"):
+        found.append("links are neither authenticated nor encrypted (insecure = true)")
+    return tuple(found) + tuple(status.get("notes") or ())
+
+
+def _remarks_on(component: Mapping[str, Any]) -> list[str]:
+    """Of one component, from every robot that was asked; a reason that a note contains is not said again."""
+    sights = {"": component, **(component.get("elsewhere") or {})}
+    if component.get("state") in ("ended", "failed"):
+        sights = {"": sight(component)}
+    lines: list[str] = []
+    for robot, seen in sights.items():
+        notes = [str(line) for line in seen.get("notes") or ()]
+        reasons = [str(line) for line in seen.get("reasons") or ()]
+        said = notes + lines
+        lines += [f"{robot}: {line}" if robot else line for line in notes if line not in lines]
+        lines += [line for line in reasons[:REASONS_SHOWN] if not any(line in other for other in said)]
+    seen = sight(component)
+    if is_unknown(seen) and component.get("elsewhere") is not None:
+        lines.append(_unknown(seen))
+    wanting = seen.get("state") == "degraded" or is_unprotected(seen)
+    if seen.get("promise") and not seen.get("promise_differs") and wanting and not is_lacking(seen):
+        lines.append(str(seen["promise"]))
+    return [f"{component['name']}: {line}" for line in lines]
+
+
+def _unknown(seen: Mapping[str, Any]) -> str:
+    """Where it should run, and that no answer came from there."""
+    primary = seen.get("primary")
+    if primary:
+        return f"{primary}, where it runs, has not answered: whether it is protected now is not known; ask there, or look again"
+    return "no robot that answered runs it; failover why tells what was decided"
+
+
+PASSING: Final = frozenset({"unknown key", "seen before, or too old", "from an earlier life of its sender"})
+"""Why a beat may be refused also when all is well: a robot has just started, or is heard on two links at once."""
+
+REASONS_SHOWN: Final = 8
+"""Of a component that cannot be captured; ``--json`` has them all."""

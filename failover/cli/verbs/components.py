@@ -1,0 +1,308 @@
+"""run, protect, release, stop, logs, handover, failback, promote, prefer: what is done with one component."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, Final
+
+from failover.cli.arguments import HOOKS
+from failover.cli.connection import connect
+from failover.cli.output import render, team_tree
+from failover.client.control import Control, Output, Result, Update
+from failover.errors import AgentRefusedError, FailoverError, LostAgentError, NoAgentError
+
+RECONNECT_S: Final = 30.0
+"""How long ``failover run`` waits for its agent to come back: a restart takes a second, an upgrade some more."""
+
+RECONNECT_EVERY_S: Final = 0.2
+
+
+# --- run -------------------------------------------------------------------------------------------------------------
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Start a program under protection; its output and exit status become ours."""
+    wanted: dict[str, Any] = {"argv": arguments.command, "env": dict(os.environ), "cwd": os.getcwd(), "umask": _umask()}
+    wanted |= {"engine": arguments.engine, "isolate": arguments.isolate, "wait": not arguments.detach}
+    wanted |= {"output": arguments.output, "hooks": {kind: getattr(arguments, kind) for kind in HOOKS}}
+    wanted["portable"] = arguments.portable
+    wanted |= {"carry": [os.path.realpath(path) for path in arguments.carry], "devices": dict(arguments.devices)}
+    wanted |= {"connections": arguments.connections, "shared": [os.path.realpath(path) for path in arguments.shared]}
+    if arguments.name:
+        wanted["name"] = arguments.name
+    if arguments.user:
+        wanted["user"] = arguments.user
+    follower = _Follower(arguments)
+    with connect(arguments) as agent:
+        if arguments.detach:
+            return _started(agent.ask("run", **wanted), arguments)
+        with follower.passing_signals_on():
+            return exit_like(follower.follow(agent, wanted))
+
+
+def _started(answer: dict[str, Any], arguments: argparse.Namespace) -> int:
+    started = answer.get("started", answer)
+    if arguments.json:
+        render.as_json(started)
+    else:
+        print(started["name"])
+        _notes(started)
+    return 0
+
+
+class _Follower:
+    """Shows one component's output until it ends, through restarts of the agent.
+
+    The component lives outside the agent, so an agent that goes away is waited for, and the output goes on where it stopped.
+    """
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        self._arguments = arguments
+        self._offsets = [0, 0]
+        self._name = ""
+
+    def follow(self, agent: Control, wanted: dict[str, Any]) -> int | None:
+        """Run and show; returns the wait status, None when it is not known."""
+        try:
+            return self._show(agent, "run", wanted)
+        except LostAgentError:
+            if not self._name:
+                raise
+        while True:
+            with reconnect(self._arguments, self._name) as agent:
+                try:
+                    return self._show(agent, "logs", {"name": self._name, "follow": True, "offsets": self._offsets})
+                except LostAgentError:
+                    continue
+
+    def _show(self, agent: Control, verb: str, wanted: dict[str, Any]) -> int | None:
+        for reply in agent.stream(verb, **wanted):
+            if isinstance(reply, Output):
+                write_output(reply)
+                self._offsets[reply.stream - 1] = reply.offset + len(reply.content)
+            elif isinstance(reply, Update):
+                self._begin(reply.value.get("started", {}))
+            else:
+                if reply.value.get("reason"):
+                    print(f"failover: {self._name}: {reply.value['reason']}", file=sys.stderr)
+                status: int | None = reply.value.get("exit_status")
+                return status
+        return None
+
+    def _begin(self, started: dict[str, Any]) -> None:
+        self._name = str(started.get("name", self._name))
+        if self._arguments.json:
+            print(render.json_text({"started": started}), file=sys.stderr, flush=True)
+        else:
+            _notes(started)
+
+    @contextmanager
+    def passing_signals_on(self) -> Iterator[None]:
+        """Ctrl-C and termination are the program's business: pass them on instead of leaving it behind."""
+        before = {number: signal.signal(number, self._pass_on) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+        try:
+            yield
+        finally:
+            for number, action in before.items():
+                signal.signal(number, action)
+
+    def _pass_on(self, number: int, _frame: FrameType | None) -> None:
+        if not self._name:  # nothing runs yet
+            raise KeyboardInterrupt
+        # A thread of its own: the agent answers when the program has ended, and we are in the middle of showing its output.
+        threading.Thread(target=self._ask_to_stop, args=(number,), daemon=True).start()
+
+    def _ask_to_stop(self, number: int) -> None:
+        try:
+            with connect(self._arguments) as agent:
+                agent.ask("stop", name=self._name, signal=number)
+        except FailoverError as error:
+            print(f"failover: {error}", file=sys.stderr)
+
+
+def reconnect(arguments: argparse.Namespace, name: str) -> Control:
+    """Wait for an agent that went away in the middle of a component's output.
+
+    Raises:
+        NoAgentError: it did not come back.
+    """
+    deadline = time.monotonic() + RECONNECT_S
+    while True:
+        try:
+            return connect(arguments)
+        except NoAgentError as error:
+            if time.monotonic() > deadline:
+                raise NoAgentError(
+                    f"the agent went away and did not come back within {RECONNECT_S:.0f} s; {name} runs on without it: "
+                    f"start failover-agent, then follow with: failover logs --follow {name}"
+                ) from error
+            time.sleep(RECONNECT_EVERY_S)
+
+
+def write_output(piece: Output) -> None:
+    """Pass a component's bytes on, unchanged, at once."""
+    stream = sys.stdout.buffer if piece.stream == 1 else sys.stderr.buffer
+    stream.write(piece.content)
+    stream.flush()
+
+
+def exit_like(wait_status: int | None) -> int:
+    """Our exit status for a program's wait status: its own, or 128 + the signal that ended it, as shells say it."""
+    if wait_status is None:
+        print("failover: the program has ended; how is not known", file=sys.stderr)
+        return 1
+    number = wait_status & 0x7F
+    return 128 + number if number else (wait_status >> 8) & 0xFF
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _notes(answer: dict[str, Any]) -> None:
+    for note in answer.get("notes") or ():
+        print(f"failover: note: {note}", file=sys.stderr)
+
+
+# --- The others: ask, and say what came of it ------------------------------------------------------------------------
+
+
+def protect(arguments: argparse.Namespace) -> int:
+    """Protect a process that runs already."""
+    name = arguments.name or f"pid-{arguments.pid}"
+    with connect(arguments) as agent:
+        carry = [os.path.realpath(path) for path in arguments.carry]
+        shared = [os.path.realpath(path) for path in arguments.shared]
+        rules = {"devices": dict(arguments.devices), "connections": arguments.connections, "shared": shared}
+        answer = agent.ask("protect", pid=arguments.pid, name=name, carry=carry, **rules)
+    return _tell(arguments, answer, f"pid {answer['pid']} is protected as {answer['name']}")
+
+
+def release(arguments: argparse.Namespace) -> int:
+    """Let a component go; its program runs on, unprotected."""
+    with connect(arguments) as agent:
+        answer = agent.ask("release", name=arguments.name)
+    what = "is forgotten" if answer["pid"] is None else f"runs on as pid {answer['pid']}, unprotected"
+    return _tell(arguments, answer, f"{answer['name']} {what}")
+
+
+def stop(arguments: argparse.Namespace) -> int:
+    """End a component's program; no robot runs it again."""
+    with connect(arguments) as agent:
+        answer = agent.ask("stop", name=arguments.name, signal=arguments.signal)
+    status = answer.get("exit_status")
+    return _tell(arguments, answer, f"{answer['name']} has ended" + ("" if status is None else f": {team_tree.ending(status)}"))
+
+
+def logs(arguments: argparse.Namespace) -> int:
+    """Show what a component wrote, from whichever robot it wrote it; with --follow through restarts of the agent."""
+    offsets = [0, 0]
+    agent = connect(arguments)
+    try:
+        while True:
+            try:
+                totals = _show_logs(agent, arguments, offsets)
+                break
+            except LostAgentError:
+                if not arguments.follow:
+                    raise
+                agent.close()
+                agent = reconnect(arguments, arguments.name)
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        agent.close()
+    if arguments.json:
+        render.as_json(totals)
+    return 0
+
+
+def _show_logs(agent: Control, arguments: argparse.Namespace, offsets: list[int]) -> dict[str, Any]:
+    """Show the streams from the offsets on, which move along; returns what the agent ends with."""
+    for reply in agent.stream("logs", name=arguments.name, follow=arguments.follow, offsets=offsets):
+        if isinstance(reply, Output):
+            _show_piece(arguments, reply)
+            offsets[reply.stream - 1] = reply.offset + len(reply.content)
+        elif isinstance(reply, Result):
+            return reply.value
+    return {}
+
+
+def _show_piece(arguments: argparse.Namespace, piece: Output) -> None:
+    if arguments.stream is not None and piece.stream != arguments.stream:
+        return
+    if arguments.json:
+        text = piece.content.decode(errors="surrogateescape")
+        render.as_json({"stream": piece.stream, "offset": piece.offset, "content": text})
+    else:
+        write_output(piece)
+
+
+def handover(arguments: argparse.Namespace) -> int:
+    """Move a component to another robot, planned: nothing is lost."""
+    with connect(arguments) as agent:
+        answer = agent.ask("handover", name=arguments.name, to=arguments.to or "")
+    return _tell(arguments, answer, _moved(answer))
+
+
+def failback(arguments: argparse.Namespace) -> int:
+    """Move a component back to where it belongs."""
+    with connect(arguments) as agent:
+        answer = agent.ask("failback", name=arguments.name)
+    return _tell(arguments, answer, _moved(answer))
+
+
+def _moved(answer: dict[str, Any]) -> str:
+    if not answer.get("moved", True):
+        return str(answer["sentence"])
+    return f"{answer['name']} runs on {answer['to']} now; the move took {answer['took_ms']:.0f} ms"
+
+
+def promote(arguments: argparse.Namespace) -> int:
+    """Have a robot run what nobody is heard to run, once whoever orders it knows what that risks."""
+    wanted = {"name": arguments.name, "robot": arguments.robot or ""}
+    with connect(arguments) as agent:
+        would = agent.ask("promote", **wanted)
+        wanted["robot"] = would["to"]
+        if not arguments.json:
+            print(f"failover: {would['sentence']}", *would["risks"], sep="\n  - ", file=sys.stderr)
+        if would["risks"] and not (arguments.yes or _agreed(f"promote {would['to']} all the same?")):
+            told = tuple(would["risks"]) if arguments.json else ()
+            raise AgentRefusedError(f"{would['name']} is left as it is; --yes promotes {would['to']} all the same", "Risk", told)
+        answer = agent.ask("promote", **wanted, sure=True)
+    answer["risks"] = would["risks"]
+    return _tell(arguments, answer, f"{answer['name']} runs on {answer['to']} now, epoch {answer['epoch']}")
+
+
+def _agreed(question: str) -> bool:
+    """Whether a person at the terminal says yes; without one nobody does."""
+    if not sys.stdin.isatty():
+        return False
+    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
+def prefer(arguments: argparse.Namespace) -> int:
+    """Say which robot should run a component."""
+    with connect(arguments) as agent:
+        answer = agent.ask("prefer", name=arguments.name, robot=arguments.robot)
+    return _tell(arguments, answer, f"{answer['name']} prefers {answer['robot']}")
+
+
+def _tell(arguments: argparse.Namespace, answer: dict[str, Any], sentence: str) -> int:
+    if arguments.json:
+        render.as_json(answer)
+    else:
+        print(sentence)
+        _notes(answer)
+    return 0

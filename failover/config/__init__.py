@@ -1,0 +1,1 @@
+"""What people write: TOML files, spans and sizes, the team file."""

@@ -1,0 +1,203 @@
+"""The team directory: who belongs, where each robot listens, and by which key it is known.
+
+::
+
+    team.toml            the same on every robot; nothing secret in it
+    keys/ROBOT.secret    that robot's own secret key, 0600; only on that robot
+
+`failover team create` begins one, `enrol` adds a robot, and the operator carries team.toml to the others. Keys are CURVE
+keys (Curve25519, 32 bytes) written as 40 characters of Z85. Source: rfc.zeromq.org/spec/32.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final, Literal
+
+from failover.config import strict_toml
+from failover.core.wire import names
+from failover.errors import NameFormatError, TeamFileError
+
+Role = Literal["robot", "server", "witness"]
+"""Robots run components; servers keep checkpoints and vote; witnesses vote."""
+
+TEAM_FILE: Final = "team.toml"
+KEY_CHARACTERS: Final = 40
+Z85: Final = "0123456789abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ.-:+=^!/*?&<>()[]{}@%$#"
+DEFAULT_BEAT_PORT: Final = 7420
+DEFAULT_BULK_PORT: Final = 7421
+ROBOT_LIMIT: Final = 64
+"""Robots of one team: each beats to each, so the traffic grows with the square."""
+
+_ODD = re.compile(r"[:\"\\.]")
+"""Not in a robot's name: it is the name of a file, a word of TOML, and stands before addresses."""
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """One member.
+
+    Attributes:
+        role: robot: runs components and protects those of others; server: keeps checkpoints of all; witness: votes only.
+        beats: "host:port" for each of its links; beats go to all of them.
+        bulk: "host:port" on the wired link, for snapshots.
+        public_key: Z85, or "" in a team without keys.
+    """
+
+    beats: tuple[str, ...]
+    bulk: str
+    role: Role = "robot"
+    public_key: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Team:
+    """The members, by name."""
+
+    team: str
+    robots: dict[str, Robot] = field(default_factory=dict)
+
+
+def read(directory: Path) -> Team:
+    """Read the team file.
+
+    Raises:
+        FileMistakeError: it is mistaken; names the line.
+        TeamFileError: it is missing, or its content makes no team.
+    """
+    path = directory / TEAM_FILE
+    if not path.exists():
+        raise TeamFileError(f"{path}: there is no such file; failover team create makes one, or carry it here from another robot")
+    team = strict_toml.read(path, Team)
+    if len(team.robots) > ROBOT_LIMIT:
+        raise TeamFileError(f"{path}: {len(team.robots)} robots are over the limit of {ROBOT_LIMIT}")
+    for name, robot in team.robots.items():
+        check_robot(str(path), name, robot)
+    return team
+
+
+def check_robot(where: str, name: str, robot: Robot) -> None:
+    """Refuse a name, an address or a key that could not work.
+
+    Raises:
+        TeamFileError: says which and why.
+    """
+    try:
+        names.check_robot(name)
+    except NameFormatError as error:
+        raise TeamFileError(f"{where}: {error}") from error
+    if _ODD.search(name):
+        raise TeamFileError(f'{where}: {name!r} cannot name a robot: it holds one of : . " and \\')
+    if not robot.beats:
+        raise TeamFileError(f"{where}: robot {name} has no beat address; give at least one host:port")
+    for address in (*robot.beats, robot.bulk):
+        split_address(address, f"{where}: robot {name}")
+    if robot.public_key and len(robot.public_key) != KEY_CHARACTERS:
+        raise TeamFileError(f"{where}: the public key of {name} has {len(robot.public_key)} characters, not {KEY_CHARACTERS}")
+    if not _is_z85(robot.public_key):
+        raise TeamFileError(f"{where}: the public key of {name} is not Z85: copy it again, every character of it")
+
+
+def _is_z85(text: str) -> bool:
+    """Whether groups of five characters are numbers of four bytes each. Source: rfc.zeromq.org/spec/32."""
+    digits = [Z85.find(character) for character in text]
+    values = (
+        sum(digit * 85 ** (4 - place) for place, digit in enumerate(digits[at : at + 5])) for at in range(0, len(digits), 5)
+    )
+    return -1 not in digits and all(value < 1 << 32 for value in values)
+
+
+def split_address(address: str, where: str) -> tuple[str, int]:
+    """("host", port) of "host:port" or "[v6]:port".
+
+    Raises:
+        TeamFileError: it is neither.
+    """
+    host, separator, port = address.rpartition(":")
+    if not separator or not host or not port.isdigit() or not 0 < int(port) < 1 << 16:
+        raise TeamFileError(f"{where}: {address!r} is no address; write host:port")
+    return host.strip("[]"), int(port)
+
+
+def for_lookup(host: str) -> str | bytes:
+    """A host as getaddrinfo is asked for it: a str would go through the codec of names, half a megabyte for good."""
+    return host.encode() if host.isascii() else host
+
+
+def write(directory: Path, team: Team) -> None:
+    """Write the team file whole: aside, then renamed."""
+    directory.mkdir(parents=True, exist_ok=True)
+    aside = directory / (TEAM_FILE + ".new")
+    aside.write_text(_as_toml(team))
+    aside.replace(directory / TEAM_FILE)
+
+
+def enrol(team: Team, name: str, robot: Robot) -> Team:
+    """The team with one more robot, or with that robot's entry replaced."""
+    check_robot("the new robot", name, robot)
+    return replace(team, robots={**team.robots, name: robot})
+
+
+def secret_key_path(directory: Path, robot: str) -> Path:
+    """Where a robot keeps its own secret key."""
+    return directory / "keys" / f"{robot}.secret"
+
+
+def write_secret_key(directory: Path, robot: str, secret: str) -> Path:
+    """Keep a secret key, 0600; an existing one is never overwritten.
+
+    Raises:
+        TeamFileError: there is one already, or it cannot be written.
+    """
+    path = secret_key_path(directory, robot)
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    except FileExistsError as error:
+        raise TeamFileError(f"{path} exists; a robot keeps its key. Remove it if {robot} shall have a new one") from error
+    except OSError as error:
+        raise TeamFileError(f"cannot write {path}: {error.strerror}") from error
+    with open(descriptor, "w") as file:
+        file.write(secret + "\n")
+    return path
+
+
+def read_secret_key(directory: Path, robot: str) -> str:
+    """This robot's secret key.
+
+    Raises:
+        TeamFileError: it is missing, others may read it, or it is no key.
+    """
+    path = secret_key_path(directory, robot)
+    try:
+        mode = path.stat().st_mode
+        secret = path.read_text().strip()
+    except OSError as error:
+        raise TeamFileError(
+            f"cannot read this robot's key {path}: {error.strerror}; failover team enrol {robot} makes one, or run without keys "
+            "by insecure = true"
+        ) from error
+    if mode & 0o077:
+        raise TeamFileError(f"{path} is open to others (mode {mode & 0o777:o}); run: chmod 600 {path}")
+    if len(secret) != KEY_CHARACTERS:
+        raise TeamFileError(f"{path} holds {len(secret)} characters; a key has {KEY_CHARACTERS}")
+    return secret
+
+
+def forget_secret_key(directory: Path, robot: str) -> None:
+    """Remove a secret key that was carried to its robot."""
+    with contextlib.suppress(FileNotFoundError):
+        secret_key_path(directory, robot).unlink()
+
+
+def _as_toml(team: Team) -> str:
+    lines = ["# The team: the same file on every robot. Nothing in it is secret.", f'team = "{team.team}"']
+    for name, robot in sorted(team.robots.items()):
+        beats = ", ".join(f'"{address}"' for address in robot.beats)
+        lines += ["", f'[robots."{name}"]', f'role = "{robot.role}"', f"beats = [{beats}]", f'bulk = "{robot.bulk}"']
+        lines += [f'public_key = "{robot.public_key}"'] if robot.public_key else []
+    return "\n".join(lines) + "\n"

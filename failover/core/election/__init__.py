@@ -1,0 +1,1 @@
+"""Who runs a component: consent of a pair, votes of a majority, leases."""

@@ -1,0 +1,112 @@
+"""How long a primary may act, and when it stands still.
+
+Invariant: while anybody else may start the component, it runs here only before ``lease_ns``, and the guard knows that instant.
+"""
+
+from __future__ import annotations
+
+from failover.core import acts
+from failover.core.component import Cause, Component, Turn
+from failover.core.election import majority
+from failover.core.election.consent import grants
+from failover.core.types import State
+
+TELL_SHARE = 4
+"""The guard is told of a new lease when it is longer by this part of a lease: not for every beat. Less is not worth a thaw."""
+
+ACTING = frozenset({State.PRIMARY, State.STARTING, State.RECOVERING, State.TAKING_OVER, State.HANDING_OVER})
+"""It runs here, or is about to: a restore may take longer than a lease, and so may the last snapshot of a handover."""
+
+RACE_SHARE = 16
+"""What the guard knows counts as over this part of a lease early: a longer one could reach it too late."""
+
+
+def watch(component: Component, turn: Turn) -> None:
+    """Count the lease anew; hold the component still when it is over, let it go on when it is back."""
+    ran_out = component.told_ns > 0 and turn.now_ns >= component.told_ns - turn.config.lease_ns // RACE_SHARE
+    component.lease_ns = counted_ns(component, turn)
+    over = on_lease(component, turn) and (ran_out or turn.now_ns >= component.lease_ns)
+    if component.state is State.PRIMARY and over:
+        component.move(Cause.LEASE_OVER)
+        component.stood = True
+        turn.order(acts.Freeze(component.name, component.epoch))
+        turn.say(component, f"{turn.me} {Cause.LEASE_OVER}")
+    if component.state is State.FROZEN and _may_thaw(component, turn):
+        component.move(Cause.LEASE_BACK)
+        component.told_ns = component.lease_ns
+        component.due_ns = turn.now_ns
+        turn.order(acts.Thaw(component.name, component.epoch, component.lease_ns))
+        turn.say(component, f"{turn.me} lets it run: it may act")
+    elif component.state in ACTING and not _has_given_way(component):
+        _tell(component, turn)
+    if _is_remembered(component, turn) and component.state is State.PRIMARY and _all_agree(component, turn):
+        component.stood = component.ordered = False
+
+
+def entrust(component: Component, turn: Turn, robot: str) -> bool:
+    """Name the robot that may take over; from now on this robot acts on leases. False when it does not hear us now."""
+    if robot in component.entrusted:
+        return True
+    peer = turn.team.peers.get(robot)
+    if peer is None or not grants(component, peer, turn.me) or turn.team.lease_ns(robot) <= turn.now_ns:
+        return False
+    component.entrusted = (*component.entrusted, robot)
+    component.lease_ns = component.told_ns = 0
+    watch(component, turn)
+    return True
+
+
+def counted_ns(component: Component, turn: Turn) -> int:
+    """Until when this robot may act; 0 where nobody else may start the component. What was granted once stays granted."""
+    if not on_lease(component, turn):
+        return 0
+    if turn.config.by_majority:
+        return max(component.lease_ns, majority.granted_ns(component, turn))
+    if not component.freezes:
+        return turn.now_ns + turn.config.lease_ns
+    return max(component.lease_ns, min(_granted_ns(component, turn, robot) for robot in component.entrusted))
+
+
+def first_ns(component: Component, turn: Turn) -> int:
+    """The lease that a program begins with: 0 only where it needs none; one that is over holds it still from the start."""
+    return max(counted_ns(component, turn), 1) if on_lease(component, turn) else 0
+
+
+def on_lease(component: Component, turn: Turn) -> bool:
+    """Whether anybody else may start the component."""
+    return turn.config.quorum > 1 if turn.config.by_majority else bool(component.entrusted)
+
+
+def _granted_ns(component: Component, turn: Turn, robot: str) -> int:
+    peer = turn.team.peers.get(robot)
+    return turn.team.lease_ns(robot) if peer is not None and grants(component, peer, turn.me) else 0
+
+
+def _is_remembered(component: Component, turn: Turn) -> bool:
+    """Whether there is something about this copy that counts where two meet again: until all peers have agreed to it."""
+    return component.stood or (component.ordered and not turn.config.by_majority)
+
+
+def _all_agree(component: Component, turn: Turn) -> bool:
+    """Whether every peer is heard, and consents: none of them runs another copy."""
+    return all(turn.alive(peer.robot) and grants(component, peer, turn.me) for peer in turn.team.peers.values())
+
+
+def _has_given_way(component: Component) -> bool:
+    """Whether another robot may claim the component: this copy, which is held still, needs no lease any more."""
+    return component.handing is not None and component.handing.yielded
+
+
+def _may_thaw(component: Component, turn: Turn) -> bool:
+    """Under majority and ``freeze`` a lease; otherwise everybody entrusted agrees by its newest word, or is dead."""
+    if component.freezes or turn.config.by_majority:
+        return not on_lease(component, turn) or turn.now_ns < component.lease_ns - turn.config.lease_ns // TELL_SHARE
+    heard = (turn.dead(robot) or _granted_ns(component, turn, robot) > turn.now_ns for robot in component.entrusted)
+    return all(heard)
+
+
+def _tell(component: Component, turn: Turn) -> None:
+    grown = component.lease_ns - component.told_ns >= turn.config.lease_ns // TELL_SHARE
+    if grown or (component.told_ns and not component.lease_ns):
+        component.told_ns = component.lease_ns
+        turn.order(acts.SetLease(component.name, component.epoch, component.lease_ns))

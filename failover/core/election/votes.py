@@ -1,0 +1,238 @@
+"""Who runs a component under the rule ``majority``: the same arrows as in ``election.py``, drawn by votes.
+
+``majority.py`` says who is free and for whom; this file claims, withdraws, follows, and answers rivals.
+"""
+
+from __future__ import annotations
+
+from checkpoint.model import Position
+from failover.core import acts
+from failover.core.component import Cause, Component, Turn
+from failover.core.election import majority
+from failover.core.election.consent import state_of
+from failover.core.election.pair import (
+    accept,
+    begin,
+    claim,
+    first_of_equals,
+    follow,
+    heard_end,
+    living_entries,
+    lose,
+    may_start_afresh,
+    refuse_request,
+    renew,
+    stronger,
+    vacant,
+)
+from failover.core.types import ENDED, HOLDING, MS, State
+from failover.core.wire.messages import ORDERED, Entry
+from failover.core.wire.names import weight
+
+WITHDRAWN_BEATS = 2
+"""Beats for each place in the order of names that a robot waits after a claim in vain: the next one finds no rival."""
+
+_SETTLED = frozenset({State.PRIMARY, State.FROZEN})
+
+
+def consider(component: Component, turn: Turn) -> None:
+    """Claim the component if it is vacant, a majority would agree, and this robot is the one to run it."""
+    if component.state not in (State.ABSENT, State.STANDBY) or turn.now_ns < component.retry_ns:
+        return
+    if component.is_exhausted or not turn.config.runs(turn.me) or not vacant(component, turn):
+        return
+    mine = component.newest
+    if _chosen(component, turn, mine) and majority.may_claim(component, turn, mine):
+        claim(component, turn, mine, "nobody runs it, and a majority is free to vote")
+
+
+def _chosen(component: Component, turn: Turn, mine: Position | None) -> bool:
+    entries = [one for one in living_entries(component, turn) if state_of(one[1]) not in HOLDING]
+    if mine is None:
+        first = all(_starts_before(component, turn.me, robot) for robot in majority.starters(component, turn))
+        is_nowhere = _newest_of(entries) is None and not _is_untold(component, turn)
+        return is_nowhere and first and may_start_afresh(component, turn)
+    best = _newest_of([one for one in entries if turn.config.runs(one[0])])
+    if (best is not None and mine < best) or _waits_for_a_server(component, turn, mine, _newest_of(entries)):
+        return False
+    return component.primary == turn.me if component.waits else first_of_equals(component, turn, entries, mine)
+
+
+def _newest_of(entries: list[tuple[str, Entry]]) -> Position | None:
+    return max((position for _, entry in entries if (position := entry.position)), default=None)
+
+
+def _is_untold(component: Component, turn: Turn) -> bool:
+    """Whether a server that lives has not said yet what it keeps of the component."""
+    return any(
+        peer.entry(component.name) is None and not peer.complete
+        for peer in turn.team.living(turn.now_ns)
+        if peer.robot in turn.config.servers
+    )
+
+
+def _waits_for_a_server(component: Component, turn: Turn, mine: Position, best: Position | None) -> bool:
+    """Whether a server may give us something newer: a standby has all that it can have, and nobody waits for it for ever."""
+    is_behind = (best is not None and mine < best) or _is_untold(component, turn)
+    if not is_behind or turn.me in component.entrusted:
+        component.behind_ns = 0
+        return False
+    component.behind_ns = component.behind_ns or turn.now_ns
+    return turn.now_ns < component.behind_ns + turn.config.ship_ms * MS
+
+
+def _starts_before(component: Component, one: str, other: str) -> bool:
+    prefer = component.rules.prefer
+    return (one != prefer, weight(one)) < (other != prefer, weight(other))
+
+
+def advance(component: Component, turn: Turn) -> None:
+    """A claim: go on once a majority has voted for it; withdraw it when that takes too long."""
+    if majority.won(component, turn):
+        _entrust_equal(component, turn)
+        begin(component, turn)
+    elif turn.now_ns >= component.until_ns:
+        withdraw(component, turn, "a majority did not vote for it")
+
+
+def _entrust_equal(component: Component, turn: Turn) -> None:
+    """A robot that holds the very checkpoint to be resumed from may use it should this one die before the next."""
+    for robot, entry in living_entries(component, turn):
+        equal = entry.position is not None and entry.position == component.plan
+        if equal and (entry.epoch, entry.primary) == (component.epoch, turn.me) and turn.config.runs(robot):
+            component.standby, component.entrusted = robot, (robot,)
+            return
+
+
+def withdraw(component: Component, turn: Turn, why: str) -> None:
+    """Give a claim up; the vote for oneself in its epoch stands, and is of no use to anybody."""
+    component.move(Cause.YIELD_CLAIM)
+    component.ordered = False
+    place = sorted((turn.me, *turn.config.peers), key=weight).index(turn.me) + 1
+    component.retry_ns = turn.now_ns + place * WITHDRAWN_BEATS * turn.config.beat_ns
+    refuse_request(component, turn, f"cannot run {component.name}: {why}; failover status tells who is heard")
+    turn.say(component, f"{turn.me} withdraws its claim of epoch {component.epoch}: {why}")
+
+
+def step_down(component: Component, turn: Turn) -> None:
+    """A primary that has given way and was not relieved clears its copy away; its checkpoint is claimed anew."""
+    component.move(Cause.OUTBID)
+    component.handing = component.flight = None
+    component.until_ns = turn.now_ns + turn.config.retry_ms * MS
+    turn.order(acts.Stop(component.name, component.epoch))
+    turn.say(component, f"{turn.me} gives its copy up: what it handed over is claimed anew")
+
+
+# Hearing
+
+
+def heard(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
+    """What another member's word about this component changes here."""
+    theirs = state_of(entry)
+    component.seen = max(component.seen, entry.epoch)
+    if theirs in HOLDING and component.holding:
+        _heard_rival(component, turn, sender, entry, theirs)
+    elif theirs in HOLDING:
+        _heard_holder(component, turn, sender, entry)
+    elif theirs in ENDED and entry.epoch >= component.epoch:
+        _heard_end(component, turn, sender, entry, theirs)
+    elif entry.epoch > component.epoch:
+        _heard_later_epoch(component, turn, sender, entry)
+
+
+def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
+    if entry.epoch < component.epoch or (component.state in ENDED and entry.epoch == component.epoch):
+        return
+    if (entry.epoch, sender) != (component.epoch, component.primary):
+        if not majority.may_follow(component, turn, sender, entry):
+            return
+        accept(component, turn, sender, entry.epoch)
+    component.entrusted = (entry.standby,) if entry.standby else ()
+    follow(component, turn, sender, entry)
+
+
+def _heard_rival(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
+    later = entry.epoch > component.epoch
+    handing = component.handing
+    if later and handing is not None and handing.yielded and handing.to == sender:
+        lose(component, turn, sender, entry)
+    elif component.state is State.CLAIMING:
+        if stronger(component, turn, sender, entry, theirs):
+            withdraw(component, turn, f"{sender} holds or claims epoch {entry.epoch}")
+            _heard_holder(component, turn, sender, entry)
+    elif majority.leased(component, turn):
+        if later and component.state in _SETTLED:
+            renew(component, turn, entry.epoch)
+    elif _prevails(component, turn, sender, entry):
+        lose(component, turn, sender, entry)
+    elif theirs is not State.CLAIMING and component.state in _SETTLED:
+        _contend(component, turn, sender, entry, theirs)
+
+
+def _prevails(component: Component, turn: Turn, sender: str, entry: Entry) -> bool:
+    """Whether a rival of ours, who have no lease, was elected, or loses nothing that was acknowledged if we follow it.
+
+    A later epoch alone says little: a robot that comes back with an old copy raises its epoch above all that it hears of.
+    """
+    if entry.epoch >= component.epoch and majority.elected(component, turn, sender, entry.epoch):
+        return True
+    if entry.epoch <= component.epoch:
+        return False
+    return bool(entry.flags & ORDERED) or not component.held or majority.eligible(component, turn, sender, entry.position)
+
+
+def _contend(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
+    """Two copies stand still, neither was elected: go above the other's epoch, once a loyalty, so that voters are heard first."""
+    if entry.epoch < component.epoch or (entry.epoch == component.epoch and stronger(component, turn, sender, entry, theirs)):
+        return
+    waited_ns = turn.now_ns - component.contested_ns
+    if waited_ns >= turn.config.loyalty_ns:
+        component.contested_ns = turn.now_ns
+        if waited_ns < 2 * turn.config.loyalty_ns:
+            renew(component, turn, entry.epoch)
+
+
+def _heard_end(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
+    """A copy that acts, or stands still, gives up to an end as it would to the copy that ended: never to a word alone."""
+    if not component.holding or component.state is State.CLAIMING:
+        heard_end(component, turn, sender, entry, theirs)
+    elif entry.epoch > component.epoch and majority.leased(component, turn):
+        if component.state in _SETTLED and turn.config.runs(sender):
+            renew(component, turn, entry.epoch)
+    elif _is_decided(component, turn, entry) or (sender == entry.primary and _prevails(component, turn, sender, entry)):
+        lose(component, turn, entry.primary, entry)
+
+
+def _is_decided(component: Component, turn: Turn, entry: Entry) -> bool:
+    elsewhere = entry.primary not in ("", turn.me)
+    return elsewhere and entry.epoch > component.epoch and majority.elected(component, turn, entry.primary, entry.epoch)
+
+
+def _heard_later_epoch(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
+    """Somebody who does not hold it knows a later epoch than ours."""
+    decided = _is_decided(component, turn, entry)
+    if component.state is State.CLAIMING:
+        if turn.config.runs(sender):
+            withdraw(component, turn, f"epoch {entry.epoch} is known already")
+    elif component.state in _SETTLED and (majority.leased(component, turn) or not decided):
+        if turn.config.runs(sender) or _needs_the_vote(component, turn):
+            renew(component, turn, entry.epoch)
+    elif component.holding and decided and not majority.leased(component, turn):
+        lose(component, turn, entry.primary, entry)
+    elif not component.holding and (decided or (not component.primary and turn.team.rested(turn.now_ns))):
+        _adopt(component, turn, entry)
+
+
+def _needs_the_vote(component: Component, turn: Turn) -> bool:
+    """A server or a witness that knows a later epoch can agree to a later one only: where it must, but not again and again."""
+    if majority.leased(component, turn) or turn.now_ns < component.contested_ns + turn.config.retry_ms * MS:
+        return False
+    component.contested_ns = turn.now_ns
+    return True
+
+
+def _adopt(component: Component, turn: Turn, entry: Entry) -> None:
+    accept(component, turn, entry.primary, entry.epoch)
+    component.entrusted = (entry.standby,) if entry.standby else ()
+    if component.state is State.ABSENT or component.state in ENDED:
+        component.move(Cause.FOLLOW)

@@ -1,0 +1,1 @@
+"""How checkpoints get to the standby and to the servers, and what waits there."""

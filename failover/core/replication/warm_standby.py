@@ -1,0 +1,71 @@
+"""What waits at a standby, so that a takeover is one message: made in advance, it has done everything before its first step.
+
+Of a program that keeps its state itself that is the program, started; of one that is captured from outside it is a stopped
+process with the newest checkpoint's memory (the ready copy). Which of the two, and whether it can be had, is the robot's affair.
+One waits a component, at the robot that its primary has entrusted, and nowhere else.
+
+Invariants: nothing waits at a robot that runs the component, or to which its primary ships nothing; what waits is what a takeover
+would start.
+"""
+
+from __future__ import annotations
+
+from failover.core import acts
+from failover.core.component import Component, Turn
+from failover.core.events import Warmed
+from failover.core.types import ComponentSpec, State, Waiting
+from failover.core.wire.messages import WARM
+
+
+def review(component: Component, turn: Turn) -> None:
+    """Order what should wait here, and the end of what should wait no longer."""
+    if component.state is State.CLAIMING:  # what waits is about to be used
+        return
+    if component.holding:  # the order to run it has used what waited, or ended it
+        _forget(component)
+        component.stored_ns = -1
+        return
+    spec = _wanted(component)
+    if spec is None and component.waiting is not None:
+        turn.order(acts.Cool(component.name, component.epoch))
+        _forget(component)
+    elif spec is not None and (waiting := _waiting(component, spec)) != component.waiting:
+        _forget(component)
+        component.waiting, component.waiting_epoch = waiting, component.epoch
+        turn.order(acts.Warm(component.name, component.epoch, spec))
+
+
+def warmed(component: Component, turn: Turn, event: Warmed) -> None:
+    """What waits here, or would, is ready now, or is not (any more)."""
+    if component.waiting is None or event.epoch != component.waiting_epoch:
+        return
+    if event.ready and not component.warm:
+        turn.say(component, f"its program waits at {turn.me}: a takeover is one message")
+    elif event.message and event.message != component.cold:
+        turn.say(component, f"its program does not wait at {turn.me}: {event.message}")
+    component.warm, component.cold = event.ready, event.message
+
+
+def is_warm(component: Component, turn: Turn) -> bool:
+    """Whether its program waits at its standby, as far as this robot knows."""
+    if not component.holding:
+        return component.warm
+    peer = turn.team.peers.get(component.standby)
+    entry = peer.entry(component.name) if peer is not None and turn.alive(component.standby) else None
+    return entry is not None and entry.epoch == component.epoch and bool(entry.flags & WARM)
+
+
+def _wanted(component: Component) -> ComponentSpec | None:
+    """What should wait here: None where nothing would be started here, or by nobody's leave."""
+    stands_by = component.state is State.STANDBY and component.trusted and not component.waits
+    is_known = component.keeps_state or component.stored_ns >= 0  # of what ran here itself nobody has said whether it does
+    return component.spec if stands_by and component.newest is not None and is_known else None
+
+
+def _waiting(component: Component, spec: ComponentSpec) -> Waiting:
+    return Waiting(spec.launch, spec.owner, component.keeps_state)
+
+
+def _forget(component: Component) -> None:
+    component.waiting, component.waiting_epoch = None, 0
+    component.warm, component.cold = False, ""

@@ -1,0 +1,192 @@
+"""What ``failover status`` says: one robot's sight of the team, and the promise in force in one sentence."""
+
+from __future__ import annotations
+
+from msgspec.structs import replace
+
+from failover.core.component import Component, Turn
+from failover.core.election import pair
+from failover.core.election.consent import state_of
+from failover.core.peer_claims import Testimony
+from failover.core.replication import standby
+from failover.core.replication.warm_standby import is_warm
+from failover.core.status import guarantee
+from failover.core.transitions import failback
+from failover.core.types import MS, ComponentView, Protection, State, StatusView
+
+NS_PER_S = 10**9
+US_PER_MS = 1_000
+
+SLOW_FACTOR = 2
+"""Deltas that take so many periods to become checkpoints are told of: fewer are taken, and each carries more."""
+
+STALE_NS = 2 * NS_PER_S
+"""A checkpoint that is older is not what was promised: the protection is degraded while the next one does not arrive."""
+
+
+def status(components: dict[str, Component], turn: Turn, boot: int, testimony: Testimony) -> StatusView:
+    """Everything, as this robot sees it."""
+    views = tuple(_component(component, turn) for _, component in sorted(components.items()) if not _is_nothing(component))
+    peers = tuple(
+        replace(peer, refused=testimony.told(peer.robot, turn.now_ns), doubted=testimony.is_recent(peer.robot, turn.now_ns))
+        for peer in turn.team.views(turn.now_ns)
+    )
+    bad = any(view.protection is Protection.DEGRADED or view.state is State.FAILED for view in views)
+    bad = bad or any(view.cold or view.unstored for view in views) or any(one.is_exhausted for one in components.values())
+    bad = bad or bool(turn.team.at_odds(turn.now_ns)) or any(peer.unread or peer.doubted for peer in peers)
+    lost = any(peer.state == "dead" for peer in peers)
+    return StatusView(turn.me, boot, str(turn.config.rule), guarantee.team(turn), not bad and not lost, peers, views)
+
+
+def _is_nothing(component: Component) -> bool:
+    """Whether it is a name alone: heard of only, or of a start that was refused, whose epoch must not be forgotten."""
+    return component.state is State.ABSENT or (component.state is State.RELEASED and component.spec is None)
+
+
+def _component(component: Component, turn: Turn) -> ComponentView:
+    protection = _protection(component, turn)
+    lag_ns = turn.now_ns - component.acked_ns if component.acked_ns >= 0 and component.holding else -1
+    return ComponentView(
+        component.name,
+        component.state,
+        component.epoch,
+        component.primary,
+        _standby(component, turn),
+        protection,
+        lag_ns,
+        component.freeze_us,
+        tuple(reversed(component.held)),
+        guarantee.one(component, turn, protection),
+        _notes(component, turn),
+        component.status,
+        component.lease_ns,
+        component.rules.period_ms,
+        component.spec.home if component.spec else "",
+        component.rules.prefer,
+        component.spec.owner if component.spec else None,
+        is_warm(component, turn),
+        component.cold,
+        guarantee.differs(component, turn),
+        component.unstored if component.state is State.STANDBY else "",
+    )
+
+
+def _standby(component: Component, turn: Turn) -> str:
+    if component.holding:
+        return component.standby
+    return turn.me if component.state is State.STANDBY and component.held else ""
+
+
+def _protection(component: Component, turn: Turn) -> Protection:
+    if component.unprotected:
+        return Protection.STOPPED
+    if not component.holding:
+        return Protection.NONE
+    if component.degraded or _overdue(component, turn):
+        return Protection.DEGRADED
+    protected = component.acked is not None and component.standby in component.entrusted and turn.alive(component.standby)
+    return Protection.PROTECTED if protected else Protection.NONE
+
+
+def _overdue(component: Component, turn: Turn) -> bool:
+    """Snapshots are taken and do not become checkpoints; an old loss says nothing while there is nothing to take."""
+    limit_ns = max(STALE_NS, 2 * component.rules.period_ms * MS)
+    return bool(component.undelivered) and not component.awaited and turn.now_ns - _state_ns(component) > limit_ns
+
+
+def _slow(component: Component, turn: Turn) -> str:
+    """Where deltas take longer than their period allows: how seldom they are taken, and why; "" otherwise."""
+    flight = component.flight
+    under_way_ns = turn.now_ns - flight.started_ns if flight is not None and flight.parent is not None else 0
+    took_ns, least_ns = max(component.took_ns, under_way_ns), standby.least_period_ns(component)
+    period_ns = component.rules.period_ms * MS
+    if not turn.alive(component.standby) or max(took_ns, least_ns) <= SLOW_FACTOR * period_ns:
+        return ""
+    why = f"it takes that long until {component.standby} has one"
+    if least_ns > took_ns:
+        still_ms, part = component.still_us / US_PER_MS, f"1/{standby.STILL_SHARE}"
+        why = f"it stands still for {still_ms:.0f} ms each time, and does so for no more than {part} of its time"
+    return (
+        f"captured every {max(took_ns, least_ns) / NS_PER_S:.1f} s instead of every {period_ns / NS_PER_S:.1f} s: {why}; what is "
+        "written meanwhile travels in the next one, once"
+    )
+
+
+def _state_ns(component: Component) -> int:
+    """When the newest state was captured from which another robot, or this one, could go on; -1 if there is none."""
+    return max(component.acked_ns, component.resumed_ns)
+
+
+def _age(component: Component, turn: Turn) -> str:
+    state_ns = _state_ns(component)
+    return (
+        f"the last checkpoint is {(turn.now_ns - state_ns) / NS_PER_S:.1f} s old"
+        if state_ns >= 0
+        else "there is no checkpoint yet"
+    )
+
+
+def _ending(component: Component, turn: Turn) -> list[str]:
+    """Living peers that are clearing away a copy of their own: a process that waits inside the kernel takes its time to end."""
+    entries = ((peer.robot, peer.entry(component.name)) for peer in turn.team.living(turn.now_ns))
+    return [robot for robot, entry in entries if entry is not None and state_of(entry) is State.STOPPING]
+
+
+def _waits_after_boot(component: Component, turn: Turn, left_ns: int) -> str:
+    silent = pair.unheard(component, turn)
+    waiting = f"waiting: {' and '.join(silent)} may run it and was not heard since {turn.me} started"
+    unknown = [robot for robot in silent if robot not in turn.team.peers]
+    claims = f"{turn.me} claims it in {left_ns / NS_PER_S:.0f} s"
+    if unknown and turn.team.strangers_until_ns() > turn.now_ns:
+        waiting += f"; team.toml here does not know {' and '.join(unknown)}, and a robot that it does not know sends to {turn.me}"
+        return f"{waiting}: bring the newest team.toml here; {claims} after the last sign of it; failover promote does not wait"
+    if unknown:
+        waiting += f"; team.toml here does not know {' and '.join(unknown)}: bring the newest one if it is still of the team"
+    return f"{waiting}; {claims} (boot_patience_s); failover promote does not wait"
+
+
+def _unread(turn: Turn) -> str:
+    """Which robots live, and only cannot be authenticated."""
+    waited_for = [robot for robot in turn.team.peers if turn.team.keeps_waiting(robot, turn.now_ns)]
+    told = (f"{robot} lives and cannot be authenticated: {turn.team.unread(robot, turn.now_ns)}" for robot in waited_for)
+    return "; ".join(told)
+
+
+def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
+    notes = []
+    if component.degraded and component.holding:
+        notes.append(f"not captured: {component.degraded}; {_age(component, turn)}")
+    elif component.awaited and component.holding:
+        notes.append(f"nothing to protect yet: {component.awaited}; {_age(component, turn)}")
+    elif component.holding and _overdue(component, turn):
+        notes.append(f"snapshots do not arrive: {component.undelivered}; {_age(component, turn)}")
+    if component.holding and (slow := _slow(component, turn)):
+        notes.append(slow)
+    if _protection(component, turn) is Protection.NONE and component.holding and (ending := _ending(component, turn)):
+        notes.append(f"{' and '.join(ending)} cannot stand by yet: a copy of it that ran there is still being ended")
+    if component.holding and component.resumed_age_ns >= STALE_NS:
+        notes.append(f"it went on at {turn.me} from a checkpoint that was {component.resumed_age_ns / NS_PER_S:.1f} s old")
+    if staying := failback.note(component):
+        notes.append(staying)
+    if component.unstored and component.state is State.STANDBY:
+        notes.append(f"a snapshot was not stored at {turn.me}: {component.unstored}")
+    if component.state is State.STANDBY and (left_ns := pair.waits_after_boot_ns(component, turn)):
+        notes.append(_waits_after_boot(component, turn, left_ns))
+    if component.state in (State.STANDBY, State.FROZEN) and (unread := _unread(turn)):
+        notes.append(f"waiting: {unread}; failover promote does not wait")
+    if component.unprotected:
+        notes.append("protected no longer, as on_unsupported = stop_protecting says; failover release, then protect, begins anew")
+    if component.cold:
+        notes.append(f"its program does not wait at {turn.me}, so a takeover would take longer, or fail: {component.cold}")
+    if component.unable:
+        notes.append(f"{turn.me} cannot run it: {component.unable}")
+    if component.state is State.FROZEN:
+        who = "no majority" if component.elects else "nobody entrusted with it"
+        notes.append(f"held still: {who} hears this robot; it goes on when the peers are back")
+    if component.state is State.CLAIMING and turn.now_ns > component.until_ns:
+        notes.append("waiting for the others' consent: when_alone = freeze")
+    if spent := pair.exhaustion(component, turn.me):
+        notes.append(spent)
+    if component.reason:
+        notes.append(component.reason)
+    return tuple(notes)

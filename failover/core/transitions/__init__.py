@@ -1,0 +1,1 @@
+"""How a component moves or ends on purpose: handover, failback, promotion, exit."""

@@ -1,0 +1,166 @@
+"""What becomes of a component whose program ended, crashed, or could not be brought to run.
+
+Invariants: an end is a record before anybody is told of it; crashes make no endless loop and throw no checkpoint away.
+"""
+
+from __future__ import annotations
+
+from failover.core import acts
+from failover.core.component import Cause, Component, Turn
+from failover.core.election import lease
+from failover.core.election.consent import state_of
+from failover.core.election.pair import refuse_request, restart_line
+from failover.core.events import ActFailed, Exited
+from failover.core.membership import Peer
+from failover.core.types import ENDED, MS, OnCrash, State
+
+SIGNAL_BITS = 0x7F
+"""Of a wait status: the signal that ended the program, 0 for none."""
+
+TRIES_MAX = 3
+"""Takeovers that fail here, one after the other without a checkpoint in between, before this robot leaves it alone."""
+
+PAUSES = (1, 10, 10)
+"""Of ``retry_ms``, before a takeover that failed is tried again: what was in the way once may be gone at once."""
+
+_WITH_PROCESS = frozenset({State.STARTING, State.TAKING_OVER, State.PRIMARY, State.FROZEN, State.HANDING_OVER, State.RECOVERING})
+
+
+def exited(component: Component, turn: Turn, event: Exited) -> None:
+    """The program ended: by itself or as asked, that is its end; by a signal, a crash."""
+    if component.state not in _WITH_PROCESS or event.epoch < component.born:
+        return
+    signal = event.status & SIGNAL_BITS
+    if event.refusal and not component.ending:
+        _refused(component, turn, event)
+    elif not signal or component.ending:
+        _end(component, turn, Cause.FINISH, event.status, "")
+        how = f"signal {signal}" if signal else f"exit code {event.status >> 8}"
+        turn.say(component, f"{turn.me} {Cause.FINISH}: {how}")
+    elif component.rules.on_crash is OnCrash.LEAVE:
+        _end(component, turn, Cause.FAIL, event.status, f"it died by signal {signal}; on_crash = leave")
+    else:
+        crashed(component, turn, event.status)
+
+
+def _refused(component: Component, turn: Turn, event: Exited) -> None:
+    """It did not go on from its checkpoint: a failed takeover; or, where it has made checkpoints already, a crash."""
+    if component.acked is None or component.acked.generation != component.generation:
+        _end_handover(component, turn, f"{component.name} ended meanwhile")
+        component.flight, component.crashed = None, 0
+        cannot(component, turn, event.refusal)
+    else:
+        turn.say(component, event.refusal)
+        crashed(component, turn, event.status)
+
+
+def crashed(component: Component, turn: Turn, status: int) -> None:
+    """Resume it here; a copy that is held still, once this robot knows that it may act."""
+    component.crashed = status if component.state is State.FROZEN else 0
+    if not component.crashed:
+        _recover(component, turn, status)
+
+
+def failed(component: Component, turn: Turn, event: ActFailed) -> None:
+    """A start or a restore came to nothing."""
+    if event.epoch != component.epoch:
+        return
+    if component.state is State.STARTING:
+        told = bool(component.request)  # the operator is told; then nothing of it is remembered: its name is whose it was before
+        component.spec = component.former if told else component.spec
+        refuse_request(component, turn, event.message)
+        _end(component, turn, Cause.RELEASE if told else Cause.FAIL, 0, event.message)
+    elif component.state is State.RECOVERING:
+        turn.say(component, f"{turn.me} could not resume it: {event.message}")
+        _recover(component, turn, component.status)
+    elif component.state is State.TAKING_OVER:
+        cannot(component, turn, event.message)
+
+
+def cannot(component: Component, turn: Turn, why: str) -> None:
+    """This robot cannot run it; the checkpoint stays, for another robot or another try."""
+    component.unable, component.tries = why, component.tries + 1
+    component.move(Cause.CANNOT)
+    component.until_ns = turn.now_ns + turn.config.retry_ms * MS
+    component.retry_ns = turn.now_ns + PAUSES[min(component.tries, len(PAUSES)) - 1] * turn.config.retry_ms * MS
+    turn.order(acts.Stop(component.name, component.epoch))
+    turn.say(component, f"{turn.me} {Cause.CANNOT}: {why}")
+
+
+def overdue(component: Component, turn: Turn) -> None:
+    """A start or a restore that says nothing has failed; a Stop that says nothing is ordered again."""
+    if turn.now_ns < component.until_ns:
+        return
+    if component.state in (State.STARTING, State.TAKING_OVER, State.RECOVERING):
+        seconds = turn.config.restore_ms // 1000
+        failed(component, turn, ActFailed(component.name, component.epoch, f"nothing was heard of it for {seconds} s"))
+    elif component.state is State.STOPPING:
+        component.until_ns = turn.now_ns + turn.config.retry_ms * MS
+        turn.order(acts.Stop(component.name, component.epoch))
+
+
+def retry(component: Component, turn: Turn) -> None:
+    """Another try of a takeover that failed here, a few times."""
+    if component.unable and component.tries < TRIES_MAX and turn.now_ns >= component.retry_ns:
+        component.unable = ""
+
+
+def report(component: Component, turn: Turn) -> None:
+    """Tell whoever waits for the end, once every living robot has it on record too (and a majority), or this robot is alone."""
+    if component.state not in ENDED or component.reported or component.primary != turn.me:
+        return
+    living = turn.team.living(turn.now_ns)
+    knows = {peer.robot: _knows_the_end(component, peer) for peer in living}
+    agreed = not turn.config.by_majority or 1 + sum(knows.values()) >= turn.config.quorum
+    if agreed and all(known for robot, known in knows.items() if turn.config.runs(robot)):
+        component.reported = True
+        failed_here = component.state is State.FAILED
+        turn.order(
+            acts.ReportExit(component.name, component.epoch, component.status, bool(living), failed_here, component.reason)
+        )
+
+
+def _knows_the_end(component: Component, peer: Peer) -> bool:
+    entry = peer.entry(component.name)
+    return entry is not None and state_of(entry) in ENDED
+
+
+def _recover(component: Component, turn: Turn, status: int) -> None:
+    """Resume here: from the newest checkpoint a few times, then from the one before, then not again."""
+    window_ns = component.rules.crash_window_ms * MS
+    while component.crashes and component.crashes[0] <= turn.now_ns - window_ns:
+        component.crashes.popleft()
+    component.crashes.append(turn.now_ns)
+    component.status = status
+    count, limit = len(component.crashes), component.rules.crash_limit
+    back = 1 if count <= limit else 2
+    if count > limit + 1 or len(component.held) < back:
+        why = "no checkpoint to resume it from" if len(component.held) < back else f"{count} crashes in {window_ns // 10**9} s"
+        _end(component, turn, Cause.FAIL, status, f"{why}; look at its logs, then run it again, or release it to forget it")
+        return
+    position = component.held[-back]
+    component.move(Cause.CRASH)
+    _end_handover(component, turn, f"{component.name} crashed meanwhile and is resumed at {turn.me}")
+    restart_line(component, turn)
+    component.until_ns = turn.now_ns + turn.config.restore_ms * MS
+    component.lease_ns = component.told_ns = lease.first_ns(component, turn)
+    why = component.resumption
+    spec, lease_ns, generation = component.spec, component.lease_ns, component.generation
+    turn.order(acts.Restore(component.name, component.epoch, position, spec, lease_ns, why, generation))
+    turn.say(component, f"{turn.me} saw it crash, {count} in the window, and resumes it from {position.sequence}")
+
+
+def _end_handover(component: Component, turn: Turn, why: str) -> None:
+    if component.handing is not None and component.handing.request:
+        turn.order(acts.Answer(component.handing.request, False, why))
+    component.handing = None
+
+
+def _end(component: Component, turn: Turn, cause: Cause, status: int, reason: str) -> None:
+    _end_handover(component, turn, f"{component.name} ended meanwhile")
+    component.move(cause)
+    component.status, component.reason = status, reason
+    component.flight = None
+    component.reported = False
+    if reason:
+        turn.say(component, f"{turn.me} {cause}: {reason}")

@@ -1,0 +1,305 @@
+"""What the rules of one robot tell those of another, as msgspec structs. The bytes are in ``PROTOCOL.md``.
+
+Two lanes. *Beats* carry state, never news: a lost beat is repaired by the next, so there is nothing to repeat and nothing to time
+out: a claim, a vote, a standby's acknowledgement, its wish for a base are fields of beats. The *bulk lane* carries snapshots, in
+chunks, under credit.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from checkpoint.model import Position
+from failover.core.types import ComponentSpec, Rule
+
+VERSION = 1
+"""Of both lanes; a peer of another version is refused by name."""
+
+
+class Echo(msgspec.Struct, frozen=True, array_like=True):
+    """The newest beat that the sender has heard of one robot: what lets that robot count its lease from the asking.
+
+    Attributes:
+        counter: of that beat; negative: heard, but no lease may be counted from it (that robot seems deaf to the sender).
+    """
+
+    robot: str
+    boot: int
+    counter: int
+
+
+class Entry(msgspec.Struct, frozen=True, array_like=True):
+    """One component as the sender of the beat holds it.
+
+    Attributes:
+        state: index into ``STATES``.
+        primary: whom the sender takes for the primary of ``epoch``; naming a peer *is* the vote for it.
+        generation, sequence, digest: newest position it can restore from; for a standby, its acknowledgement. Sequence 0: none.
+        standby: the robot that the primary has entrusted, "" if none; under majority its followers repeat what they have noted.
+        yields_to: (primary, handing over) the robot that may claim now.
+        flags: ``NEEDS_BASE`` (standby), ``UNPROTECTED`` (primary has stopped protecting), ``HOLDS`` (on_loss is hold),
+            ``WARM`` (standby: its program waits there, started already); ``WANTS`` (a checkpoint, to run it);
+            ``SAFE`` (primary: its newest position is acknowledged); ``STOOD`` (primary of a pair); ``FREE``, ``OPEN``,
+            ``STARTS``, ``ORDERED`` (majority); ``BEGUN``.
+        status: of a finished component, waitpid's.
+        born: epoch under which the sender's copy was started or restored; 0 does not tell.
+    """
+
+    name: str
+    state: int
+    epoch: int
+    primary: str = ""
+    generation: int = 0
+    sequence: int = 0
+    digest: bytes = b""
+    standby: str = ""
+    yields_to: str = ""
+    flags: int = 0
+    status: int = 0
+    born: int = 0
+
+    @property
+    def position(self) -> Position | None:
+        """What the sender can restore from."""
+        return Position(self.generation, self.sequence, self.digest) if self.sequence else None
+
+
+NEEDS_BASE = 1
+UNPROTECTED = 2
+HOLDS = 4
+WARM = 8
+FREE = 16
+"""The sender is bound to no primary: it would vote for a robot that holds all that was acknowledged."""
+
+OPEN = 32
+"""It has waited long enough for those robots: it would vote for any other."""
+
+STARTS = 64
+"""It would start the component from the beginning, as configured."""
+
+ORDERED = 128
+"""An operator asked for this claim: a robot with an older checkpoint may have it."""
+
+WANTS = 256
+"""An operator wants the sender to run it, and it has no checkpoint: whoever keeps one sends it."""
+
+
+SAFE = 512
+"""The position that the sender, a primary, tells of counts as acknowledged: every robot that holds it may show its output."""
+
+
+STOOD = 1024
+"""The sender's copy stood still, or began without a word of the robots that ran it, since all its peers last agreed to it."""
+
+BEGUN = 2048
+"""A checkpoint of it was given away in this epoch or an earlier one: a robot that has none does not start it afresh."""
+
+
+class Beat(msgspec.Struct, frozen=True, array_like=True):
+    """ "I live", and all that follows from it.
+
+    Attributes:
+        boot: start count of the sender's agent; ``counter``: of its beats since then, from 1.
+        settled: counter of the beat since which no entry of the sender has changed its epoch, its state or its primary.
+            Whoever knows an entry only from a beat older than that does not know enough to act on it.
+        load: of the sender, 0 to 255.
+        entries: those that fit; the others follow in the next beats, in turn. The changed ones go first.
+        total: how many there are altogether.
+        rule: the sender's, as its number in ``RULES``; 0 does not tell.
+    """
+
+    sender: str
+    boot: int
+    counter: int
+    settled: int = 0
+    load: int = 0
+    total: int = 0
+    echoes: tuple[Echo, ...] = ()
+    entries: tuple[Entry, ...] = ()
+    rule: int = 0
+
+
+RULES = ("", *Rule)
+"""A rule's place in here is its number in a beat."""
+
+
+# The bulk lane: connection-oriented, authenticated and encrypted by the transport; in order while a connection lives.
+
+CHUNK_SIZE_MAX = 256 * 1024
+"""Bytes of a snapshot per chunk: at 1 Gbit/s a small message behind one waits 2 ms."""
+
+WINDOW_CHUNKS = 8
+"""Chunks that may be on their way without credit for more."""
+
+BELONGINGS_MAX = 512
+"""Files in one message: with long paths it stays a small one beside a chunk."""
+
+SNAPSHOT_SIZE_MAX = 1 << 38
+"""Bytes that an encoded snapshot may claim to have; the disk decides earlier."""
+
+
+class Hello(msgspec.Struct, frozen=True, tag="hello"):
+    """First message of each side on every new connection. Another version or team is answered by Goodbye.
+
+    Attributes:
+        boot: start count of the sender's agent.
+        beat_key: random bytes of this life; the sender's beats to this receiver are sealed with it from now on.
+        again: on a connection that stands, because the receiver has begun anew; what is under way on it goes on.
+    """
+
+    version: int
+    team: str
+    robot: str
+    boot: int
+    beat_key: bytes = b""
+    again: bool = False
+
+
+class Goodbye(msgspec.Struct, frozen=True, tag="goodbye"):
+    """The connection ends; ``reason`` is a sentence."""
+
+    reason: str
+
+
+class Offer(msgspec.Struct, frozen=True, tag="offer"):
+    """A snapshot is ready for you. Answered by Credit or Refuse.
+
+    Attributes:
+        transfer: chosen by the sender, never used twice in one life of it.
+        size: bytes of the encoded snapshot (``checkpoint/snapshot/FORMAT.md``); ``digest``: blake3 of them, 32 bytes.
+        parent: what it continues; None for a base.
+        acknowledged: the newest position of its line that counts as acknowledged; None: not known, or an older agent.
+    """
+
+    transfer: int
+    component: str
+    epoch: int
+    position: Position
+    parent: Position | None
+    size: int
+    digest: bytes
+    spec: ComponentSpec
+    acknowledged: Position | None = None
+
+
+class Belonging(msgspec.Struct, frozen=True, array_like=True):
+    """A file that a program needs wherever it goes on.
+
+    Attributes:
+        path: as the program names it, absolute.
+        size: bytes; ``digest``: blake3 of them, 32 bytes, b"" where it was not taken: such a file cannot be brought.
+        exact: only this content will do; otherwise whatever stands at the path.
+    """
+
+    path: str
+    size: int
+    digest: bytes
+    exact: bool = True
+
+
+class Belongings(msgspec.Struct, frozen=True, tag="belongings"):
+    """What a program needs: which of it do you lack? Comes before the offer of a snapshot. Answered by Lacking.
+
+    Attributes:
+        number: chosen by the sender, never used twice in one life of it.
+        files: at most ``BELONGINGS_MAX``; more are asked in several.
+    """
+
+    number: int
+    component: str
+    files: tuple[Belonging, ...]
+
+
+class Lacking(msgspec.Struct, frozen=True, tag="lacking"):
+    """Which of the files the sender has neither at their paths nor by content.
+
+    Attributes:
+        digests: of those that it will take; they may be offered to it from now on.
+        reason: why it cannot take all that it lacks, a sentence that names files; "" when it can.
+    """
+
+    number: int
+    digests: tuple[bytes, ...]
+    reason: str = ""
+
+
+class Content(msgspec.Struct, frozen=True, tag="content"):
+    """The content of a file that you lack is ready for you. Answered by Credit or Refuse; Taken says that it is stored.
+
+    Attributes:
+        transfer: as of an Offer; of ``size`` bytes with this blake3 ``digest``.
+    """
+
+    transfer: int
+    size: int
+    digest: bytes
+
+
+class Credit(msgspec.Struct, frozen=True, tag="credit"):
+    """Bytes [0, ``until``) of the transfer may be sent."""
+
+    transfer: int
+    until: int
+
+
+class Chunk(msgspec.Struct, frozen=True, tag="chunk"):
+    """Bytes of a snapshot, in order, without gaps; the one that reaches ``Offer.size`` is the last."""
+
+    transfer: int
+    offset: int
+    content: bytes
+
+
+class Taken(msgspec.Struct, frozen=True, tag="taken"):
+    """All bytes arrived and their digest is right. (That they are stored is said by the beat; a content is stored by then.)"""
+
+    transfer: int
+
+
+class Refuse(msgspec.Struct, frozen=True, tag="refuse"):
+    """The offer, or the rest of it, is not wanted: stale epoch, wrong parent, no room. ``needs_base``: only a base would help."""
+
+    transfer: int
+    reason: str
+    needs_base: bool = False
+
+
+class Cancel(msgspec.Struct, frozen=True, tag="cancel"):
+    """The sender gives up this transfer; what had arrived of it is forgotten."""
+
+    transfer: int
+
+
+class Errand(msgspec.Struct, frozen=True, tag="errand"):
+    """An operator's order, given at the sender and meant for the robot where the component runs. Answered by ErrandDone.
+
+    Attributes:
+        number: chosen by the sender, never used twice in one life of it.
+        verb: as on the control socket (`failover.client.control`).
+        arguments: its arguments, a msgpack map.
+        by: uid of who gave it, -1: the robot by itself; whoever carries it out looks whether he may.
+    """
+
+    number: int
+    verb: str
+    arguments: bytes
+    by: int = -1
+
+
+class ErrandDone(msgspec.Struct, frozen=True, tag="errand_done"):
+    """What became of an order.
+
+    Attributes:
+        content: the result, a msgpack map; empty when it was refused.
+        refusal: why not, a sentence; "" when it was done.
+        kind: class of the refusal, as on the control socket.
+    """
+
+    number: int
+    content: bytes
+    refusal: str = ""
+    kind: str = "RefusedError"
+    reasons: tuple[str, ...] = ()
+
+
+Bulk = Hello | Goodbye | Belongings | Lacking | Content | Offer | Credit | Chunk | Taken | Refuse | Cancel | Errand | ErrandDone

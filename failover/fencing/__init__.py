@@ -1,0 +1,1 @@
+"""The fencing token as a program reads it, and a gateway that refuses an older one."""

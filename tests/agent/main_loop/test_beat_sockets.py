@@ -1,0 +1,85 @@
+"""The beat sockets of two robots on the loopback: what comes, over which interface, and when."""
+
+from __future__ import annotations
+
+import select
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import closing
+
+import pytest
+
+from agent.main_loop.beat_sockets import TURN_LIMIT, BeatLane
+from agent.system import clock
+from failover.config.team import Robot
+from failover.core.wire.codec import FRAME_SIZE_MAX, MAGIC
+
+PATIENCE_MS = 10_000
+BEAT = MAGIC + b" and so on"
+
+
+def robot(links: int) -> Robot:
+    return Robot(tuple(f"127.0.0.1:{free_port()}" for _ in range(links)), "127.0.0.1:1")
+
+
+def free_port() -> int:
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+@pytest.fixture
+def lanes() -> Iterator[tuple[BeatLane, BeatLane]]:
+    """Of robot1 and robot2, with two links each."""
+    first, second = robot(2), robot(2)
+    ours, theirs = BeatLane(first, {"robot2": second}), BeatLane(second, {"robot1": first})
+    yield ours, theirs
+    ours.close()
+    theirs.close()
+
+
+def waits(lane: BeatLane) -> bool:
+    """Whether something comes, as the heart's loop finds out."""
+    with closing(select.epoll()) as loop:
+        loop.register(lane.fileno(), select.EPOLLIN)
+        return bool(loop.poll(PATIENCE_MS / 1e3))
+
+
+def test_a_beat_comes_over_every_link_and_says_when(lanes: tuple[BeatLane, BeatLane]) -> None:
+    ours, theirs = lanes
+    before_ns = clock.now_ns()
+    ours.send("robot2", BEAT)
+    sent_ns = clock.now_ns()
+    assert waits(theirs)
+    time.sleep(0.05)  # it waits for us, and that does not count
+    came = list(theirs.receive())
+    assert [(frame, link) for frame, link, *_ in came] == [(BEAT, "lo")] * 2
+    for _, _, wall_ns, _ in came:
+        assert before_ns - 1_000_000 < clock.of_wall_ns(wall_ns) < sent_ns + 1_000_000
+
+
+def test_where_nothing_waits_nothing_comes(lanes: tuple[BeatLane, BeatLane]) -> None:
+    assert list(lanes[0].receive()) == []
+
+
+def test_a_flood_is_taken_in_parts_and_none_of_it_is_lost(lanes: tuple[BeatLane, BeatLane]) -> None:
+    ours, theirs = lanes
+    for number in range(TURN_LIMIT):
+        ours.send("robot2", MAGIC + b"%d" % number)
+    assert waits(theirs)
+    parts = [[frame for frame, *_ in theirs.receive()] for _ in range(3)]
+    assert [len(part) for part in parts] == [TURN_LIMIT, TURN_LIMIT, 0]
+    assert sorted(int(frame[2:]) for part in parts for frame in part) == sorted([*range(TURN_LIMIT)] * 2)
+
+
+def test_what_does_not_begin_as_a_beat_is_dropped_by_the_kernel_and_counted(lanes: tuple[BeatLane, BeatLane]) -> None:
+    ours, theirs = lanes
+    longest = MAGIC + bytes(FRAME_SIZE_MAX - len(MAGIC))
+    for frame in (b"", b"f", b"GET / HTTP/1.1", longest + b"\0", *[bytes(1_000)] * 5_000):
+        ours.send("robot2", frame)
+    ours.send("robot2", longest)
+    assert waits(theirs)
+    assert [frame for frame, *_ in theirs.receive()] == [longest] * 2
+    assert theirs.dropped() == 2 * 5_004
+    assert ours.dropped() == 0

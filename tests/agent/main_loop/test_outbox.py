@@ -1,0 +1,87 @@
+"""Persist → send → act while the disk is slow: nothing that depends on the disk leaves, and the beat goes on."""
+
+from __future__ import annotations
+
+from agent.main_loop.outbox import Due, Outbox
+from checkpoint.model import Position
+from failover.core.acts import Acknowledge, Act, Ready, SetLease
+from failover.core.types import Ballot, Record
+from failover.core.wire.messages import Beat, Echo, Entry
+
+BEAT_NS = 20_000_000
+ECHOES = (Echo("robot2", 1, 5), Echo("robot3", 1, 9))
+OLD = Ballot((Record("/a", epoch=3, primary="robot2"), Record("/b", epoch=1, primary="robot3")))
+NEW = Ballot((Record("/a", epoch=4, primary="robot1"), Record("/b", epoch=1, primary="robot3")))
+
+
+def beat(counter: int, settled: int = 0) -> Beat:
+    return Beat("robot1", 1, counter, settled, echoes=ECHOES, entries=(Entry("/a", 1, 3),), total=1)
+
+
+def act(sequence: int) -> Act:
+    return Acknowledge("/a", 1, Position(1, sequence, b""), True)
+
+
+def outbox() -> Outbox:
+    box = Outbox(OLD, BEAT_NS)
+    assert box.take(Ready(send=(beat(1, 1),)), 0).beats == (beat(1, 1),)
+    return box
+
+
+def test_without_a_ballot_everything_leaves_at_once() -> None:
+    assert outbox().take(Ready(send=(beat(2),), act=(act(1),)), BEAT_NS) == Due(None, (beat(2),), (act(1),))
+
+
+def test_acts_wait_for_the_ballot_they_depend_on_and_keep_their_order() -> None:
+    box = outbox()
+    first = box.take(Ready(NEW, act=(act(1),)), 1)
+    assert first == Due((1, NEW), (), ())
+    assert box.take(Ready(act=(act(2),)), 2).acts == ()
+    assert box.take(Ready(NEW, act=(act(3),)), 3).persist == (2, NEW)
+    assert box.kept(1, NEW, 4).acts == (act(1), act(2))
+    assert box.kept(2, NEW, 5).acts == (act(3),)
+
+
+def test_leases_do_not_pile_up_behind_a_disk_that_is_full() -> None:
+    box = outbox()
+    box.take(Ready(NEW, act=(act(1),)), 1)
+    for instant in range(2, 1000):
+        box.take(Ready(act=(SetLease("/a", 4, instant), SetLease("/b", 1, instant))), instant)
+    assert box.kept(1, NEW, 1000).acts == (act(1), SetLease("/a", 4, 999), SetLease("/b", 1, 999))
+
+
+def test_a_later_ballot_covers_the_earlier_ones() -> None:
+    box = outbox()
+    box.take(Ready(NEW, act=(act(1),)), 1)
+    box.take(Ready(NEW, act=(act(2),)), 2)
+    assert box.kept(2, NEW, 3).acts == (act(1), act(2))
+
+
+def test_a_due_beat_goes_out_stripped_while_the_disk_is_slow() -> None:
+    box = outbox()
+    box.take(Ready(NEW), 1)
+    (sent,) = box.take(Ready(send=(beat(2, 2),)), BEAT_NS).beats
+    assert sent.counter == 2
+    assert sent.entries == ()
+    assert sent.settled == 1, "peers go on knowing what the last durable beat told them"
+
+
+def test_a_robot_whose_primacy_is_given_up_gets_no_echo_that_would_extend_its_lease() -> None:
+    box = outbox()
+    box.take(Ready(NEW), 1)
+    (sent,) = box.take(Ready(send=(beat(2, 2),)), BEAT_NS).beats
+    assert sent.echoes == (Echo("robot3", 1, 9),)
+
+
+def test_an_early_beat_waits_for_the_disk_and_then_goes_whole() -> None:
+    box = outbox()
+    box.take(Ready(NEW), 1)
+    assert box.take(Ready(send=(beat(2, 2),)), 2).beats == ()
+    assert box.kept(1, NEW, 3).beats == (beat(2, 2),)
+
+
+def test_a_beat_that_went_stripped_is_not_sent_again() -> None:
+    box = outbox()
+    box.take(Ready(NEW), 1)
+    box.take(Ready(send=(beat(2, 2),)), BEAT_NS)
+    assert box.kept(1, NEW, BEAT_NS + 1).beats == ()

@@ -1,0 +1,16 @@
+"""Copies that lost are kept for people, a few of each component."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from agent.worker.components import lost_copies
+
+
+def test_the_newest_of_each_component_are_kept(tmp_path: Path) -> None:
+    directory = tmp_path / "lost"
+    other = lost_copies.keep(directory, "/lab/r1/mapper-epoch", 1, b"another component's")
+    kept = [lost_copies.keep(directory, "/lab/r1/[m]apper", epoch, b"%d" % epoch) for epoch in (2, 9, 10, 11)]
+    assert [path.exists() for path in kept] == [False, True, True, True]
+    assert (kept[-1].read_bytes(), other.read_bytes()) == (b"11", b"another component's")
+    assert kept[-1].stat().st_mode & 0o077 == 0 == directory.stat().st_mode & 0o077

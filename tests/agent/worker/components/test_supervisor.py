@@ -1,0 +1,305 @@
+"""Leases and freezes overtake what waits in a component's queue; a takeover that what waits cannot carry out starts anew."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from agent.config import ComponentConfig
+from agent.errors import GuardError
+from agent.system.clock import Laps
+from agent.worker.components import prerequisites, resume
+from agent.worker.components.component import Component
+from agent.worker.components.context import Surroundings
+from agent.worker.components.keeper_client import Following
+from agent.worker.components.run_records import Records
+from agent.worker.components.supervisor import Charge
+from agent.worker.components.warm_program import Standby
+from agent.worker.control.verbs import Verbs
+from checkpoint.model import Position
+from failover.core import acts
+
+NAME = "/lab/robot1/mapper"
+LATE_NS, NEWER_NS = 100, 200
+
+
+class Told:
+    """Stands for a guard whose clock shows `now_ns`: what it was told, and whether the program runs."""
+
+    def __init__(self) -> None:
+        self.lease_ns = 0
+        self.now_ns = 0
+        self.runs = False
+        self.refused = 0
+        self.pid = 1
+        self.engine = "ptrace"
+        self.keeper = Following(NAME, cast(Any, None))
+
+    async def lease(self, until_ns: int) -> None:
+        self.lease_ns = until_ns
+
+    def output_pending(self) -> int:
+        return 0
+
+    async def freeze(self) -> None:
+        self.runs = False
+
+    async def capture(self, **_: object) -> None:
+        raise GuardError("it stands still by now, and nothing more is asked here")
+
+    async def thaw(self) -> None:
+        if self.lease_ns <= self.now_ns:
+            self.refused += 1
+            raise GuardError("its lease is over")
+        self.runs = True
+
+
+def carried_out(orders: Callable[[Charge, Told], Any], directory: Path) -> Told:
+    """What the guard was told in the end."""
+    guard = Told()
+
+    async def run() -> None:
+        none = cast(Any, None)
+        around = Surroundings(none, none, Records(directory), lambda _: None, none, none, lambda _: ComponentConfig())
+        charge = Charge(NAME, around, cast(Component, guard), epoch=3)
+        orders(charge, guard)
+        charge.begin()
+        await settled()
+        guard.now_ns = LATE_NS + 1
+        if guard.refused:
+            charge.order(acts.SetLease(NAME, 3, NEWER_NS))
+            await settled()
+        for task in tuple(charge._tasks):
+            task.cancel()
+
+    asyncio.run(run())
+    return guard
+
+
+async def settled() -> None:
+    """Everything that can go on has gone on."""
+    for _ in range(20):
+        await asyncio.sleep(0)
+
+
+def test_a_thaw_that_waited_does_not_bring_its_older_lease_back(tmp_path: Path) -> None:
+    def orders(charge: Charge, guard: Told) -> None:
+        guard.now_ns = LATE_NS + 1
+        charge.order(acts.Thaw(NAME, 3, LATE_NS))
+        charge.order(acts.SetLease(NAME, 3, NEWER_NS))
+
+    guard = carried_out(orders, tmp_path)
+    assert (guard.runs, guard.lease_ns, guard.refused) == (True, NEWER_NS, 0)
+
+
+def test_a_thaw_that_came_too_late_for_its_lease_comes_with_the_next(tmp_path: Path) -> None:
+    def orders(charge: Charge, guard: Told) -> None:
+        guard.now_ns = LATE_NS + 1
+        charge.order(acts.Thaw(NAME, 3, LATE_NS))
+
+    guard = carried_out(orders, tmp_path)
+    assert (guard.runs, guard.lease_ns, guard.refused) == (True, NEWER_NS, 1)
+
+
+def test_a_thaw_that_waited_does_not_undo_a_later_freeze(tmp_path: Path) -> None:
+    def orders(charge: Charge, _: Told) -> None:
+        charge.order(acts.Thaw(NAME, 3, LATE_NS))
+        charge.order(acts.Freeze(NAME, 3))
+
+    assert not carried_out(orders, tmp_path).runs
+
+
+def test_a_lease_lets_nothing_run_whose_last_snapshot_before_a_handover_was_ordered(tmp_path: Path) -> None:
+    def orders(charge: Charge, guard: Told) -> None:
+        guard.now_ns = LATE_NS + 1
+        charge.order(acts.Thaw(NAME, 3, LATE_NS))
+        charge.order(acts.Capture(NAME, 3, False, 1, 1, hold=True))
+
+    guard = carried_out(orders, tmp_path)
+    assert (guard.runs, guard.lease_ns, guard.refused) == (False, NEWER_NS, 1)
+
+
+class SlowStore:
+    """Stands for a store that folds until it may go on."""
+
+    def __init__(self) -> None:
+        self.may_go_on = threading.Event()
+        self.begun = threading.Semaphore(0)
+        self.calls: list[object] = []
+
+    def prune(self, _: str, oldest: Position) -> None:
+        self.calls.append(oldest.sequence)
+        self.begun.release()
+        self.may_go_on.wait()
+
+    def set_aside(self, _: str, generations: tuple[int, ...]) -> None:
+        self.calls.append(generations)
+
+
+def test_nobody_waits_until_a_chain_is_folded_but_who_forgets_of_it(tmp_path: Path) -> None:
+    store, guard, none = SlowStore(), Told(), cast(Any, None)
+
+    async def run() -> None:
+        around = Surroundings(none, cast(Any, store), Records(tmp_path), lambda _: None, none, none, lambda _: ComponentConfig())
+        charge = Charge(NAME, around, cast(Component, guard), epoch=3)
+        charge.begin()
+        charge.order(acts.Prune(NAME, 3, Position(1, 1, b"")))
+        await asyncio.to_thread(store.begun.acquire)
+        for sequence in (2, 3):
+            charge.order(acts.Prune(NAME, 3, Position(1, sequence, b"")))
+        charge.order(acts.Thaw(NAME, 3, LATE_NS))
+        charge.order(acts.Forget(NAME, 3, (2,)))
+        await settled()
+        assert guard.runs and store.calls == [1]
+        store.may_go_on.set()
+        await forgotten(store)
+        for task in tuple(charge._tasks):
+            task.cancel()
+
+    asyncio.run(run())
+    assert store.calls == [1, 3, (2,)], "the newest order contains those before it"
+
+
+async def forgotten(store: SlowStore) -> None:
+    while not {3, (2,)} <= set(store.calls):
+        await asyncio.sleep(0.001)
+
+
+def test_a_takeover_that_what_waited_cannot_carry_out_starts_the_program_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nothing = cast(Any, None)
+    waiting, anew = cast(Component, object()), cast(Component, object())
+    tried: list[Component | None] = []
+
+    async def brought_back(
+        around: object, act: object, chain: object, outage_ns: int, laps: object, waits: Any = None
+    ) -> Component:
+        tried.append(waits)
+        return waits or anew
+
+    async def let_it_run(self: Charge, component: Component, epoch: int, outage_ns: int, laps: object) -> tuple[Component, int]:
+        if component is waiting:
+            raise GuardError("the program has ended")
+        return component, outage_ns
+
+    monkeypatch.setattr(resume, "brought_back", brought_back)
+    monkeypatch.setattr(Charge, "_let_it_run", let_it_run)
+    monkeypatch.setattr(Standby, "take", lambda _: waiting)
+
+    async def run() -> None:
+        charge = Charge(NAME, Surroundings(nothing, nothing, Records(tmp_path), lambda _: None, nothing, nothing, nothing))
+        assert await charge._resumed(acts.Restore(NAME, 3, Position(1, 1, b"d"), None), [], 7, Laps()) == (anew, 7)
+        assert tried == [waiting, None]
+
+    asyncio.run(run())
+
+
+class Guarded:
+    """Stands for a component whose guard answers late, or not at all."""
+
+    pid = 1
+
+    def __init__(self, trouble: GuardError | None = None) -> None:
+        self.answers = asyncio.Event()
+        self.trouble = trouble
+
+    async def release(self) -> None:
+        await self.answers.wait()
+        if self.trouble is not None:
+            raise self.trouble
+
+
+def released(directory: Path, trouble: GuardError | None = None) -> Exception | None:
+    """Have a component released as an operator orders it; what he is told, which is nothing before its guard has answered."""
+
+    async def run() -> Exception | None:
+        none = cast(Any, None)
+        around = Surroundings(none, none, Records(directory), lambda _: None, none, none, lambda _: ComponentConfig())
+        guard = Guarded(trouble)
+        charge = Charge(NAME, around, cast(Component, guard), epoch=3)
+        charge.begin()
+
+        async def command(_: object) -> acts.Answer:
+            charge.order(acts.LetGo(NAME, 3))
+            return acts.Answer(1, True, "it is protected no longer")
+
+        async def known(name: str) -> str:
+            return name
+
+        verbs = Verbs.__new__(Verbs)
+        verbs.__dict__.update(_lanes=SimpleNamespace(charge=lambda _: charge), _command=command, _known=known)
+        answer = asyncio.create_task(verbs.release({"name": NAME}))
+        await settled()
+        assert not answer.done()
+        guard.answers.set()
+        (outcome,) = await asyncio.gather(answer, return_exceptions=True)
+        for task in tuple(charge._tasks):
+            task.cancel()
+        return outcome if isinstance(outcome, Exception) else None
+
+    return asyncio.run(run())
+
+
+def test_a_release_is_answered_once_the_guard_has_been_told(tmp_path: Path) -> None:
+    records = Records(tmp_path)
+    records.note(NAME, 3)
+    assert released(tmp_path) is None
+    assert not records.epoch(NAME)
+
+
+def test_a_release_that_the_guard_was_not_told_of_is_not_said_to_be_one(tmp_path: Path) -> None:
+    told = released(tmp_path, GuardError("its guard is gone"))
+    assert str(told) == f"cannot let {NAME} go: its guard is gone"
+
+
+class Ending(Guarded):
+    """Its program takes a while to end."""
+
+    async def stop(self, _: int) -> None:
+        await self.answers.wait()
+
+    async def forget(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+def test_what_is_lacking_is_looked_at_once_the_copy_that_was_here_has_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a handover it holds its ports and names for a moment yet, which were told as another process's for half a minute."""
+    nothing = cast(Any, None)
+
+    async def run() -> None:
+        guard = Ending()
+
+        async def compared(*_: object) -> tuple[str, ...]:
+            return () if guard.answers.is_set() else ("its port is another process's here",)
+
+        async def onlooker() -> Any:
+            return SimpleNamespace(end=lambda: None)
+
+        monkeypatch.setattr(prerequisites, "_compared", compared)
+        nursery = SimpleNamespace(onlooker=onlooker, relieve=lambda *_: None)
+        places = cast(Any, SimpleNamespace(nursery=nursery))
+        around = Surroundings(places, nothing, Records(tmp_path), lambda _: None, nothing, nothing, lambda _: ComponentConfig())
+        charge = Charge(NAME, around, cast(Component, guard), epoch=3)
+        charge.begin()
+        charge.order(acts.Stop(NAME, 4))
+        await settled()
+        found = asyncio.create_task(prerequisites.look(around, [charge]))
+        await settled()
+        guard.answers.set()
+        assert await found == {NAME: ()}
+        for task in tuple(charge._tasks):
+            task.cancel()
+
+    asyncio.run(run())

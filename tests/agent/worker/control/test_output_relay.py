@@ -1,0 +1,83 @@
+"""What a component wrote, passed on: all of it from the moment at which status says that it has ended."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from agent.errors import RefusedError
+from agent.guard.output_logs import OutputLogs
+from agent.worker.components.paths import Places, log_directory
+from agent.worker.control.output_relay import Outflow
+from failover.core.types import State
+
+NAME = "/lab/r1/mapper"
+WRITTEN = b"one\ntwo\nthree\n"
+COMMITTED = len(b"one\n")
+
+
+class Listener:
+    """A client that keeps what it is sent."""
+
+    def __init__(self) -> None:
+        self.heard = b""
+        self.caller = SimpleNamespace(uid=0)
+
+    async def output(self, _stream: int, _offset: int, content: bytes) -> None:
+        self.heard += content
+
+
+class Lanes:
+    """A robot whose core says that the component is in a state, while its charge has not heard of an end."""
+
+    def __init__(self, places: Places, state: State) -> None:
+        self.settings: Any = None
+        self.errands: Any = None
+        self.places = places
+        self.charges: Any = {NAME: SimpleNamespace(ended=None, component=SimpleNamespace())}
+        self._view = SimpleNamespace(name=NAME, state=state, primary="r1", positions=())
+
+    async def ask(self, _what: object, _component: str = "") -> Any:
+        return SimpleNamespace(status=SimpleNamespace(components=(self._view,), peers=()))
+
+
+@pytest.fixture
+def places(tmp_path: Path) -> Places:
+    nursery: Any = None
+    found = Places(tmp_path / "state", tmp_path / "run", nursery)
+    logs = OutputLogs(log_directory(NAME, found))
+    logs.write(1, 0, WRITTEN)
+    logs.commit((COMMITTED, 0))
+    logs.close()
+    return found
+
+
+@pytest.mark.parametrize(
+    ("state", "heard"),
+    [(State.PRIMARY, WRITTEN[:COMMITTED]), (State.FINISHED, WRITTEN), (State.FAILED, WRITTEN)],
+)
+def test_logs_show_all_of_it_as_soon_as_status_says_that_it_has_ended(places: Places, state: State, heard: bytes) -> None:
+    listener: Any = Listener()
+    outflow = Outflow(Lanes(places, state))
+    asyncio.run(outflow.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
+    assert listener.heard == heard
+
+
+def test_a_robot_shows_no_user_what_another_users_component_of_the_same_name_wrote(places: Places) -> None:
+    """That one was released; what it wrote lies here until the new one has written something."""
+    logs = OutputLogs(log_directory(NAME, places))
+    logs.belong(7002)
+    logs.close()
+    listener: Any = Listener()
+    listener.caller = SimpleNamespace(uid=7001)
+    outflow = Outflow(Lanes(places, State.PRIMARY))
+    with pytest.raises(RefusedError, match="belongs to uid 7002"):
+        asyncio.run(outflow.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
+    assert listener.heard == b""
+    listener.caller = SimpleNamespace(uid=7002)
+    asyncio.run(outflow.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
+    assert listener.heard == WRITTEN[:COMMITTED]

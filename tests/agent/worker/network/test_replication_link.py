@@ -1,0 +1,208 @@
+"""Two and more bulk lanes on the loopback: who gets in, what arrives, what is told."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Any
+
+import pytest
+
+from agent.errors import LaneError
+from agent.system import connection_quota
+from agent.worker.network.replication_link import MEND, BulkLane, Keys, LinkState, new_keys, shown
+from failover.core.wire.messages import CHUNK_SIZE_MAX, Bulk, Cancel, Chunk
+
+PATIENCE_S = 20.0
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
+class Pair:
+    """robot1 and robot2, and what each of them heard."""
+
+    def __init__(self, keys1: Keys, keys2: Keys) -> None:
+        self.ports = {"robot1": free_port(), "robot2": free_port()}
+        self.heard: dict[str, list[tuple[str, Bulk]]] = {"robot1": [], "robot2": []}
+        self.unread: dict[str, list[tuple[str, str]]] = {"robot1": [], "robot2": []}
+        self.lanes = {name: self.lane(name, keys) for name, keys in (("robot1", keys1), ("robot2", keys2))}
+
+    def lane(self, name: str, keys: Keys) -> BulkLane:
+        def receive(peer: str, message: Bulk) -> None:
+            self.heard[name].append((peer, message))
+
+        peers = {peer: f"127.0.0.1:{port}" for peer, port in self.ports.items() if peer != name}
+
+        def unread(*sign: str) -> None:
+            self.unread[name].append((sign[0], sign[1]))
+
+        where = f"127.0.0.1:{self.ports[name]}"
+        return BulkLane(name, where, peers, keys, receive, lambda *_: None, unread=unread)
+
+    def state(self, name: str) -> LinkState:
+        other = next(peer for peer in self.ports if peer != name)
+        return self.lanes[name].links[other].state
+
+    def connected(self) -> bool:
+        return all(self.state(name) is LinkState.CONNECTED for name in self.ports)
+
+
+def run(keys1: Keys, keys2: Keys, body: Callable[[Pair], Awaitable[None]]) -> None:
+    async def main() -> None:
+        pair = Pair(keys1, keys2)
+        for lane in pair.lanes.values():
+            lane.open()
+        try:
+            await body(pair)
+        finally:
+            for lane in pair.lanes.values():
+                await lane.close()
+
+    coroutine: Coroutine[Any, Any, None] = main()
+    asyncio.run(coroutine)
+
+
+def team_keys() -> tuple[Keys, Keys]:
+    pairs = {name: new_keys() for name in ("robot1", "robot2")}
+    publics = {name: public for name, (public, _) in pairs.items()}
+    return Keys(*pairs["robot1"], publics), Keys(*pairs["robot2"], publics)
+
+
+@pytest.mark.parametrize("keyed", [True, False])
+def test_words_and_chunks_arrive_whole_and_in_order(keyed: bool) -> None:
+    keys1, keys2 = team_keys() if keyed else (Keys("", "", {}), Keys("", "", {}))
+
+    async def body(pair: Pair) -> None:
+        await until(pair.connected)
+        pieces = [os.urandom(CHUNK_SIZE_MAX) for _ in range(20)]
+        for index, piece in enumerate(pieces):
+            await pair.lanes["robot1"].ship("robot2", Chunk(1, index, piece))
+        pair.lanes["robot2"].say("robot1", Cancel(7))
+        await until(lambda: len(pair.heard["robot2"]) == len(pieces) and bool(pair.heard["robot1"]))
+        assert [message for _, message in pair.heard["robot2"]] == [Chunk(1, i, piece) for i, piece in enumerate(pieces)]
+        assert pair.heard["robot1"] == [("robot2", Cancel(7))]
+
+    run(keys1, keys2, body)
+
+
+def test_a_stranger_with_a_key_of_its_own_is_refused_and_both_sides_say_so() -> None:
+    keys1, keys2 = team_keys()
+    public, secret = new_keys()
+    stranger = Keys(public, secret, {**keys2.peers, "robot2": public})
+
+    async def body(pair: Pair) -> None:
+        await until(lambda: pair.state("robot2") is LinkState.REFUSED)
+        assert "team.toml" in pair.lanes["robot2"].links["robot1"].reason
+        assert pair.lanes["robot1"].strangers > 0
+        pair.lanes["robot2"].say("robot1", Cancel(1))
+        with pytest.raises(LaneError, match="down"):
+            await pair.lanes["robot2"].ship("robot1", Chunk(1, 0, b"let me in"))
+        assert pair.heard["robot1"] == []
+        await until(lambda: len(pair.unread["robot1"]) > 1 and len(pair.unread["robot2"]) > 1)  # each is told again and again
+        assert ("robot2", mismatch) in pair.unread["robot1"] and mismatch in pair.lanes["robot1"].troubles()
+        assert any(peer == "robot1" and shown(public) in why for peer, why in pair.unread["robot2"])
+
+    mismatch = f"robot2 presents the key {shown(public)}, and team.toml here has {shown(keys1.peers['robot2'])} for it: {MEND}"
+    run(keys1, stranger, body)
+
+
+def test_a_member_cannot_speak_under_another_members_name() -> None:
+    keys1, _ = team_keys()
+    public3, secret3 = new_keys()
+    everybody = {**keys1.peers, "robot3": public3}
+
+    async def body(pair: Pair) -> None:
+        await until(lambda: pair.state("robot2") is LinkState.CONNECTED)
+        before = pair.lanes["robot1"].strangers
+        pair.lanes["robot2"].say("robot1", Cancel(1))
+        await until(lambda: pair.lanes["robot1"].strangers > before)
+        assert pair.heard["robot1"] == []
+
+    run(Keys(keys1.public, keys1.secret, everybody), Keys(public3, secret3, everybody), body)
+
+
+def test_a_link_that_is_lost_says_so_and_comes_back() -> None:
+    keys1, keys2 = team_keys()
+
+    async def body(pair: Pair) -> None:
+        await until(pair.connected)
+        await pair.lanes["robot2"].close()
+        await until(lambda: pair.state("robot1") is not LinkState.CONNECTED)
+        with pytest.raises(LaneError):
+            await pair.lanes["robot1"].ship("robot2", Chunk(1, 0, b""))
+        pair.lanes["robot2"] = pair.lane("robot2", keys2)
+        pair.lanes["robot2"].open()
+        await until(pair.connected)
+        pair.lanes["robot1"].say("robot2", Cancel(2))
+        await until(lambda: ("robot1", Cancel(2)) in pair.heard["robot2"])
+
+    run(keys1, keys2, body)
+
+
+def hangs_up(connection: socket.socket) -> bool:
+    """Whether the other end has hung up by now."""
+    try:
+        while connection.recv(1 << 16):
+            pass  # ZeroMQ greets everybody
+    except BlockingIOError:
+        return False
+    except ConnectionError:
+        pass
+    return True
+
+
+def test_connections_of_strangers_are_limited_and_a_member_comes_in_beside_them() -> None:
+    keys1, keys2 = team_keys()
+    many = connection_quota.OTHERS_MAX + 40
+
+    async def body(pair: Pair) -> None:
+        port, strangers = pair.ports["robot1"], []
+        await until(pair.connected)
+        await pair.lanes["robot2"].close()
+        try:
+            for number in range(many):
+                stranger = socket.create_connection(("127.0.0.1", port), source_address=(f"127.0.1.{number % 60 + 1}", 0))
+                stranger.setblocking(False)
+                strangers.append(stranger)
+                await asyncio.sleep(0)
+            await until(lambda: sum(map(hangs_up, strangers)) >= many - connection_quota.OTHERS_MAX)
+            pair.lanes["robot2"] = pair.lane("robot2", keys2)
+            pair.lanes["robot2"].open()
+            await until(pair.connected)
+            (told,) = pair.lanes["robot1"].troubles()
+            assert "connections to port" in told
+            assert "were turned away, last from 127.0.1." in told
+        finally:
+            for stranger in strangers:
+                stranger.close()
+
+    run(keys1, keys2, body)
+
+
+def test_one_address_holds_no_more_than_its_share() -> None:
+    keys1, keys2 = team_keys()
+
+    async def body(pair: Pair) -> None:
+        await until(pair.connected)
+        crowd = [socket.create_connection(("127.0.0.1", pair.ports["robot1"])) for _ in range(3 * connection_quota.ADDRESS_MAX)]
+        for one in crowd:
+            one.setblocking(False)
+        await until(lambda: sum(map(hangs_up, crowd)) >= 2 * connection_quota.ADDRESS_MAX)
+        assert pair.connected()
+        assert any("were turned away" in told for told in pair.lanes["robot1"].troubles())
+        for one in crowd:
+            one.close()
+
+    run(keys1, keys2, body)

@@ -1,0 +1,253 @@
+"""Transfers under credit: whole or without a trace, whatever the other side does."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from agent.errors import LaneError
+from agent.system import crash
+from agent.worker.replication import transfer
+from agent.worker.replication.transfer import Receiver, Refusal, Shipper, digest_of
+from checkpoint.model import Position
+from failover.core.types import ComponentSpec
+from failover.core.wire.messages import CHUNK_SIZE_MAX, Bulk, Cancel, Chunk, Credit, Offer, Refuse, Taken
+
+SIZE = 5 * CHUNK_SIZE_MAX + 17
+BOUND_S = 20.0
+
+
+class Lane:
+    """A lane whose other end is the test's function."""
+
+    def __init__(self, deliver: Callable[[str, Bulk], None]) -> None:
+        self.deliver = deliver
+        self.connected = True
+        self.said: list[Bulk] = []
+
+    def say(self, peer: str, message: Bulk) -> bool:
+        if self.connected:
+            self.said.append(message)
+            asyncio.get_running_loop().call_soon(self.deliver, peer, message)
+        return self.connected
+
+    async def ship(self, peer: str, chunk: Chunk) -> None:
+        self.say(peer, chunk)
+
+
+class Desk:
+    """Takes everything that it admits."""
+
+    def __init__(self, refusal: str = "") -> None:
+        self.refusal = refusal
+        self.taken: list[bytes] = []
+        self.failed: list[str] = []
+
+    def admits(self, peer: str, offer: Offer) -> None:
+        if self.refusal:
+            raise Refusal(self.refusal)
+
+    async def take(self, peer: str, offer: Offer, descriptor: int) -> None:
+        self.taken.append(os.pread(descriptor, offer.size, 0))
+
+    async def make_room(self, size: int) -> None:
+        self.room = size
+
+    def not_taken(self, peer: str, offer: Offer, why: str) -> None:
+        self.failed.append(why)
+
+
+class Two:
+    """A shipper and a receiver, joined by two lanes; ``spoil`` changes, or drops, what the shipper says."""
+
+    def __init__(self, directory: Path, desk: Desk, spoil: Callable[[Bulk], Bulk | None] = lambda message: message) -> None:
+        self.desk = desk
+        self.out = Lane(self._arrive)
+        self.back = Lane(self._answer)
+        self.shipper = Shipper(self.out)
+        self.receiver = Receiver(self.back, directory, desk)
+        self._spoil = spoil
+
+    def _arrive(self, _peer: str, sent: Bulk) -> None:
+        match self._spoil(sent):
+            case Offer() as message:
+                self.receiver.offered("robot1", message)
+            case Chunk() as message:
+                self.receiver.chunk("robot1", message)
+            case Cancel() as message:
+                self.receiver.cancelled("robot1", message)
+
+    def _answer(self, _peer: str, message: Bulk) -> None:
+        if isinstance(message, Credit | Taken | Refuse):
+            self.shipper.heard("robot2", message)
+
+
+@pytest.fixture
+def content(tmp_path: Path) -> Path:
+    path = tmp_path / "snapshot"
+    path.write_bytes(os.urandom(SIZE))
+    return path
+
+
+@pytest.fixture(autouse=True)
+def _little_patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transfer, "PATIENCE_S", 0.2)
+
+
+async def ship(two: Two, path: Path) -> None:
+    with path.open("rb") as file:
+        digest = digest_of(file.fileno(), SIZE)
+        offer = Offer(0, "/lab/a", 1, Position(1, 1, b""), None, SIZE, digest, ComponentSpec("/lab/a"))
+        await asyncio.wait_for(two.shipper.ship("robot2", offer, file.fileno()), BOUND_S)
+
+
+def run(body: Coroutine[Any, Any, None]) -> None:
+    asyncio.run(body)
+
+
+def left_in(directory: Path) -> list[str]:
+    return [path.name for path in directory.iterdir() if path.name != "snapshot"]
+
+
+def test_a_snapshot_arrives_whole(tmp_path: Path, content: Path) -> None:
+    async def body() -> None:
+        two = Two(tmp_path, Desk())
+        await ship(two, content)
+        while not two.desk.taken:
+            await asyncio.sleep(0)
+        assert two.desk.taken == [content.read_bytes()]
+
+    run(body())
+
+
+def test_never_more_chunks_are_under_way_than_there_is_credit_for(tmp_path: Path, content: Path) -> None:
+    async def body() -> None:
+        two = Two(tmp_path, Desk())
+        two.shipper = Shipper(Lane(lambda *_: None))
+        task = asyncio.create_task(ship(two, content))
+        with pytest.raises(LaneError, match="took nothing"):
+            await task
+
+    run(body())
+
+
+def test_an_offer_that_cannot_leave_is_given_up_at_once(tmp_path: Path, content: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transfer, "PATIENCE_S", 10 * BOUND_S)
+
+    async def body() -> None:
+        two = Two(tmp_path, Desk())
+        two.out.connected = False
+        with pytest.raises(LaneError, match="is not connected"):
+            await ship(two, content)
+
+    run(body())
+
+
+@pytest.mark.parametrize("at", [0, 3])
+def test_a_sender_that_falls_silent_leaves_nothing_and_is_told_why(tmp_path: Path, content: Path, at: int) -> None:
+    def spoil(message: Bulk) -> Bulk | None:
+        return None if isinstance(message, Chunk) and message.offset >= at * CHUNK_SIZE_MAX else message
+
+    async def body() -> None:
+        two = Two(tmp_path, Desk(), spoil)
+        with pytest.raises(LaneError, match=r"silent|took nothing"):
+            await ship(two, content)
+        assert two.desk.taken == []
+
+    run(body())
+    assert left_in(tmp_path) == []
+
+
+def test_one_flipped_bit_under_way_is_noticed(tmp_path: Path, content: Path) -> None:
+    def spoil(message: Bulk) -> Bulk | None:
+        if isinstance(message, Chunk) and message.offset == CHUNK_SIZE_MAX:
+            return msgspec.structs.replace(message, content=b"\x00" + message.content[1:])
+        return message
+
+    changed = content.read_bytes()
+    content.write_bytes(changed[:CHUNK_SIZE_MAX] + b"\x01" + changed[CHUNK_SIZE_MAX + 1 :])
+
+    async def body() -> None:
+        two = Two(tmp_path, Desk(), spoil)
+        with pytest.raises(LaneError, match="digest"):
+            await ship(two, content)
+        assert two.desk.taken == []
+
+    run(body())
+
+
+def test_a_full_disk_is_said_by_name(tmp_path: Path, content: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(transfer, "_keep", full)
+
+    async def body() -> None:
+        two = Two(tmp_path, Desk())
+        with pytest.raises(LaneError, match="No space left on device"):
+            await ship(two, content)
+        assert two.desk.taken == []
+        assert two.desk.failed == ["cannot write it there: No space left on device"]
+
+    run(body())
+
+
+def test_what_the_desk_does_not_admit_does_not_travel(tmp_path: Path, content: Path) -> None:
+    async def body() -> None:
+        two = Two(tmp_path, Desk("epoch 1 is over"))
+        with pytest.raises(LaneError, match="epoch 1 is over"):
+            await ship(two, content)
+        assert not any(isinstance(message, Chunk) for message in two.out.said)
+
+    run(body())
+
+
+@pytest.mark.parametrize("size", [0, -1, 1 << 60])
+def test_an_absurd_size_is_refused_at_once(tmp_path: Path, size: int) -> None:
+    async def body() -> None:
+        two = Two(tmp_path, Desk())
+        spec = ComponentSpec("/lab/a")
+        two.receiver.offered("robot1", Offer(1, "/lab/a", 1, Position(1, 1, b""), None, size, b"", spec))
+        assert isinstance(two.back.said[0], Refuse)
+
+    run(body())
+
+
+def test_a_chunk_without_credit_ends_its_transfer(tmp_path: Path) -> None:
+    async def body() -> None:
+        two = Two(tmp_path, Desk())
+        spec = ComponentSpec("/lab/a")
+        two.receiver.offered("robot1", Offer(1, "/lab/a", 1, Position(1, 1, b""), None, 1 << 30, b"", spec))
+        for index in range(100):
+            two.receiver.chunk("robot1", Chunk(1, index * CHUNK_SIZE_MAX, b"x"))
+        assert any(isinstance(message, Refuse) and "credit" in message.reason for message in two.back.said)
+
+    run(body())
+
+
+def test_a_mistake_in_taking_a_snapshot_in_is_not_passed_over(
+    tmp_path: Path, content: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Mistaken(Desk):
+        async def take(self, peer: str, offer: Offer, descriptor: int) -> None:
+            raise ZeroDivisionError
+
+    ended: list[int] = []
+    monkeypatch.setattr(os, "_exit", ended.append)
+    monkeypatch.setattr(transfer, "PATIENCE_S", BOUND_S)
+
+    async def body() -> None:
+        two = Two(tmp_path, Mistaken())
+        await ship(two, content)
+        async with asyncio.timeout(BOUND_S):
+            while not ended:
+                await asyncio.sleep(0)
+
+    run(body())
+    assert ended == [crash.STATUS]

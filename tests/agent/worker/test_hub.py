@@ -1,0 +1,73 @@
+"""A witness may be anybody's process: what it says to a robot starts, ends and overwrites nothing."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from agent import config as configuration
+from agent.main_loop.messages import ToLanes
+from agent.worker.network.connections import BULK
+from agent.worker.process import Lanes
+from checkpoint.keeper.messages import Channel, pair
+from checkpoint.model import Position
+from failover.config import team
+from failover.config.team import Robot, Team
+from failover.core.types import ComponentSpec
+from failover.core.wire.messages import Errand, ErrandDone, Offer, Refuse
+
+OFFER = Offer(7, "/lab/a", 1, Position(64, 1, b"d"), None, 10, b"x", ComponentSpec("/lab/a"))
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> configuration.Settings:
+    """robot1's, in a team with a witness."""
+    members = {
+        "robot1": Robot(("127.0.0.1:7420",), "127.0.0.1:7421"),
+        "gate": Robot(("127.0.0.1:7430",), "127.0.0.1:7431", "witness"),
+        "robot2": Robot(("127.0.0.1:7440",), "127.0.0.1:7441"),
+    }
+    team.write(tmp_path / "team", Team("lab", members))
+    path = tmp_path / "agent.toml"
+    places = "".join(f'{part}_directory = "{tmp_path / part}"\n' for part in ("team", "state", "runtime"))
+    path.write_text(f'robot = "robot1"\ninsecure = true\n{places}')
+    return configuration.load(path)
+
+
+def heard(settings: configuration.Settings, peer: str, message: Any, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What a robot answers to a message at once."""
+
+    async def hear() -> list[Any]:
+        ours, theirs = pair()
+        with ours, theirs:
+            lanes = Lanes(settings, Channel(ours, ToLanes))
+            said: list[Any] = []
+            monkeypatch.setattr(lanes._ways, "say", lambda _peer, answer: said.append(answer))
+            monkeypatch.setattr(lanes._lane, "say", lambda _peer, answer: said.append(answer))
+            monkeypatch.setattr(lanes.errands, "received", lambda _peer, errand: said.append(errand))
+            lanes._hear(BULK, peer, message)
+            return said
+
+    return asyncio.run(hear())
+
+
+@pytest.mark.parametrize("verb", ["stop", "release", "handover", "prefer", "promoted", "piece"])
+def test_an_order_of_a_witness_is_refused(settings: configuration.Settings, verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    order = Errand(3, verb, b"\x80", 0)
+    (answer,) = heard(settings, "gate", order, monkeypatch)
+    assert isinstance(answer, ErrandDone) and answer.number == 3 and "gate is a witness: it votes" in answer.refusal
+    assert heard(settings, "robot2", order, monkeypatch) == [order], "a robot's is carried out"
+
+
+@pytest.mark.parametrize("verb", ["standing", "picture", "story"])
+def test_a_witness_may_ask_how_things_stand(settings: configuration.Settings, verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    question = Errand(3, verb, b"\x80", 0)
+    assert heard(settings, "gate", question, monkeypatch) == [question]
+
+
+def test_a_snapshot_of_a_witness_is_refused(settings: configuration.Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    (answer,) = heard(settings, "gate", OFFER, monkeypatch)
+    assert isinstance(answer, Refuse) and "gate is a witness" in answer.reason

@@ -1,0 +1,304 @@
+"""A snapshot file holds exactly what was written, or is refused."""
+
+from __future__ import annotations
+
+import os
+import random
+import resource
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from checkpoint.errors import FormatError
+from checkpoint.model import OutputPiece, PageRun, Resource, Snapshot
+from checkpoint.snapshot import format, layout, validity
+from tests.checkpoint.snapshots import PAGE, START, family, history, page, snapshot, vma
+
+FACTS = st.recursive(
+    st.none() | st.booleans() | st.integers(-(1 << 63), (1 << 64) - 1) | st.text(max_size=8) | st.binary(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
+    max_leaves=6,
+)
+CONTENTS = st.one_of(
+    st.just(bytes(PAGE)),
+    st.integers(0, 255).map(lambda byte: bytes([byte]) * PAGE),
+    st.randoms().map(lambda dice: dice.randbytes(PAGE)),
+)
+
+
+@st.composite
+def snapshots(draw: st.DrawFn) -> Snapshot:
+    """Any snapshot that a capture could make of a small process."""
+    state = draw(st.dictionaries(st.integers(0, 63), CONTENTS, max_size=8))
+    made = snapshot(state, sequence=draw(st.integers(2, 1 << 40)), component=draw(st.text(min_size=1, max_size=20)))
+    facts = draw(st.dictionaries(st.text(max_size=6), FACTS, max_size=3))
+    pieces = (OutputPiece(1, draw(st.integers(0, 1 << 40)), draw(st.binary(max_size=50))),)
+    return replace(
+        made,
+        resources=(Resource("files", "fd 3", facts),),
+        output=pieces,
+        notes=tuple(draw(st.lists(st.text(max_size=10), max_size=2))),
+        epoch=draw(st.integers(0, 1 << 62)),
+        cleared=() if draw(st.booleans()) else (PageRun(START, START + PAGE),),
+    )
+
+
+@settings(max_examples=150, deadline=None)
+@given(snapshots())
+def test_what_was_written_is_what_is_read(made: Snapshot) -> None:
+    content = format.encode_bytes(made)
+    assert format.decode(content) == made
+    assert format.encode_bytes(made) == content
+    outline = format.read_outline(content)
+    assert replace(outline, contents=made.contents) == made
+    assert format.verify(content) == format.read_header(content)
+    assert format.verified_outline(content) == outline
+    assert format.read_header(content).position == made.position
+
+
+def test_a_file_of_several_frames_is_read_from_a_path_a_descriptor_and_memory(tmp_path: Path) -> None:
+    dice = random.Random(5)
+    state = {number: dice.randbytes(PAGE) if number % 3 else page(str(number)) for number in range(700)}
+    made = snapshot(state, vmas=(vma(0, 700),))
+    path = tmp_path / "snapshot"
+    with path.open("wb") as file:
+        size = format.encode(made, file)
+    assert size == path.stat().st_size
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        assert format.decode(path) == format.decode(descriptor) == format.decode(path.read_bytes()) == made
+    finally:
+        os.close(descriptor)
+
+
+def large(frames: int = 12) -> Snapshot:
+    """One of so many frames, of which each other one compresses."""
+    dice, per_frame = random.Random(6), layout.FRAME_SIZE // PAGE
+    count = frames * per_frame - 3
+    return snapshot(
+        {n: dice.randbytes(PAGE) if n // per_frame % 2 else bytes([n % 251]) * PAGE for n in range(count)}, vmas=(vma(0, count),)
+    )
+
+
+def test_several_threads_write_and_read_the_very_same_bytes(tmp_path: Path) -> None:
+    made = large()
+    alone = format.encode_bytes(made)
+    with (tmp_path / "snapshot").open("wb", buffering=0) as file:
+        assert format.encode(made, file, threads=3) == len(alone)
+    assert (tmp_path / "snapshot").read_bytes() == alone
+    assert format.decode(tmp_path / "snapshot", threads=3) == format.decode(alone) == made
+
+
+def test_several_threads_find_the_damage_that_one_finds(tmp_path: Path) -> None:
+    whole = format.encode_bytes(large())
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1
+    for damaged in (bytes(flipped), whole[: len(whole) // 2], whole[:-1], whole + b"x"):
+        said = []
+        for threads in (1, 3):
+            with pytest.raises(FormatError) as refused:
+                format.decode(damaged, threads=threads)
+            said.append(str(refused.value))
+        assert said[0] == said[1]
+
+
+def test_a_file_that_takes_nothing_more_ends_the_threads_that_write_it() -> None:
+    before = threading.active_count()
+    with pytest.raises(OSError, match="takes nothing more"):
+        format.encode(large(), FullSink(5 << 20), threads=3)
+    assert threading.active_count() == before
+
+
+@pytest.fixture(scope="module")
+def sample() -> bytes:
+    return format.encode_bytes(history(2)[1])
+
+
+def test_one_flipped_bit_anywhere_is_refused(sample: bytes) -> None:
+    altered = bytearray(sample)
+    for place in range(len(sample)):
+        for bit in range(8) if place < 2 * layout.PREAMBLE_SIZE else (place % 8,):
+            altered[place] ^= 1 << bit
+            with pytest.raises(FormatError):
+                format.decode(bytes(altered))
+            altered[place] ^= 1 << bit
+    assert bytes(altered) == sample
+
+
+def test_a_file_that_ends_anywhere_too_early_is_refused(sample: bytes) -> None:
+    for size in range(len(sample)):
+        with pytest.raises(FormatError):
+            format.decode(sample[:size])
+
+
+def test_a_file_that_something_follows_is_refused(sample: bytes) -> None:
+    with pytest.raises(FormatError, match="follow"):
+        format.decode(sample + b"\0")
+
+
+def test_another_version_is_named(sample: bytes) -> None:
+    altered = bytearray(sample)
+    altered[8] = 9
+    with pytest.raises(FormatError, match="version 9"):
+        format.decode(bytes(altered))
+
+
+@pytest.mark.parametrize("content", [b"", b"hello, world\n" * 100, bytes(5000)])
+def test_what_is_no_snapshot_is_said_so(content: bytes) -> None:
+    with pytest.raises(FormatError, match="not a snapshot"):
+        format.decode(content)
+
+
+def with_guards(made: Snapshot, first: int, count: int) -> Snapshot:
+    guards = (PageRun(START + first * PAGE, START + (first + count) * PAGE),)
+    return replace(made, vmas=(replace(made.vmas[0], guards=guards),))
+
+
+BROKEN = {
+    "page size": lambda made: replace(made, machine=replace(made.machine, page_size=5000)),
+    "overlaps": lambda made: replace(made, vmas=made.vmas * 2),
+    "lies in no mapping": lambda made: replace(made, runs=(PageRun(PAGE, 5 * PAGE),)),
+    "not all inside": lambda made: with_guards(made, 200, 1),
+    "is carried, too": lambda made: with_guards(made, 3, 2),
+    "where the runs need": lambda made: replace(made, contents=made.contents[:-1]),
+    "page sum": lambda made: replace(made, page_sum=b""),
+    "same id": lambda made: replace(made, threads=made.threads * 2),
+    "the first is": lambda made: replace(made, threads=(replace(made.threads[0], tid=99), *made.threads[1:])),
+    "is not before": lambda made: replace(made, parent=replace(made.position, sequence=99)),
+    "cannot be": lambda made: replace(made, output=(OutputPiece(3, 0, b""),)),
+    "epoch": lambda made: replace(made, epoch=-1),
+}
+
+
+@pytest.mark.parametrize("words", [*BROKEN])
+def test_a_snapshot_that_does_not_hold_together_is_not_written(words: str) -> None:
+    with pytest.raises(FormatError, match=words):
+        format.encode_bytes(BROKEN[words](snapshot({n: page("x") for n in range(4)})))
+
+
+def with_child(made: Snapshot, **changes: object) -> Snapshot:
+    child = made.members[0]
+    return replace(made, members=(replace(child, **changes),))
+
+
+BROKEN_FAMILIES = {
+    "there are none": lambda made: with_child(made, threads=()),
+    "none of them": lambda made: with_child(made, process=replace(made.members[0].process, ppid=77)),
+    "ancestor of its own": lambda made: replace(
+        made,
+        members=(
+            replace(made.members[0], process=replace(made.members[0].process, ppid=5)),
+            replace(
+                made.members[0],
+                slot=2,
+                process=replace(made.members[0].process, pid=5, ppid=3),
+                threads=(replace(made.members[0].threads[0], tid=5),),
+            ),
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("words", [*BROKEN_FAMILIES])
+def test_a_family_that_does_not_hold_together_is_not_written(words: str) -> None:
+    with pytest.raises(FormatError, match=words):
+        format.encode_bytes(BROKEN_FAMILIES[words](family(1)[0]))
+
+
+FUZZ = """
+import random, sys
+from checkpoint import format, layout, validity
+from checkpoint.errors import FormatError
+sample = open(sys.argv[1], "rb").read()
+dice = random.Random(int(sys.argv[2]))
+def resealed(content):
+    # As a stranger could: every digest right, the content not.
+    try:
+        preamble = layout.Preamble.parse(sample)
+    except FormatError:
+        return content
+    body = bytearray(content[:layout.PREAMBLE_SIZE])
+    for index, section in enumerate(preamble.sections):
+        stored = content[section.offset:section.offset + section.stored_size]
+        entry = 32 + 64 * index
+        body[entry + 32:entry + 64] = layout.digest_of(stored)
+    body[-32:] = layout.digest_of(bytes(body[:-32]))
+    return bytes(body) + content[layout.PREAMBLE_SIZE:]
+for turn in range(int(sys.argv[3])):
+    content = bytearray(sample)
+    for _ in range(dice.randrange(1, 6)):
+        place = dice.randrange(len(content))
+        act = dice.randrange(4)
+        if act == 0:
+            content[place] = dice.randrange(256)
+        elif act == 1:
+            content[place:place + 8] = dice.choice((0, 1, 255, (1 << 63) - 1, (1 << 64) - 1)).to_bytes(8, "little")
+        elif act == 2:
+            content[place:place + dice.randrange(64)] = b""
+        else:
+            content[place:place] = dice.randbytes(dice.randrange(64))
+    content = bytes(content)
+    if turn % 2:
+        content = resealed(content)
+    if content == sample:
+        continue
+    try:
+        format.decode(content)
+    except FormatError:
+        continue
+    if format.decode(content) != format.decode(sample):
+        print("accepted", turn)  # a resealed state section may differ and be whole: it was rewritten, not damaged
+print("done")
+"""
+
+
+def test_no_input_makes_the_reader_crash_hang_or_allocate_without_bound(sample: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "sample"
+    path.write_bytes(sample)
+    seed = int(os.environ.get("FAILOVER_FUZZ_SEED", random.randrange(1 << 30)))
+    turns = os.environ.get("FAILOVER_FUZZ_TURNS", "4000")
+    print(f"FAILOVER_FUZZ_SEED={seed}")
+    limit = 1 << 30
+    done = subprocess.run(
+        [sys.executable, "-c", FUZZ, path, str(seed), turns],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
+    )
+    assert done.returncode == 0, f"seed {seed}: {done.stderr[-2000:]}"
+    assert done.stdout.endswith("done\n")
+
+
+class FullSink:
+    """A file that takes so many bytes, and then nothing, and says no reason."""
+
+    def __init__(self, room: int = 0) -> None:
+        self._room = room
+
+    def write(self, content: bytes | memoryview, /) -> int:
+        taken = min(len(content), self._room)
+        self._room -= taken
+        return taken
+
+
+def test_a_file_that_takes_nothing_more_is_an_error_and_no_endless_loop() -> None:
+    with pytest.raises(OSError, match="takes nothing more"):
+        format.encode(history(1)[0], FullSink())
+
+
+def test_a_file_that_expands_to_more_than_the_limit_is_refused_before_a_page_is_copied(monkeypatch: pytest.MonkeyPatch) -> None:
+    (base,) = family(1)
+    size = len(base.contents) + sum(copy.size for copy in base.copies)
+    encoded = format.encode_bytes(base)
+    monkeypatch.setattr(validity, "MAX_CONTENTS_SIZE", size)
+    assert format.decode(encoded).copies
+    monkeypatch.setattr(validity, "MAX_CONTENTS_SIZE", size - PAGE)
+    with pytest.raises(FormatError, match=f"copies: {size} bytes with what they are of, above the limit of {size - PAGE}"):
+        format.decode(encoded)
