@@ -105,7 +105,7 @@ def _live(
     for _ in range(faults or (random.randrange(4, 16) if votes else random.randrange(1, 9))):
         world.at(random.randrange(trouble_ns), Trouble(world, invariants, random, specs, endless=faults > 0))
     if liars:
-        _let_one_lie(world, Random(seed ^ 0x11A2), trouble_ns)
+        _let_one_lie(world, invariants, Random(seed ^ 0x11A2), trouble_ns)
     elif votes and random.random() < 0.3:
         _lose_a_disk(world, random)
     world.run(trouble_ns)
@@ -146,10 +146,12 @@ def _make_harsh(world: World) -> None:
         robot.slow, robot.clock.rate = 1, 1 + DRIFT_MAX * (1 if place else -1)
 
 
-def _let_one_lie(world: World, random: Random, until_ns: int) -> None:
+def _let_one_lie(world: World, invariants: Invariants, random: Random, until_ns: int) -> None:
     """A member, and one lie after the other."""
     name = random.choice(list(world.robots))
-    lies = ROBOTS_LIES if world.robots[name].config.runs(name) else LIES
+    lies = LIES
+    if world.robots[name].config.runs(name):
+        invariants.liar, lies = name, ROBOTS_LIES
 
     def lie() -> None:
         if world.now_ns < until_ns:

@@ -36,10 +36,13 @@ class Invariants:
         begun: where the copy of each epoch began.
         ordered: components and the epochs that an operator's order claimed: it may cost what was acknowledged.
         last: components whose end was reported as acknowledged.
+        liar: a robot whose key was stolen. It may give away, end or hold back what it runs and keeps itself; so then only that is
+            looked at which no robot's word may break: the others run nothing twice, vote once, and no epoch falls.
     """
 
     safe: set[str] = field(default_factory=set)
     votes: bool = False
+    liar: str = ""
     gone: set[Position] = field(default_factory=set)
     given: dict[tuple[str, str, int], str] = field(default_factory=dict)
     cast: set[tuple[str, str, int, str]] = field(default_factory=set)
@@ -56,6 +59,10 @@ class Invariants:
 
     def __call__(self, world: World, robot: str, what: object) -> None:
         """Look at one thing that happened, or (None) at the state of the world."""
+        if self.liar and isinstance(what, acts.Show | acts.Acknowledge | acts.ReportExit | acts.Start | acts.Restore):
+            if robot != self.liar and isinstance(what, acts.Start | acts.Restore):
+                self._one_primary(world, robot, what)
+            return
         match what:
             case None:
                 self._one_acts(world)
@@ -94,7 +101,7 @@ class Invariants:
     def _one_acts(self, world: World) -> None:
         copies = [name for robot in world.robots.values() for name in robot.programs]
         for component in {name for name in copies if copies.count(name) > 1}:
-            where = world.acting(component)
+            where = [name for name in world.acting(component) if name != self.liar]
             if len(where) > 1:
                 self.split.add(component)
                 if component in self.safe:
@@ -106,7 +113,7 @@ class Invariants:
             raise _broken(world, f"{component} should wait at {standby or 'no robot'}: it waits at {waiting}")
 
     def _one_primary(self, world: World, robot: str, act: acts.Start | acts.Restore) -> None:
-        others = [name for name in world.acting(act.component) if name != robot]
+        others = [name for name in world.acting(act.component) if name not in (robot, self.liar)]
         if others and act.component in self.safe:
             raise _broken(world, f"{robot} is to run {act.component} while the lease of {' and '.join(others)} is valid")
         owner = self.owners.setdefault((act.component, act.epoch), robot)
@@ -228,6 +235,8 @@ class Invariants:
 
     def ended_well(self, world: World) -> None:
         """After healing: each component that goes on acts at one robot, and the other protects it."""
+        if self.liar:
+            return
         for component in sorted({record.name for robot in world.robots.values() for record in ballot_of(robot).records}):
             if component.startswith(INVENTED_NAME):
                 continue  # there is none such
