@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import functools
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
@@ -47,6 +48,7 @@ def imported(tree: ast.AST, known: Iterable[str]) -> set[str]:
     return names & known
 
 
+@functools.cache
 def graph(root: Path = ROOT) -> dict[str, set[str]]:
     """The imports of all modules of the product."""
     known = modules(root)

@@ -40,7 +40,7 @@ def test_ctrl_c_while_a_command_loads_ends_it_quietly(entry: str, later: int) ->
 
 
 def test_an_interruption_that_was_to_be_ignored_stays_ignored() -> None:
-    script = "from signal import *\nfrom checkpoint import quiet\nquiet.begin()\nprint(getsignal(SIGINT) == SIG_IGN)"
+    script = "from signal import *\nfrom checkpoint.runtime.early_interrupt import begin\nbegin()\nprint(getsignal(2) == SIG_IGN)"
     ran = subprocess.run(
         [sys.executable, "-c", script],
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
@@ -53,7 +53,7 @@ def test_an_interruption_that_was_to_be_ignored_stays_ignored() -> None:
 
 LEFT = """
 import atexit, sys, threading
-from checkpoint import quiet
+from checkpoint.runtime import early_interrupt as quiet
 atexit.register(lambda: print("said goodbye"))
 print("printed", end=" ")
 if {threads}:

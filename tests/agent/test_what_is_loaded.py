@@ -12,7 +12,7 @@ from checkpoint.runtime import slim_imports
 
 LOADED: Final = """
 import sys
-from checkpoint import lean
+from checkpoint.runtime import slim_imports as lean
 lean.begin()
 import {}
 print(*(name for name, module in sys.modules.items() if vars(module or object).get("__spec__")))
@@ -56,7 +56,7 @@ def test_the_lanes_load_no_numpy_before_a_snapshot_comes(lanes: str) -> None:
 
 USED: Final = """
 import sys, threading
-from checkpoint import lean
+from checkpoint.runtime import slim_imports as lean
 lean.begin()
 import inspect
 assert type(sys.modules["inspect"]) is lean._Seldom

@@ -59,8 +59,8 @@ if 0 not in children:
 
 KNOCK = """
 import asyncio, sys
-from agent.transport import BulkLane, Keys, LinkState, new_keys
-from failover.core.messages import Cancel
+from agent.worker.network.replication_link import BulkLane, Keys, LinkState, new_keys
+from failover.core.wire.messages import Cancel
 
 async def knock(name, address, server_key):
     public, secret = new_keys()

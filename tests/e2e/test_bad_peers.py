@@ -26,7 +26,7 @@ COUNT = "import time\nfor i in range(1000000):\n    print(i, flush=True)\n    ti
 HEAD = 32
 """Bytes of a frame before its body; the last 16 are its authentication code."""
 
-OTHER_VERSION = "from failover.core import messages\nmessages.VERSION += 1\n"
+OTHER_VERSION = "from failover.core.wire import messages\nmessages.VERSION += 1\n"
 """Run by every Python of an agent before anything else: a release of another protocol version."""
 
 Pair = tuple[RobotMachine, RobotMachine]

@@ -20,7 +20,7 @@ import os
 
 from msgspec.structs import replace
 
-from failover.core import speaker
+from failover.core import beat_builder as speaker
 
 honest = speaker.Speaker.beat
 CHANGES = {

@@ -19,7 +19,7 @@ from tests.checkpoint.round_trip import as_nobody
 
 LOCKED: Final = """
 import threading
-from agent import kernel
+from agent.system import syscalls as kernel
 kernel.small_stacks()
 try:
     kernel.lock_memory()
@@ -50,7 +50,7 @@ def test_two_threads_of_a_process_that_is_locked_take_little_memory() -> None:
 
 LOCKED_FILES: Final = """
 import mmap, sys, tempfile
-from agent import kernel
+from agent.system import syscalls as kernel
 with tempfile.TemporaryFile() as file:
     file.truncate(1 << 20)
     unread = mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ, flags=mmap.MAP_PRIVATE)

@@ -10,7 +10,7 @@ from checkpoint.keeper.messages import Channel, Reply
 
 MAKES_GARBAGE = """
 import os, sys, weakref
-from checkpoint import keeper
+from checkpoint.keeper import server as keeper
 from checkpoint.errors import ProbeError
 
 class Held:
@@ -32,7 +32,7 @@ os._exit(keeper.main(["keeper", sys.argv[1]]))
 
 HOLDS_ERRORS = """
 import os, sys, weakref
-from checkpoint import keeper
+from checkpoint.keeper import server as keeper
 from checkpoint.errors import CaptureError, ProbeError
 
 class Held:

@@ -27,7 +27,7 @@ threading.Event().wait()
 
 DEAF = """
 import signal, sys, threading
-from checkpoint import keeper
+from checkpoint.keeper import server as keeper
 threading.Thread(target=threading.Event().wait, daemon=True).start()
 signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGCHLD})  # the kernel tells the other thread, as it may at any time
 sys.exit(keeper.main(["keeper", sys.argv[1]]))

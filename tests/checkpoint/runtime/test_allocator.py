@@ -10,7 +10,7 @@ import pytest
 
 WORKS = """
 import ctypes, threading
-from checkpoint import allocator
+from checkpoint.runtime import allocator
 
 allocator.be_frugal()
 kept = []

@@ -10,7 +10,7 @@ import pytest
 
 LOADED: Final = """
 import os, sys
-from checkpoint import lean
+from checkpoint.runtime import slim_imports as lean
 lean.begin()
 lean.load_numpy()
 import numpy as np

@@ -213,7 +213,7 @@ def test_a_family_that_does_not_hold_together_is_not_written(words: str) -> None
 
 FUZZ = """
 import random, sys
-from checkpoint import format, layout, validity
+from checkpoint.snapshot import format, layout, validity
 from checkpoint.errors import FormatError
 sample = open(sys.argv[1], "rb").read()
 dice = random.Random(int(sys.argv[2]))

@@ -367,7 +367,7 @@ def test_only_the_newest_of_what_lost_is_kept_aside(tmp_path: Path) -> None:
 FULL_DISK = """
 import os, sys
 from checkpoint.errors import StoreError
-from checkpoint.store import open_store
+from checkpoint.store.store import open_store
 from pathlib import Path
 store = open_store(Path(sys.argv[1]))
 descriptor = os.open(sys.argv[2], os.O_RDONLY)

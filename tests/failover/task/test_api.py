@@ -678,7 +678,7 @@ def test_no_child_is_forked_while_the_first_write_builds_what_all_writes_need(fo
         folder,
         """
         import failover, os, sys, threading, time
-        from checkpoint import format
+        from checkpoint.snapshot import format
 
         begun, steps, read_outline = threading.Event(), [], format.read_outline
 

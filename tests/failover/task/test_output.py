@@ -7,8 +7,8 @@ import sys
 
 STUCK = """
 import os, sys
-from checkpoint.stream_counts import COUNTERS
-from failover.client.task_output import OwnOutput
+from checkpoint.segment.output_counters import COUNTERS
+from failover.task.output import OwnOutput
 counters = os.memfd_create("counters")
 os.pwrite(counters, COUNTERS.pack(1, 7, 0, 0, 0, 0), 0)
 output = OwnOutput(counters)

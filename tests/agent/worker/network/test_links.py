@@ -169,8 +169,8 @@ def test_a_kernel_that_does_not_tell_is_said_and_hinders_nothing(sysfs: Sysfs, m
 
 IN_A_NAMESPACE = """
 import select, subprocess, sys
-from agent import rtnetlink
-from agent.links import Facts, Scene
+from agent.system import rtnetlink
+from agent.worker.network.links import Facts, Scene
 
 def ip(*words):
     subprocess.run(["ip", *words], check=True)

@@ -23,7 +23,7 @@ BOUND_S = 60.0
 ROOT = Path(__file__).parents[4]
 PROGRAM = """\
 import ctypes, platform, sys, threading
-from checkpoint.segment_writer import SegmentWriter
+from checkpoint.segment.writer import SegmentWriter
 from tests.checkpoint.segments import Telling, layout
 
 state, writer = Telling(), SegmentWriter(layout())

@@ -10,7 +10,7 @@ import pytest
 pytestmark = pytest.mark.root
 
 SPENT = """
-from checkpoint.linux import silence
+from checkpoint.linux.net import packet_drop as silence
 first, second = (silence.Connection(("10.0.0.1", port), ("10.0.0.2", 80)) for port in (1, 2))
 silence.SILENCE_S = 0
 silence.impose([first])
@@ -24,7 +24,7 @@ assert not list(silence._tables())
 """
 
 MANY = """
-from checkpoint.linux import silence
+from checkpoint.linux.net import packet_drop as silence
 connections = [silence.Connection(("10.0.0.1", port), ("10.0.0.2", 80)) for port in range(1, 401)]
 silence.impose(connections)
 assert {name for name, _ in silence._tables()} == {one.table for one in connections}

@@ -12,7 +12,7 @@ from checkpoint.linux.spawn import namespaces
 UNKNOWN_CALL = 1 << 20
 BORN = """
 import os, sys
-from checkpoint.linux import namespaces
+from checkpoint.linux.spawn import namespaces
 namespaces._SYS_CLOSE_RANGE = int(sys.argv[1])
 for number in (40, 41, 42, 43):
     os.dup2(0, number, inheritable=True)

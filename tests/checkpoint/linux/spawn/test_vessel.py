@@ -131,7 +131,7 @@ exec chroot "$1/root" "$2" -c "$3"
 ENTERS = """
 import sys
 sys.path[:] = {path!r}
-from checkpoint.linux import namespaces
+from checkpoint.linux.spawn import namespaces
 entered = namespaces.enter(pids=True, clocks=False)
 print(entered.pids, *entered.notes)
 """

@@ -38,8 +38,8 @@ def test_a_report_that_came_before_the_sleep_ends_it(reports: Reports) -> None:
 
 STOPS = """
 import os, sys
-from checkpoint.linux.reports import Reports, sleep_until_report
-from checkpoint.linux.tracee import Tracee
+from checkpoint.linux.trace.stop_events import Reports, sleep_until_report
+from checkpoint.linux.trace.tracee import Tracee
 tracee, reports = Tracee(int(sys.argv[1])), Reports()
 assert len(os.listdir("/proc/self/task")) == 1
 reports.keep()

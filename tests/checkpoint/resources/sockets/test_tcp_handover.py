@@ -28,7 +28,7 @@ PORT = "7000"
 ROOT = Path(__file__).resolve().parents[4]
 HOLD = """
 import os, signal
-from checkpoint.engine import CaptureOrder, ProtectOrder, Terms, engine_named
+from checkpoint.engine import CaptureOrder, ProtectOrder, Terms; from checkpoint.engines.registry import engine_named
 from tests.checkpoint.round_trip import at_last, captured_at_last
 order = ProtectOrder("/test/talks", terms=Terms(connections=True))
 session = at_last(lambda: engine_named("ptrace").protect({pid}, order))

@@ -241,7 +241,7 @@ def test_who_was_captured_is_dead_when_the_command_returns(tmp_path: Path) -> No
 
 TRACER = """
 import sys
-from checkpoint.linux.tracee import Tracee
+from checkpoint.linux.trace.tracee import Tracee
 tracee = Tracee(int(sys.argv[1]))
 tracee.seize()
 tracee.freeze()
