@@ -83,7 +83,7 @@ class Streams(Struct, frozen=True):
     """The guard's end of a component's standard streams: descriptors of *this* process.
 
     Attributes:
-        counters: memfd, little-endian u64 ``[busy1, count1, busy2, count2, first1, first2]`` (ARCHITECTURE §4).
+        counters: memfd, little-endian u64 ``[busy1, count1, busy2, count2, first1, first2]`` (docs/internals.md §5).
         outputs: read ends of the pipes (or the pseudo-terminal's masters) of standard output and standard error.
         logs: the files that the guard appends what it has read to.
     """

@@ -64,7 +64,8 @@ def test_a_link_that_leads_nowhere_is_seen() -> None:
 
 def command_lines(text: str) -> list[list[str]]:
     """What a document tells to type, in words: lines of code blocks, and spans of code with options, that begin with ours."""
-    blocks = re.findall(r"```\w*\n(.*?)```", text, flags=re.DOTALL)
+    fenced = re.findall(r"```(\w*)\n(.*?)```", text, flags=re.DOTALL)
+    blocks = [block for language, block in fenced if language != "layers"]  # those are parts of the product
     spans = re.findall(r"`([^`\n]+ --[^`\n]+)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
     lines = [part for block in blocks for line in block.splitlines() for part in re.split(r"&&|\|", line.partition("  #")[0])]
     found = [re.split(r"\s[<>]", line.strip())[0] for line in (*lines, *spans)]

@@ -1,7 +1,7 @@
 """Moves a program's output from its pipes into its logs, counting every byte, and never lets the program die of it.
 
 The counters are shared with the keeper, so that a snapshot's output is exact without asking anybody during a freeze
-(ARCHITECTURE.md, section 4). A byte is counted when it leaves the pipe and written afterwards, outside ``busy``: a slow disk
+(docs/internals.md, section 5). A byte is counted when it leaves the pipe and written afterwards, outside ``busy``: a slow disk
 never prolongs a freeze, and the keeper finds the bytes in the log after the thaw.
 
 Held output (``--output=committed``) that nobody may see yet has a bound: when more of it waits than `HOLD_LIMIT`, the pump leaves

@@ -1,6 +1,6 @@
 """Processors as data: files of the same names in the same order; this machine's are `cpu`, `stubs`, `extended` and `levels`.
 
-How to add one stands in ARCHITECTURE.md. On a machine whose processor has no files here, those of x86-64 are what `cpu` and the
+docs/processors.md says how to add one. On a machine whose processor has no files here, those of x86-64 are what `cpu` and the
 others are: nothing of them is used there, as `why_unsupported` and `number_of` see to.
 """
 

@@ -1,6 +1,6 @@
 """How much a guarded component has written to its standard streams, and the bytes themselves, without asking anybody.
 
-The guard counts a byte when it takes it out of the pipe, and writes it to the log a little later (ARCHITECTURE §4).
+The guard counts a byte when it takes it out of the pipe, and writes it to the log a little later (docs/internals.md, section 5).
 Of held output it may leave bytes in the pipe: they are read there, and stay.
 """
 

@@ -1,6 +1,6 @@
 """How many bytes a guarded program has written to its output streams until now: those counted, and those still in the pipe.
 
-The guard takes bytes out of a pipe and counts them as one act (ARCHITECTURE §4); what is unread, either end of the pipe tells.
+The guard takes bytes out of a pipe and counts them as one act (docs/internals.md §5); either end of the pipe tells the rest.
 """
 
 from __future__ import annotations
