@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sys
 
-from checkpoint.runtime import early_interrupt, slim_imports
+from checkpoint.runtime import early_interrupt
 
 
 def main() -> int:
     """Load and run the daemon's command line."""
     early_interrupt.begin()
+    from checkpoint.runtime import slim_imports
+
     slim_imports.begin()
     from agent.main import main as run
 

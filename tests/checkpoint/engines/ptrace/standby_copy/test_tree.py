@@ -34,8 +34,8 @@ from checkpoint.pages import page_set
 from checkpoint.store import chain
 from checkpoint.store.member_pages import MemberPages
 from checkpoint.store.xor_cache import Sender
-from tests.checkpoint import test_tree_states as states
 from tests.checkpoint.engines.ptrace.capture.test_trees import FAMILY, POOL
+from tests.checkpoint.engines.ptrace.restore import test_tree_states as states
 from tests.checkpoint.engines.ptrace.restore.test_tree_states import BORN_LATE, PREAMBLE, STOPPED, shared_out
 from tests.checkpoint.engines.ptrace.standby_copy.test_single import (
     age_ns,
