@@ -1,4 +1,4 @@
-"""How much memory the control groups of this process leave to it: the smallest limit of any of them, up to the outermost.
+"""How much memory the control groups of this process leave to it: the smallest remainder in any of them, up to the outermost.
 
 The module reads both versions, because machines mix them. A group that sets no limit, or that cannot be read, does not count.
 Memory that the kernel uses for files counts as free: the kernel releases it before it kills a process.

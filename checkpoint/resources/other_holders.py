@@ -1,7 +1,7 @@
 """Check whether another program holds the same open file: then it is not the program's alone, and cannot move with it.
 
-Other processes get an open file only by a fork, by a message of a unix socket or by inheriting it at their birth. So an open file
-that was once the program's alone is not checked again under its number.
+Other processes get an open file only by a fork, by a message of a unix socket or by inheriting it when they are created. So an
+open file that was once the program's alone is not checked again under its number.
 
 Source: kcmp(2).
 """

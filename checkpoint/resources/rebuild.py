@@ -4,8 +4,8 @@ Every resource stands for one *open file description*: descriptors made by dup s
 again. Facts that all resources have: ``descriptors``, a list of [number, 1 if close-on-exec].
 
 Order: first the vessel's own 0, 1 and 2 move out of the way. Then every number is restored in ascending order, so that each file
-that is opened gets a number that is still wanted or free. Then the moved descriptors are closed. Last, files that refer to other
-descriptors are told of them.
+that is opened gets a number that is still wanted or free. Then the moved descriptors are closed. Last, the restore passes other
+descriptors to the files that refer to them.
 
 Sources: open(2), dup(2), fdinfo of proc_pid_fdinfo(5).
 """

@@ -1,7 +1,7 @@
 """Read the owner and signal of open files (fcntl(2)) at the same instant as the memory.
 
 The query costs a few calls for each open file, and hardly any has an owner. So the freeze asks only about files that may well
-have one: they send signals (O_ASYNC), have a lease, are on their way in a socket, or had an owner at the last capture. After the
+have one: they send signals (O_ASYNC), have a lease, are in transit in a socket, or had an owner at the last capture. After the
 process has resumed, all others are asked. If one of them has an owner, the file got it unnoticed, perhaps before the freeze,
 perhaps after it: the capture is made again, and asks about that file in time.
 

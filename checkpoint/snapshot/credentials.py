@@ -1,8 +1,8 @@
 """The rights that a snapshot gets when it is restored: what its threads ask for, limited to the rights of its owner.
 
-`bounded` is the only limit: a snapshot goes through it wherever it is restored for an owner who is not root. `excess` lists what
-it takes away, and `beyond` lists what no owner but root can have (an agent refuses that). Threads with other rights than their
-first one are in a resource of their own kind, which `checkpoint.resources.process.thread_credentials` makes.
+`bounded` is the only limit: a snapshot goes through it wherever it is restored for an owner who is not root. `excess` lists the
+rights that it takes away, and `beyond` lists rights that only root can have (an agent refuses that). Threads with other rights
+than their first one are in a resource of their own kind, which `checkpoint.resources.process.thread_credentials` makes.
 
 Sources: credentials(7); capabilities(7), on securebits; sched(7); getrlimit(2).
 """

@@ -3,7 +3,7 @@
 A *chain* is a tuple of snapshots of one component: a base, then deltas, each the child of the one before it.
 
 A delta changes the state of its parent in steps: pages outside its own mappings go, pages in ``cleared`` go, pages in ``runs``
-are set (those in ``differences`` to what is there XOR their bytes), pages in ``copies`` as those that they name. A position's
+are set (those in ``differences`` to the present bytes XOR theirs), pages in ``copies`` as those that they name. A position's
 digest covers the result (``state_digest``), so a fold proves itself.
 """
 

@@ -1,7 +1,7 @@
 """Silence TCP connections: the kernel drops all packets to and from them.
 
 While a connection moves, no machine may answer in its place: neither a kernel that has no such socket any more (it would reset
-the peer's), nor one whose program was ended with the connection open. The peer hears nothing and sends again, as after a lost
+the peer's), nor one whose program was ended with the connection open. The peer receives nothing and sends again, as after a lost
 packet.
 
 Each connection has a table of its own in nf_tables, named by its two ends, so that any process that takes the connection over

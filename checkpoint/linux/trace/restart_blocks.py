@@ -1,7 +1,7 @@
 """Handle calls that the kernel continues from its restart block, if a stop hides them (`FORGETS_CALLS` of a processor).
 
-On such a processor, a thread that was stopped in a relative sleep is about to make the same call. Only when it runs again, the
-kernel puts restart_syscall(2) in its place. If a tracer led it away meanwhile, it would sleep for its whole time once more. So
+On such a processor, a thread that was stopped in a relative sleep is about to make the same call. Only when it runs again does
+the kernel put restart_syscall(2) in its place. If a tracer led it away meanwhile, it would sleep for its whole time once more. So
 the tracer brings it to the point where the call begins, which shows which call it is. The call is not made, and the thread is
 again at the point where it is about to make it.
 

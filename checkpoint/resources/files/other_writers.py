@@ -1,8 +1,8 @@
 """Find other processes that hold a file open for writing: a program is never restored onto a file that another one writes to.
 
 The check asks the kernel first: it grants a read lease only on a file that no process may write to. That takes microseconds for
-any number of processes. Only when the kernel refuses, or the file is not ours to lease or its file system has no leases, the
-check looks through the descriptors of all processes, to find their names.
+any number of processes. Only when the kernel refuses, or the file is not ours to lease or its file system has no leases, does the
+check look through the descriptors of all processes, to find their names.
 
 Source: F_SETLEASE in fcntl(2); fdinfo in proc_pid_fdinfo(5).
 """

@@ -3,8 +3,8 @@
 If the component has a guard, the state is recorded only for children, and only while the first process runs. The guard may hold
 the whole component by SIGSTOP, and after a restore it is another guard.
 
-A child may have resumed without its parent having been told yet (WCONTINUED). The capture asks the parent itself; the state is
-recorded for one child only.
+A child may have resumed without its parent having been told yet (WCONTINUED). The capture asks the parent itself, and so learns
+of one such child only.
 
 Facts: ``descriptors`` (none); ``signal`` by which it is stopped, 0 if it has resumed and its parent is to be told; ``untold``:
 the code that wait(2) still has to report to its parent for the stop (CLD_STOPPED, 5), 0 if nothing.

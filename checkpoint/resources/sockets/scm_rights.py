@@ -1,4 +1,4 @@
-"""Open files on their way in a unix socket (SCM_RIGHTS) that the program itself has closed since.
+"""Open files in transit in a unix socket (SCM_RIGHTS) that the program itself has closed since.
 
 The capture reads them through descriptors of our own, with numbers above all of the program's. The restore opens them under these
 numbers until they have been sent again. Fact of such a resource: ``travelling``, true.

@@ -13,7 +13,7 @@ can see it: the program sets the whole register for each call that it makes, and
 this is the same call that the tracer made again, and that it has not returned since. No call times out too early, because it
 began before the tracer saw it. It may time out late, by less than its timeout and by less than the time between three captures. A
 signal handler that runs ends the call with EINTR, as usual. If the tracer dies, it leaves a system call that times out by itself.
-Only if it dies in the middle of a stop, before it has made the call again, the EINTR of that stop remains.
+Only if it dies in the middle of a stop, before it has made the call again, does the EINTR of that stop remain.
 
 Programs that make such a call again themselves, with the rest of its time, are more exact than the tracer. Of their calls this
 module makes only those without a timeout again (`makes_calls_again`).

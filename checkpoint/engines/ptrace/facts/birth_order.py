@@ -1,7 +1,7 @@
 """Plan the order in which a restore creates the processes of a component, so that parents, sessions and process groups match.
 
 A child is created in the session and the process group of its parent. A process cannot join a session, and can join a group only
-within its session. So a leader makes its session after the birth of its children that have an older session, and before the birth
+within its session. So a leader makes its session after the creation of its children that have an older session, and before that
 of its other children. Some processes are created with the help of a *stand-in*, a process that ends when it has done its part, as
 the process that it replaces has ended. These are: processes that have lost their parent; processes in a session or group whose
 leader has ended; and processes that were given to another parent, one that asks for orphans. The last kind is created below that

@@ -1,7 +1,7 @@
 """Decide which bases may be written into their vessel before all of their pages are verified.
 
 The restore writes a base that lies in files into its vessel frame by frame (`checkpoint.store.base_on_disk`). Only after the last
-frame it knows whether all frames were those that were captured. If not, it gives the vessel up, and nothing of the vessel may
+frame does it know whether all frames were those that were captured. If not, it gives the vessel up, and nothing of the vessel may
 remain.
 """
 
